@@ -21,8 +21,9 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import load_bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.window import SlidingWindow, WindowStatistics
-from models.levels.measures import hop_levels
-from service.monitor.levels import LevelWatch
+from models.levels.judgement import LevelJudge
+from models.levels.measures import WindowLevels, hop_levels
+from models.levels.reference import learn_levels
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import load_scenario
 from simulator.stream import blocks
@@ -49,17 +50,21 @@ def main() -> None:
     bundle, plan = load_bundle("lab", machine), plan_for(machine, levels=True)
     window = SlidingWindow(plan)
     windows: list[WindowStatistics] = []
+    measures: list[WindowLevels] = []
     samples = np.concatenate([plan.to_si(block.samples) for block in stream])
     for _ in window.feed(samples, 0):
-        full = window.statistics()
-        if full is not None:
+        full, loud = window.statistics(), window.levels()
+        if full is not None and loud is not None:
             windows.append(full)
+            measures.append(loud)
     piece = samples[: plan.preamble + plan.hop]
     level = piece[:, : len(plan.states)].mean(axis=0)
     rows = np.ascontiguousarray(piece.T)  # as the moments have them
     own, angle, measured = rows[:-1, -plan.hop :].T, rows[-1, -plan.hop :], plan.levels
-    levels = LevelWatch(plan, machine, Installed(machine, bundle))
     assert measured is not None  # noqa: S101  # planned above
+    channels = [machine.sensors[column] for column in plan.columns]
+    judge = LevelJudge(measured, channels, machine.levels)
+    healthy = learn_levels("commissioned", [channel.name for channel in channels], measures)
     fit, relation = LikelihoodFit(machine), RelationDiagnostician(machine, bundle.networks)
     if bundle.amortised is None:
         raise SystemExit("the shipped bundle has no amortised networks: train it again")
@@ -86,7 +91,9 @@ def main() -> None:
         "Fourier transforms alone (yardstick)": median_s(yardstick, 1),
         "moments of a hop": median_s(lambda: hop_moments(plan, piece, level, 0), 1),
         "  of which levels of the hop": often(lambda: hop_levels(measured, own, angle)),
-        "levels of a window, judged": often(lambda: levels.take(window)),
+        "levels of a window": often(window.levels),
+        "  judged, known machine": often(lambda: judge.judge(measures[-1], None)),
+        "  judged against commissioning": often(lambda: judge.judge(measures[-1], healthy)),
         "statistics of a window": median_s(window.statistics, 1),
         "likelihood, warm": median_s(lambda: [fit.diagnose(one) for one in windows], len(windows)),
         "likelihood, followed": median_s(lambda: [following.diagnose(one) for one in windows], len(windows)),

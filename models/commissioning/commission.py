@@ -29,7 +29,7 @@ from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import from_scale, slope, to_scale
 from models.errors import EstimationError
 from models.levels.gains import learn_gains, place_of
-from models.levels.judgement import alerts_of
+from models.levels.limits import alerts_of
 from models.levels.reference import learn_levels
 from models.machine import Machine, MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETER_TEXT, PARAMETERS

@@ -91,22 +91,35 @@ class Growth:
     limit: float  # ratio from which on it is an alert
 
 
-def growth(
+@dataclass(frozen=True, slots=True)
+class BandLimits:
+    """What the bands of some channels are judged by in windows of one length; nothing where there is no reference."""
+
+    # All (n_bands, n).
+    own: FloatArray  # mean healthy level
+    mean: FloatArray  # that of the loudest of its neighbourhood
+    limit: FloatArray
+
+
+def band_limits(
     levels: BandLevels,
-    column: int,
-    reference: BandReference,
+    references: Sequence[BandReference | None],
     ratio: float,
     beyond_range: float,
     n_errors: float,
     shorter: float,
-) -> Growth | None:
-    """Compare a channel's bands with the reference; None where there is nothing to compare.
+) -> BandLimits:
+    """Limits of the bands of all channels.
 
     The ratio of the mean squares of two stretches of Gaussian noise follows an F distribution (J. S. Bendat, A. G.
     Piersol, "Random Data", 4th ed., chapter 4): no limit is nearer than what chance exceeds once in 10⁹ bands.
 
     Parameters
     ----------
+    levels : BandLevels
+        Of a window of that length.
+    references : sequence of BandReference or None
+        By column.
     ratio : float
         Limit, times the mean of the reference.
     beyond_range : float
@@ -116,42 +129,43 @@ def growth(
     shorter : float
         By how much a level scatters more than in the healthy windows, while the window fills.
     """
-    known = _limits(
-        reference, levels.edges_hz.tobytes(), levels.freedom.tobytes(), ratio, beyond_range, n_errors, shorter
-    )
-    if known is None:
-        return None
-    own, mean, limit = known
-    now = levels.rms[:, column]
-    looked_at = (now > _COUNTS * np.sqrt(np.sum(now**2))) & (own > 0)
-    if not looked_at.any():
-        return None
+    own, mean, limit = np.zeros((3, *levels.rms.shape))
+    for column, reference in enumerate(references):
+        if reference is None or levels.edges_hz.size != len(reference.edges_hz):
+            continue
+        if not np.allclose(levels.edges_hz, reference.edges_hz, rtol=1e-3):
+            continue
+        around, high, error = (_around(np.array(each)) for each in (reference.mean, reference.high, reference.error))
+        chance = np.sqrt(fdtri(levels.freedom, np.array(reference.freedom), 1 - _CHANCE))
+        relative = n_errors * np.divide(error, around, out=np.zeros_like(around), where=around > 0)
+        loudest = np.maximum(beyond_range, 1 + relative * np.sqrt(shorter**2 - 1)) * high
+        own[:, column], mean[:, column] = reference.mean, around
+        limit[:, column] = np.max(
+            [np.maximum(ratio, chance) * around, loudest, (1 + relative * shorter) * around], axis=0
+        )
+    return BandLimits(own, mean, limit)
+
+
+def growth(levels: BandLevels, limits: BandLimits) -> list[Growth | None]:
+    """Compare every channel's bands with its reference; None where there is nothing to compare."""
+    now, columns = levels.rms, np.arange(levels.rms.shape[1])
+    looked_at = (now > _COUNTS * np.sqrt(np.sum(now**2, axis=0))) & (limits.own > 0)
+    ratios = np.divide(now, limits.own, out=np.full(now.shape, np.inf), where=looked_at)
+    count = looked_at.sum(axis=0)
+    ratios.sort(axis=0)
     # What grows in all bands alike is growth of the excitation, which the overall level is judged by.
-    limit = limit * max(1.0, float(np.median(now[looked_at] / own[looked_at])))
-    at = int(np.argmax(np.where(looked_at, now / np.where(mean > 0, limit, 1.0), 0.0)))
-    edges = levels.edges_hz
-    return Growth((float(edges[at]), float(edges[at + 1])), float(now[at] / mean[at]), float(limit[at] / mean[at]))
-
-
-@lru_cache(maxsize=1024)
-def _limits(
-    reference: BandReference,
-    edges_hz: bytes,
-    freedom: bytes,
-    ratio: float,
-    beyond_range: float,
-    n_errors: float,
-    shorter: float,
-) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Mean of every band, that of the loudest of its neighbourhood, and limit; the same in every full window."""
-    edges, own, degrees = np.frombuffer(edges_hz), np.array(reference.mean), np.frombuffer(freedom)
-    if edges.size != len(reference.edges_hz) or not np.allclose(edges, reference.edges_hz, rtol=1e-3):
-        return None
-    mean, high, error = (_around(np.array(each)) for each in (reference.mean, reference.high, reference.error))
-    chance = np.sqrt(fdtri(degrees, np.array(reference.freedom), 1 - _CHANCE))
-    relative = n_errors * np.divide(error, mean, out=np.zeros_like(mean), where=mean > 0)
-    loudest = np.maximum(beyond_range, 1 + relative * np.sqrt(shorter**2 - 1)) * high
-    return own, mean, np.max([np.maximum(ratio, chance) * mean, loudest, (1 + relative * shorter) * mean], axis=0)
+    median = (ratios[(count - 1) // 2, columns] + ratios[count // 2, columns]) / 2
+    limit = limits.limit * np.maximum(1.0, np.where(count > 0, median, 1.0))
+    at = np.divide(now, limit, out=np.zeros(now.shape), where=looked_at).argmax(axis=0)
+    edges, mean = levels.edges_hz, limits.mean[at, columns]
+    return [
+        Growth(
+            (float(edges[band]), float(edges[band + 1])), float(now[band, n] / mean[n]), float(limit[band, n] / mean[n])
+        )
+        if count[n]
+        else None
+        for n, band in enumerate(at.tolist())
+    ]
 
 
 def _around(values: FloatArray) -> FloatArray:

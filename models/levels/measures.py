@@ -97,14 +97,21 @@ class LevelPlan:
 
     def columns(self, *quantities: Quantity) -> npt.NDArray[np.intp]:
         """Columns of some quantities."""
-        return _columns(self.quantities, quantities)
+        return _columns(self.quantities, quantities)[0]
+
+    def has(self, *quantities: Quantity) -> npt.NDArray[np.bool_]:
+        """Whether each column is of one of some quantities."""
+        return _columns(self.quantities, quantities)[1]
 
 
 @lru_cache(maxsize=64)
-def _columns(every: tuple[Quantity, ...], wanted: tuple[Quantity, ...]) -> npt.NDArray[np.intp]:
-    columns = np.array([at for at, one in enumerate(every) if one in wanted], dtype=np.intp)
-    columns.flags.writeable = False
-    return columns
+def _columns(
+    every: tuple[Quantity, ...], wanted: tuple[Quantity, ...]
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
+    has = np.array([one in wanted for one in every], dtype=np.bool_)
+    (columns,) = has.nonzero()
+    columns.flags.writeable = has.flags.writeable = False
+    return columns, has
 
 
 def level_plan(
@@ -400,10 +407,7 @@ def window_levels(
     """
     sums = np.stack([hop.sums for hop in hops])
     count, _, n = sums.shape
-    displacements, accelerations = (
-        np.isin(np.arange(n), plan.columns(*of))
-        for of in ((Quantity.DISPLACEMENT, Quantity.TILT), (Quantity.ACCELERATION,))
-    )
+    displacements, accelerations = plan.has(Quantity.DISPLACEMENT, Quantity.TILT), plan.has(Quantity.ACCELERATION)
     mean = sums[:, 0].mean(axis=0)
     square = (sums[:, 1] + (sums[:, 0] - mean) ** 2).mean(axis=0)
     rms, peak = np.sqrt(square), sums[:, 2].max(axis=0)
@@ -411,7 +415,7 @@ def window_levels(
     s_max = np.full((count, n), np.nan)
     for number, (y, _) in enumerate(plan.pairs):
         s_max[:, y] = [hop.radius[number] for hop in hops]
-    turning = np.abs(np.nan_to_num(speeds_rad_s)) > _STANDS
+    turning = np.abs(speeds_rad_s) > _STANDS  # not where it is not known
     every_order = np.stack([hop.orders for hop in hops])
     orders = every_order[turning]
     amplitudes, scatter, vectors = _amplitudes(orders, phase_reference=phase_reference)

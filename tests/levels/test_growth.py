@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models.levels.judgement import LevelJudge, alerts_of, growth_seen
+from models.levels.judgement import LevelJudge, growth_seen
+from models.levels.limits import alerts_of
 from models.levels.measures import COMPARED, WindowLevels, level_plan
 from models.levels.reference import LevelReference, learn_levels
 from models.levels.settings import LevelSettings

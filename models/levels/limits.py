@@ -1,0 +1,187 @@
+"""The limits of levels: one of them, and those relative to a reference.
+
+A limit relative to a reference is never nearer than the reference itself has been: not within a quarter of its largest
+healthy level, nor within six standard errors of one window. So excitation that varies as it did in the healthy windows
+raises nothing, and a line that was nothing but noise has to stand out of it. While a window fills it scatters more,
+about the loudest and the quietest healthy level as well as about their mean.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+from models.levels.bands import BandLimits, band_limits
+from models.levels.measures import WindowLevels
+from models.levels.reference import LevelReference, OperatingState, ReferenceLevel
+from models.levels.settings import LevelSettings
+from models.signals.channels import Channel, Quantity
+from rotorwatch.records.levels import LevelBound
+
+BEYOND_RANGE = 1.25
+ERRORS = 6.0
+_TURNED = 0.6
+PEAK_TO_PEAK = (Quantity.DISPLACEMENT, Quantity.TILT)
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """One limit of a level, as shown."""
+
+    source: str
+    absolute: bool
+    alert: float | None = None
+    danger: float | None = None
+    fall: float | None = None
+    zones: tuple[float, float, float] | None = field(default=None, kw_only=True)
+
+    def bound(self) -> LevelBound:
+        """The limit as it is told."""
+        alert, danger, fall = (None if edge is None else rounded(edge) for edge in (self.alert, self.danger, self.fall))
+        if self.zones is None:
+            return LevelBound(source=self.source, alert=alert, danger=danger, fall=fall)
+        first, second, third = map(rounded, self.zones)
+        standard = self.source.rpartition(", zone ")[0]
+        return LevelBound(source=standard, zones=(first, second, third), alert=alert, danger=danger, fall=fall)
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """The acceptance region of a 1x vector (ISO 20816-1, criterion II)."""
+
+    centre: complex
+    radius: float
+    alert: float  # limit of the amplitude, SI units
+
+
+@dataclass(frozen=True, slots=True)
+class RelativeLimits:
+    """The limits relative to a reference, of windows of one length in one operating state."""
+
+    source: str
+    # By column, and measure.
+    limits: tuple[dict[str, Limit], ...]
+    regions: tuple[Region | None, ...]
+    bands: BandLimits | None
+
+
+def relative_limits(
+    levels: WindowLevels, reference: LevelReference, channels: Sequence[Channel], given: LevelSettings
+) -> RelativeLimits:
+    """What a window is judged by, and all others of as many hops in the same operating state."""
+    state, seen = reference.at(levels.speed_rad_s)
+    source = reference.source if seen else f"{reference.source} at another speed"
+    shorter = _shorter(state, levels.hops)
+    limits, regions = [], []
+    for channel in channels:
+        of_channel, region = dict[str, Limit](), None
+        for name, one in state.levels.get(channel.name, {}).items():
+            spread = ERRORS * one.error * shorter
+            alert = _alert_from(one, given, shorter)
+            danger = None  # what levels are at another speed says too little
+            if seen:
+                danger = max(given.danger_ratio * one.mean, alert * given.danger_ratio / given.alert_ratio)
+            fall = None
+            if name in {"overall", "velocity"} and given.fall_ratio:
+                quietest = one.low * min(1 / BEYOND_RANGE, 1 - _filling(one, shorter))
+                fall = min(given.fall_ratio * one.mean, quietest, one.mean - spread)
+            shown = [None if edge is None else shown_level(channel, name, edge) for edge in (alert, danger, fall)]
+            of_channel[name] = Limit(source, False, *shown)
+            if seen and name == "x1" and one.vector is not None:
+                region = _region(channel, one, complex(*one.vector), alert, shorter)
+        limits.append(of_channel)
+        regions.append(region)
+    bands = None
+    if seen and levels.bands is not None:  # at a speed that was never seen lines are elsewhere
+        own = [state.bands.get(channel.name) for channel in channels]
+        bands = band_limits(levels.bands, own, given.alert_ratio, BEYOND_RANGE, ERRORS, shorter)
+    return RelativeLimits(source, tuple(limits), tuple(regions), bands)
+
+
+def _region(channel: Channel, one: ReferenceLevel, centre: complex, alert: float, shorter: float) -> Region:
+    factor = of_amplitude(channel)
+    farthest = max(BEYOND_RANGE * one.turned, one.turned + _filling(one, shorter) * one.mean / factor)
+    by_chance = ERRORS * one.error * shorter / factor
+    return Region(centre, max(_TURNED * abs(centre), farthest, by_chance), alert)
+
+
+def of_amplitude(channel: Channel) -> float:
+    """What makes the level of a line of its amplitude."""
+    return 2.0 if channel.quantity in PEAK_TO_PEAK else math.sqrt(0.5)
+
+
+def _shorter(state: OperatingState, hops: int) -> float:
+    """By how much a level scatters more than in the healthy windows while the window fills."""
+    return math.sqrt(max(1.0, state.hops / hops))
+
+
+def _filling(one: ReferenceLevel, shorter: float) -> float:
+    """By how much, relative, a level may scatter about that of a full window; nothing once the window is full."""
+    return ERRORS * one.error / one.mean * math.sqrt(shorter**2 - 1) if one.mean else 0.0
+
+
+def _alert_from(one: ReferenceLevel, given: LevelSettings, shorter: float) -> float:
+    loudest = one.high * max(BEYOND_RANGE, 1 + _filling(one, shorter))
+    return max(given.alert_ratio * one.mean, loudest, one.mean + ERRORS * one.error * shorter)
+
+
+@dataclass(frozen=True, slots=True)
+class AlertFrom:
+    """From where on a level of a channel raises an alert relative to its reference, as shown."""
+
+    state: OperatingState
+    channel: Channel
+    measure: str
+    unit: str
+    healthy: float  # mean of the healthy windows
+    alert: float
+
+    @property
+    def growth(self) -> float | None:
+        """Of the mean healthy level, relative; None where that is nothing."""
+        return self.alert / self.healthy - 1 if self.healthy > 0 else None
+
+
+def alerts_of(
+    reference: LevelReference, channels: Sequence[Channel], settings: LevelSettings, hops: int
+) -> Iterator[AlertFrom]:
+    """Alert limits relative to a reference, state by state.
+
+    Parameters
+    ----------
+    hops : int
+        In the windows that are judged.
+    """
+    for state in reference.states:
+        for channel in channels:
+            for name, one in state.levels.get(channel.name, {}).items():
+                alert = _alert_from(one, settings, _shorter(state, hops))
+                healthy, limit = (shown_level(channel, name, value) for value in (one.mean, alert))
+                peak_to_peak = channel.quantity in PEAK_TO_PEAK
+                yield AlertFrom(state, channel, name, unit_of(channel.unit, name, peak_to_peak), healthy, limit)
+
+
+def shown_level(channel: Channel, name: str, value: float) -> float:
+    """A level in the unit in which it is shown."""
+    if name in {"crest", "kurtosis"}:
+        return value
+    if name == "velocity":
+        return value * 1e3
+    return value / channel.to_si
+
+
+def unit_of(unit: str, name: str, peak_to_peak: bool) -> str:
+    """The unit in which a measure is shown, of a channel in `unit`."""
+    if name in {"crest", "kurtosis"}:
+        return ""
+    if name == "growth":
+        return "times the reference"
+    if name == "velocity":
+        return "mm/s rms"
+    if name in {"peak", "s_max", "mean"}:
+        return f"{unit} peak" if name != "mean" else unit
+    return f"{unit} {'pp' if peak_to_peak and name != 'not_x1' else 'rms'}"
+
+
+def rounded(value: float) -> float:
+    """Five digits: no sensor has more."""
+    return float(f"{value:.5g}")
