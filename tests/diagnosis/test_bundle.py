@@ -53,6 +53,18 @@ def test_round_trip(tmp_path: Path) -> None:
         save_bundle(tmp_path / "other", LAB, shipped.networks, MADE, uncalibrated)
 
 
+def test_machines_of_one_kind_hold_the_weights_of_their_bundle_once(tmp_path: Path) -> None:
+    copied = shutil.copytree(SHIPPED, tmp_path / "copy")
+    one, other = (load_bundle(place, LAB.model_copy(update={"name": place.name})) for place in (SHIPPED, copied))
+    assert one.amortised is not None
+    assert other.amortised is not None
+    for mine, theirs in zip(one.amortised.networks, other.amortised.networks, strict=True):
+        assert all(a is b for a, b in zip(mine.weights, theirs.weights, strict=True))
+    assert one.amortised.basis.directions is other.amortised.basis.directions
+    with pytest.raises(ValueError, match="read-only"):
+        one.amortised.networks[0].weights[0][0, 0] = 0.0
+
+
 def test_an_uncalibrated_network_is_not_saved(tmp_path: Path) -> None:
     trained = load_bundle("lab", LAB).networks[0]
     with pytest.raises(BundleError, match="equation 28 has no healthy spread"):

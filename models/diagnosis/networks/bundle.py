@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from weakref import WeakValueDictionary
 
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
@@ -36,6 +37,8 @@ _FORMAT = 2
 _PHYSICS = ("rotor", "operation", "condition", "rate_hz", "window")
 _BASIS = ("mean", "directions", "centre", "scale", "precision_factor")
 _ARRAYS = ("input_scale", "W1", "b1", "W2", "b2")
+# By hash of the file and name: machines of one kind hold the weights of their bundle once, for as long as one has them.
+_shared: WeakValueDictionary[tuple[str, str], _Array] = WeakValueDictionary()
 
 
 class HealthyEntry(BaseModel, extra="forbid", frozen=True):
@@ -236,9 +239,11 @@ def load_bundle(name_or_path: str | Path, machine: Machine) -> Bundle:
             f"{directory}: trained for another machine than {machine.site}/{machine.name}: {'; '.join(differences)}"
         )
     try:
-        arrays = load(weights)
+        arrays = {name: _shared.setdefault((digest, name), array) for name, array in load(weights).items()}
     except SafetensorError as error:
         raise BundleError(f"{directory}/weights.safetensors: {error}") from error
+    for array in arrays.values():
+        array.flags.writeable = False
     amortised = None if manifest.amortised is None else _amortised(directory, manifest.amortised, arrays)
     return Bundle(manifest, tuple(_network(directory, entry, arrays) for entry in manifest.equations), amortised)
 
