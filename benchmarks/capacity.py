@@ -1,11 +1,14 @@
 """How many machines one monitor carries: end to end, from the last sample of a hop to its report on the topic.
 
 Run: ``python benchmarks/capacity.py --machines 10 20 40`` (some minutes for each). A monitor with its history in a file
-and networks on watches so many rotor kits (9 channels, 2 kHz, windows of 60 s, hops of 5 s); this process, which shares
-the computer with it, sends streams simulated beforehand at pace 1, the machines' hops spread evenly over time. Cores
-and memory are the monitor's own; *yardstick* is the processor time of the Fourier transforms that a hop's cross-spectra
-need at the very least, measured here before. ``--stall 10`` stops the monitor for as long in the middle of it and tells
-when reports are in time again.
+and networks on watches so many rotor kits (9 channels, 2 kHz, windows of 60 s, hops of 5 s), or machines of another
+kind: ``--channels 13 --rate 4000 --hop 10 --no-networks``, or ``--levels`` of any number of channels. This process,
+which shares the computer with it, sends streams simulated beforehand at pace 1, the machines' hops spread evenly over
+time. Cores and memory are the monitor's own; *yardstick* is the processor time of the Fourier transforms that a hop's
+cross-spectra need at the very least, measured here before. ``--stall 10`` stops the monitor, or with
+``--of-shard`` one of its processes, for as long in the middle of it, and tells when reports are in time again, what is
+lost, and which hops were not evaluated. ``costs.py`` measures kinds of machines with it, for
+``rotorwatch size``.
 """
 
 import os
@@ -15,12 +18,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import argparse
 import json
 import signal
+import sqlite3
 import tempfile
 import threading
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -28,15 +32,14 @@ import httpx
 import numpy as np
 import zenoh
 import zenoh.ext
+from machine_kind import MachineKind
 from running_monitor import on_loopback, started, url_of
 
 from models.diagnosis.moments import plan_for
-from models.machine import MachineFile, load_machine
+from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from models.signals.wire import encode_block
-from simulator.scenario import load_scenario
-from simulator.stream import blocks
 
 BLOCK_S = 0.1
 KINDS = 4
@@ -101,11 +104,14 @@ class Plant:
     sent_s: dict[tuple[str, int], float] = field(default_factory=dict)  # of every block, by its number
     heard: list[tuple[float, float]] = field(default_factory=list)  # when, and how late
     windows: dict[str, list[tuple[float, int]]] = field(default_factory=lambda: defaultdict(list))  # when, and end
+    told_bytes: int = 0
     behind_s: float = 0.0
 
     def hear(self, sample: zenoh.Sample) -> None:
         """Take a report."""
-        now_s, report = time.monotonic(), json.loads(sample.payload.to_bytes())
+        now_s, payload = time.monotonic(), sample.payload.to_bytes()
+        report = json.loads(payload)
+        self.told_bytes += len(payload)
         last = -(-(report["end_ns"] - self.start_ns) // round(BLOCK_S * 1e9)) - 1
         self.heard.append((now_s, now_s - self.sent_s[report["machine"], last]))
         self.windows[report["machine"]].append((now_s, report["end_ns"] - self.start_ns))
@@ -143,15 +149,12 @@ class Plant:
 
 
 @contextmanager
-def monitored(folder: Path, machines: Sequence[MachineFile]) -> Iterator[tuple[Process, str, str]]:
-    """A monitor of these machines: its process, its endpoint and its address."""
+def monitored(
+    folder: Path, machines: Sequence[MachineFile], bundle: dict[str, str]
+) -> Iterator[tuple[Process, str, str]]:
+    """A monitor of these machines, whose files are in the folder: its process, its endpoint and its address."""
     environment, endpoint = on_loopback(folder)
-    text = Path("models/machines/lab.toml").read_text(encoding="utf-8")
-    entries = []
-    for machine in machines:
-        file = folder / f"{machine.name}.toml"
-        file.write_text(text.replace('name = "lab"', f'name = "{machine.name}"'), encoding="utf-8")
-        entries.append({"file": str(file), "bundle": "lab"})
+    entries = [{"file": str(folder / f"{machine.name}.toml"), **bundle} for machine in machines]
     environment["ROTORWATCH_MACHINES"] = json.dumps(entries)
     process = started(["service.rotorwatch", "run"], folder / "out", folder / "log", environment)
     try:
@@ -183,70 +186,135 @@ def sending(
             subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
-def lost(url: str) -> int:
-    """Blocks that were refused, dropped or are missing, of all machines."""
-    count = 0
+def lost(url: str, machines: Sequence[MachineFile]) -> tuple[int, float, Counter[str]]:
+    """Of all machines: blocks refused, dropped or missing; seconds of data missing; alarms raised, by name."""
+    count, missing_s, raised = 0, 0.0, Counter[str]()
     with httpx.Client(base_url=url, trust_env=False, timeout=60.0, verify=False) as http:  # noqa: S501  # no HTTPS
-        for machine in http.get("/api/v1/machines").json()["machines"]:
-            health = http.get(f"/api/v1/machines/{machine['site']}/{machine['machine']}/health").json()
-            quality = health["quality"]
+        for machine in machines:
+            path = f"/api/v1/machines/{machine.site}/{machine.name}"
+            quality = http.get(f"{path}/health").raise_for_status().json()["quality"]
             count += sum(quality["refused_blocks"].values()) + quality["queue_dropped_blocks"] + quality["gaps"]
-    return count
+            missing_s += quality["missing_s"]
+            events = http.get(f"{path}/alarms/events?limit=1000").raise_for_status().json()["events"]
+            raised.update(one["data"]["name"] for one in events if one["data"]["kind"] == "raised")
+    return count, missing_s, raised
 
 
-def measure(count: int, seed: int, length_s: float, stall_s: float) -> None:
-    """Watch so many machines for a while after their windows have filled, and print what it took."""
-    base = load_machine("lab")
-    machines = [base.model_copy(update={"name": f"kit{number}"}) for number in range(count)]
-    scenario, _ = load_scenario("healthy")
-    warm_s = base.window.length_s + 4 * base.window.hop_s
-    streams = [
-        [
-            block
-            for block, _ in blocks(
-                scenario.overridden(seed=seed + kind, duration_s=warm_s + length_s), base, BLOCK_S, start_ns=0
+@dataclass(slots=True)
+class Held:
+    """What a history in a file holds."""
+
+    size_bytes: int
+    reports: int
+    report_bytes: int  # of all texts, compressed
+    readings_bytes: int
+
+    @classmethod
+    def of(cls, file: Path) -> "Held":
+        """Look, beside the monitor that writes it."""
+        with closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True, timeout=60.0)) as database:
+            pages, free, size = (
+                database.execute(f"PRAGMA {name}").fetchone()[0]
+                for name in ("page_count", "freelist_count", "page_size")
             )
+            reports = database.execute("SELECT count(*), total(length(text)) FROM reports").fetchone()
+            readings = database.execute("SELECT total(length(readings)) FROM windows").fetchone()
+        return cls((pages - free) * size, reports[0], round(reports[1]), round(readings[0]))
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """What a plant of one kind took; of one hop of one machine where nothing else is said."""
+
+    cores: float  # of all
+    processor_ms: float
+    yardstick_ms: float
+    idle_mb: float  # memory of all, before data
+    memory_mb: float  # of all
+    written_kb: float
+    reports_kb: float  # of the history's file, with indexes
+    readings_kb: float
+    told_kb: float  # report on the topic
+
+
+def measure(kind: MachineKind, count: int, seed: int, length_s: float, stall_s: float, *, of_shard: bool) -> Figures:
+    """Watch so many machines for a while after their windows have filled, print what it took, and return it."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        machines = [kind.machine(folder, f"kit{number}") for number in range(count)]
+        window, yardstick = machines[0].window, yardstick_s(machines[0])
+        warm_s = window.length_s + 4 * window.hop_s
+        streams = [
+            kind.stream(folder, seed + number, warm_s + length_s, BLOCK_S) for number in range(min(KINDS, count))
         ]
-        for kind in range(min(KINDS, count))
-    ]
-    yardstick = yardstick_s(base)
-    with (
-        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name,
-        monitored(Path(name), machines) as (process, endpoint, url),
-    ):
-        idle_mb = process.memory_mb()
-        with sending(endpoint, machines, streams) as (plant, _):
-            time.sleep(warm_s)
-            before, begin_s = (process.cpu_s(), process.written_mb(), time.process_time()), time.monotonic()
-            first = len(plant.heard)
-            again_s = _stalled(process, plant, stall_s, length_s) if stall_s else None
-            time.sleep(max(0.0, begin_s + length_s - time.monotonic()))
-            took_s = time.monotonic() - begin_s
-            cpu_s, written_mb = process.cpu_s() - before[0], process.written_mb() - before[1]
-            late = np.array([one for _, one in plant.heard[first:]])
-            memory_mb, missing = process.memory_mb(), lost(url)
-    expected = count * took_s / base.window.hop_s
+        with monitored(folder, machines, kind.bundle) as (process, endpoint, url):
+            idle_mb = process.memory_mb()
+            with sending(endpoint, machines, streams) as (plant, _):
+                time.sleep(warm_s)
+                before, begin_s = (process.cpu_s(), process.written_mb(), time.process_time()), time.monotonic()
+                first, told_bytes, held = len(plant.heard), plant.told_bytes, Held.of(folder / "history.sqlite")
+                again_s = _stalled(process, plant, stall_s, length_s, of_shard=of_shard) if stall_s else None
+                time.sleep(max(0.0, begin_s + length_s - time.monotonic()))
+                took_s = time.monotonic() - begin_s
+                cpu_s, written_mb = process.cpu_s() - before[0], process.written_mb() - before[1]
+                late = np.array([one for _, one in plant.heard[first:]])
+                told_bytes, memory_mb = plant.told_bytes - told_bytes, process.memory_mb()
+                now = Held.of(folder / "history.sqlite")
+                (missing, missing_s, raised), skipped = lost(url, machines), _skipped(plant)
+    expected, reports = count * took_s / window.hop_s, max(1, now.reports - held.reports)
+    readings_kb = (now.readings_bytes - held.readings_bytes) / reports / 1e3
+    texts_kb = (now.report_bytes - held.report_bytes) / reports / 1e3
+    # Pages and indexes are shared out as the bytes are that stand in them.
+    taken_kb = (now.size_bytes - held.size_bytes) / reports / 1e3
+    figures = Figures(
+        cores=cpu_s / took_s,
+        processor_ms=1e3 * cpu_s / expected,
+        yardstick_ms=1e3 * yardstick,
+        idle_mb=idle_mb,
+        memory_mb=memory_mb,
+        written_kb=1e3 * written_mb / expected,
+        reports_kb=taken_kb * texts_kb / (texts_kb + readings_kb),
+        readings_kb=taken_kb * readings_kb / (texts_kb + readings_kb),
+        told_kb=told_bytes / max(1, late.size) / 1e3,
+    )
     print(
-        f"{count:4d} machines: {cpu_s / took_s:5.2f} cores ({1e3 * cpu_s / expected:.0f} ms a hop, "
-        f"{cpu_s / expected / yardstick:.0f} x the yardstick of {1e3 * yardstick:.2f} ms), "
-        f"{memory_mb:.0f} MB ({idle_mb:.0f} before data), {1e3 * written_mb / expected:.0f} kB written a hop; "
+        f"{count:4d} machines: {figures.cores:5.2f} cores ({figures.processor_ms:.0f} ms a hop, "
+        f"{cpu_s / expected / yardstick:.0f} x the yardstick of {figures.yardstick_ms:.2f} ms), "
+        f"{memory_mb:.0f} MB ({idle_mb:.0f} before data), {figures.written_kb:.0f} kB written a hop, {taken_kb:.1f} kept; "
         f"{late.size} reports of {expected:.0f}, late by {np.median(late):.2f} s (median), "
         f"{np.quantile(late, 0.99):.2f} (99 %), {late.max():.2f} (most); {missing} blocks lost; "
         f"this process {(time.process_time() - before[2]) / took_s:.2f} cores, {plant.behind_s:.2f} s behind",
         flush=True,
     )
     if again_s is not None:
-        print(f"     after {stall_s:g} s without a processor, reports were in time again after {again_s:.1f} s")
+        alarms = ", ".join(f"{name} {number}" for name, number in sorted(raised.items())) or "none"
+        print(
+            f"     after {stall_s:g} s without a processor, reports were in time again after {again_s:.1f} s; "
+            f"{missing_s:.1f} s of data missing, {skipped} hops without a report; alarms raised: {alarms}",
+            flush=True,
+        )
+    return figures
 
 
-def _stalled(process: Process, plant: Plant, stall_s: float, most_s: float) -> float:
+def _stalled(process: Process, plant: Plant, stall_s: float, most_s: float, *, of_shard: bool) -> float:
     """Stop the monitor for a while; seconds from then on until the last report that came late."""
-    process.signal(signal.SIGSTOP)
-    time.sleep(stall_s)
-    process.signal(signal.SIGCONT)
+    stopped = process.all()[1:2] if of_shard else process.all()
+    if not stopped:
+        raise SystemExit("--of-shard: one process monitors all machines; thirty are shared")
+    for number, wait_s in ((signal.SIGSTOP, stall_s), (signal.SIGCONT, 0.0)):
+        for one in stopped:
+            os.kill(int(one.name), number)
+        time.sleep(wait_s)
     again_s = time.monotonic()
     time.sleep(max(0.0, most_s - stall_s))
     return max((at_s - again_s for at_s, late_s in plant.heard if at_s > again_s and late_s > IN_TIME_S), default=0.0)
+
+
+def _skipped(plant: Plant) -> int:
+    """Hops between the first and the latest report of a machine that no report is about."""
+    hop_ns = round(plant.machines[0].window.hop_s * 1e9)
+    ends = ({end_ns for _, end_ns in found} for found in plant.windows.values())
+    return sum((max(found) - min(found)) // hop_ns + 1 - len(found) for found in ends)
 
 
 def main() -> None:
@@ -255,10 +323,19 @@ def main() -> None:
     parser.add_argument("--machines", type=int, nargs="+", default=[10, 20, 40])
     parser.add_argument("--seconds", type=float, default=120.0, help="that are measured, after the windows are full")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--channels", type=int, default=9)
+    parser.add_argument("--rate", type=float, default=2000.0, help="samples per second and channel")
+    parser.add_argument("--hop", type=float, default=5.0, help="seconds between reports")
+    parser.add_argument("--levels", action="store_true", help="nothing is known of the machines but their channels")
+    parser.add_argument("--no-networks", action="store_true", help="rotor kits without trained networks")
     parser.add_argument("--stall", type=float, default=0.0, help="seconds for which the monitor is stopped")
+    parser.add_argument("--of-shard", action="store_true", help="stop one of the processes that share the machines")
     asked = parser.parse_args()
+    kind = MachineKind(
+        asked.channels, asked.rate, asked.hop, not asked.levels, not (asked.levels or asked.no_networks)
+    )
     for count in asked.machines:
-        measure(count, asked.seed, asked.seconds, asked.stall)
+        measure(kind, count, asked.seed, asked.seconds, asked.stall, of_shard=asked.of_shard)
 
 
 if __name__ == "__main__":

@@ -12,44 +12,20 @@ import sys
 import tempfile
 from pathlib import Path
 
-import models
+from machine_kind import rotor_kit
+
 from models.machine import load_machine
 from simulator.recorder import record
 from simulator.scenario import load_scenario
 from simulator.stream import blocks
-
-_TILT = """
-[[sensors]]
-name = "{name}"
-quantity = "{quantity}"
-location = "disc"
-direction = "{direction}"
-unit = "rad{per_s}"
-"""
-
-
-def large_machine(folder: Path) -> Path:
-    """Write the machine file: the shipped rotor kit with four tilt channels more, at twice its rate."""
-    text = (
-        (Path(models.__file__).parent / "machines" / "lab.toml")
-        .read_text(encoding="utf-8")
-        .replace("rate_hz = 2000.0", "rate_hz = 4000.0")
-    )
-    for quantity, per_s in (("tilt", ""), ("tilt_rate", "/s")):
-        for direction in "yz":
-            name = f"{quantity}-{direction}"
-            text += _TILT.format(name=name, quantity=quantity, direction=direction, per_s=per_s)
-    file = folder / "large.toml"
-    file.write_text(text, encoding="utf-8")
-    return file
-
 
 def main() -> None:
     """Measure and print."""
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
     one_thread = os.environ | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     with tempfile.TemporaryDirectory() as place:
-        file = large_machine(Path(place))
+        file = Path(place) / "large.toml"
+        file.write_text(rotor_kit(4000.0, tilt=True), encoding="utf-8")
         machine = load_machine(file)
         scenario, _ = load_scenario("healthy")
         print(f"{len(machine.sensors)} channels at {machine.rate_hz:g} Hz")

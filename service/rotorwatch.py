@@ -14,6 +14,7 @@ from service.commands import interchange as interchange_commands
 from service.commands import plot as plot_commands
 from service.commands import record as record_commands
 from service.commands import replay as replay_commands
+from service.commands import size as size_commands
 from service.commands import watching as watching_commands
 from service.commands import webhook as webhook_commands
 from service.commands.replay import NamespaceOption, in_namespace
@@ -323,6 +324,7 @@ def _checked(file: Path) -> str:
 
 # After the commands of this module, which are the first in the list.
 installation_commands.register(app)
+size_commands.register(app)
 watching_commands.register(app)
 access_commands.register(app)
 webhook_commands.register(app)

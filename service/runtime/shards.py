@@ -23,7 +23,7 @@ from service.stream.shard_link import hear
 from service.stream.transport import LinkError
 from service.terminal.logs import logger
 
-_OF_A_SHARD = 15
+OF_A_SHARD = 15
 """Machines from which on another process is worth its memory."""
 _START_S = 120.0
 _STOP_S = 60.0
@@ -52,7 +52,7 @@ def shard_count(settings: ServiceSettings) -> int:
         return 1
     machines = len(settings.machines)
     if wanted is None:
-        wanted = min(len(os.sched_getaffinity(0)), machines // _OF_A_SHARD)
+        wanted = min(len(os.sched_getaffinity(0)), machines // OF_A_SHARD)
     return max(1, min(wanted, machines))
 
 

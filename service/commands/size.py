@@ -1,0 +1,130 @@
+"""``rotorwatch size``: what a plant will take, from measured figures."""
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from models.errors import MachineFileError
+from service.commands.running import prepare_numerics
+
+if TYPE_CHECKING:  # imports numpy and scipy, which --help must not wait for
+    from service.history.records import Retention
+    from service.runtime.sizing import Costs, Kind, Size
+    from service.settings.service import RecordingSettings
+
+_PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(size)
+
+
+def size(
+    machines: Annotated[int, typer.Option("--machines", min=1, max=1_000_000, help="How many.")],
+    channels: Annotated[int, typer.Option("--channels", min=1, max=1000, help="Of each, the shaft angle too.")] = 9,
+    rate: Annotated[
+        float, typer.Option("--rate", metavar="HZ", min=1.0, max=1e6, help="Samples per second and channel.")
+    ] = 2000.0,
+    hop: Annotated[float, typer.Option("--hop", metavar="S", min=0.1, help="Seconds between reports.")] = 5.0,
+    levels_only: Annotated[
+        bool, typer.Option("--levels-only", help="Vibration levels are watched, nothing is diagnosed.")
+    ] = False,
+    networks: Annotated[bool, typer.Option(help="Trained networks beside the likelihood.")] = True,
+    cores: Annotated[int, typer.Option("--cores", min=1, max=1024, help="Of a computer.")] = 8,
+    busy: Annotated[
+        float, typer.Option("--busy", min=0.05, max=1.0, help="How much of them may be used in the mean.")
+    ] = 0.6,
+    reports_days: Annotated[float | None, typer.Option("--reports-days", help="As in \\[history.retention].")] = None,
+    readings_days: Annotated[float | None, typer.Option("--readings-days", help="The same.")] = None,
+    keep_days: Annotated[float | None, typer.Option("--keep-days", help="As in \\[recording].")] = None,
+    keep_gb: Annotated[float | None, typer.Option("--keep-gb", help="The same; of each machine.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The figures of all machines, for another program.")] = False,
+) -> None:
+    """Reckon what a plant will take: processor, memory, disk, network, processes and computers.
+
+    From figures that were measured on simulated machines and a model between them, both told beside the result; what
+    is kept how long counts as in the settings. Page, API and other programs on the same computers come on top.
+
+    [bold]Examples[/bold]
+
+    [cyan]rotorwatch size --machines 200 --channels 12 --rate 4000[/cyan]
+    [cyan]rotorwatch size --machines 500 --channels 4 --rate 1000 --levels-only[/cyan]
+    """
+    prepare_numerics()
+    from models.mistakes import checked  # noqa: PLC0415  # keeps --help quick
+    from service.history.records import Retention  # noqa: PLC0415
+    from service.runtime.sizing import Kind, load_costs, sized  # noqa: PLC0415
+    from service.settings.service import RecordingSettings  # noqa: PLC0415
+
+    days = {"reports_days": reports_days, "readings_days": readings_days, "keep_days": keep_days, "keep_gb": keep_gb}
+    given = {name: value for name, value in days.items() if value is not None}
+    retention = checked(Retention, {n: value for n, value in given.items() if n in Retention.model_fields}, "arguments")
+    recording = checked(
+        RecordingSettings, {n: value for n, value in given.items() if n in RecordingSettings.model_fields}, "arguments"
+    )
+    costs = load_costs()
+    kind = Kind(
+        channels=channels, rate_hz=rate, hop_s=hop, diagnosed=not levels_only, networks=networks and not levels_only
+    )
+    found = sized(costs, kind, machines, retention=retention, recording=recording, cores=cores, busy=busy)
+    if as_json:
+        told = {"kind": kind.model_dump(), **dataclasses.asdict(found), "outside": costs.outside(kind)}
+        typer.echo(json.dumps(told, indent=2))
+        return
+    for line in _lines(costs, kind, found, retention, recording, busy):
+        typer.echo(line)
+
+
+def _lines(
+    costs: "Costs", kind: "Kind", found: "Size", retention: "Retention", recording: "RecordingSettings", busy: float
+) -> Iterator[str]:
+    """The result for people, at most 80 characters wide."""
+    made = "levels only" if not kind.diagnosed else "diagnosed, networks" if kind.networks else "diagnosed, no networks"
+    yield f"{kind.channels} channels at {kind.rate_hz:g} Hz, a report every {kind.hop_s:g} s, {made}"
+    yield ""
+    yield f"{'':38}{'one machine':>16}{f'{found.machines} machines':>18}"
+
+    def row(what: str, of_all: float, unit: str) -> str:
+        return f"{what:<38}{_amount(of_all / found.machines, unit):>16}{_amount(of_all, unit):>18}"
+
+    history = f"{retention.reports_days:g} and {retention.readings_days:g} days"
+    yield row("processor", found.cores, "cores")
+    yield row("  for recorders besides", found.recording_cores, "cores")
+    yield row("memory", found.memory_mb * 1e6, "B")
+    yield row("network, samples in", found.network_in_mb_s * 1e6, "B/s")
+    yield row("  reports out, each subscriber", found.network_out_mb_s * 1e6, "B/s")
+    yield row("history, written to the disk", found.history_written_gb_day * 1e9, "B/day")
+    yield row(f"  its size ({history})", found.history_gb * 1e9, "B")
+    yield row("recordings, written to the disk", found.recorded_gb_day * 1e9, "B/day")
+    yield row(f"  their size ({found.recordings_days:.3g} days)", found.recordings_gb * 1e9, "B")
+    yield row("  kept for alarms, at most", found.alarm_recordings_gb * 1e9, "B")
+    yield ""
+    processes = f"{found.shards} processes beside the one that serves" if found.shards else "one process"
+    computers = "one computer" if found.computers == 1 else f"{found.computers} computers"
+    yield f"{processes}; {computers}, {busy:.0%} busy at most in the mean"
+    if found.busiest_core > busy:
+        yield (
+            f"The machines of a process take {found.busiest_core:.2f} of the one core that it can use: give them more"
+        )
+        yield "processes ([shards] count)."
+    yield ""
+    yield f"Measured on {costs.computer},"
+    yield f"{costs.machines} machines in a process, {costs.seconds:g} s each, rotorwatch {costs.version}; from these figures the"
+    yield (
+        f"model deviates by at most {costs.deviation('processor_ms'):.0%} (processor) and "
+        f"{costs.deviation('memory_mb'):.0%} (memory)."
+    )
+    for what in costs.outside(kind):
+        yield f"OUTSIDE of what was measured: {what}"
+
+
+def _amount(value: float, unit: str) -> str:
+    """A number with three digits and its unit; bytes with the prefix that suits them."""
+    if unit.startswith("B"):
+        value, unit = next(((value / size, f"{prefix}{unit}") for size, prefix in _PREFIXES if value >= size), (value, unit))
+    digits = 0 if value >= 100 else 1 if value >= 10 else 2 if value >= 1 else 4
+    return f"{value:.{digits}f} {unit}"

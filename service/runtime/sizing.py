@@ -1,0 +1,214 @@
+"""What a plant will take: processor, memory, disk and network, from what machines of several kinds were measured to take.
+
+The figures are data (``costs.toml``, written by ``python benchmarks/costs.py``). Between them stands a model in which
+everything is a sum of terms that are not negative, fitted to all kinds at once so that relative deviations are least
+(non-negative least squares, C. L. Lawson, R. J. Hanson: Solving Least Squares Problems, 1974):
+
+- processor for a report: so much each, for each second of data, for each sample of all channels; of a machine that is
+  diagnosed, more each and for each sample; for its networks;
+- memory of a machine: so much each, for each sample of a hop; diagnosed, more each and for each pair of channels; for its
+  networks; beside what a process has before it monitors any;
+- bytes of a report, whatever their way: so much each, for each channel, where it is diagnosed, for its networks.
+
+What is computed exactly: samples as they come in, 4 bytes each, and how long things are kept.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, Field
+from scipy.optimize import nnls
+
+from models.mistakes import read_toml
+from models.signals.block import FloatArray
+from service.history.records import Retention
+from service.runtime.shards import OF_A_SHARD
+from service.settings.service import RecordingSettings
+
+_DAY_S = 86_400.0
+_SAMPLE_BYTES = 4
+_BUCKET = 2.0
+"""Bytes of a bucket to those of the readings of a window (docs/history.md)."""
+_FIGURES = Path(__file__).with_name("costs.toml")
+
+Measured = Literal["processor_ms", "memory_mb", "written_kb", "reports_kb", "readings_kb", "told_kb"]
+
+
+class Kind(BaseModel, extra="forbid", frozen=True):
+    """How much data come of a machine, and what is made of them."""
+
+    channels: int = Field(ge=1, description="channels of the stream, the shaft angle among them")
+    rate_hz: float = Field(gt=0, description="samples per second and channel")
+    hop_s: float = Field(gt=0, description="seconds between reports")
+    diagnosed: bool = Field(description="parameters are read; otherwise levels alone are watched")
+    networks: bool = Field(description="trained networks beside the likelihood")
+
+    @property
+    def samples(self) -> float:
+        """Samples of all channels in a hop, millions."""
+        return self.channels * self.rate_hz * self.hop_s / 1e6
+
+    def terms(self, what: Measured) -> list[float]:
+        """What the model adds up, each times a cost that is the same for all kinds."""
+        diagnosed, networks = float(self.diagnosed), float(self.networks)
+        if what == "processor_ms":
+            return [1.0, self.hop_s, self.samples, diagnosed, diagnosed * self.samples, networks]
+        if what == "memory_mb":
+            return [1.0, self.samples, diagnosed, diagnosed * self.channels**2, networks]
+        return [1.0, self.channels, diagnosed, networks]
+
+
+class Case(Kind):
+    """A kind of machine that was measured: of a report and machine, memory of a machine."""
+
+    processor_ms: float = Field(gt=0)
+    memory_mb: float = Field(gt=0, description="beside that of a process without machines")
+    written_kb: float = Field(ge=0, description="to the disk, by the history")
+    reports_kb: float = Field(gt=0, description="of the history's file, for the report")
+    readings_kb: float = Field(gt=0, description="of the history's file, for the readings")
+    told_kb: float = Field(gt=0, description="of the report on its topic")
+
+
+class RecordingCost(BaseModel, extra="forbid", frozen=True):
+    """What recorders take of the samples (``python benchmarks/recording.py``)."""
+
+    compressed: float = Field(gt=0, le=1, description="bytes in the file to bytes that came; noise hardly compresses")
+    processor_s_per_mb: float = Field(ge=0)
+
+
+class Costs(BaseModel, extra="forbid", frozen=True):
+    """Everything that was measured, and on what."""
+
+    computer: str
+    version: str = Field(description="of this program")
+    machines: int = Field(ge=1, description="of each kind, in one process")
+    seconds: float = Field(gt=0, description="for which each kind was measured")
+    seeds: tuple[int, ...]
+    process_mb: float = Field(gt=0, description="memory of a process without machines")
+    recording: RecordingCost
+    cases: tuple[Case, ...] = Field(min_length=1)
+
+    @cached_property
+    def _of_terms(self) -> dict[Measured, FloatArray]:
+        return {what: self._fitted(what) for what in _ALL}
+
+    def _fitted(self, what: Measured) -> FloatArray:
+        measured = np.array([getattr(case, what) for case in self.cases])
+        scale = np.maximum(measured, 1e-3 * max(measured.max(), 1e-9))
+        of_terms: FloatArray = nnls(np.array([case.terms(what) for case in self.cases]) / scale[:, None], measured / scale)[0]
+        return of_terms
+
+    def of(self, kind: Kind, what: Measured) -> float:
+        """What the model says of a kind of machine."""
+        return float(self._of_terms[what] @ kind.terms(what))
+
+    def deviation(self, what: Measured) -> float:
+        """Largest relative difference between the model and what was measured."""
+        return max(abs(self.of(case, what) / getattr(case, what) - 1) for case in self.cases if getattr(case, what))
+
+    def outside(self, kind: Kind) -> list[str]:
+        """In what a kind lies outside of those that were measured, in words; empty if it does not."""
+        like = [case for case in self.cases if case.diagnosed == kind.diagnosed]
+        told = []
+        for name, unit in (("channels", ""), ("rate_hz", " Hz"), ("hop_s", " s")):
+            value, found = getattr(kind, name), [getattr(case, name) for case in like]
+            if found and not min(found) <= value <= max(found):
+                what = name.partition("_")[0]
+                told.append(f"{what} {value:g}{unit}, measured {min(found):g} to {max(found):g}{unit}")
+        return told or ([] if like else ["diagnosed or not: no such machine was measured"])
+
+
+_ALL: tuple[Measured, ...] = ("processor_ms", "memory_mb", "written_kb", "reports_kb", "readings_kb", "told_kb")
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """What machines of one kind take, all of them together."""
+
+    machines: int
+    cores: float
+    recording_cores: float
+    shards: int  # processes beside the serving one
+    busiest_core: float  # what the machines of a process take of the one core that it can use
+    computers: int
+    memory_mb: float
+    network_in_mb_s: float
+    network_out_mb_s: float  # to one subscriber of all reports
+    history_written_gb_day: float
+    history_gb: float
+    recorded_gb_day: float
+    recordings_gb: float
+    recordings_days: float  # how far back they go
+    alarm_recordings_gb: float  # at most
+
+
+def load_costs(file: Path = _FIGURES) -> Costs:
+    """What was measured.
+
+    Raises
+    ------
+    MachineFileError
+        If the file cannot be read.
+    ValidationError
+        If it is not what `Costs` says.
+    """
+    return Costs.model_validate(read_toml(file))
+
+
+def sized(
+    costs: Costs,
+    kind: Kind,
+    machines: int,
+    *,
+    retention: Retention,
+    recording: RecordingSettings,
+    cores: int,
+    busy: float,
+) -> Size:
+    """Size of a plant.
+
+    Parameters
+    ----------
+    retention, recording : Retention, RecordingSettings
+        How long things are kept.
+    cores : int
+        Of a computer.
+    busy : float
+        How much of them may be used in the mean, up to 1.
+    """
+    a_day = _DAY_S / kind.hop_s
+    stream_mb_s = kind.channels * kind.rate_hz * _SAMPLE_BYTES / 1e6
+    recorded_gb_day = stream_mb_s * costs.recording.compressed * _DAY_S / 1e3
+    used = machines * costs.of(kind, "processor_ms") / 1e3 / kind.hop_s
+    recorders = machines * stream_mb_s * costs.recording.processor_s_per_mb
+    computers = math.ceil((used + recorders) / (busy * cores))
+    if computers > 1:  # as `fleet_count` says
+        processes = math.ceil(machines / OF_A_SHARD)
+    else:  # as `shard_count` does
+        processes = max(1, min(cores, machines // OF_A_SHARD))
+    shards = processes if processes > 1 else 0
+    reports_kb, readings_kb = costs.of(kind, "reports_kb"), costs.of(kind, "readings_kb")
+    kept_kb = a_day * (reports_kb * retention.reports_days + readings_kb * retention.readings_days)
+    kept_kb += _BUCKET * readings_kb * _DAY_S / retention.bucket_s * retention.buckets_days
+    kept_days = min(recording.keep_days, recording.keep_gb / recorded_gb_day)
+    return Size(
+        machines=machines,
+        cores=used,
+        recording_cores=recorders,
+        shards=shards,
+        busiest_core=used / processes,
+        computers=computers,
+        memory_mb=costs.process_mb * (1 + shards) + machines * costs.of(kind, "memory_mb"),
+        network_in_mb_s=machines * stream_mb_s,
+        network_out_mb_s=machines * costs.of(kind, "told_kb") / kind.hop_s / 1e3,
+        history_written_gb_day=machines * costs.of(kind, "written_kb") * a_day / 1e6,
+        history_gb=machines * kept_kb / 1e6,
+        recorded_gb_day=machines * recorded_gb_day,
+        recordings_gb=machines * kept_days * recorded_gb_day,
+        recordings_days=kept_days,
+        alarm_recordings_gb=machines * min(recording.alarm_keep_gb, recording.alarm_keep_days * recorded_gb_day),
+    )
