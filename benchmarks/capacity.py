@@ -280,7 +280,8 @@ def measure(kind: MachineKind, count: int, seed: int, length_s: float, stall_s: 
     print(
         f"{count:4d} machines: {figures.cores:5.2f} cores ({figures.processor_ms:.0f} ms a hop, "
         f"{cpu_s / expected / yardstick:.0f} x the yardstick of {figures.yardstick_ms:.2f} ms), "
-        f"{memory_mb:.0f} MB ({idle_mb:.0f} before data), {figures.written_kb:.0f} kB written a hop, {taken_kb:.1f} kept; "
+        f"{memory_mb:.0f} MB ({idle_mb:.0f} before data), "
+        f"{figures.written_kb:.0f} kB written a hop, {taken_kb:.1f} kept; "
         f"{late.size} reports of {expected:.0f}, late by {np.median(late):.2f} s (median), "
         f"{np.quantile(late, 0.99):.2f} (99 %), {late.max():.2f} (most); {missing} blocks lost; "
         f"this process {(time.process_time() - before[2]) / took_s:.2f} cores, {plant.behind_s:.2f} s behind",
@@ -331,9 +332,7 @@ def main() -> None:
     parser.add_argument("--stall", type=float, default=0.0, help="seconds for which the monitor is stopped")
     parser.add_argument("--of-shard", action="store_true", help="stop one of the processes that share the machines")
     asked = parser.parse_args()
-    kind = MachineKind(
-        asked.channels, asked.rate, asked.hop, not asked.levels, not (asked.levels or asked.no_networks)
-    )
+    kind = MachineKind(asked.channels, asked.rate, asked.hop, not asked.levels, not (asked.levels or asked.no_networks))
     for count in asked.machines:
         measure(kind, count, asked.seed, asked.seconds, asked.stall, of_shard=asked.of_shard)
 

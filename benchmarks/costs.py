@@ -1,8 +1,8 @@
 """What a machine of several kinds takes, end to end: the figures that ``rotorwatch size`` reckons with.
 
-Run: ``python benchmarks/costs.py`` (half an hour; ``--cases 1 4`` measures the first and the fourth kind alone and keeps
-the others). One kind after the other is watched by a monitor of one process, as ``capacity.py`` does it, and what it
-took is written to ``service/runtime/costs.toml``. Processor time counts, not duration, but on a busy computer it is
+Run: ``python benchmarks/costs.py`` (half an hour; ``--cases 1 4`` measures the first and the fourth kind alone and
+keeps the others). One kind after the other is watched by a monitor of one process, as ``capacity.py`` does it, and what
+it took is written to ``service/runtime/costs.toml``. Processor time counts, not duration, but on a busy computer it is
 longer, too: let nothing else run.
 """
 
@@ -38,7 +38,7 @@ CASES = (
 )
 FILE = Path("service/runtime/costs.toml")
 _SMALLEST = MachineKind(1, 1000.0, 5.0, diagnosed=False, networks=False)
-_HEADING = """# What machines of several kinds take: `python benchmarks/costs.py` writes this file, `rotorwatch size` reckons with it.
+_HEADING = """# What machines of several kinds take, for `rotorwatch size`; written by `python benchmarks/costs.py`.
 # What each figure means stands in service/runtime/sizing.py.
 """
 
@@ -46,7 +46,9 @@ _HEADING = """# What machines of several kinds take: `python benchmarks/costs.py
 def computer() -> str:
     """Name of the processor, and how many there are."""
     lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown processor")
+    name = next(
+        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown processor"
+    )
     return f"{os.cpu_count()} cores of {name.replace('(R)', '').replace('(TM)', '')}"
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import models
-from models.machine import MachineFile, load_machine_file
+from models.machine import Machine, MachineFile, load_machine_file
 from models.signals.block import SampleBlock
 from simulator.scenario import load_scenario
 from simulator.stream import blocks
@@ -83,8 +83,9 @@ class MachineKind:
         """What one machine sends, from time 0 on: a simulated rotor kit, or noise where levels alone are watched."""
         if self.diagnosed:
             scenario, _ = load_scenario("healthy")
-            given = scenario.overridden(seed=seed, duration_s=length_s)
-            return [block for block, _ in blocks(given, self.machine(folder, "lab"), block_s, start_ns=0)]
+            given, machine = scenario.overridden(seed=seed, duration_s=length_s), self.machine(folder, "lab")
+            assert isinstance(machine, Machine)  # noqa: S101  # its file gives all parameters
+            return [block for block, _ in blocks(given, machine, block_s, start_ns=0)]
         rng, size = np.random.default_rng(seed), (round(self.rate_hz * block_s), self.channels)
         return [
             SampleBlock(

@@ -19,6 +19,7 @@ from simulator.recorder import record
 from simulator.scenario import load_scenario
 from simulator.stream import blocks
 
+
 def main() -> None:
     """Measure and print."""
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0

@@ -49,6 +49,7 @@ _LONGEST = (
     "test_browser_replays",
     "test_fleet",
     "test_shards",
+    "test_hosts",
     "test_evidence",
     "test_browser_plots",
     "test_window_again",

@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from models.errors import MachineFileError
 from service.commands.running import prepare_numerics
 
 if TYPE_CHECKING:  # imports numpy and scipy, which --help must not wait for
     from service.history.records import Retention
     from service.runtime.sizing import Costs, Kind, Size
-    from service.settings.service import RecordingSettings
 
 _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
 
@@ -75,13 +73,11 @@ def size(
         told = {"kind": kind.model_dump(), **dataclasses.asdict(found), "outside": costs.outside(kind)}
         typer.echo(json.dumps(told, indent=2))
         return
-    for line in _lines(costs, kind, found, retention, recording, busy):
+    for line in _lines(costs, kind, found, retention, busy):
         typer.echo(line)
 
 
-def _lines(
-    costs: "Costs", kind: "Kind", found: "Size", retention: "Retention", recording: "RecordingSettings", busy: float
-) -> Iterator[str]:
+def _lines(costs: "Costs", kind: "Kind", found: "Size", retention: "Retention", busy: float) -> Iterator[str]:
     """The result for people, at most 80 characters wide."""
     made = "levels only" if not kind.diagnosed else "diagnosed, networks" if kind.networks else "diagnosed, no networks"
     yield f"{kind.channels} channels at {kind.rate_hz:g} Hz, a report every {kind.hop_s:g} s, {made}"
@@ -112,12 +108,9 @@ def _lines(
         )
         yield "processes ([shards] count)."
     yield ""
-    yield f"Measured on {costs.computer},"
-    yield f"{costs.machines} machines in a process, {costs.seconds:g} s each, rotorwatch {costs.version}; from these figures the"
-    yield (
-        f"model deviates by at most {costs.deviation('processor_ms'):.0%} (processor) and "
-        f"{costs.deviation('memory_mb'):.0%} (memory)."
-    )
+    yield f"Measured on {costs.computer}, {costs.machines} machines in a process,"
+    yield f"rotorwatch {costs.version}. From these {len(costs.cases)} kinds of machines the model deviates by at most"
+    yield f"{costs.deviation('processor_ms'):.0%} (processor) and {costs.deviation('memory_mb'):.0%} (memory)."
     for what in costs.outside(kind):
         yield f"OUTSIDE of what was measured: {what}"
 
@@ -125,6 +118,8 @@ def _lines(
 def _amount(value: float, unit: str) -> str:
     """A number with three digits and its unit; bytes with the prefix that suits them."""
     if unit.startswith("B"):
-        value, unit = next(((value / size, f"{prefix}{unit}") for size, prefix in _PREFIXES if value >= size), (value, unit))
+        value, unit = next(
+            ((value / size, f"{prefix}{unit}") for size, prefix in _PREFIXES if value >= size), (value, unit)
+        )
     digits = 0 if value >= 100 else 1 if value >= 10 else 2 if value >= 1 else 4
     return f"{value:.{digits}f} {unit}"

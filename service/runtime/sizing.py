@@ -1,4 +1,4 @@
-"""What a plant will take: processor, memory, disk and network, from what machines of several kinds were measured to take.
+"""What a plant will take: processor, memory, disk and network, from what machines of several kinds were seen to take.
 
 The figures are data (``costs.toml``, written by ``python benchmarks/costs.py``). Between them stands a model in which
 everything is a sum of terms that are not negative, fitted to all kinds at once so that relative deviations are least
@@ -6,8 +6,8 @@ everything is a sum of terms that are not negative, fitted to all kinds at once 
 
 - processor for a report: so much each, for each second of data, for each sample of all channels; of a machine that is
   diagnosed, more each and for each sample; for its networks;
-- memory of a machine: so much each, for each sample of a hop; diagnosed, more each and for each pair of channels; for its
-  networks; beside what a process has before it monitors any;
+- memory of a machine: so much each, for each sample of a hop; diagnosed, more each and for each pair of channels; for
+  its networks; beside what a process has before it monitors any;
 - bytes of a report, whatever their way: so much each, for each channel, where it is diagnosed, for its networks.
 
 What is computed exactly: samples as they come in, 4 bytes each, and how long things are kept.
@@ -99,12 +99,15 @@ class Costs(BaseModel, extra="forbid", frozen=True):
     def _fitted(self, what: Measured) -> FloatArray:
         measured = np.array([getattr(case, what) for case in self.cases])
         scale = np.maximum(measured, 1e-3 * max(measured.max(), 1e-9))
-        of_terms: FloatArray = nnls(np.array([case.terms(what) for case in self.cases]) / scale[:, None], measured / scale)[0]
+        of_terms: FloatArray = nnls(
+            np.array([case.terms(what) for case in self.cases]) / scale[:, None], measured / scale
+        )[0]
         return of_terms
 
     def of(self, kind: Kind, what: Measured) -> float:
         """What the model says of a kind of machine."""
-        return float(self._of_terms[what] @ kind.terms(what))
+        cost: float = self._of_terms[what] @ np.array(kind.terms(what))
+        return cost
 
     def deviation(self, what: Measured) -> float:
         """Largest relative difference between the model and what was measured."""
@@ -186,10 +189,8 @@ def sized(
     used = machines * costs.of(kind, "processor_ms") / 1e3 / kind.hop_s
     recorders = machines * stream_mb_s * costs.recording.processor_s_per_mb
     computers = math.ceil((used + recorders) / (busy * cores))
-    if computers > 1:  # as `fleet_count` says
-        processes = math.ceil(machines / OF_A_SHARD)
-    else:  # as `shard_count` does
-        processes = max(1, min(cores, machines // OF_A_SHARD))
+    in_fleet, on_one = math.ceil(machines / OF_A_SHARD), max(1, min(cores, machines // OF_A_SHARD))
+    processes = in_fleet if computers > 1 else on_one  # as `fleet_count` and `shard_count` say
     shards = processes if processes > 1 else 0
     reports_kb, readings_kb = costs.of(kind, "reports_kb"), costs.of(kind, "readings_kb")
     kept_kb = a_day * (reports_kb * retention.reports_days + readings_kb * retention.readings_days)

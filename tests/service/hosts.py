@@ -1,0 +1,101 @@
+"""Hosts as network namespaces of this computer, each joined to the one in the middle by a cable."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+
+from tests.service.live import Program
+
+MIDDLE = "middle"
+_ASK = "import sys, urllib.request; sys.stdout.write(urllib.request.urlopen(sys.argv[1], timeout=20).read().decode())"
+
+
+def why_not() -> str:
+    """Why there can be no hosts on this computer; empty if there can."""
+    if os.geteuid() != 0:
+        return "network namespaces need root"
+    if shutil.which("ip") is None:
+        return "network namespaces need ip (Debian: iproute2)"
+    probe = f"rw{os.getpid()}probe"
+    made = subprocess.run(["ip", "netns", "add", probe], capture_output=True, text=True, check=False)
+    if made.returncode:
+        return f"network namespaces are refused here: {made.stderr.strip()}"
+    subprocess.run(["ip", "netns", "del", probe], check=True)
+    return ""
+
+
+@dataclass(frozen=True, slots=True)
+class Hosts:
+    """The hosts that there are; the n-th knows the middle as 10.77.n.1."""
+
+    names: tuple[str, ...]
+
+    def within(self, name: str) -> tuple[str, ...]:
+        """What goes before a command that is to run on a host."""
+        return ("ip", "netns", "exec", self._space(name))
+
+    def middle_from(self, name: str) -> str:
+        """Address of the host in the middle, as another one reaches it."""
+        return f"10.77.{self.names.index(name)}.1"
+
+    def cut(self, name: str) -> None:
+        """Cut the cable of a host: connections stay as they are, and nothing arrives any more."""
+        _ip("-n", self._space(MIDDLE), "link", "set", self._cable(name), "down")
+
+    def mend(self, name: str) -> None:
+        """Put the cable back."""
+        _ip("-n", self._space(MIDDLE), "link", "set", self._cable(name), "up")
+
+    def lose(self, name: str, *running: Program) -> None:
+        """Take the power from a host on which these programs run: nobody is told, and no connection is closed."""
+        _ip("-n", self._space(MIDDLE), "link", "del", self._cable(name))
+        for one in running:
+            one.kill()
+        self.take_away(name)
+
+    def put(self, name: str) -> None:
+        """Put a host there, with its cable; or back there, after it was lost."""
+        space = self._space(name)
+        _ip("netns", "add", space)
+        _ip("-n", space, "link", "set", "lo", "up")
+        if name == MIDDLE:
+            return
+        middle, number = self._space(MIDDLE), self.names.index(name)
+        _ip("-n", middle, "link", "add", self._cable(name), "type", "veth", "peer", "name", "cable", "netns", space)
+        for end, device, last in ((middle, self._cable(name), 1), (space, "cable", 2)):
+            _ip("-n", end, "address", "add", f"10.77.{number}.{last}/30", "dev", device)
+            _ip("-n", end, "link", "set", device, "up")
+
+    def take_away(self, name: str) -> None:
+        """Take a host away, if it is there."""
+        subprocess.run(["ip", "netns", "del", self._space(name)], capture_output=True, check=False)
+
+    def asked(self, name: str, url: str) -> str:
+        """Answer to an HTTP request that is sent on a host."""
+        command = [*self.within(name), sys.executable, "-c", _ASK, url]
+        return subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
+
+    def _cable(self, name: str) -> str:
+        return f"to{self.names.index(name)}"
+
+    def _space(self, name: str) -> str:
+        return f"rw{os.getpid()}{name}"
+
+
+@contextmanager
+def hosts(*names: str) -> Iterator[Hosts]:
+    """Hosts with these names, and one in the middle; gone, with all that is between them, when the block is left."""
+    made = Hosts(names)
+    with ExitStack() as undo:
+        for name in (MIDDLE, *names):
+            undo.callback(made.take_away, name)
+            made.put(name)
+        yield made
+
+
+def _ip(*words: str) -> None:
+    subprocess.run(["ip", *words], check=True, capture_output=True, text=True)
