@@ -111,7 +111,9 @@ class Costs(BaseModel, extra="forbid", frozen=True):
 
     def deviation(self, what: Measured) -> float:
         """Largest relative difference between the model and what was measured."""
-        return max(abs(self.of(case, what) / getattr(case, what) - 1) for case in self.cases if getattr(case, what))
+        measured: list[float] = [getattr(case, what) for case in self.cases]
+        ratios = [self.of(case, what) / one for case, one in zip(self.cases, measured, strict=True) if one]
+        return max(abs(ratio - 1) for ratio in ratios)
 
     def outside(self, kind: Kind) -> list[str]:
         """In what a kind lies outside of those that were measured, in words; empty if it does not."""

@@ -1,0 +1,101 @@
+"""How an archive of recordings is evaluated faster on two Ray workers than on one.
+
+Run: ``python benchmarks/archive.py [--minutes 20] [--machines 4]`` (minutes). So many rotor kits (9 channels, 2 kHz)
+are recorded for so long each, and the archive is evaluated as ``rotorwatch replay --offline --ray`` does it, by a
+cluster of this computer with one core and with two, in turns, twice. Beside the duration stands the processor time of
+all workers: on a computer whose cores others use as well, durations say little, and how much more processor two workers
+take for the same, because they disturb each other, says by how much they can be faster at most.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+
+import argparse
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from machine_kind import MachineKind
+from ray.cluster_utils import Cluster
+
+from models.machine import load_machine
+from service.runtime.archive import MachineTask, on_cluster
+from simulator.recorder import record
+from simulator.scenario import load_scenario
+from simulator.stream import blocks
+
+EVER_NS = 2**63 - 1
+
+
+def archive(folder: Path, machines: int, minutes: float) -> list[MachineTask]:
+    """Record the machines; what is to be evaluated of them."""
+    scenario, _ = load_scenario("healthy")
+    tasks = []
+    for number in range(machines):
+        MachineKind().machine(folder, f"kit{number}")
+        file = folder / f"kit{number}.toml"
+        machine, recording = load_machine(file), folder / f"kit{number}.mcap"
+        given = scenario.overridden(seed=number + 1, duration_s=60 * minutes)
+        record(machine, blocks(given, machine), recording)
+        tasks.append(MachineTask(f"{machine.site}/{machine.name}", (recording,), f"{file}@lab", "", 0, EVER_NS))
+    return tasks
+
+
+def descendants_s() -> float:
+    """Processor time of all programs that this one, and those that it has started, have started and that still run."""
+    found: dict[int, tuple[int, float]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text(encoding="utf-8").rsplit(")", 1)[1].split()
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        found[int(stat.parent.name)] = int(fields[1]), (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    ours, total_s = {os.getpid()}, 0.0
+    while new := {pid for pid, (parent, _) in found.items() if parent in ours} - ours:
+        ours |= new
+        total_s += sum(found[pid][1] for pid in new)
+    return total_s
+
+
+def evaluated(tasks: Sequence[MachineTask], workers: int) -> tuple[float, float, float]:
+    """Seconds, and processor time of the workers, for all tasks; and how long their data are."""
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": workers, "include_dashboard": False})
+    try:
+        list(on_cluster(cluster.address, tasks[:0]))
+        begin_s, before_s = time.monotonic(), descendants_s()
+        data_s = sum(summary.data_s for summary, _ in on_cluster(cluster.address, tasks))
+        return time.monotonic() - begin_s, descendants_s() - before_s, data_s
+    finally:
+        cluster.shutdown()  # type: ignore[no-untyped-call]
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description="an archive on two Ray workers against one")
+    parser.add_argument("--minutes", type=float, default=20.0)
+    parser.add_argument("--machines", type=int, default=4)
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        tasks = archive(Path(name), asked.machines, asked.minutes)
+        for _ in range(2):
+            took: dict[int, tuple[float, float]] = {}
+            for workers in (1, 2):
+                took_s, used_s, data_s = evaluated(tasks, workers)
+                took[workers] = took_s, used_s
+                print(
+                    f"{workers} worker{'s' if workers > 1 else ''}: {data_s:.0f} s of data in {took_s:.1f} s "
+                    f"({data_s / took_s:.0f} x real time), {used_s:.1f} s of processor",
+                    flush=True,
+                )
+            (one_s, one_used_s), (two_s, two_used_s) = took[1], took[2]
+            print(
+                f"two against one: {one_s / two_s:.2f} x; by processor time {2 * one_used_s / two_used_s:.2f} x at most"
+            )
+
+
+if __name__ == "__main__":
+    main()
