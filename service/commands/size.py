@@ -36,16 +36,24 @@ def size(
     busy: Annotated[
         float, typer.Option("--busy", min=0.05, max=1.0, help="How much of them may be used in the mean.")
     ] = 0.6,
-    reports_days: Annotated[float | None, typer.Option("--reports-days", help="As in \\[history.retention].")] = None,
-    readings_days: Annotated[float | None, typer.Option("--readings-days", help="The same.")] = None,
-    keep_days: Annotated[float | None, typer.Option("--keep-days", help="As in \\[recording].")] = None,
-    keep_gb: Annotated[float | None, typer.Option("--keep-gb", help="The same; of each machine.")] = None,
+    reports_days: Annotated[
+        float | None, typer.Option("--reports-days", metavar="DAYS", help="How long reports are kept.")
+    ] = None,
+    readings_days: Annotated[
+        float | None, typer.Option("--readings-days", metavar="DAYS", help="How long single readings are kept.")
+    ] = None,
+    keep_days: Annotated[
+        float | None, typer.Option("--keep-days", metavar="DAYS", help="How long recordings without an alarm are kept.")
+    ] = None,
+    keep_gb: Annotated[
+        float | None, typer.Option("--keep-gb", metavar="GB", help="Most of them that is kept of a machine.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The figures of all machines, for another program.")] = False,
 ) -> None:
     """Reckon what a plant will take: processor, memory, disk, network, processes and computers.
 
-    From figures that were measured on simulated machines and a model between them, both told beside the result; what
-    is kept how long counts as in the settings. Page, API and other programs on the same computers come on top.
+    From figures that were measured on simulated machines, and a model between them, both told beside the result. How
+    long things are kept is as in the settings, unless it is given. Page, API and other programs come on top.
 
     [bold]Examples[/bold]
 
@@ -73,11 +81,13 @@ def size(
         told = {"kind": kind.model_dump(), **dataclasses.asdict(found), "outside": costs.outside(kind)}
         typer.echo(json.dumps(told, indent=2))
         return
-    for line in _lines(costs, kind, found, retention, busy):
+    for line in _lines(costs, kind, found, retention, cores, busy):
         typer.echo(line)
 
 
-def _lines(costs: "Costs", kind: "Kind", found: "Size", retention: "Retention", busy: float) -> Iterator[str]:
+def _lines(
+    costs: "Costs", kind: "Kind", found: "Size", retention: "Retention", cores: int, busy: float
+) -> Iterator[str]:
     """The result for people, at most 80 characters wide."""
     made = "levels only" if not kind.diagnosed else "diagnosed, networks" if kind.networks else "diagnosed, no networks"
     yield f"{kind.channels} channels at {kind.rate_hz:g} Hz, a report every {kind.hop_s:g} s, {made}"
@@ -99,14 +109,11 @@ def _lines(costs: "Costs", kind: "Kind", found: "Size", retention: "Retention", 
     yield row(f"  their size ({found.recordings_days:.3g} days)", found.recordings_gb * 1e9, "B")
     yield row("  kept for alarms, at most", found.alarm_recordings_gb * 1e9, "B")
     yield ""
-    processes = f"{found.shards} processes beside the one that serves" if found.shards else "one process"
-    computers = "one computer" if found.computers == 1 else f"{found.computers} computers"
-    yield f"{processes}; {computers}, {busy:.0%} busy at most in the mean"
+    yield f"processes     {f'{found.shards} beside the one that serves' if found.shards else 'one'}"
+    yield f"computers     {found.computers} with {cores} cores, {busy:.0%} busy at most in the mean"
     if found.busiest_core > busy:
-        yield (
-            f"The machines of a process take {found.busiest_core:.2f} of the one core that it can use: give them more"
-        )
-        yield "processes ([shards] count)."
+        yield f"The machines of a process take {found.busiest_core:.2f} of the one core that it can use:"
+        yield "set [shards] count to more."
     yield ""
     yield f"Measured on {costs.computer}, {costs.machines} machines in a process,"
     yield f"rotorwatch {costs.version}. From these {len(costs.cases)} kinds of machines the model deviates by at most"

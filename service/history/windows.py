@@ -5,7 +5,7 @@ what compressing leaves of them.
 """
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,7 @@ BUCKET = np.dtype(
         ("errors", "<i4"), ("errors_total", "<f8"),
     ]
 )  # fmt: skip
+_FEW = 4  # places to count in, for each number
 _log = structlog.get_logger("rotorwatch", part="history")
 
 
@@ -66,17 +67,30 @@ def finite(parts: Records) -> npt.NDArray[np.bool_]:
     return found
 
 
+def _distinct(numbers: npt.NDArray[np.integer[Any]]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Which numbers there are, and the place of each among them: `np.unique`, without sorting where they are small."""
+    if not len(numbers) or numbers.min() < 0 or numbers.max() > _FEW * len(numbers) + 1000:
+        found, places = np.unique(numbers, return_inverse=True)
+        return found.astype(np.int64), places
+    there = np.bincount(numbers) > 0
+    return np.flatnonzero(there), (np.cumsum(there) - 1)[numbers]
+
+
 def add_up(parts: Records, places: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], Records]:
     """Buckets, those at the same place and of the same series in one, by place and series; and their places."""
-    series_ids, column = np.unique(parts["series_id"], return_inverse=True)
+    series_ids, column = _distinct(parts["series_id"])
     width = max(1, len(series_ids))
-    keys, group = np.unique(places * width + column, return_inverse=True)
+    keys, group = _distinct(places * width + column)
     made = np.empty(len(keys), BUCKET)
-    made["series_id"], made["minimum"], made["maximum"] = series_ids[keys % width], np.inf, -np.inf
+    made["series_id"] = series_ids[keys % width]
     for name in ("count", "total", "errors", "errors_total"):
         made[name] = np.bincount(group, parts[name], len(keys))
-    np.minimum.at(made["minimum"], group, parts["minimum"])
-    np.maximum.at(made["maximum"], group, parts["maximum"])
+    # Numbers of two bytes are sorted without comparing them.
+    order = np.argsort(group.astype(np.uint16) if len(keys) <= 2**16 else group, kind="stable")
+    sizes = np.bincount(group, minlength=len(keys))
+    first = np.cumsum(sizes) - sizes
+    made["minimum"] = np.minimum.reduceat(parts["minimum"][order], first)
+    made["maximum"] = np.maximum.reduceat(parts["maximum"][order], first)
     return keys // width, made
 
 

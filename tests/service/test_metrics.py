@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +11,10 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from service.access.scopes import Scope
+from service.delivery.metrics.machine import Observed, machine_families
 from service.delivery.metrics.requests import RequestCounts
 from service.history.records import StoreError
+from service.monitor.reports import Tally
 from service.runtime.runtime import Runtime, running
 from service.settings.service import HistorySettings
 from tests.service.hooked import hook, settings_for
@@ -132,7 +134,7 @@ def test_data_and_alarms_are_counted_as_they_came(read: Read, served: tuple[Runt
     assert read.of_lab("window_filled_ratio") == worker.health().filled
     assert read.of_lab("data_age_seconds") >= 0.0
     for name in ("queue_blocks", "queue_dropped_blocks_total", "link_missed_blocks_total", "publisher_alive",
-                 "worker_errors_total", "history_waiting_steps", "restored_at_start"):  # fmt: skip
+                 "worker_errors_total", "history_waiting_steps", "lag_seconds", "restored_at_start"):  # fmt: skip
         assert read.of_lab(name) == 0.0, name
     assert read.of_lab("worker_alive") == 1.0
     assert read.of_lab("alarms", state="unacknowledged", severity="alert") == 1.0
@@ -146,6 +148,13 @@ def test_data_and_alarms_are_counted_as_they_came(read: Read, served: tuple[Runt
     assert set(states.values()) == {0.0}
     identity = worker.identity
     assert read.of_lab("machine_info", bundle="", machine_hash=identity["machine_hash"]) == 1.0
+
+
+def test_blocks_that_wait_are_told_as_seconds_of_data(served: tuple[Runtime, str, Read]) -> None:
+    worker = served[0].machines()[0]
+    waiting = replace(worker.status(), queue_blocks=40, tally=Tally(blocks=16, data_s=1.4))
+    families = {one.name: one for one in machine_families([Observed(worker, worker.health(), waiting, {})])}
+    assert [one.value for one in families["rotorwatch_lag_seconds"].samples] == [pytest.approx(3.5)]
 
 
 def test_the_service_itself(read: Read, served: tuple[Runtime, str, Read]) -> None:

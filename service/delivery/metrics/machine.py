@@ -71,6 +71,12 @@ def _state(machine: Observed) -> _Values:
     return (((state.value,), float(machine.health.state is state)) for state in HealthState)
 
 
+def _lag_s(machine: Observed) -> float:
+    """Blocks that wait, of the mean length of those that were taken."""
+    status = machine.status
+    return status.queue_blocks * status.tally.data_s / max(1, status.tally.blocks)
+
+
 def _recorder_state(machine: Observed) -> _Values:
     now = "off" if machine.status.recorder is None else machine.status.recorder.state
     return (((state,), float(state == now)) for state in _RECORDER_STATES)
@@ -114,6 +120,7 @@ _FAMILIES = (
             _one(lambda machine: machine.health.quality.missing_s)),
     _Family("gauge", "queue_blocks", "Blocks that have arrived and wait for evaluation",
             _one(lambda machine: machine.status.queue_blocks)),
+    _Family("gauge", "lag_seconds", "Length of the data that have arrived and wait for evaluation", _one(_lag_s)),
     _Family("counter", "queue_dropped_blocks_total", "Blocks dropped because the monitor could not keep up",
             _one(lambda machine: machine.health.quality.queue_dropped_blocks)),
     _Family("counter", "link_missed_blocks_total", "Blocks lost on the way, as far as the link knows",
