@@ -15,8 +15,10 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 import argparse
 import tempfile
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from machine_kind import MachineKind
@@ -45,30 +47,48 @@ def archive(folder: Path, machines: int, minutes: float) -> list[MachineTask]:
     return tasks
 
 
-def descendants_s() -> float:
-    """Processor time of all programs that this one, and those that it has started, have started and that still run."""
+def descendants_s() -> dict[int, float]:
+    """Processor time of every program that this one has started, and of those that they have, by its number."""
     found: dict[int, tuple[int, float]] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = stat.read_text(encoding="utf-8").rsplit(")", 1)[1].split()
         except (FileNotFoundError, ProcessLookupError):
             continue
-        found[int(stat.parent.name)] = int(fields[1]), (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    ours, total_s = {os.getpid()}, 0.0
+        found[int(stat.parent.name)] = int(fields[1]), sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
+    ours = {os.getpid()}
     while new := {pid for pid, (parent, _) in found.items() if parent in ours} - ours:
         ours |= new
-        total_s += sum(found[pid][1] for pid in new)
-    return total_s
+    return {pid: found[pid][1] for pid in ours - {os.getpid()}}
+
+
+@contextmanager
+def watched() -> Iterator[dict[int, float]]:
+    """Processor time of all descendants as it was last seen: workers end as soon as there is nothing left to do."""
+    seen, over = descendants_s(), threading.Event()
+
+    def watch() -> None:
+        while not over.wait(0.1):
+            seen.update(descendants_s())
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield seen
+    finally:
+        over.set()
+        thread.join()
 
 
 def evaluated(tasks: Sequence[MachineTask], workers: int) -> tuple[float, float, float]:
-    """Seconds, and processor time of the workers, for all tasks; and how long their data are."""
+    """Seconds, and processor time of the cluster, for all tasks; and how long their data are."""
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": workers, "include_dashboard": False})
     try:
-        list(on_cluster(cluster.address, tasks[:0]))
-        begin_s, before_s = time.monotonic(), descendants_s()
-        data_s = sum(summary.data_s for summary, _ in on_cluster(cluster.address, tasks))
-        return time.monotonic() - begin_s, descendants_s() - before_s, data_s
+        with watched() as seen:
+            begin_s, before_s = time.monotonic(), sum(seen.values())
+            data_s = sum(summary.data_s for summary, _ in on_cluster(cluster.address, tasks))
+            took_s = time.monotonic() - begin_s
+        return took_s, sum(seen.values()) - before_s, data_s
     finally:
         cluster.shutdown()  # type: ignore[no-untyped-call]
 

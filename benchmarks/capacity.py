@@ -200,26 +200,14 @@ def lost(url: str, machines: Sequence[MachineFile]) -> tuple[int, float, Counter
     return count, missing_s, raised
 
 
-@dataclass(slots=True)
-class Held:
-    """What a history in a file holds."""
-
-    size_bytes: int
-    reports: int
-    report_bytes: int  # of all texts, compressed
-    readings_bytes: int
-
-    @classmethod
-    def of(cls, file: Path) -> "Held":
-        """Look, beside the monitor that writes it."""
-        with closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True, timeout=60.0)) as database:
-            pages, free, size = (
-                database.execute(f"PRAGMA {name}").fetchone()[0]
-                for name in ("page_count", "freelist_count", "page_size")
-            )
-            reports = database.execute("SELECT count(*), total(length(text)) FROM reports").fetchone()
-            readings = database.execute("SELECT total(length(readings)) FROM windows").fetchone()
-        return cls((pages - free) * size, reports[0], round(reports[1]), round(readings[0]))
+def held_bytes(file: Path) -> tuple[int, int, int]:
+    """How many reports a history holds, and the pages of the file that reports and readings take with their indexes."""
+    with closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True, timeout=60.0)) as database:
+        pages = "SELECT cast(total(pgsize) AS INTEGER) FROM dbstat WHERE name GLOB ?"
+        of_reports, of_windows = (
+            database.execute(pages, [f"*{name}*"]).fetchone()[0] for name in ("reports", "windows")
+        )
+        return database.execute("SELECT count(*) FROM reports").fetchone()[0], of_reports, of_windows
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,20 +240,17 @@ def measure(kind: MachineKind, count: int, seed: int, length_s: float, stall_s: 
             with sending(endpoint, machines, streams) as (plant, _):
                 time.sleep(warm_s)
                 before, begin_s = (process.cpu_s(), process.written_mb(), time.process_time()), time.monotonic()
-                first, told_bytes, held = len(plant.heard), plant.told_bytes, Held.of(folder / "history.sqlite")
+                first, told_bytes, held = len(plant.heard), plant.told_bytes, held_bytes(folder / "history.sqlite")
                 again_s = _stalled(process, plant, stall_s, length_s, of_shard=of_shard) if stall_s else None
                 time.sleep(max(0.0, begin_s + length_s - time.monotonic()))
                 took_s = time.monotonic() - begin_s
                 cpu_s, written_mb = process.cpu_s() - before[0], process.written_mb() - before[1]
                 late = np.array([one for _, one in plant.heard[first:]])
                 told_bytes, memory_mb = plant.told_bytes - told_bytes, process.memory_mb()
-                now = Held.of(folder / "history.sqlite")
+                now = held_bytes(folder / "history.sqlite")
                 (missing, missing_s, raised), skipped = lost(url, machines), _skipped(plant)
-    expected, reports = count * took_s / window.hop_s, max(1, now.reports - held.reports)
-    readings_kb = (now.readings_bytes - held.readings_bytes) / reports / 1e3
-    texts_kb = (now.report_bytes - held.report_bytes) / reports / 1e3
-    # Pages and indexes are shared out as the bytes are that stand in them.
-    taken_kb = (now.size_bytes - held.size_bytes) / reports / 1e3
+    expected = count * took_s / window.hop_s
+    reports, report_bytes, readings_bytes = (last - first for last, first in zip(now, held, strict=True))
     figures = Figures(
         cores=cpu_s / took_s,
         processor_ms=1e3 * cpu_s / expected,
@@ -273,15 +258,16 @@ def measure(kind: MachineKind, count: int, seed: int, length_s: float, stall_s: 
         idle_mb=idle_mb,
         memory_mb=memory_mb,
         written_kb=1e3 * written_mb / expected,
-        reports_kb=taken_kb * texts_kb / (texts_kb + readings_kb),
-        readings_kb=taken_kb * readings_kb / (texts_kb + readings_kb),
+        reports_kb=report_bytes / max(1, reports) / 1e3,
+        readings_kb=readings_bytes / max(1, reports) / 1e3,
         told_kb=told_bytes / max(1, late.size) / 1e3,
     )
     print(
         f"{count:4d} machines: {figures.cores:5.2f} cores ({figures.processor_ms:.0f} ms a hop, "
         f"{cpu_s / expected / yardstick:.0f} x the yardstick of {figures.yardstick_ms:.2f} ms), "
         f"{memory_mb:.0f} MB ({idle_mb:.0f} before data), "
-        f"{figures.written_kb:.0f} kB written a hop, {taken_kb:.1f} kept; "
+        f"{figures.written_kb:.0f} kB written a hop, "
+        f"{figures.reports_kb + figures.readings_kb:.1f} kept; "
         f"{late.size} reports of {expected:.0f}, late by {np.median(late):.2f} s (median), "
         f"{np.quantile(late, 0.99):.2f} (99 %), {late.max():.2f} (most); {missing} blocks lost; "
         f"this process {(time.process_time() - before[2]) / took_s:.2f} cores, {plant.behind_s:.2f} s behind",

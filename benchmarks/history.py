@@ -143,7 +143,7 @@ def questions(machine: MachineFile, machines: Sequence[MachineFile]) -> dict[str
     place = f"/api/v1/machines/{machine.site}/{machine.name}"
     of = "&".join(f"of={one.site}/{one.name}/parameter/k_by" for one in machines)
     end_ns = time.time_ns()
-    day = f"since_ns={end_ns - 86_400 * 10**9}"
+    day, most = (f"since_ns={end_ns - hours * 3600 * 10**9}" for hours in (24, 19))
     return {
         "machine list": "/api/v1/machines",
         "health of a machine": f"{place}/health",
@@ -157,7 +157,7 @@ def questions(machine: MachineFile, machines: Sequence[MachineFile]) -> dict[str
         "trend of all parameters, a day": f"{place}/readings?points=240&{day}",
         "trend of all parameters, all there is": f"{place}/readings?points=240",
         "trend of one parameter, all there is": f"{place}/readings?points=240&name=k_by",
-        "trend of all levels, 19 hours": f"{place}/readings?quantity=level&points=240&since_ns={end_ns - 68_400 * 10**9}",
+        "trend of all levels, 19 hours": f"{place}/readings?quantity=level&points=240&{most}",
         "trend of all levels, all there is": f"{place}/readings?quantity=level&points=240",
         "trends of all machines, a day": f"/api/v1/trends?{of}",
         "how large the history is": "/api/v1/history",
