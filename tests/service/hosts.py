@@ -7,8 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-
-from tests.service.live import Program
+from typing import Protocol
 
 MIDDLE = "middle"
 _ASK = "import sys, urllib.request; sys.stdout.write(urllib.request.urlopen(sys.argv[1], timeout=20).read().decode())"
@@ -28,9 +27,16 @@ def why_not() -> str:
     return ""
 
 
+class Running(Protocol):
+    """What runs on a host."""
+
+    def kill(self) -> object:
+        """kill -9."""
+
+
 @dataclass(frozen=True, slots=True)
 class Hosts:
-    """The hosts that there are; the n-th knows the middle as 10.77.n.1."""
+    """The hosts that there are: the n-th is 10.77.n.2, and knows the middle as 10.77.n.1."""
 
     names: tuple[str, ...]
 
@@ -42,6 +48,10 @@ class Hosts:
         """Address of the host in the middle, as another one reaches it."""
         return f"10.77.{self.names.index(name)}.1"
 
+    def address(self, name: str) -> str:
+        """Address of a host."""
+        return f"10.77.{self.names.index(name)}.2"
+
     def cut(self, name: str) -> None:
         """Cut the cable of a host: connections stay as they are, and nothing arrives any more."""
         _ip("-n", self._space(MIDDLE), "link", "set", self._cable(name), "down")
@@ -50,7 +60,7 @@ class Hosts:
         """Put the cable back."""
         _ip("-n", self._space(MIDDLE), "link", "set", self._cable(name), "up")
 
-    def lose(self, name: str, *running: Program) -> None:
+    def lose(self, name: str, *running: Running) -> None:
         """Take the power from a host on which these programs run: nobody is told, and no connection is closed."""
         _ip("-n", self._space(MIDDLE), "link", "del", self._cable(name))
         for one in running:
@@ -69,6 +79,7 @@ class Hosts:
         for end, device, last in ((middle, self._cable(name), 1), (space, "cable", 2)):
             _ip("-n", end, "address", "add", f"10.77.{number}.{last}/30", "dev", device)
             _ip("-n", end, "link", "set", device, "up")
+        _ip("-n", space, "route", "add", "default", "via", self.middle_from(name))
 
     def take_away(self, name: str) -> None:
         """Take a host away, if it is there."""
@@ -87,13 +98,18 @@ class Hosts:
 
 
 @contextmanager
-def hosts(*names: str) -> Iterator[Hosts]:
-    """Hosts with these names, and one in the middle; gone, with all that is between them, when the block is left."""
+def hosts(*names: str, joined: bool = False) -> Iterator[Hosts]:
+    """Hosts with these names, and one in the middle; gone, with all that is between them, when the block is left.
+
+    The one in the middle passes on what they send each other only if they are `joined`.
+    """
     made = Hosts(names)
     with ExitStack() as undo:
         for name in (MIDDLE, *names):
             undo.callback(made.take_away, name)
             made.put(name)
+        forward = ["sh", "-c", f"echo {int(joined)} > /proc/sys/net/ipv4/ip_forward"]
+        subprocess.run([*made.within(MIDDLE), *forward], check=True)
         yield made
 
 

@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(_WHY_NOT), reason=f"NO H
 PACE = 10.0
 CUT_S = 13.0
 """Longer than Zenoh waits for a sign of life (10 s); at this pace, longer than the publisher keeps what it sent too."""
-LATER_S, LENGTH_S = 900.0, 60.0
+LATER_S, LENGTH_S = 900.0, 45.0
 """When the data of the machine begin again, whose host was lost, and for how long."""
 START_NS = 1_767_225_600 * 10**9
 BLOCK_S = 0.1
@@ -92,7 +92,7 @@ def test_what_a_cut_cable_and_a_lost_host_cost_is_stated_and_the_alarm_log_arriv
             follower = running.enter_context(subprocess.Popen(follow, stdout=out, cwd=ROOT))
         running.callback(follower.kill)
         url = monitor.url()
-        publisher = published(START_NS, 25.0, LATER_S)
+        publisher = published(START_NS, 15.0, LATER_S)
         until(lambda: any(one[2:] == ("raised", "k_by") for one in log_of(history)), "alarm")
 
         net.cut("monitor")
