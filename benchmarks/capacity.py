@@ -187,7 +187,7 @@ def sending(
 
 
 def lost(url: str, machines: Sequence[MachineFile]) -> tuple[int, float, dict[str, list[str]]]:
-    """Blocks refused, dropped or missing of all machines; seconds of data missing; and where which alarms were raised."""
+    """Blocks refused, dropped or missing of all machines; seconds of data missing; where which alarms were raised."""
     count, missing_s, raised = 0, 0.0, defaultdict[str, list[str]](list)
     with httpx.Client(base_url=url, trust_env=False, timeout=60.0, verify=False) as http:  # noqa: S501  # no HTTPS
         for machine in machines:

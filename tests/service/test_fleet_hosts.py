@@ -136,7 +136,7 @@ def logs_of(database: str) -> dict[str, list[tuple[int, str, str, int]]]:
     query = "SELECT name, sequence, kind, alarm, time_ns FROM alarm_events JOIN machines USING (machine_id)"
     with psycopg.connect(database) as connection:
         for name, *event in connection.execute(f"{query} ORDER BY sequence").fetchall():
-            found[name].append(tuple(event))  # type: ignore[arg-type]  # of four
+            found[name].append(tuple(event))
     return found
 
 
