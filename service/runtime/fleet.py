@@ -25,12 +25,12 @@ from models.errors import MachineFileError, RotorwatchError
 from models.signals.link import LinkSettings
 from service.runtime.processes import ShardProcess
 from service.runtime.shard import run_shard
+from service.runtime.shards import OF_A_SHARD
 from service.settings.service import ServiceSettings
 from service.stream.shard_link import KnownSettings
 from service.stream.transport import Link
 from service.terminal.logs import logger
 
-_OF_A_SHARD = 15
 _CORES_OF_A_MACHINE = 0.025
 _MB_OF_A_PROCESS, _MB_OF_A_MACHINE = 140, 20
 """As measured, see ``docs/performance.md``."""
@@ -61,7 +61,7 @@ def fleet_count(settings: ServiceSettings) -> int:
             "move from one computer to another"
         )
     machines = len(settings.machines)
-    return min(machines, settings.shards.count or math.ceil(machines / _OF_A_SHARD))
+    return min(machines, settings.shards.count or math.ceil(machines / OF_A_SHARD))
 
 
 class Fleet:
