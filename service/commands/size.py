@@ -52,8 +52,8 @@ def size(
 ) -> None:
     """Reckon what a plant will take: processor, memory, disk, network, processes and computers.
 
-    From figures that were measured on simulated machines, and a model between them, both told beside the result. How
-    long things are kept is as in the settings, unless it is given. Page, API and other programs come on top.
+    From figures that were measured on simulated machines, and a model between them, both told beside the result.
+    How long things are kept is as in the settings, unless it is given. Page, API and other programs come on top.
 
     [bold]Examples[/bold]
 
