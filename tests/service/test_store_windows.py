@@ -64,15 +64,16 @@ def test_readings_come_out_of_their_value_as_they_went_in(windows: list[list[tup
     assert places.tolist() == [place for place, each in enumerate(windows) for _ in each]
 
 
-def test_what_is_added_up_is_what_numpy_says() -> None:
+@pytest.mark.parametrize(("first", "apart"), [(-3, 1), (0, 1), (0, 1_000_000)])
+def test_what_is_added_up_is_what_numpy_says(first: int, apart: int) -> None:
     rng = np.random.default_rng(3)
     readings = np.zeros(1000, READING)
-    readings["series_id"], readings["value"] = rng.integers(5, 9, 1000), rng.standard_normal(1000)
+    readings["series_id"], readings["value"] = apart * rng.integers(5, 9, 1000), rng.standard_normal(1000)
     readings["standard_error"] = np.where(rng.random(1000) < 0.3, np.nan, rng.random(1000))
-    at = rng.integers(-3, 4, 1000)
+    at = rng.integers(first, first + 7, 1000)
     places, made = add_up(singles(readings), at)
     keys = list(zip(places.tolist(), made["series_id"].tolist(), strict=True))
-    assert keys == [(place, series_id) for place in range(-3, 4) for series_id in range(5, 9)]
+    assert keys == [(place, apart * series_id) for place in range(first, first + 7) for series_id in range(5, 9)]
     for place, one in zip(places, made, strict=True):
         own = readings[(at == place) & (readings["series_id"] == one["series_id"])]
         errors = own["standard_error"][~np.isnan(own["standard_error"])]
