@@ -310,9 +310,9 @@ class MachineWorker:
 
     @property
     def _silent(self) -> bool:
-        """Whether no usable block has come for longer than a silence may last."""
+        """Whether no usable block has come for longer than a silence may last, since this program stood still last."""
         latest_s = self._begin_s if self._latest_data_s is None else self._latest_data_s
-        return self._clocks.monotonic_s() - latest_s > self.machine.ingest.no_data_after_s
+        return self._clocks.monotonic_s() - max(latest_s, self._held_up_s) > self.machine.ingest.no_data_after_s
 
     def _data_now_ns(self) -> int:
         """Data time that has been reached: end of the newest data, and what has passed since."""

@@ -345,11 +345,13 @@ def test_a_program_that_stood_still_calls_nobody_silent(tmp_path: Path) -> None:
         at.put(block(0))
         now_s[0] += 60.0  # stopped by the system: what came meanwhile is still on its way
         at.tick()
+        assert not at.worker.health().stream.silent
         at.put(block(1))
         assert at.log() == []
         for _ in range(6):
             now_s[0] += 1.0
             at.tick()
+        assert at.worker.health().stream.silent
         assert at.log() == [(0, "raised", STREAM_LOST)]
 
 
