@@ -63,10 +63,12 @@ class OneComputer:
     ----------
     link : LinkSettings
         Where streams come in.
+    waits : bool
+        A shard that does not keep up slows down the source.
     """
 
-    def __init__(self, link: LinkSettings) -> None:
-        self._link = link
+    def __init__(self, link: LinkSettings, *, waits: bool) -> None:
+        self._link, self._waits = link, waits
         self._inner = LinkSettings()
         self._router: Link | None = None
 
@@ -81,7 +83,8 @@ class OneComputer:
         streams, inner = (f"unixsock-stream/{folder / name}" for name in ("streams", "inner"))
         if self._link.listen:
             listen = (*self._link.listen, streams)
-            self._router = Link(RelaySettings(**dict(self._link) | {"mode": "router", "listen": listen}))
+            relay = dict(self._link) | {"mode": "router", "listen": listen, "waits": self._waits}
+            self._router = Link(RelaySettings(**relay))
             undo.callback(self._router.close)
             alone = {"mode": "client", "listen": (), "connect": (streams,), "tls": None, "user": None}
             self._link = self._link.model_copy(update=alone | {"password_file": None, "password_variable": None})

@@ -77,7 +77,8 @@ class Runtime:
         elif (count := shard_count(settings)) == 1:
             self._machines = LocalMachines(settings, self.store, self)
         else:
-            self._machines = Shards(settings, count, OneComputer(settings.link), self.store, self)
+            here = OneComputer(settings.link, waits=settings.queue.when_full == "wait")
+            self._machines = Shards(settings, count, here, self.store, self)
         self._server: HttpServer | None = None
         self._undo = ExitStack()
 
