@@ -190,50 +190,27 @@ class Client:
             Only of this alarm, kind, severity.
         """
         chosen = {"since_ns": since_ns, "until_ns": until_ns, "name": name, "kind": kind, "severity": severity}
-        before: int | None = None
-        while True:
-            page = self._get(AlarmEventList, place, "alarms/events", after=after, before=before, limit=_PAGE, **chosen)
+        path = _path(place, "alarms/events")
+        cursor = "before" if after is None else "after"
+        for page in self._pages(AlarmEventList, path, cursor, after, limit=_PAGE, **chosen):
             yield from page.events
-            if after is not None:
-                after = page.next_after
-                if len(page.events) < _PAGE:
-                    return
-            elif page.next_before is None:
+            if after is not None and len(page.events) < _PAGE:
                 return
-            before = page.next_before
 
     def reports(self, place: str, *, since_ns: int | None = None, until_ns: int | None = None) -> Iterator[Report]:
         """Window reports, the latest to arrive first, fetched page by page."""
-        before: int | None = None
-        while True:
-            page = self._get(
-                ReportList, place, "reports", since_ns=since_ns, until_ns=until_ns, before=before, limit=_PAGE
-            )
+        path = _path(place, "reports")
+        for page in self._pages(ReportList, path, "before", None, since_ns=since_ns, until_ns=until_ns, limit=_PAGE):
             yield from page.reports
-            if page.next_before is None:
-                return
-            before = page.next_before
 
     def readings(
         self, place: str, quantity: str, name: str = "", *, since_ns: int | None = None, until_ns: int | None = None
     ) -> Iterator[Reading]:
         """Every reading of a parameter, equation, misfit or speed, oldest first, fetched page by page."""
-        after: int | None = None
-        while True:
-            page = self._get(
-                ReadingList,
-                place,
-                "readings",
-                quantity=quantity,
-                name=name or None,
-                since_ns=since_ns,
-                until_ns=until_ns,
-                after=after,
-            )
+        wanted: dict[str, _Parameter] = {"quantity": quantity, "name": name or None}
+        path = _path(place, "readings")
+        for page in self._pages(ReadingList, path, "after", None, since_ns=since_ns, until_ns=until_ns, **wanted):
             yield from page.readings
-            if page.next_after is None:
-                return
-            after = page.next_after
 
     def trend(
         self,
@@ -251,14 +228,8 @@ class Client:
 
     def audit(self, *, machine: str | None = None, actor: str | None = None) -> Iterator[AuditRecord]:
         """Who asked for what and what came of it, newest first, fetched page by page."""
-        before: int | None = None
-        while True:
-            answer = self._ask("GET", "/api/v1/audit", before=before, machine=machine, actor=actor, limit=_PAGE)
-            page = understood(AuditList, answer.content, "/api/v1/audit")
+        for page in self._pages(AuditList, "/api/v1/audit", "before", None, machine=machine, actor=actor, limit=_PAGE):
             yield from page.entries
-            if page.next_before is None:
-                return
-            before = page.next_before
 
     # What the monitor holds now
 
@@ -350,6 +321,17 @@ class Client:
     def _get(self, model: type[M], place: str, below: str = "", **parameters: _Parameter) -> M:
         path = _path(place, below)
         return understood(model, self._ask("GET", path, **parameters).content, path)
+
+    def _pages(
+        self, model: type[M], path: str, cursor: str, begin: int | None, **parameters: _Parameter
+    ) -> Iterator[M]:
+        """One page after the other, as long as each says where the next begins."""
+        while True:
+            page = understood(model, self._ask("GET", path, **{cursor: begin}, **parameters).content, path)
+            yield page
+            begin = getattr(page, f"next_{cursor}")
+            if begin is None:
+                return
 
     def _operate(self, place: str, seen: Alarm, kind: OperationKind, **order: str | float | bool) -> OperationDone:
         path = _path(place, f"alarms/{seen.name}/{kind}")

@@ -13,18 +13,7 @@ from rotorwatch.records.fields import EXAMPLE_NS, Name, Record, Site
 
 _Series = tuple[float | None, ...]
 
-_Source = Annotated[
-    Literal["newest samples", "history", "recordings"],
-    Field(description="where the values come from", examples=["newest samples"]),
-]
-
 _Reason = Annotated[str, Field(description="why there is nothing, or less than asked for; else empty", examples=[""])]
-
-_StartNs = Annotated[
-    int | None, Field(description="time of the oldest data in it; null without", examples=[EXAMPLE_NS - 400_000_000])
-]
-
-_EndNs = Annotated[int | None, Field(description="end of the newest data in it", examples=[EXAMPLE_NS])]
 
 _Speed = Annotated[
     float | None,
@@ -44,6 +33,21 @@ _Times = Annotated[
 _Location = Annotated[str, Field(description="place of two displacements", examples=["bearing"])]
 
 
+class _Values(Record):
+    site: Site
+    machine: Name
+    source: Literal["newest samples", "history", "recordings"] = Field(
+        description="where the values come from", examples=["newest samples"]
+    )
+
+
+class _ValuesOfSamples(_Values):
+    start_ns: int | None = Field(
+        default=None, description="time of the oldest data in it; null without", examples=[EXAMPLE_NS - 400_000_000]
+    )
+    end_ns: int | None = Field(default=None, description="end of the newest data in it", examples=[EXAMPLE_NS])
+
+
 class ChannelWaveform(Record):
     """The newest samples of one channel about their mean; n_samples values."""
 
@@ -53,14 +57,9 @@ class ChannelWaveform(Record):
     values: _Series = Field(description="samples less their mean", examples=[(3.2, 4.1)])
 
 
-class WaveformSnapshot(Record):
+class WaveformSnapshot(_ValuesOfSamples):
     """The newest whole revolutions, channel by channel."""
 
-    site: Site
-    machine: Name
-    source: _Source
-    start_ns: _StartNs = None
-    end_ns: _EndNs = None
     speed_rad_s: _Speed = None
     revolutions: int = Field(default=0, description="whole revolutions; 0 where none can be told", examples=[8])
     times_s: tuple[float, ...] = Field(
@@ -84,14 +83,9 @@ class PlaceSpectrum(Record):
     values: _Series = Field(description="diameter of the circle of each line", examples=[(0.8, 0.3, 7.4)])
 
 
-class FullSpectrumSnapshot(Record):
+class FullSpectrumSnapshot(_ValuesOfSamples):
     """Full spectra: what goes round with the rotation, and what against it."""
 
-    site: Site
-    machine: Name
-    source: _Source
-    start_ns: _StartNs = None
-    end_ns: _EndNs = None
     speed_rad_s: _Speed = None
     frequencies_hz: tuple[float, ...] = Field(
         default=(),
@@ -115,14 +109,9 @@ class WaterfallRow(Record):
     values: _Series = Field(description="amplitudes in `unit`", examples=[(0.8, 7.4)])
 
 
-class WaterfallSnapshot(Record):
+class WaterfallSnapshot(_ValuesOfSamples):
     """Spectra of one channel over time or speed."""
 
-    site: Site
-    machine: Name
-    source: _Source
-    start_ns: _StartNs = None
-    end_ns: _EndNs = None
     channel: str = Field(default="", description="name of the channel; empty without one", examples=["y1"])
     unit: str = Field(default="", description="unit of the amplitudes", examples=["µm p-p"])
     over: Literal["time", "speed"] = Field(description="what the rows go over", examples=["time"])
@@ -141,12 +130,9 @@ class ChannelVectors(Record):
     phase_lag_deg: _Series = Field(description="phase lag, 0 to 360°", examples=[(12.0, 15.5, 21.3)])
 
 
-class VectorSeries(Record):
+class VectorSeries(_Values):
     """Vectors at an order of running speed over time and speed: what Bode and polar plots show."""
 
-    site: Site
-    machine: Name
-    source: _Source
     order: int = Field(description="multiple of running speed", examples=[1])
     revolutions: int | None = Field(
         default=None, description="that each vector is of; null where it is of a window of the monitor", examples=[None]
@@ -176,12 +162,9 @@ class PlaceCentreline(Record):
     z_um: _Series = Field(description="position along z, µm", examples=[(0.0, 4.2, 8.9)])
 
 
-class CentrelineSeries(Record):
+class CentrelineSeries(_Values):
     """Where the shaft was on average, over time and speed (API 670: average shaft centreline)."""
 
-    site: Site
-    machine: Name
-    source: _Source
     times_ns: _Times = ()
     speeds_rad_s: _Speeds = ()
     places: tuple[PlaceCentreline, ...] = Field(default=(), description="place by place")

@@ -14,18 +14,6 @@ Units = Literal["channel", "SI"]
 
 _Series = tuple[float | None, ...]
 
-_StartNs = Annotated[
-    int | None, Field(description="oldest data in the window; null without one", examples=[EXAMPLE_NS - 60_000_000_000])
-]
-
-_EndNs = Annotated[int | None, Field(description="end of the newest data in the window", examples=[EXAMPLE_NS])]
-
-_Filled = Annotated[float, Field(description="fraction of a full window that is there now", examples=[1.0])]
-
-_Speed = Annotated[
-    float | None, Field(description="mean speed in the window; null if it is not known", examples=[138.23])
-]
-
 _Reason = Annotated[str, Field(description="why there is nothing to show; empty if there is", examples=[""])]
 
 _SumUnit = Annotated[
@@ -35,6 +23,19 @@ _SumUnit = Annotated[
 _DensityUnit = Annotated[
     str, Field(description="unit of the values: a product of two channels' units, per Hz", examples=["um^2/Hz"])
 ]
+
+
+class _OfWindow(Record):
+    site: Site
+    machine: Name
+    start_ns: int | None = Field(
+        description="oldest data in the window; null without one", examples=[EXAMPLE_NS - 60_000_000_000]
+    )
+    end_ns: int | None = Field(description="end of the newest data in the window", examples=[EXAMPLE_NS])
+    filled: float = Field(description="fraction of a full window that is there now", examples=[1.0])
+    speed_rad_s: float | None = Field(
+        description="mean speed in the window; null if it is not known", examples=[138.23]
+    )
 
 
 class PredictedChange(Record):
@@ -92,15 +93,9 @@ class CorrelationPair(Record):
     )
 
 
-class CorrelationSnapshot(Record):
+class CorrelationSnapshot(_OfWindow):
     """Correlation functions of a window, measured and predicted."""
 
-    site: Site
-    machine: Name
-    start_ns: _StartNs
-    end_ns: _EndNs
-    filled: _Filled
-    speed_rad_s: _Speed
     lags_s: tuple[float, ...] = Field(description="τ, n_lags values from 0 on", examples=[(0.0, 0.001, 0.002)])
     method: Literal["samples", "spectrum"] = Field(
         description="samples: from the samples themselves, standard errors from the scatter of the window's hops. "
@@ -163,15 +158,9 @@ class CrossSpectrum(Record):
     )
 
 
-class SpectrumSnapshot(Record):
+class SpectrumSnapshot(_OfWindow):
     """Power spectral densities of a window, measured and predicted."""
 
-    site: Site
-    machine: Name
-    start_ns: _StartNs
-    end_ns: _EndNs
-    filled: _Filled
-    speed_rad_s: _Speed
     frequencies_hz: tuple[float, ...] = Field(description="n_lines values", examples=[(3.0, 3.2, 3.4)])
     line_spacing_hz: float | None = Field(
         description="distance of the lines; null without a window. The segments have a Hann window: a line sees 1.5 "
@@ -267,15 +256,9 @@ class PlaceOrbit(Record):
     path: PathSamples | None = Field(description="samples as measured; null without, see `path_reason`")
 
 
-class OrbitSnapshot(Record):
+class OrbitSnapshot(_OfWindow):
     """Orbits at all places where displacements are measured in both directions."""
 
-    site: Site
-    machine: Name
-    start_ns: _StartNs
-    end_ns: _EndNs
-    filled: _Filled
-    speed_rad_s: _Speed
     speed_source: Literal["phase reference", "estimated", "unknown"] = Field(
         description="where the speed is from; estimated: from the line in the vibration", examples=["phase reference"]
     )

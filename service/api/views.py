@@ -13,8 +13,7 @@ from service.api.routes.replays import ReplayDesk
 from service.delivery.event_feed import EventFeed
 from service.delivery.metrics.collector import Metrics
 from service.delivery.webhooks.webhooks import Webhooks
-from service.history.holdings import Holdings
-from service.history.shared import AuditLog
+from service.history.store import Store
 from service.recordings.catalogue import Catalogue
 from service.stream.monitored import Monitored
 
@@ -54,33 +53,12 @@ class ServiceView(Protocol):
     def readiness(self) -> Readiness:
         """Whether the service can do its work."""
 
-    @property
-    def metrics(self) -> Metrics:
-        """The metrics."""
-
-    @property
-    def webhooks(self) -> Webhooks:
-        """Who is told of alarm events."""
-
-    @property
-    def feed(self) -> EventFeed:
-        """Where news of alarms and health arrive."""
-
-    @property
-    def audit(self) -> AuditLog:
-        """Who asked for what."""
-
-    @property
-    def holdings(self) -> Holdings:
-        """How far back the history goes."""
-
-    @property
-    def catalogue(self) -> Catalogue | None:
-        """Recordings, or None if no directory for them is set."""
-
-    @property
-    def replays(self) -> ReplayDesk:
-        """Where replays are started."""
+    metrics: Metrics
+    webhooks: Webhooks
+    feed: EventFeed
+    store: Store
+    catalogue: Catalogue | None  # None if no directory for recordings is set
+    replays: ReplayDesk
 
 
 def found_machine(service: ServiceView, site: str, name: str) -> Monitored:

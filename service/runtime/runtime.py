@@ -24,9 +24,7 @@ from service.delivery.event_feed import EventFeed
 from service.delivery.metrics.collector import Metrics
 from service.delivery.metrics.requests import RequestCounts, RequestMeter
 from service.delivery.webhooks.webhooks import Webhooks
-from service.history.holdings import Holdings
 from service.history.records import StoreError
-from service.history.shared import AuditLog
 from service.history.store import Store
 from service.recordings.catalogue import Catalogue
 from service.runtime.machines import LocalMachines
@@ -88,16 +86,6 @@ class Runtime:
         if self._server is None:
             raise HttpError("the HTTP API is not started")
         return self._server.url
-
-    @property
-    def audit(self) -> AuditLog:
-        """Who asked for what."""
-        return self.store.audit
-
-    @property
-    def holdings(self) -> Holdings:
-        """How far back the history goes."""
-        return self.store.holdings
 
     def machines(self) -> Sequence[Monitored]:
         """Every monitored machine."""

@@ -41,17 +41,12 @@ class MachineStatus:
 class Monitored(Protocol):
     """A monitored machine; for any thread. `service.stream.worker.MachineWorker` is one."""
 
-    @property
-    def machine(self) -> MachineFile:
-        """The machine file as it is in use."""
+    machine: MachineFile
+    history: MachineStore
 
     @property
     def identity(self) -> Identity:
         """The machine, and the exact files its monitor runs on."""
-
-    @property
-    def history(self) -> MachineStore:
-        """What is kept of it."""
 
     @property
     def snapshots(self) -> MachineSnapshots:

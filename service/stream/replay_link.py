@@ -287,7 +287,7 @@ def replay_to_network(
                     link.put(found)
             wanted = None if plan.everything else _sent_by(plan.machines)
             stretch = PlayPlan(wanted, plan.pace, plan.from_ns, plan.to_ns, number)
-            count += play(source, link, stretch, control, on_progress)
+            count += play(source, link.put, stretch, control, on_progress)
             if not control.stopped:
                 if plan.pace is None:
                     link.drain(_DRAIN_S)

@@ -176,16 +176,11 @@ class Timed(Control):
         return 100.0
 
 
-class Nobody:
-    def put(self, message: RecordedMessage) -> None:
-        pass
-
-
 def played(path: Path, **limits: int) -> tuple[list[float], list[ReplayProgress]]:
     source, control, progress = RecordingSource([path]), Timed(), list[ReplayProgress]()
     span = source.span()
     where = {"from_ns": span.start_ns, "to_ns": span.end_ns + 1} | limits
-    play(source, Nobody(), PlayPlan({LAB.keys.stream}, 2.0, **where), control, progress.append)
+    play(source, lambda _: None, PlayPlan({LAB.keys.stream}, 2.0, **where), control, progress.append)
     return [due_s - 100.0 for due_s in control.due_s], progress
 
 

@@ -131,34 +131,34 @@ def plan(pace: float | None = None, from_s: float = 0.0, to_s: float = 100.0) ->
 def test_messages_are_handed_out_as_they_were(tmp_path: Path) -> None:
     said = [message(1.0), RecordedMessage(KEY, b"\0\xff", b"header", "a/b;c", 2 * SECOND, 3), message(2.5, "other")]
     taker = Taker()
-    assert play(RecordingSource([write(tmp_path / "a.mcap", said)]), taker, plan(), Control()) == 2
+    assert play(RecordingSource([write(tmp_path / "a.mcap", said)]), taker.put, plan(), Control()) == 2
     assert taker.messages == said[:2]
 
 
 def test_seeking_forward_skips_and_back_repeats(tmp_path: Path) -> None:
     source, control = RecordingSource([tens(tmp_path / "a.mcap", 0, 100)]), Control()
     taker = Taker(1.0, lambda: control.seek_by(5.0))
-    play(source, taker, plan(), control)
+    play(source, taker.put, plan(), control)
     assert taker.times == [at / 10 for at in (*range(11), *range(60, 100))]
     taker = Taker(2.0, lambda: control.seek(SECOND))
-    play(source, taker, plan(pace=1000.0), control)
+    play(source, taker.put, plan(pace=1000.0), control)
     assert taker.times == [at / 10 for at in (*range(21), *range(10, 100))]
 
 
 def test_seeking_stays_within_what_is_replayed(tmp_path: Path) -> None:
     source, control = RecordingSource([tens(tmp_path / "a.mcap", 0, 100)]), Control()
     taker = Taker(4.0, lambda: control.seek_by(-60.0))
-    play(source, taker, plan(from_s=3.0, to_s=5.0), control)
+    play(source, taker.put, plan(from_s=3.0, to_s=5.0), control)
     assert taker.times == [at / 10 for at in (*range(30, 41), *range(30, 50))]
     taker = Taker(4.0, lambda: control.seek_by(60.0))
-    play(source, taker, plan(from_s=3.0, to_s=5.0), control)
+    play(source, taker.put, plan(from_s=3.0, to_s=5.0), control)
     assert taker.times == [at / 10 for at in range(30, 41)]
 
 
 def test_a_paused_replay_says_where_it_was_moved_and_does_not_end_at_the_end(tmp_path: Path) -> None:
     source, control = RecordingSource([tens(tmp_path / "a.mcap", 0, 100)]), Control()
     taker, told = Taker(2.0, control.pause), list[ReplayProgress]()
-    thread = threading.Thread(target=play, args=(source, taker, plan(to_s=10.0), control, told.append), daemon=True)
+    thread = threading.Thread(target=play, args=(source, taker.put, plan(to_s=10.0), control, told.append), daemon=True)
     thread.start()
     until(lambda: bool(told) and told[-1].paused, "the pause")
     assert told[-1].position_ns == 2 * SECOND
@@ -174,7 +174,7 @@ def test_a_paused_replay_says_where_it_was_moved_and_does_not_end_at_the_end(tmp
 def test_stopping_ends_before_the_next_message(tmp_path: Path) -> None:
     control = Control()
     taker = Taker(1.0, lambda: control.stop("enough"))
-    assert play(RecordingSource([tens(tmp_path / "a.mcap", 0, 100)]), taker, plan(), control) == 11
+    assert play(RecordingSource([tens(tmp_path / "a.mcap", 0, 100)]), taker.put, plan(), control) == 11
     assert (control.stopped, control.reason) == (True, "enough")
 
 

@@ -10,11 +10,12 @@ import pytest
 import trustme
 from standardwebhooks.webhooks import WebhookVerificationError
 
-from service.delivery.webhooks.dispatcher import Cursors, Dispatcher
+from service.delivery.webhooks.dispatcher import Dispatcher
 from service.delivery.webhooks.receiver import CONTENT_TYPE, Receiver
 from service.delivery.webhooks.signature import new_secret
 from service.history.machine import MachineStore
 from service.history.records import Retention, Step, StoredEvent, StoreError
+from service.history.shared import WebhookCursors
 from service.history.store import Store
 from service.settings.webhooks import WebhookSettings
 from tests.service.guarded import Clock
@@ -70,7 +71,7 @@ class Turned:
 
 
 @contextmanager
-def turned(settings: WebhookSettings, plant: Plant, cursors: Cursors | None = None) -> Iterator[Turned]:
+def turned(settings: WebhookSettings, plant: Plant, cursors: WebhookCursors | None = None) -> Iterator[Turned]:
     receiver, clock = Receiver(settings), Clock()
     made = Dispatcher(
         settings, receiver, plant.logs, cursors or plant.store.webhooks, clock=clock, now_ns=lambda: 77,
@@ -295,24 +296,19 @@ def test_what_is_not_delivered_at_the_end_is_sent_after_the_next_start(tmp_path:
             assert len(receiver.got) == 4  # a new one begins now
 
 
-class Failing:
+class Failing(WebhookCursors):
     """The cursors of a real history, which fails when told to."""
 
-    def __init__(self, plant: Plant) -> None:
-        self.cursors = plant.store.webhooks
-        self.broken = False
-
-    def get(self, name: str, machine_key: str) -> int:
-        return self.cursors.get(name, machine_key)
+    broken = False
 
     def set(self, name: str, machine_key: str, sequence: int) -> None:
         if self.broken:
             raise StoreError("the disk is full")
-        self.cursors.set(name, machine_key, sequence)
+        super().set(name, machine_key, sequence)
 
 
 def test_alarms_are_delivered_although_it_cannot_be_remembered(tmp_path: Path, history: Plant) -> None:
-    cursors = Failing(history)
+    cursors = Failing(history.store.webhooks._database)
     with hook() as receiver:
         settings = settings_for(receiver, tmp_path)
         with turned(settings, history, cursors) as webhook:

@@ -201,14 +201,14 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
         limit: Limit = 100,
     ) -> AuditList:
         """Who asked for what and what came of it, newest first; kept for ever."""
-        found = service.audit.entries(before, limit, machine=machine, actor=actor)
+        found = service.store.audit.entries(before, limit, machine=machine, actor=actor)
         entries = tuple(AuditRecord(**asdict(one)) for one in found)
         return AuditList(entries=entries, next_before=found[-1].number if len(found) == limit else None)
 
     @app.get("/api/v1/history", tags=["service"], dependencies=[guard.configure], responses=responses(HistoryStatus))
     def history() -> HistoryStatus:
         """How large the history is, how far back it goes, and for how long things are kept."""
-        return service.holdings.read()
+        return service.store.holdings.read()
 
 
 def _trend(service: ServiceView, of: str, hours: int, points: int) -> Trend:

@@ -36,9 +36,7 @@ class MeasuredService(Protocol):
     def readiness(self) -> Readiness:
         """Whether the service can do its work."""
 
-    @property
-    def webhooks(self) -> Webhooks:
-        """Those who are told of alarm events."""
+    webhooks: Webhooks
 
 
 class _EventCounts:

@@ -17,15 +17,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from secrets import SystemRandom
-from typing import Protocol
 
 from pydantic import ValidationError
 
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.monitor import WebhookStatus
-from service.delivery.webhooks.answer import Answer, Meaning, pause_s
+from service.delivery.webhooks.answer import Meaning, pause_s
+from service.delivery.webhooks.receiver import Receiver
 from service.history.machine import MachineStore
 from service.history.records import StoredEvent, StoreError
+from service.history.shared import WebhookCursors
 from service.settings.webhooks import WebhookSettings
 from service.terminal.logs import Limiter, logger
 
@@ -34,29 +35,6 @@ _QUIET_S = 15.0
 _AGAIN_S = 1.0
 _JOIN_S = 10.0
 _CHANCE = SystemRandom().random
-
-
-class Post(Protocol):
-    """Who makes attempts; `service.delivery.webhooks.receiver.Receiver` is one."""
-
-    def post(self, identifier: str, body: bytes) -> Answer:
-        """Make one attempt."""
-
-    def interrupt(self) -> None:
-        """Give up the present attempt; for any thread."""
-
-    def close(self) -> None:
-        """Make no more."""
-
-
-class Cursors(Protocol):
-    """Where it is remembered how far each webhook has been served; `service.history.shared.WebhookCursors` is one."""
-
-    def get(self, name: str, machine_key: str) -> int:
-        """Return what was set; -1 if nothing was."""
-
-    def set(self, name: str, machine_key: str, sequence: int) -> None:
-        """Remember a number."""
 
 
 @dataclass(slots=True)
@@ -80,7 +58,7 @@ class Dispatcher:
     ----------
     logs : mapping of str to MachineStore
         Of all machines, by ``site/machine``. A webhook that is new is told what comes after this moment.
-    cursors : Cursors
+    cursors : WebhookCursors
         What is remembered is the sequence of the next event, so that a webhook that begins with an empty log (0) can be
         told from a new one (-1).
     clock : callable
@@ -94,9 +72,9 @@ class Dispatcher:
     def __init__(
         self,
         settings: WebhookSettings,
-        receiver: Post,
+        receiver: Receiver,
         logs: Mapping[str, MachineStore],
-        cursors: Cursors,
+        cursors: WebhookCursors,
         *,
         clock: Callable[[], float] = time.monotonic,
         now_ns: Callable[[], int] = time.time_ns,

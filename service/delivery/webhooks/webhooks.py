@@ -8,9 +8,10 @@ from contextlib import closing
 from models.errors import RotorwatchError
 from rotorwatch.records.monitor import WebhookList
 from service.delivery.webhooks.answer import Meaning
-from service.delivery.webhooks.dispatcher import Cursors, Dispatcher
+from service.delivery.webhooks.dispatcher import Dispatcher
 from service.delivery.webhooks.receiver import Receiver
 from service.history.machine import MachineStore
+from service.history.shared import WebhookCursors
 from service.monitor.alarm_conversion import rfc3339
 from service.settings.webhooks import WebhookSettings
 
@@ -32,14 +33,14 @@ class Webhooks:
         self._receivers = [(settings, Receiver(settings)) for settings in webhooks]
         self._dispatchers: tuple[Dispatcher, ...] = ()
 
-    def start(self, logs: Mapping[str, MachineStore], cursors: Cursors) -> None:
+    def start(self, logs: Mapping[str, MachineStore], cursors: WebhookCursors) -> None:
         """Begin to send.
 
         Parameters
         ----------
         logs : mapping of str to MachineStore
             Of all machines, by ``site/machine``; webhooks that are new get what comes after this moment.
-        cursors : Cursors
+        cursors : WebhookCursors
             How far the others have been served.
         """
         self._dispatchers = tuple(

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import Protocol
 
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.replays import ReplayProgress
@@ -14,19 +13,12 @@ _LONGEST_PAUSE_NS = 3600 * 10**9
 _BELIEVED = 10
 
 
-class Sink(Protocol):
-    """Where replayed messages go; `service.stream.replay_link.ReplayLink` is one."""
-
-    def put(self, message: RecordedMessage) -> None:
-        """Publish a message as it was."""
-
-
 @dataclass(frozen=True, slots=True)
 class PlayPlan:
     """What is replayed, and how fast."""
 
     keys: Collection[str] | None  # only these keys; None is everything
-    pace: float | None  # seconds of data per second; None is as fast as the sink takes it
+    pace: float | None  # seconds of data per second; None is as fast as they are taken
     # Times of the data: from `from_ns` up to, and without, `to_ns`.
     from_ns: int
     to_ns: int
@@ -35,7 +27,7 @@ class PlayPlan:
 
 def play(
     source: RecordingSource,
-    sink: Sink,
+    put: Callable[[RecordedMessage], None],
     plan: PlayPlan,
     control: Control,
     on_progress: Callable[[ReplayProgress], None] | None = None,
@@ -68,7 +60,7 @@ def play(
             if not control.wait_until(due_s, lambda: tell(control.position_ns)):
                 break
             control.at(time_ns)
-            sink.put(message)
+            put(message)
             count += 1
             tell(time_ns)
         else:
