@@ -119,9 +119,10 @@ def read_healthy(path: Path, machine: MachineFile, until_s: float | None = None)
     """
     found = healthy_from_blocks(path.name, machine, _blocks(path, machine), until_s)
     if not found.hops and not found.refused:
+        streams = [key for key in summarize_recording(path).messages if key.endswith("/stream")]
         raise RecordingError(
             f"{path}: no hop of {machine.hop_data_s:g} s of {machine.site}/{machine.name} in it; it holds "
-            f"{', '.join(_streams(path)) or 'no stream'}"
+            f"{', '.join(streams) or 'no stream'}"
         )
     return found
 
@@ -132,10 +133,6 @@ def _blocks(path: Path, machine: MachineFile) -> Iterator[tuple[SampleBlock, str
             yield decode_block(message.payload, message.attachment, message.encoding)
         except WireError as error:
             raise RecordingError(f"{path}: a message of {message.key} cannot be decoded: {error}") from error
-
-
-def _streams(path: Path) -> list[str]:
-    return [key for key in summarize_recording(path).messages if key.endswith("/stream")]
 
 
 def foreign_lines(recording: HealthyRecording) -> tuple[Line, ...]:

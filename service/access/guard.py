@@ -161,7 +161,8 @@ class Guard:
         else:
             caller = await self._authenticated(request, address)
         key = network_of(address) if caller is None else key_of(caller)
-        if not _is_probe(request) and (wait_s := self._requests.hit(key)):
+        is_probe = request.scope["path"] in PROBE_PATHS and request.method in SAFE_METHODS
+        if not is_probe and (wait_s := self._requests.hit(key)):
             raise _too_many(f"more than {self.access.limits.requests_per_minute} requests in a minute", wait_s)
         if caller is None:
             raise HTTPException(401, unauthenticated(request))
@@ -264,10 +265,6 @@ class Guard:
 def _is_public(request: Request) -> bool:
     path = request.scope["path"]
     return request.method in SAFE_METHODS and (path in PUBLIC_PATHS or path.startswith(PAGE_FILES))
-
-
-def _is_probe(request: Request) -> bool:
-    return request.scope["path"] in PROBE_PATHS and request.method in SAFE_METHODS
 
 
 def _too_many(detail: str, wait_s: float) -> HTTPException:

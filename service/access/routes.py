@@ -25,7 +25,7 @@ def declared_scopes(app: FastAPI, endpoint: Callable[..., Any] | None) -> frozen
     found: set[Scope] = set()
     for context in iter_route_contexts(app.routes):
         if context.endpoint is endpoint and endpoint is not None:
-            declared = _scopes(context)
+            declared = _required(context.dependant) if isinstance(context.original_route, APIRoute) else None
             if not declared:
                 return frozenset()
             found |= declared
@@ -40,12 +40,6 @@ def unguarded_routes(app: FastAPI, gate: Callable[..., Any]) -> list[str]:
         if not isinstance(context.original_route, APIRoute)
         or not any(inner.call == gate for inner in context.dependant.dependencies)
     )
-
-
-def _scopes(context: RouteContext) -> frozenset[Scope]:
-    if not isinstance(context.original_route, APIRoute):
-        return frozenset()
-    return frozenset(_required(context.dependant))
 
 
 def _required(dependant: Dependant) -> set[Scope]:

@@ -326,14 +326,10 @@ def summary_lines(summary: "OfflineSummary") -> list[str]:
 
 
 @contextmanager
-def _lines(out: Path | None, overwrite: bool) -> "Iterator[Callable[[str], None]]":
+def _lines(out: Path | None, overwrite: bool) -> "Iterator[Callable[[str], object]]":
     if out is None:
-
-        def to_terminal(line: str) -> None:
-            sys.stdout.write(line + "\n")
-
         try:
-            yield to_terminal
+            yield lambda line: sys.stdout.write(line + "\n")
             sys.stdout.flush()
         except BrokenPipeError:  # whoever read has seen enough
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -343,13 +339,9 @@ def _lines(out: Path | None, overwrite: bool) -> "Iterator[Callable[[str], None]
         raise MachineFileError(f"{out}: exists already; --overwrite replaces it")
     try:
         with out.open("w", encoding="utf-8", newline="\n") as file:
-            yield lambda line: _discard(file.write(line + "\n"))
+            yield lambda line: file.write(line + "\n")
     except OSError as error:
         raise MachineFileError(f"{out}: cannot be written ({error.strerror or error})") from error
-
-
-def _discard(_: object) -> None:
-    pass
 
 
 @contextmanager

@@ -6,7 +6,6 @@ import numpy as np
 
 from models.signals.block import lowest_valid_hz, settling_s
 from service.interchange.importing import Imported
-from service.interchange.samples import Gap
 
 _LISTED = 10
 
@@ -44,7 +43,11 @@ def _gap_lines(done: Imported) -> list[str]:
         gaps = [gap for gap in gaps if not schedule.is_silence((gap.to_ns - gap.from_ns) / 1e9)]
     total_s = sum(gap.to_ns - gap.from_ns for gap in gaps) / 1e9
     lines = [f"gaps: {len(gaps)}, {total_s:.6g} s in all, kept as gaps" if gaps else "gaps: none"]
-    lines += [f"  {_gap_text(done, gap)}" for gap in gaps[:_LISTED]]
+    lines += [
+        f"  before row {gap.row + 1}: {(gap.to_ns - gap.from_ns) / 1e9:.6g} s from "
+        f"{_when(done.clock.origin_ns + round(gap.from_ns))}"
+        for gap in gaps[:_LISTED]
+    ]
     if len(gaps) > _LISTED:
         lines.append(f"  and {len(gaps) - _LISTED} more")
     if done.read.filled:
@@ -53,11 +56,6 @@ def _gap_lines(done: Imported) -> list[str]:
             f"{done.read.filled}"
         )
     return lines
-
-
-def _gap_text(done: Imported, gap: Gap) -> str:
-    begin = _when(done.clock.origin_ns + round(gap.from_ns))
-    return f"before row {gap.row + 1}: {(gap.to_ns - gap.from_ns) / 1e9:.6g} s from {begin}"
 
 
 def _filter_lines(done: Imported) -> list[str]:

@@ -11,7 +11,6 @@ Names sort by time. The files' own indexes say everything else, so that files ma
 
 import json
 import re
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -59,7 +58,7 @@ class Catalogue:
     def recordings(self, site: str | None = None, machine: str | None = None) -> tuple[Recording, ...]:
         """List recordings, sorted by site, machine and file name, which is by time."""
         found: list[Recording] = []
-        for folder in self._folders(site, machine):
+        for folder in (one for upper in _subfolders(self.directory, site) for one in _subfolders(upper, machine)):
             kept = kept_reasons(folder)
             for path in _entries(folder):
                 recording = self._recording(path) if _FILE.fullmatch(path.name) else None
@@ -84,10 +83,6 @@ class Catalogue:
         if recording is None:
             return None
         return recording.model_copy(update={"kept_because": kept_reasons(folder).get(match["file"], "")})
-
-    def _folders(self, site: str | None, machine: str | None) -> Iterator[Path]:
-        for upper in _subfolders(self.directory, site):
-            yield from _subfolders(upper, machine)
 
     def _recording(self, path: Path) -> Recording | None:
         """Describe a file; None if it is none of this directory's own, or gone."""

@@ -45,9 +45,5 @@ def _messages(path: Path, key: str, since_ns: int) -> Iterator[RecordedMessage]:
         except RecordingError:
             if path.exists():
                 raise
-    if _touched_ns(complete) >= since_ns:
+    if complete.exists() and complete.stat().st_mtime_ns >= since_ns:
         yield from read_recording(complete, keys={key}, from_ns=since_ns)
-
-
-def _touched_ns(path: Path) -> int:
-    return path.stat().st_mtime_ns if path.exists() else 0

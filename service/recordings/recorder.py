@@ -16,6 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -317,7 +318,8 @@ class MachineRecorder:
         if writer is not None:
             writer.abandon()
             if not writer.flushed:  # nothing in it: attempts on a full disk would litter the folder
-                _remove(writer.part)
+                with suppress(OSError):
+                    writer.part.unlink(missing_ok=True)
         again = list(self._unsafe)
         if self._at_hand and again and again[-1] is self._pending[0]:
             again.pop()
@@ -383,10 +385,3 @@ class MachineRecorder:
         for recording, why in decision.dropped:
             recording.path.unlink(missing_ok=True)
             self._log.info("recording dropped", file=recording.path.name, why=why)
-
-
-def _remove(path: Path) -> None:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError:
-        return

@@ -229,7 +229,8 @@ def budget_sentences(report: CommissioningReport) -> tuple[str, ...]:
     found = [one for one in read if _found_already(one)]
     if found:
         sizes = {one.name: one.wished for one in found}
-        told.append(f"{_wished(sizes)} of {listed(sizes)} is found as things are.")
+        wished = listed(percent(size) for size in sorted({size for size in sizes.values() if size}))
+        told.append(f"The wished change of {wished} of {listed(sizes)} is found as things are.")
     never = [one.name for one in read if one.wished is not None and one.window_s_for_wished is None]
     if never:
         told.append(
@@ -261,10 +262,6 @@ def growth_sentence(report: CommissioningReport) -> str:
 def _found_already(parameter: ParameterSummary) -> bool:
     loss, gain, wished = parameter.detectable_loss, parameter.detectable_gain, parameter.wished
     return loss is not None and gain is not None and wished is not None and max(-loss, gain) <= wished
-
-
-def _wished(sizes: dict[str, float | None]) -> str:
-    return f"The wished change of {listed(percent(size) for size in sorted({s for s in sizes.values() if s}))}"
 
 
 def _sentence(text: str) -> str:

@@ -166,9 +166,6 @@ def test_stretches_add_by_inverse_variance() -> None:
     np.testing.assert_allclose(together.blurred(0.01).estimate()[1], cov / 4 + 1e-4 * np.eye(6), rtol=1e-6)
 
 
-SEED_OF_AGREEMENT = 88_400
-
-
 def diagnosis(by: str, **changes: tuple[float, float]) -> Diagnosis:
     return Diagnosis(by, tuple(parameter_reading(name, by, *value) for name, value in changes.items()))
 

@@ -385,10 +385,9 @@ def test_the_service_ends_its_replays_and_old_results_make_room(directory: Path)
         problem(client.get(f"{REPLAYS}/{first.id}"), 404)
         until(lambda: get(client, f"{REPLAYS}/{second.id}", ReplayJob).progress is not None, "first block")
         jobs = runtime.replays.jobs
-    assert jobs is not None
-    stopped = jobs.job(second.id)
+    stopped = jobs.find(second.id)
     assert stopped is not None
-    assert stopped.state == "stopped"
+    assert stopped.view.state == "stopped"
     assert not processes_with(second.id)
 
 

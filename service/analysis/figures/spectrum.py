@@ -93,7 +93,11 @@ def paint_spectrum(found: Spectrum, name: str, look: Look, lines: Lines) -> Figu
         figure,
         look,
         f"{name}: " + ("power spectral density" if found.scaling == "density" else "amplitude spectrum"),
-        (stretch_text(found.start_ns, found.end_ns), rpm(found.speed_rad_s), _method(found)),
+        (
+            stretch_text(found.start_ns, found.end_ns),
+            rpm(found.speed_rad_s),
+            f"{found.resolution_hz:.3g} Hz, Hann, {found.averages} averages",
+        ),
     )
     return figure
 
@@ -268,7 +272,3 @@ def _shown(found: Spectrum | Waterfall, to_hz: float | None) -> tuple[tuple[floa
 def _depth(found: Spectrum | Waterfall) -> float:
     """Smallest height that is shown, over the greatest: 80 dB below."""
     return float(10.0 ** (-_DECADES if found.scaling == "amplitude" else -2 * _DECADES))
-
-
-def _method(found: Spectrum) -> str:
-    return f"{found.resolution_hz:.3g} Hz, Hann, {found.averages} averages"

@@ -34,7 +34,7 @@ def chosen_channels(machine: MachineFile, names: Sequence[str], field: str = "ch
     SnapshotError
         If there is no such channel, or it is the shaft angle, or there are too many names.
     """
-    there = {channel.name: channel for channel in vibration_channels(machine)}
+    there = {channel.name: channel for channel in machine.sensors if state_name(channel) != "theta"}
     if len(names) > _MOST_CHANNELS:
         raise SnapshotError(
             f"{machine.site}/{machine.name}: {len(names)} values of {field}, expected at most {_MOST_CHANNELS}"
@@ -106,11 +106,6 @@ def check_held(machine: MachineFile, channels: Sequence[Channel], states: Sequen
         raise SnapshotError(
             f"{machine.site}/{machine.name}: of {', '.join(without)} only levels are watched, and no spectra are held"
         )
-
-
-def vibration_channels(machine: MachineFile) -> tuple[Channel, ...]:
-    """All but the shaft angle, in the order of the stream."""
-    return tuple(channel for channel in machine.sensors if state_name(channel) != "theta")
 
 
 def seen_by(channels: Sequence[Channel]) -> tuple[tuple[str, ...], FloatArray | None]:

@@ -2,6 +2,7 @@
 
 from functools import lru_cache
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated
 
@@ -51,14 +52,14 @@ def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) ->
     ) -> RecordingList:
         """Recordings, by site, machine and time."""
         listed = _present(index).recordings(site, machine)
-        kept = (
+        chosen = [
             one
             for one in listed
             if (since_ns is None or one.end_ns >= since_ns) and (until_ns is None or one.start_ns < until_ns)
-        )
-        chosen = list(kept)
+        ]
         if latest is not None:
-            chosen = [one for _, group in groupby(chosen, _place_of) for one in list(group)[-latest:]]
+            places = groupby(chosen, attrgetter("site", "machine"))
+            chosen = [one for _, group in places for one in list(group)[-latest:]]
         return RecordingList(recordings=tuple(map(_with_data_times, chosen) if data_times else chosen))
 
     @app.get(
@@ -91,10 +92,6 @@ def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) ->
         if not found.complete:
             raise HTTPException(409, f"{found.id} is incomplete: it is being written, or was left by a crash")
         return _RecordingFile(found.path, media_type="application/octet-stream", filename=found.path.name)
-
-
-def _place_of(recording: Recording) -> tuple[str, str]:
-    return recording.site, recording.machine
 
 
 def _with_data_times(recording: Recording) -> Recording:

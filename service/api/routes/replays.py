@@ -2,6 +2,7 @@
 
 import asyncio
 import re
+import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,7 +34,7 @@ from service.access.guard import Guard
 from service.access.problems import problem_responses, responses
 from service.api.routes.recordings import found_recording
 from service.recordings.catalogue import Catalogue
-from service.recordings.replay.jobs import REPLAYS, JobPlan, ReplayJobError, ReplayJobs, TooManyReplaysError, now_ns
+from service.recordings.replay.jobs import REPLAYS, JobPlan, ReplayJobError, ReplayJobs, RunningJob, TooManyReplaysError
 from service.recordings.replay.machine import check_sent, choose_machine, is_shipped_bundle, is_shipped_machine
 from service.settings.service import MachineEntry, ServiceSettings
 
@@ -66,10 +67,9 @@ class ReplayDesk:
         self._settings = settings
         self._index = index
         self._entries: dict[str, MachineEntry] | None = None
-        self.jobs: ReplayJobs | None = None
-        if index is not None:
-            plan = settings.replay
-            self.jobs = ReplayJobs(index.directory / REPLAYS, limit=plan.jobs, nice=plan.nice, kept=plan.kept)
+        plan = settings.replay
+        folder = None if index is None else index.directory / REPLAYS
+        self.jobs = ReplayJobs(folder, limit=plan.jobs, nice=plan.nice, kept=plan.kept)
 
     @property
     def enabled(self) -> bool:
@@ -85,10 +85,7 @@ class ReplayDesk:
         HTTPException
             With what is wrong with the request.
         """
-        jobs = self.jobs
         recordings = [found_recording(self._index, name) for name in request.recordings]
-        if jobs is None:
-            raise HTTPException(404, "no directory of recordings is set")
         for recording in recordings:
             if not recording.complete or recording.problem:
                 raise HTTPException(
@@ -103,7 +100,7 @@ class ReplayDesk:
         bundle = self._beside_sent(request, machines[0])
         _check_changes(request, machine)
         job = ReplayJob(
-            id=(job_id := jobs.new_id()),
+            id=(job_id := ReplayJobs.new_id()),
             state="running",
             mode=request.mode,
             recordings=request.recordings,
@@ -114,7 +111,7 @@ class ReplayDesk:
             to_ns=request.to_ns,
             pace=None if offline else request.pace,
             prefix="" if offline else f"replay/{job_id}",
-            started_ns=now_ns(),
+            started_ns=time.time_ns(),
             progress=None,
             summary=None,
             error="",
@@ -130,7 +127,7 @@ class ReplayDesk:
             arguments += ["--pace", f"{request.pace:g}", "--prefix", job.prefix]
             arguments += [part for end in _endpoints(self._settings.link) for part in ("--connect", end)]
         try:
-            return jobs.start(JobPlan(job, tuple(arguments), request.machine_file or "", bundle))
+            return self.jobs.start(JobPlan(job, tuple(arguments), request.machine_file or "", bundle))
         except TooManyReplaysError as error:
             raise HTTPException(429, str(error)) from error
         except ReplayJobError as error:
@@ -144,7 +141,7 @@ class ReplayDesk:
         HTTPException
             404 if there is none.
         """
-        return _job(self, replay_id)
+        return _found(self, replay_id).view
 
     def installed(self, job: ReplayJob) -> Installed:
         """What an offline replay is evaluated with.
@@ -155,7 +152,8 @@ class ReplayDesk:
             404 if that cannot be read any more.
         """
         keys = MachineKeys(*job.recordings[0].split("/")[:2])
-        sent = None if self.jobs is None else self.jobs.machine_file(job.id)
+        found = self.jobs.find(job.id)
+        sent = None if found is None else found.machine_file
         try:
             return choose_machine(keys, sent or job.machine, "\n".join(job.changes))
         except RotorwatchError as error:  # where the file is concerns nobody who asks over HTTP
@@ -163,7 +161,7 @@ class ReplayDesk:
 
     def report(self, job: ReplayJob, end_ns: int) -> Report | None:
         """What an offline replay found in the window that ends at a time, which may be rounded to a microsecond."""
-        for message in _messages(None if self.jobs is None else self.jobs.results(job.id), "/report"):
+        for message in _messages(self.jobs.find(job.id), "/report"):
             end = _END.search(message)
             if end is not None and abs(int(end[1]) - end_ns) < _SAME_NS:
                 return Report.model_validate_json(message)
@@ -171,8 +169,7 @@ class ReplayDesk:
 
     def close(self) -> None:
         """End every replay."""
-        if self.jobs is not None:
-            self.jobs.close()
+        self.jobs.close()
 
     def _machine(self, request: ReplayRequest, recorded: str) -> str | None:
         """FILE or FILE@BUNDLE; None leaves the choice to the recorded name."""
@@ -253,12 +250,12 @@ def _add_reading_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
     @app.get(_PLACE, responses=responses(ReplayList), **common)
     def replays() -> ReplayList:
         """Replays since the service started, the latest first."""
-        return ReplayList(replays=() if desk.jobs is None else desk.jobs.jobs())
+        return ReplayList(replays=desk.jobs.jobs())
 
     @app.get(_JOB, responses=responses(ReplayJob, 404, 422), **common)
     def replay(replay_id: str) -> ReplayJob:
         """How far a replay is, and in the end what it found."""
-        return _job(desk, replay_id)
+        return desk.job(replay_id)
 
     @app.get(f"{_JOB}/reports", responses=responses(ReplayReportList, 404, 422), **common)
     def replay_reports(replay_id: str, offset: _Offset = 0, limit: _Limit = 100, every: _Every = 1) -> ReplayReportList:
@@ -282,9 +279,9 @@ def _add_reading_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
     )
     def replay_events(replay_id: str) -> StreamingResponse:
         """Progress as server-sent events until the end: `progress`, then `end`, each with the replay as data."""
-        _job(desk, replay_id)
+        desk.job(replay_id)
         return StreamingResponse(
-            _events(lambda: _job(desk, replay_id)),
+            _events(lambda: desk.job(replay_id)),
             media_type="text/event-stream",
             headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
         )
@@ -304,8 +301,9 @@ def _add_changing_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
     @app.delete(_JOB, responses=responses(ReplayJob, 404, 422), **common)
     def stop_replay(replay_id: str) -> ReplayJob:
         """Stop a replay; what it found so far stays."""
-        _job(desk, replay_id)
-        return _there(None if desk.jobs is None else desk.jobs.stop(replay_id), replay_id)
+        found = _found(desk, replay_id)
+        found.end()
+        return found.view
 
     @app.post(f"{_JOB}/pause", responses=responses(ReplayJob, *problems, 409), **common)
     def pause_replay(replay_id: str, order: NothingToSay) -> ReplayJob:
@@ -341,34 +339,32 @@ def _switch(desk: ReplayDesk) -> Callable[[], None]:
     return check
 
 
-def _job(desk: ReplayDesk, replay_id: str) -> ReplayJob:
-    return _there(None if desk.jobs is None else desk.jobs.job(replay_id), replay_id)
-
-
-def _there(job: ReplayJob | None, replay_id: str) -> ReplayJob:
-    if job is None:
+def _found(desk: ReplayDesk, replay_id: str) -> RunningJob:
+    found = desk.jobs.find(replay_id)
+    if found is None:
         raise HTTPException(404, f"no replay {replay_id}; they are forgotten when the service stops")
-    return job
+    return found
 
 
 def _order(desk: ReplayDesk, replay_id: str, order: str) -> ReplayJob:
-    job = _job(desk, replay_id)
-    if job.mode != "paced":
+    found = _found(desk, replay_id)
+    if found.view.mode != "paced":
         raise HTTPException(409, "an offline replay has no pace: only paced replays can be paused or moved")
-    if job.state not in ("running", "paused"):
-        raise HTTPException(409, f"the replay has ended: {job.state}")
-    return _there(None if desk.jobs is None else desk.jobs.order(replay_id, order), replay_id)
+    if not found.running:
+        raise HTTPException(409, f"the replay has ended: {found.view.state}")
+    found.order(order)
+    return found.view
 
 
 def _results(
     desk: ReplayDesk, replay_id: str, topic: str, offset: int, limit: int, every: int = 1
 ) -> tuple[list[str], int | None]:
     """Messages of one topic, and where those that follow begin."""
-    if _job(desk, replay_id).mode != "offline":
+    job = _found(desk, replay_id)
+    if job.view.mode != "offline":
         raise HTTPException(404, "a paced replay only publishes: ask the monitor in its namespace what it found")
-    path = None if desk.jobs is None else desk.jobs.results(replay_id)
     found: list[str] = []
-    for number, message in enumerate(_messages(path, topic)):
+    for number, message in enumerate(_messages(job, topic)):
         if number < offset or (number - offset) % every:
             continue
         if len(found) == limit:
@@ -377,10 +373,10 @@ def _results(
     return found, None
 
 
-def _messages(path: Path | None, topic: str) -> Iterator[str]:
-    if path is None or not path.exists():
+def _messages(job: RunningJob | None, topic: str) -> Iterator[str]:
+    if job is None or not job.results.exists():
         return
-    with path.open(encoding="utf-8") as lines:
+    with job.results.open(encoding="utf-8") as lines:
         for line in lines:
             if not line.endswith("\n"):  # being written
                 return

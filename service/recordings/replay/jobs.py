@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -55,8 +54,8 @@ class ReplayJobs:
 
     Parameters
     ----------
-    folder : Path
-        Where results go, a folder per job.
+    folder : Path or None
+        Where results go, a folder per job; without one there are no jobs.
     limit : int
         Most jobs that run at once.
     nice : int
@@ -65,13 +64,13 @@ class ReplayJobs:
         Most folders that are kept; the oldest are removed.
     """
 
-    def __init__(self, folder: Path, *, limit: int, nice: int, kept: int) -> None:
+    def __init__(self, folder: Path | None, *, limit: int, nice: int, kept: int) -> None:
         self._folder = folder
         self._limit = limit
         self._nice = nice
         self._kept = max(kept, limit)
         self._lock = threading.Lock()
-        self._jobs: dict[str, _Job] = {}
+        self._jobs: dict[str, RunningJob] = {}
         self._closed = False
 
     @staticmethod
@@ -90,8 +89,8 @@ class ReplayJobs:
             If its folder cannot be written or its process not be started.
         """
         with self._lock:
-            if self._closed:
-                raise ReplayJobError("the service is stopping")
+            if self._closed or self._folder is None:
+                raise ReplayJobError("the service is stopping" if self._closed else "there is no folder for results")
             running = [job.view.id for job in self._jobs.values() if job.running]
             if len(running) >= self._limit:
                 raise TooManyReplaysError(
@@ -102,8 +101,8 @@ class ReplayJobs:
                 folder.mkdir(parents=True)
                 if plan.machine_file:
                     (folder / _MACHINE).write_text(plan.machine_file, encoding="utf-8")
-                self._make_room()
-                job = self._jobs[plan.job.id] = _Job(plan, folder, self._nice)
+                self._make_room(self._folder)
+                job = self._jobs[plan.job.id] = RunningJob(plan, folder, self._nice)
             except OSError as error:
                 raise ReplayJobError(f"{folder}: no replay can be started ({error.strerror or error})") from error
         _log.info("replay started", id=plan.job.id, recordings=len(plan.job.recordings), mode=plan.job.mode)
@@ -114,42 +113,10 @@ class ReplayJobs:
         with self._lock:
             return tuple(job.view for job in reversed(self._jobs.values()))
 
-    def job(self, job_id: str) -> ReplayJob | None:
+    def find(self, job_id: str) -> "RunningJob | None":
         """One job, or None if there is none of this id."""
         with self._lock:
-            found = self._jobs.get(job_id)
-        return None if found is None else found.view
-
-    def results(self, job_id: str) -> Path | None:
-        """File with the result lines of a job; it may not be there yet."""
-        with self._lock:
-            found = self._jobs.get(job_id)
-        return None if found is None else found.folder / _RESULTS
-
-    def machine_file(self, job_id: str) -> str | None:
-        """Machine file that was sent with a job, where it was put, with what it is evaluated with; None if none was."""
-        with self._lock:
-            found = self._jobs.get(job_id)
-        return None if found is None else found.machine_file
-
-    def order(self, job_id: str, *orders: str) -> ReplayJob | None:
-        """Hand orders to a job's process, see `service.recordings.replay.console`; one that has ended hears none."""
-        with self._lock:
-            found = self._jobs.get(job_id)
-        if found is None:
-            return None
-        for order in orders:
-            found.order(order)
-        return found.view
-
-    def stop(self, job_id: str) -> ReplayJob | None:
-        """End a job and wait until it has ended."""
-        with self._lock:
-            found = self._jobs.get(job_id)
-        if found is None:
-            return None
-        found.end()
-        return found.view
+            return self._jobs.get(job_id)
 
     def close(self) -> None:
         """End every job."""
@@ -161,11 +128,9 @@ class ReplayJobs:
         for job in jobs:
             job.end()
 
-    def _make_room(self) -> None:
+    def _make_room(self, within: Path) -> None:
         """Remove the oldest folders beyond the number that is kept, also those of an earlier service."""
-        folders = [
-            entry for entry in self._folder.iterdir() if _FOLDER.fullmatch(entry.name) and not entry.is_symlink()
-        ]
+        folders = [entry for entry in within.iterdir() if _FOLDER.fullmatch(entry.name) and not entry.is_symlink()]
         busy = {job.view.id for job in self._jobs.values() if job.running}
         for folder in sorted(folders, key=lambda entry: entry.stat().st_mtime_ns, reverse=True)[self._kept :]:
             if folder.name not in busy:
@@ -173,11 +138,20 @@ class ReplayJobs:
                 shutil.rmtree(folder, ignore_errors=True)
 
 
-class _Job:
-    """One process and the thread that listens to it."""
+class RunningJob:
+    """One process and the thread that listens to it; goes on to tell what came of it when that has ended.
+
+    Attributes
+    ----------
+    results : Path
+        File with the result lines; it may not be there yet.
+    machine_file : str or None
+        Machine file that was sent with it, where it was put, with what it is evaluated with; None if none was.
+    """
 
     def __init__(self, plan: JobPlan, folder: Path, nice: int) -> None:
         self.folder = folder
+        self.results = folder / _RESULTS
         self._lock = threading.Lock()
         self._stop_asked = False
         self._view = plan.job
@@ -205,7 +179,7 @@ class _Job:
         return self._view.state in ("running", "paused")
 
     def order(self, order: str) -> None:
-        """Hand an order to the process."""
+        """Hand an order to the process, see `service.recordings.replay.console`; one that has ended hears none."""
         with self._lock:
             if not self.running or self._process.stdin is None:
                 return
@@ -238,7 +212,7 @@ class _Job:
         command += ["--progress", "json", "--control", "--nice", str(nice)]
         if self.machine_file is not None:
             command += ["--machine", self.machine_file]
-        return command + (["--out", str(self.folder / _RESULTS)] if plan.job.mode == "offline" else [])
+        return command + (["--out", str(self.results)] if plan.job.mode == "offline" else [])
 
     def _listen(self) -> None:
         if self._process.stdout is not None:
@@ -277,8 +251,3 @@ class _Job:
             _log.error("a replay ended with a defect", id=self._view.id, messages=text[-_ERROR_CHARACTERS:])
             return "an error inside the replay; the service's log says more"
         return text.strip()[-_ERROR_CHARACTERS:].replace(f"{self.folder}/", "")
-
-
-def now_ns() -> int:
-    """Time of this computer."""
-    return time.time_ns()

@@ -50,7 +50,7 @@ class OfflineReplay:
         source: RecordingSource,
         keys: MachineKeys,
         installed: Installed,
-        write: Callable[[str], None],
+        write: Callable[[str], object],
         *,
         from_ns: int | None = None,
         to_ns: int | None = None,
@@ -130,10 +130,8 @@ class OfflineReplay:
         The hash covers site and name; with another machine's file the number of channels is checked, and every other
         difference of the descriptors is stated.
         """
-        return encoding.partition(";")[0] if self._other_name and self._only_the_name_differs() else encoding
-
-    def _only_the_name_differs(self) -> bool:
-        return all(text.startswith(("site is ", "machine is ")) for text in self._differences)
+        only_named = all(text.startswith(("site is ", "machine is ")) for text in self._differences)
+        return encoding.partition(";")[0] if self._other_name and only_named else encoding
 
     def _progress(self, at_ns: int) -> ReplayProgress:
         length_ns = max(1, self._to_ns - 1 - self._from_ns)
