@@ -163,9 +163,7 @@ def parameter_summaries(
                 text=PARAMETER_TEXT[name],
                 evaluable=True,
                 identified=identified.get(name),
-                healthy_spread=float(np.std([r.relative_change for r in readings], ddof=1))
-                if len(readings) > 1
-                else None,
+                healthy_spread=_spread(readings),
                 window_error=own,
                 commissioning_error=shared,
                 detectable_loss=max(-1.0, from_scale(name, -threshold * math.hypot(own, shared, elsewhere))),

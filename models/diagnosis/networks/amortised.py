@@ -7,9 +7,11 @@ conditions, and answers in microseconds; its standard errors are calibrated on w
 """
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, Field
 
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.networks.features import FeatureBasis, Float32Array, ForceFeatures
@@ -53,15 +55,16 @@ class AmortisedNetwork:
         return mean, factor
 
 
-@dataclass(frozen=True, slots=True)
-class Calibration:
+class Calibration(BaseModel, extra="forbid", frozen=True):
     """What windows simulated in time say about one network's parameter."""
 
-    bias: float  # median error of the logarithmic ratio; it is taken off
-    log_deviation: tuple[float, ...]  # logarithms of stated standard errors, ascending: knots
-    # At each knot, what the standard error has to be multiplied by for its 95 % interval to hold 95 %.
-    z_scale: tuple[float, ...]
-    freedom: float | None = None  # degrees of freedom of the scaled errors (Student's t); None: normal
+    bias: float = Field(allow_inf_nan=False)  # median error of the logarithmic ratio; it is taken off
+    # Logarithms of stated standard errors, ascending: knots. At each, what the standard error has to be multiplied by
+    # for its 95 % interval to hold 95 %.
+    log_deviation: tuple[Annotated[float, Field(allow_inf_nan=False)], ...] = Field(min_length=1)
+    z_scale: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(min_length=1)
+    # Degrees of freedom of the scaled errors (Student's t); None: normal.
+    freedom: float | None = Field(default=None, gt=0, allow_inf_nan=False)
 
     def scale(self, deviation: FloatArray) -> FloatArray:
         """Factor for stated standard errors."""

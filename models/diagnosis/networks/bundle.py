@@ -12,10 +12,10 @@ Loading refuses a bundle that is damaged or was trained for another machine, and
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -41,18 +41,6 @@ _ARRAYS = ("input_scale", "W1", "b1", "W2", "b2")
 _shared: WeakValueDictionary[tuple[str, str], _Array] = WeakValueDictionary()
 
 
-class HealthyEntry(BaseModel, extra="forbid", frozen=True):
-    """Healthy spread of one equation, see `models.diagnosis.networks.relation.Healthy`."""
-
-    windows: int = Field(ge=1)
-    msd: float = Field(ge=0)
-    z_scale: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...]
-    spread: tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...]
-    floor: tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...] = ()
-    gain: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = ()
-    freedom: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = ()
-
-
 class EquationEntry(BaseModel, extra="forbid", frozen=True):
     """One equation of the bundle."""
 
@@ -62,16 +50,7 @@ class EquationEntry(BaseModel, extra="forbid", frozen=True):
     inputs: tuple[str, ...] = Field(description="inputs in order, divided by the rms of the target")
     parameters: tuple[str, ...]
     hidden: int
-    healthy: HealthyEntry
-
-
-class CalibrationEntry(BaseModel, extra="forbid", frozen=True):
-    """Calibration of one parameter, see `models.diagnosis.networks.amortised.Calibration`."""
-
-    bias: float = Field(allow_inf_nan=False)
-    log_deviation: tuple[Annotated[float, Field(allow_inf_nan=False)], ...] = Field(min_length=1)
-    z_scale: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(min_length=1)
-    freedom: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    healthy: Healthy
 
 
 class AmortisedEntry(BaseModel, extra="forbid", frozen=True):
@@ -81,8 +60,8 @@ class AmortisedEntry(BaseModel, extra="forbid", frozen=True):
     units: Literal["SI"] = Field(default="SI", description="units of the channels")
     equations: tuple[Literal["28", "29", "30", "31"], ...]
     layers: tuple[int, ...]
-    calibration: dict[str, CalibrationEntry]
-    coherent: dict[str, CalibrationEntry] = Field(default={}, description="where the forces are coherent; empty: same")
+    calibration: dict[str, Calibration]
+    coherent: dict[str, Calibration] = Field(default={}, description="where the forces are coherent; empty: same")
     coherence_limit: float = Field(default=1.0, ge=0, le=1, description="mean squared coherence beyond which they are")
     calibration_windows: int = Field(ge=1)
     novelty_limit: float = Field(gt=0, allow_inf_nan=False)
@@ -163,7 +142,7 @@ def save_bundle(
                 inputs=trained.equation.input_names,
                 parameters=trained.equation.parameters,
                 hidden=HIDDEN,
-                healthy=HealthyEntry(**asdict(healthy)),
+                healthy=healthy,
             )
         )
     entry = None
@@ -279,7 +258,7 @@ def _network(directory: Path, entry: EquationEntry, arrays: _Arrays) -> Equation
         if name == "input_scale" and not np.all(array > 0):
             raise BundleError(f"{where}: weight input_scale has a value that is not above 0")
         parts.append(array)
-    return EquationNetwork(equation, Network(*parts), Healthy(**dict(healthy)))
+    return EquationNetwork(equation, Network(*parts), healthy)
 
 
 def _finite(array: _Array | None, kind: np.dtype[Any], shape: tuple[int, ...], what: str) -> _Array:
@@ -305,8 +284,8 @@ def _amortised_entry(amortised: AmortisedNetworks, training: Training) -> Amorti
             "channels": amortised.states,
             "equations": tuple(network.equation for network in amortised.networks),
             "layers": LAYERS,
-            "calibration": {name: asdict(one) for name, one in amortised.calibration.items()},
-            "coherent": {name: asdict(one) for name, one in amortised.coherent.items()},
+            "calibration": amortised.calibration,
+            "coherent": amortised.coherent,
             "coherence_limit": amortised.coherence_limit,
             "calibration_windows": training.network_calibration_windows or training.calibration_windows,
             "novelty_limit": amortised.novelty_limit,
@@ -358,18 +337,14 @@ def _amortised(directory: Path, entry: AmortisedEntry, arrays: _Arrays) -> Amort
         )
         for number in entry.equations
     )
-    calibration, coherent = (
-        {name: Calibration(**dict(one)) for name, one in calibrated.items()}
-        for calibrated in (entry.calibration, entry.coherent)
-    )
     return AmortisedNetworks(
         entry.channels,
         basis,
         networks,
-        calibration,
+        entry.calibration,
         entry.novelty_limit,
         entry.log_range,
-        coherent,
+        entry.coherent,
         entry.coherence_limit,
     )
 

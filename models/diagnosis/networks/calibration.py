@@ -178,4 +178,4 @@ def _calibration(pairs: FloatArray) -> Calibration:
     scaled = z / np.interp(np.log(deviation), knots, scales)
     # Whatever its tails are, 1.96 errors hold 95 %: only the shape is free.
     freedom = max(_FREEDOMS, key=lambda n: float(np.sum(student.logpdf(scaled * _wider(n), n) + np.log(_wider(n)))))
-    return Calibration(bias, tuple(knots), tuple(scales), freedom)
+    return Calibration(bias=bias, log_deviation=tuple(knots), z_scale=tuple(scales), freedom=freedom)

@@ -4,8 +4,10 @@ Training needs torch, evaluation does not: the monitor starts without it and giv
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from models.diagnosis.networks.equations import (
     EQUATIONS,
@@ -23,6 +25,8 @@ from rotorwatch.records.windows import Equation as EquationReading
 from rotorwatch.records.windows import Parameter
 
 HIDDEN = 15  # neurons of the hidden layer, as in the paper
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,20 +47,19 @@ class Network:
         return np.asarray(hidden @ self.W2 + self.b2[0], dtype=np.float64)
 
 
-@dataclass(frozen=True, slots=True)
-class Healthy:
+class Healthy(BaseModel, extra="forbid", frozen=True):
     """How an equation reads on healthy windows that training did not see."""
 
-    windows: int  # how many
-    msd: float  # mean of the mean squared deviation
+    windows: int = Field(ge=1)
+    msd: float = Field(ge=0)  # mean of the mean squared deviation
     # What the scatter over the hops is multiplied by, so that with `floor` 95 % intervals hold 95 %.
-    z_scale: tuple[float, ...]
-    spread: tuple[float, ...]  # robust standard deviation of each own parameter's reading
+    z_scale: tuple[_Positive, ...]
+    spread: tuple[_NotNegative, ...]  # robust standard deviation of each own parameter's reading
     # Relative error that all hops of a window share and their scatter does not show; empty: none.
-    floor: tuple[float, ...] = ()
+    floor: tuple[_NotNegative, ...] = ()
     # How much of a change is read; the rest the network explains by itself. Empty: all of it.
-    gain: tuple[float, ...] = ()
-    freedom: tuple[float, ...] = ()  # degrees of freedom of the errors (Student's t); empty: normal
+    gain: tuple[_Positive, ...] = ()
+    freedom: tuple[_Positive, ...] = ()  # degrees of freedom of the errors (Student's t); empty: normal
 
     def stated(self, change: FloatArray, scatter: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Changes and their standard errors, of what the signatures see of the residual and its scatter."""
