@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from rotorwatch.records.fields import EXAMPLE_NS, BundleIdentity, MachineHash, Name, Number, Record, Site
+from rotorwatch.records.fields import EXAMPLE_NS, BundleIdentity, MachineHash, Number, OfMachine, Record
 
 
 class Severity(StrEnum):
@@ -156,11 +156,9 @@ class Alarm(Record):
     )
 
 
-class AlarmStates(Record):
+class AlarmStates(OfMachine):
     """The alarms of one machine that are not normal (or all there have been, if asked for)."""
 
-    site: Site
-    machine: Name
     alarms: tuple[Alarm, ...] = Field(description="one entry per alarm")
     sequence: int = Field(
         description="sequence number of the machine's latest event; -1 before the first", examples=[0]
@@ -169,11 +167,9 @@ class AlarmStates(Record):
     machine_hash: MachineHash
 
 
-class AlarmEventData(Record):
+class AlarmEventData(OfMachine):
     """What happened to an alarm."""
 
-    site: Site
-    machine: Name
     name: _AlarmName
     text: str = Field(
         description="the event in a sentence",
@@ -230,11 +226,9 @@ class AlarmCloudEvent(Record):
     data: AlarmEventData = Field(description="what happened")
 
 
-class AlarmLogPage(Record):
+class AlarmLogPage(OfMachine):
     """Part of a machine's alarm log, from a given sequence number on: the answer to a query on ``alarm/event``."""
 
-    site: Site
-    machine: Name
     events: tuple[AlarmCloudEvent, ...] = Field(description="events after the one asked for, in order, without a hole")
     latest: int = Field(
         description="sequence number of the machine's latest event; -1 before the first. Ask again from the last event "

@@ -39,6 +39,14 @@ MachineHash = Annotated[
     Field(description="12 hexadecimal digits that change with the machine file's content", examples=["9a0c41d27be8"]),
 ]
 
+
+class OfMachine(Record):
+    """A record that says first which machine it is of."""
+
+    site: Site
+    machine: Name
+
+
 ParameterName = Annotated[str, Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])]
 
 ParameterText = Annotated[str, Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])]

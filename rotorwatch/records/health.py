@@ -9,7 +9,7 @@ from typing import Annotated
 from pydantic import Field
 
 from rotorwatch.records.alarms import Alarm
-from rotorwatch.records.fields import EXAMPLE_NS, BundleIdentity, MachineHash, Name, Number, Reason, Record, Site
+from rotorwatch.records.fields import EXAMPLE_NS, BundleIdentity, MachineHash, Number, OfMachine, Reason, Record
 from rotorwatch.records.levels import ChannelLevels, LevelGrowth
 from rotorwatch.records.windows import Detectable, Equation, Opinion, Parameter, SensorFault, Shape, Verdict
 
@@ -45,11 +45,9 @@ class Measure:
     unit: str
 
 
-class Report(Record):
+class Report(OfMachine):
     """One evaluation of the sliding window."""
 
-    site: Site
-    machine: Name
     start_ns: int = Field(description="oldest data in the window", examples=[EXAMPLE_NS - 60_000_000_000])
     end_ns: int = Field(description="end of the newest data in the window", examples=[EXAMPLE_NS])
     state: State
@@ -154,11 +152,9 @@ class StreamStatus(Record):
     )
 
 
-class Health(Record):
+class Health(OfMachine):
     """Where a machine stands: state, report of the latest window, alarms, quality of the data."""
 
-    site: Site
-    machine: Name
     state: HealthState = Field(
         description="warming, healthy, unchanged (no equation can be evaluated, but every channel is as it was), "
         "alert, danger, outside-model, data-health (a sensor is at fault), no-data (silence, and no alarm on the "

@@ -3,7 +3,7 @@
 from pydantic import Field
 
 from rotorwatch.records.alarms import AlarmCloudEvent
-from rotorwatch.records.fields import EXAMPLE_NS, Name, Record, Site
+from rotorwatch.records.fields import EXAMPLE_NS, OfMachine, Record
 from rotorwatch.records.health import MEASURES, Report
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 
@@ -44,11 +44,9 @@ class Picture(Record):
     )
 
 
-class AlarmEvidence(Record):
+class AlarmEvidence(OfMachine):
     """What one occurrence of an alarm rests on, and what the machine was like before."""
 
-    site: Site
-    machine: Name
     name: str = Field(description="of the alarm", examples=["k_by"])
     occurrence: int = Field(description="which time its condition began", examples=[1])
     before: Picture | None = Field(
@@ -105,11 +103,9 @@ class ReadingList(Record):
     )
 
 
-class Trend(Record):
+class Trend(OfMachine):
     """One reading of one machine up to its newest window; n values each."""
 
-    site: Site
-    machine: Name
     quantity: str = Field(description="as in the list of readings", examples=["parameter"])
     name: str = Field(description="which parameter, equation or level", examples=["k_by"])
     length_ns: int | None = Field(description="of each bucket; null if there is none", examples=[1_800_000_000_000])

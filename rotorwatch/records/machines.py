@@ -6,11 +6,10 @@ from rotorwatch.records.fields import (
     EXAMPLE_NS,
     BundleIdentity,
     MachineHash,
-    Name,
+    OfMachine,
     ParameterName,
     ParameterText,
     Record,
-    Site,
 )
 from rotorwatch.records.health import State
 
@@ -35,11 +34,9 @@ class Channel(Record):
     )
 
 
-class MachineDescription(Record):
+class MachineDescription(OfMachine):
     """A monitored machine: what it is, what its stream looks like, where to find what is said about it."""
 
-    site: Site
-    machine: Name
     description: str = Field(description="from the machine file", examples=["Rotor kit with an overhung disc"])
     state: State
     speed_rpm: float | None = Field(
@@ -77,11 +74,9 @@ class MachineList(Record):
     machines: tuple[MachineDescription, ...] = Field(description="in the order of the settings")
 
 
-class MachineConfiguration(Record):
+class MachineConfiguration(OfMachine):
     """What a machine is monitored with."""
 
-    site: Site
-    machine: Name
     file: dict[str, JsonValue] = Field(
         description="the machine file, what it leaves out filled in", examples=[{"site": "demo", "name": "lab"}]
     )
@@ -101,11 +96,9 @@ class DetectableParameter(Record):
     )
 
 
-class DetectableChanges(Record):
+class DetectableChanges(OfMachine):
     """What would be found on this machine as it runs now, with 95 % probability."""
 
-    site: Site
-    machine: Name
     window_end_ns: int | None = Field(description="end of the window this is computed from", examples=[EXAMPLE_NS])
     window_length_s: float = Field(description="length of the window", examples=[60.0])
     false_alarms_per_month: float = Field(description="declared in the machine file", examples=[1.0])

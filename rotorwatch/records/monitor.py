@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from rotorwatch.records.fields import EXAMPLE_NS, REQUEST, Name, Record, Site
+from rotorwatch.records.fields import EXAMPLE_NS, REQUEST, OfMachine, Record
 from rotorwatch.records.health import State
 
 
@@ -14,11 +14,9 @@ class Alive(Record):
     alive: bool = Field(description="always true", examples=[True])
 
 
-class MachineReadiness(Record):
+class MachineReadiness(OfMachine):
     """Whether one machine's monitor works."""
 
-    site: Site
-    machine: Name
     state: State
     worker_alive: bool = Field(description="the thread that evaluates the machine's blocks runs", examples=[True])
     worker_errors: int = Field(description="blocks lost to an error inside the monitor", examples=[0])
@@ -127,11 +125,9 @@ class TokenCreated(Record):
     )
 
 
-class HistorySpan(Record):
+class HistorySpan(OfMachine):
     """How far back the history of one machine goes, data time."""
 
-    site: Site
-    machine: Name
     oldest_event_ns: int | None = Field(description="oldest alarm event; null without any", examples=[EXAMPLE_NS])
     oldest_report_ns: int | None = Field(
         description="end of the oldest window whose report is kept", examples=[EXAMPLE_NS]

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from rotorwatch.records.fields import EXAMPLE_NS, Name, Record, Site
+from rotorwatch.records.fields import EXAMPLE_NS, OfMachine, Record
 
 _Series = tuple[float | None, ...]
 
@@ -33,9 +33,7 @@ _Times = Annotated[
 _Location = Annotated[str, Field(description="place of two displacements", examples=["bearing"])]
 
 
-class _Values(Record):
-    site: Site
-    machine: Name
+class _Values(OfMachine):
     source: Literal["newest samples", "history", "recordings"] = Field(
         description="where the values come from", examples=["newest samples"]
     )

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from rotorwatch.records.fields import EXAMPLE_NS, BundleIdentity, MachineHash, Name, ParameterName, Record, Site
+from rotorwatch.records.fields import EXAMPLE_NS, BundleIdentity, MachineHash, OfMachine, ParameterName, Record
 
 Units = Literal["channel", "SI"]
 
@@ -25,9 +25,7 @@ _DensityUnit = Annotated[
 ]
 
 
-class _OfWindow(Record):
-    site: Site
-    machine: Name
+class _OfWindow(OfMachine):
     start_ns: int | None = Field(
         description="oldest data in the window; null without one", examples=[EXAMPLE_NS - 60_000_000_000]
     )

@@ -69,8 +69,6 @@ class Guard:
         Looked up at every request, so that a token that is revoked is refused at the next one.
     host : str
         Address that is listened on; a name of the service's.
-    clock_ns : callable
-        Time of day, nanoseconds since 1970 UTC.
 
     Attributes
     ----------
@@ -91,12 +89,11 @@ class Guard:
         access: AccessSettings,
         host: str,
         *,
-        clock_ns: Callable[[], int] = time.time_ns,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         limits = access.limits
         self.access = access
-        self.trail = AuditTrail(audit, limits.refusals_recorded_per_minute, clock_ns=clock_ns, monotonic=monotonic)
+        self.trail = AuditTrail(audit, limits.refusals_recorded_per_minute, monotonic=monotonic)
         self.seats = StreamSeats(limits.streams_per_caller, limits.streams)
         self.read: Any = requires(Scope.READ, in_browsers=True)
         self.operate: Any = requires(Scope.OPERATE)
@@ -104,7 +101,6 @@ class Guard:
         self.stream: Any = Depends(self._stream_dependency())
         self.gate: Any = Depends(self.pass_gate)
         self.tokens = tokens
-        self.clock_ns = clock_ns
         self.last_used_ns: dict[str, int] = {}
         self._host = host.lower()
         self._requests = MovingWindow(limits.requests_per_minute, clock=monotonic)
@@ -203,7 +199,7 @@ class Guard:
         if not caller.token_id:
             return True
         record = self.tokens.find(caller.token_id)
-        return record is not None and token_state(record, self.clock_ns()) == "valid"
+        return record is not None and token_state(record, time.time_ns()) == "valid"
 
     def _stream_dependency(self) -> Callable[[Caller], AsyncIterator[Caller]]:
         async def stream(caller: Annotated[Caller, self.read]) -> AsyncIterator[Caller]:
@@ -227,7 +223,7 @@ class Guard:
         if wait_s := self._failures.wait(identity):
             raise _too_many("too many attempts with this wrong token", wait_s)
         record = None if presented is None else await self._looked_up(presented, request.method)
-        valid = token_is_valid(record, presented, self.clock_ns())
+        valid = token_is_valid(record, presented, time.time_ns())
         if record is None or presented is None or not valid:
             if presented is not None:
                 self._known.pop(presented.secret_hash, None)
@@ -236,7 +232,7 @@ class Guard:
             if wait_s := self._failures.hit(network_of(address)):
                 raise _too_many("too many attempts with a wrong token from this address", wait_s)
             return None
-        self.last_used_ns[record.token_id] = self.clock_ns()
+        self.last_used_ns[record.token_id] = time.time_ns()
         granted = frozenset(scope for scope in Scope if scope.value in record.scopes)
         return Caller(record.name, granted, address, record.token_id)
 
@@ -254,7 +250,7 @@ class Guard:
             raise HTTPException(
                 503, "tokens cannot be looked up in the history: nothing was done; the log says why"
             ) from error
-        if record is not None and token_is_valid(record, presented, self.clock_ns()):
+        if record is not None and token_is_valid(record, presented, time.time_ns()):
             self._known[presented.secret_hash] = _Known(record, now_s)
             self._known.move_to_end(presented.secret_hash)
             if len(self._known) > _KNOWN_TOKENS:

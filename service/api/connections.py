@@ -19,7 +19,7 @@ import struct
 import sys
 import termios
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, cast
@@ -120,8 +120,6 @@ class HttpConnections:
         Addresses and networks of whom only the connections in all count.
     plain : bool
         Whether a refusal can be said in plain HTTP.
-    clock : callable
-        Monotonic seconds.
 
     Attributes
     ----------
@@ -129,15 +127,7 @@ class HttpConnections:
         How often a connection could not be accepted because the process or the system has no file left.
     """
 
-    def __init__(
-        self,
-        settings: HttpSettings,
-        most: int,
-        proxies: Sequence[str],
-        *,
-        plain: bool = True,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, settings: HttpSettings, most: int, proxies: Sequence[str], *, plain: bool = True) -> None:
         self.exhausted = 0
         self._most = most
         self._per_address = settings.connections_per_address
@@ -149,9 +139,8 @@ class HttpConnections:
         self._send_s = settings.send_timeout_s
         self._proxies = [ipaddress.ip_network(proxy) for proxy in proxies]
         self._plain = plain
-        self._clock = clock
-        self._limiter = Limiter(clock, _MINUTE_S)
-        self._looked_s = clock()
+        self._limiter = Limiter(quiet_s=_MINUTE_S)
+        self._looked_s = time.monotonic()
         self._open: dict[Any, _Connection] = {}
 
     def listener(self, listening: socket.socket) -> socket.socket:
@@ -173,7 +162,7 @@ class HttpConnections:
 
     def watch(self, loop: asyncio.AbstractEventLoop) -> None:
         """Look at all connections a few times a second from now on; accept errors are logged once a minute."""
-        self._looked_s = self._clock()
+        self._looked_s = time.monotonic()
         loop.set_exception_handler(self._on_error)
         loop.call_later(_LOOK_S, self._look, loop)
 
@@ -181,7 +170,7 @@ class HttpConnections:
         """A connection has got past its handshake."""
         if found := self._open.get(address):
             found.protocol = protocol
-            found.look(self._clock())
+            found.look(time.monotonic())
             if found.ended:
                 found.end()
 
@@ -190,7 +179,7 @@ class HttpConnections:
 
         If there is not, the one goes of which the service has waited longest; if it waits for none, the new one goes.
         """
-        now_s = self._clock()
+        now_s = time.monotonic()
         present = self._present()
         network = network_of(address[0])
         mine = [one for one in present if one.network == network]
@@ -223,7 +212,7 @@ class HttpConnections:
 
     def _look(self, loop: asyncio.AbstractEventLoop) -> None:
         loop.call_later(_LOOK_S, self._look, loop)
-        now_s = self._clock()
+        now_s = time.monotonic()
         # What the loop was late itself, because the computer is busy, is not charged to the other side.
         late_s = max(0.0, now_s - self._looked_s - _LOOK_S)
         self._looked_s = now_s

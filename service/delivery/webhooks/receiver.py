@@ -3,7 +3,6 @@
 import asyncio
 import ssl
 import time
-from collections.abc import Callable
 from contextlib import suppress
 
 import httpx
@@ -28,8 +27,6 @@ class Receiver:
     ----------
     settings : WebhookSettings
         Secrets and certificates are read at once.
-    now_s : callable
-        Time of day, seconds since 1970 UTC.
 
     Raises
     ------
@@ -37,10 +34,9 @@ class Receiver:
         If the address, the secret or the authority cannot be used.
     """
 
-    def __init__(self, settings: WebhookSettings, now_s: Callable[[], float] = time.time) -> None:
+    def __init__(self, settings: WebhookSettings) -> None:
         self._settings = settings
         self._keys = signing_keys(settings)
-        self._now_s = now_s
         self._environment = not settings.on_this_computer
         self._trust = _trusted(settings, self._environment)
         self._url = _address(settings)
@@ -104,7 +100,7 @@ class Receiver:
                 async with self._opened().stream(
                     "POST", self._url, content=body, headers=self._headers(identifier, body)
                 ) as response:
-                    answer = answer_of(response.status_code, response.headers, self._now_s())
+                    answer = answer_of(response.status_code, response.headers, time.time())
                     await _drained(response)
         except TimeoutError:
             why = f"no answer within {self._settings.timeout_s:g} s"
@@ -129,7 +125,7 @@ class Receiver:
         return self._client
 
     def _headers(self, identifier: str, body: bytes) -> dict[str, str]:
-        timestamp_s = int(self._now_s())
+        timestamp_s = int(time.time())
         return {
             "content-type": CONTENT_TYPE,
             "user-agent": f"rotorwatch/{__version__}",
