@@ -2,7 +2,6 @@
 
 import base64
 import hmac
-from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
@@ -29,12 +28,6 @@ ROUTES = {
 }
 
 ASKED = 'Bearer realm="rotorwatch"'
-
-
-@pytest.fixture
-def monitor(tmp_path: Path) -> Iterator[Guarded]:
-    with guarded(tmp_path) as running:
-        yield running
 
 
 def test_every_route_but_healthz_refuses_whoever_has_no_token(monitor: Guarded) -> None:

@@ -26,12 +26,6 @@ READ, OPERATE, CONFIGURE = Scope
 DAY_NS = 86_400 * 10**9
 
 
-@pytest.fixture
-def monitor(tmp_path: Path) -> Iterator[Guarded]:
-    with guarded(tmp_path) as running:
-        yield running
-
-
 # How much
 
 

@@ -23,7 +23,6 @@ from tests.service.browsing import (
     SEEN_AT,
     VIEWS,
     Plant,
-    chromium,
     kept,
     looking,
     plant_running,
@@ -33,12 +32,6 @@ from tests.service.browsing import (
 )
 from tests.service.live import until
 from tests.service.monitored import GUARDED, PLACE, client, fed, token
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture(scope="module")

@@ -13,17 +13,11 @@ from rotorwatch.records.monitor import MachineReadiness, Readiness, WebhookList
 from service.access.scopes import Scope
 from service.history.records import AuditEntry
 from service.runtime.runtime import Runtime
-from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, unreached, violations
+from tests.service.browsing import PATIENCE_MS, kept, looking, unreached, violations
 from tests.service.monitored import GUARDED, fed, token
 
 OLD = 60
 """Entries of the audit log from before, more than a page."""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture(scope="module")

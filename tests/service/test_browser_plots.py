@@ -14,7 +14,7 @@ from rotorwatch.records.example import example
 from rotorwatch.records.health import Health
 from rotorwatch.records.windows import SensorFault, UnbalanceVector
 from service.runtime.runtime import Runtime
-from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, route_events, violations
+from tests.service.browsing import PATIENCE_MS, kept, looking, route_events, violations
 from tests.service.live import ROOT
 from tests.service.monitored import faulty
 from tests.service.replaying import recording
@@ -39,12 +39,6 @@ PLOTS = (
     ("centreline-plot", "centrelines", "svg", r"^History, \d+ mean positions"),
     ("correlation-plot", "correlations", "canvas", r"^Window .*without mean and 1×; theory is apart"),
 )
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture(scope="module")

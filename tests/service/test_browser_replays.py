@@ -13,7 +13,7 @@ from rotorwatch.records.snapshots import OrbitSnapshot, SpectrumSnapshot
 from service.runtime.runtime import Runtime, running
 from service.settings.service import RecordingSettings
 from simulator.scenario import parse_fault
-from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, unreached, violations
+from tests.service.browsing import PATIENCE_MS, kept, looking, unreached, violations
 from tests.service.live import SHORT, START_NS, endpoint, machine_file, scenario_blocks, send, settings, until
 from tests.service.monitored import PLACE, answered, client
 from tests.service.replaying import recording
@@ -33,12 +33,6 @@ _LATE_FIRST_SEEK = """() => {
         return ask(...asked).finally(() => { window.moved += 1; });
     };
 }"""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture(scope="module")

@@ -182,17 +182,6 @@ def test_every_route_asks_for_its_scope(runtime: Runtime, http: httpx.Client, de
     assert http.get("/openapi.json").status_code == 200
 
 
-def test_a_browser_shows_the_page_of_the_api_with_the_token_as_password(runtime: Runtime) -> None:
-    with client(runtime) as browser:
-        first = browser.get("/docs", headers={"accept": "text/html"})
-        asked = [one.partition(" ")[0] for one in first.headers.get_list("www-authenticate")]
-        assert (first.status_code, asked) == (401, ["Bearer", "Basic"])
-        page = browser.get("/docs", auth=("anybody", token(runtime, READ, name="screen")))
-        assert page.headers["content-type"] == "text/html; charset=utf-8"
-        assert "swagger-ui" in page.text
-        problem(browser.get("/docs", auth=("anybody", token(runtime, OPERATE, name="no screen"))), 403)
-
-
 def test_the_page_of_the_api_loads_nothing_from_elsewhere(http: httpx.Client) -> None:
     page = http.get("/docs")
     assert page.headers["content-type"] == "text/html; charset=utf-8"

@@ -35,17 +35,6 @@ T0 = 1_767_225_600 * NS
 NUMBERS = count()
 
 
-@pytest.fixture(params=KINDS)
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    return database_url(request.param, tmp_path)
-
-
-@pytest.fixture
-def store(url: str) -> Iterator[Store]:
-    with opened(url) as made:
-        yield made
-
-
 @pytest.fixture(scope="module", params=KINDS)
 def shared(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     with opened(database_url(request.param, tmp_path_factory.mktemp("shared"))) as made:

@@ -4,17 +4,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from tests.service.live import program
-from tests.service.postgres import KINDS, database_url, opened
+from tests.service.postgres import opened
 
 ROUNDS = 4
-
-
-@pytest.fixture(params=KINDS)
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    return database_url(request.param, tmp_path)
 
 
 def test_a_killed_writer_leaves_whole_steps(url: str, tmp_path: Path) -> None:

@@ -1,8 +1,6 @@
 """Readings of a window in one value, and when they are added to buckets."""
 
 import math
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from service.history.records import Retention, Step, StoredReading
 from service.history.store import Store
 from service.history.tables import buckets, machines
 from service.history.windows import READING, add_up, packed, singles, unpacked
-from tests.service.postgres import KINDS, database_url, opened
 from tests.service.test_store import T0, executed
 
 NS = 1_000_000_000
@@ -24,17 +21,6 @@ NUMBER = st.floats(allow_nan=False, width=64)
 WINDOW = st.lists(
     st.tuples(st.integers(0, 2**31 - 1), NUMBER, NUMBER | st.just(math.nan)), max_size=5, unique_by=lambda each: each[0]
 )
-
-
-@pytest.fixture(params=KINDS)
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    return database_url(request.param, tmp_path)
-
-
-@pytest.fixture
-def store(url: str) -> Iterator[Store]:
-    with opened(url) as made:
-        yield made
 
 
 def commit(lab: MachineStore, *times_s: float, value: float = 1.0) -> None:

@@ -1,0 +1,39 @@
+"""What several modules of tests of the service ask for by the same name; a module may still say its own."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from service.history.store import Store
+from tests.service.guarded import Guarded, guarded
+from tests.service.postgres import KINDS, database_url, opened
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator["Browser"]:
+    from tests.service.browsing import chromium  # noqa: PLC0415  # only who looks at pages waits for the library
+
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture
+def monitor(tmp_path: Path) -> Iterator[Guarded]:
+    with guarded(tmp_path) as running:
+        yield running
+
+
+@pytest.fixture(params=KINDS)
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    return database_url(request.param, tmp_path)
+
+
+@pytest.fixture
+def store(url: str) -> Iterator[Store]:
+    with opened(url) as made:
+        yield made
