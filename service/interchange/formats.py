@@ -2,14 +2,10 @@
 
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
 
+from service.interchange.mapping import Format, Mapping
 from service.interchange.source import Source, SourceError
 
-if TYPE_CHECKING:
-    from service.interchange.mapping import Mapping
-
-Format = Literal["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"]
 _SOURCES: dict[Format, tuple[str, tuple[str, ...]]] = {
     "csv": ("tables.CsvSource", (".csv", ".txt", ".tsv")),
     "parquet": ("tables.ParquetSource", (".parquet", ".pq")),
@@ -23,13 +19,13 @@ _SOURCES: dict[Format, tuple[str, tuple[str, ...]]] = {
 """Class in this package, imported when it is needed with the library that only it needs, and how files are named."""
 
 
-def format_of(path: Path, mapping: "Mapping") -> Format | None:
+def format_of(path: Path, mapping: Mapping) -> Format | None:
     """Format that the mapping or the end of a file's name says; None if neither does."""
     suffixes = {suffix: kind for kind, (_, those) in _SOURCES.items() for suffix in those}
     return mapping.format or suffixes.get(path.suffix.lower())
 
 
-def open_source(path: Path, mapping: "Mapping") -> Source:
+def open_source(path: Path, mapping: Mapping) -> Source:
     """Open a file by the format that the mapping or the end of its name says.
 
     Raises

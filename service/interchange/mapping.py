@@ -13,8 +13,8 @@ from models.errors import MachineFileError
 from models.machine import MachineFile
 from models.mistakes import checked, did_you_mean, read_toml
 from models.signals.channels import Channel, Quantity, time_unit_ns, unit_factor
-from service.interchange.formats import Format
 
+Format = Literal["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"]
 _DATETIME = "datetime"
 
 

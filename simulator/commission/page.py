@@ -80,8 +80,7 @@ def _spectra_caption(portraits: Sequence[Portrait]) -> str:
     text = f"Shaded: the band that is used, {band[0]:g} to {band[-1]:g} Hz. "
     speeds = [one.speed_hz for one in portraits if np.isfinite(one.speed_hz)]
     if speeds:
-        low, high = f"{min(speeds):.1f}", f"{max(speeds):.1f}"
-        text += f"Grey: the rotation at {low if low == high else f'{low} to {high}'} Hz and its double"
+        text += f"Grey: the rotation at {_between(f'{min(speeds):.1f}', f'{max(speeds):.1f}')} Hz and its double"
         if any(one.statistics.speed_source == "estimated" for one in portraits):
             text += " (there is no phase reference: the speed is estimated from the vibration)"
         text += ". The rotation is taken out before anything is learned."
@@ -179,6 +178,7 @@ def _render(
     }
     template = resources.files("simulator.commission").joinpath(_TEMPLATE).read_text(encoding="utf-8")
     portraits = [portrait(number, one) for number, one in enumerate(recordings, start=1)]
+    turned = None if report.conditions is None else report.conditions.speed_rpm
     hashes = {} if commissioned is None else {one.name: one.sha256 for one in commissioned.recordings}
     return environment.from_string(template).render(
         report=report,
@@ -195,7 +195,7 @@ def _render(
         equations_text=_EQUATIONS[report.level],
         symbols=_symbols(report),
         pictures=pictures_of(report, [one.name for one in recordings], [one for one in portraits if one is not None]),
-        speed_range=_speed_range(report),
+        speed_range="" if turned is None else _speeds(turned),
         levels=_levels(report),
         growths=_growths(report),
         growth_sentence=verdict.growth_sentence(report),
@@ -210,11 +210,12 @@ def _symbols(report: CommissioningReport) -> tuple[tuple[str, str], ...]:
     return tuple((word, verdict.channel_text(word)) for word in sorted(words) if verdict.channel_text(word) != word)
 
 
-def _speed_range(report: CommissioningReport) -> str:
-    if report.conditions is None or report.conditions.speed_rpm is None:
-        return ""
-    low, high = (f"{edge:.0f}" for edge in report.conditions.speed_rpm)
-    return f"{low if low == high else f'{low} to {high}'} rpm"
+def _between(low: str, high: str) -> str:
+    return low if low == high else f"{low} to {high}"
+
+
+def _speeds(rpm: tuple[float, float]) -> str:
+    return f"{_between(*(f'{edge:.0f}' for edge in rpm))} rpm"
 
 
 def _levels(report: CommissioningReport) -> tuple[tuple[str, str], ...]:
@@ -225,8 +226,8 @@ def _levels(report: CommissioningReport) -> tuple[tuple[str, str], ...]:
     for state in ordered(report.conditions.rms):
         edges = report.conditions.rms[state]
         unit, scale = verdict.channel_unit(state)
-        low, high = (verdict.significant(scale * edge, 3) for edge in edges)
-        found.append((verdict.channel_text(state), f"{low if low == high else f'{low} to {high}'} {unit}"))
+        shown = _between(*(verdict.significant(scale * edge, 3) for edge in edges))
+        found.append((verdict.channel_text(state), f"{shown} {unit}"))
     return tuple(found)
 
 
@@ -234,10 +235,7 @@ def _growths(report: CommissioningReport) -> tuple[tuple[str, ...], ...]:
     """Rows of the table of levels: operating state, windows, channel, level, healthy, alert from, growth."""
     found = []
     for one in report.levels:
-        state = "any"
-        if one.speed_rpm is not None:
-            low, high = (f"{edge:.0f}" for edge in one.speed_rpm)
-            state = f"{low if low == high else f'{low} to {high}'} rpm"
+        state = "any" if one.speed_rpm is None else _speeds(one.speed_rpm)
         healthy, alert = (f"{verdict.significant(edge, 3)} {one.unit}" for edge in (one.healthy, one.alert))
         growth = "–" if one.growth is None else f"{100 * one.growth:.0f}%"
         found.append((state, str(one.windows), one.channel, one.measure, healthy, alert, growth))

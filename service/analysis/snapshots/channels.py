@@ -154,3 +154,8 @@ def figures(values: npt.ArrayLike) -> tuple[float | None, ...]:
     return tuple(
         value if is_finite else None for value, is_finite in zip(rounded.tolist(), finite.tolist(), strict=True)
     )
+
+
+def known_figures(values: npt.ArrayLike) -> tuple[float, ...]:
+    """The same, without what is not finite."""
+    return tuple(one for one in figures(values) if one is not None)

@@ -16,7 +16,7 @@ from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSample
 from service.analysis.orbit import MODELLED, Ellipse, no_pair, orbit_pairs, phase_lag_deg, planes_of
 from service.analysis.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
 from service.analysis.revolutions import Excerpt, Revolutions, newest_revolutions, no_revolutions
-from service.analysis.snapshots.channels import SnapshotError, figures
+from service.analysis.snapshots.channels import SnapshotError, figures, known_figures
 from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
 
 MOST_REVOLUTIONS = 64
@@ -74,7 +74,7 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
         ),
         revolutions=path.count,
         path_start_ns=None if path.excerpt is None else path.excerpt.start_ns,
-        pulses_s=tuple(one for one in figures(path.pulses / machine.rate_hz) if one is not None),
+        pulses_s=known_figures(path.pulses / machine.rate_hz),
         theory=theory(changes, lacking, estimated_reason),
         reason=reason,
         path_reason=path.reason,
@@ -197,8 +197,7 @@ def _path(machine: MachineFile, path: Revolutions, pair: tuple[Channel, Channel]
     y, z = planes_of(pair).turned(np.stack([samples[:, names.index(one.name)] * one.to_si * factor for one in pair]))
     times_s = np.arange(y.size) / machine.rate_hz
     # What is not finite was refused when it came in.
-    shown = (tuple(one for one in figures(each) if one is not None) for each in (times_s, y - y.mean(), z - z.mean()))
-    return PathSamples(**dict(zip(("times_s", "y", "z"), shown, strict=True)))
+    return PathSamples(times_s=known_figures(times_s), y=known_figures(y - y.mean()), z=known_figures(z - z.mean()))
 
 
 def _rounded(value: float) -> float:

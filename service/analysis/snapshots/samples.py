@@ -18,7 +18,7 @@ from rotorwatch.records.plots import (
 from service.analysis.orbit import recorded_pairs
 from service.analysis.recorded import Described, Recorded, Sampled
 from service.analysis.revolutions import Excerpt, newest_revolutions
-from service.analysis.snapshots.channels import figures
+from service.analysis.snapshots.channels import figures, known_figures
 from service.analysis.spectrum import lowest_hz, read_full_spectrum, read_waterfall, shown_as, steady, unit_shown
 
 _MOST_SAMPLES = 20_000
@@ -57,8 +57,8 @@ def waveform_snapshot(
         end_ns=shown.end_ns,
         speed_rad_s=speed,
         revolutions=found.count,
-        times_s=_known(np.arange(shown.samples.shape[0]) / shown.rate_hz),
-        pulses_s=_known(found.pulses / shown.rate_hz),
+        times_s=known_figures(np.arange(shown.samples.shape[0]) / shown.rate_hz),
+        pulses_s=known_figures(found.pulses / shown.rate_hz),
         waveforms=tuple(
             ChannelWaveform(
                 channel=channel.name,
@@ -91,7 +91,7 @@ def full_spectrum_snapshot(data: Sampled) -> FullSpectrumSnapshot:
         start_ns=found.start_ns,
         end_ns=found.end_ns,
         speed_rad_s=figures([found.speed_rad_s])[0],
-        frequencies_hz=_known(_grouped(found.lines[lines], group).mean(axis=-1)),
+        frequencies_hz=known_figures(_grouped(found.lines[lines], group).mean(axis=-1)),
         resolution_hz=found.resolution * group,
         averages=found.averages,
         places=tuple(
@@ -137,7 +137,7 @@ def waterfall_snapshot(data: Sampled, channel: Channel, over: Literal["time", "s
         channel=channel.name,
         unit=shown_as(channel, "amplitude")[0],
         over=over,
-        frequencies_hz=_known(_grouped(found.frequencies_hz[lines], group).mean(axis=-1)),
+        frequencies_hz=known_figures(_grouped(found.frequencies_hz[lines], group).mean(axis=-1)),
         resolution_hz=found.resolution_hz * group,
         rows=tuple(
             WaterfallRow(
@@ -169,10 +169,6 @@ def whose(data: Described, source: Source) -> Whose:
 def _newest(excerpt: Excerpt) -> Excerpt:
     size = excerpt.samples.shape[0]
     return excerpt.part(max(0, size - min(_MOST_SAMPLES, round(_WITHOUT_SPEED_S * excerpt.rate_hz))), size)
-
-
-def _known(values: FloatArray) -> tuple[float, ...]:
-    return tuple(one for one in figures(values) if one is not None)
 
 
 def _grouped(values: FloatArray, group: int) -> FloatArray:

@@ -20,6 +20,7 @@ from service.analysis.snapshots.channels import (
     chosen_channels,
     chosen_pairs,
     figures,
+    known_figures,
     product_unit,
     seen_by,
 )
@@ -120,7 +121,7 @@ def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
     low, high = (float(freedom / chdtri(freedom, 1 - part)) for part in reversed(_OUTER))
     return SpectrumSnapshot(
         **head,
-        frequencies_hz=tuple(one for one in figures(_grouped(frequencies_hz, group)) if one is not None),
+        frequencies_hz=known_figures(_grouped(frequencies_hz, group)),
         line_spacing_hz=spacing_hz * group,
         averaged_lines=group,
         degrees_of_freedom=float(freedom),
