@@ -1,6 +1,5 @@
 """Samples without a gap, and the revolutions of the shaft in them."""
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -135,28 +134,3 @@ def newest_revolutions(
 def no_revolutions(reason: str) -> Revolutions:
     """None, and why."""
     return Revolutions(None, 0, np.empty(0), reason)
-
-
-class NewestBlocks:
-    """The newest accepted blocks of a stream, without a gap between them.
-
-    One thread adds, any thread may read: what is read is replaced as a whole.
-    """
-
-    def __init__(self, length_s: float = 10.0) -> None:
-        self._length_s = length_s
-        self._held: deque[SampleBlock] = deque()
-        self._n_samples = 0
-        self.blocks: tuple[SampleBlock, ...] = ()
-
-    def add(self, block: SampleBlock, *, continuous: bool) -> None:
-        """Add the next accepted block; one that does not continue the others takes their place."""
-        if not continuous:
-            self._held.clear()
-            self._n_samples = 0
-        self._held.append(block)
-        self._n_samples += block.samples.shape[0]
-        kept = round(self._length_s * block.rate_hz)
-        while len(self._held) > 1 and self._n_samples - self._held[0].samples.shape[0] >= kept:
-            self._n_samples -= self._held.popleft().samples.shape[0]
-        self.blocks = tuple(self._held)

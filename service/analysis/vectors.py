@@ -1,4 +1,4 @@
-"""Vectors at orders of running speed, and mean positions, of whole revolutions one after the other."""
+"""Vectors at orders of running speed, of whole revolutions one after the other."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
@@ -32,7 +32,6 @@ class Vectors:
     revolutions: npt.NDArray[np.int64]  # (n_pieces,)
     # (n_pieces, 4, n_channels), q of x = Re{q e^{jkθ}} at the orders k of `models.levels.measures.ORDERS`.
     orders: npt.NDArray[np.complex128]
-    mean: FloatArray  # (n_pieces, n_channels)
 
 
 def vectors_of(excerpt: Excerpt, channels: Sequence[Channel], revolutions: int) -> Vectors:
@@ -55,16 +54,14 @@ def vectors_of(excerpt: Excerpt, channels: Sequence[Channel], revolutions: int) 
         x, angle = si[rows], excerpt.angle_rad[rows]
         if last - first == 1:  # seen twice: in one revolution half an order cannot be told from the others
             x, angle = np.concatenate([x, x[1:]]), np.concatenate([angle, angle[1:]])
-        levels = hop_levels(plan, x, angle)
-        found.append((levels.orders, levels.sums[0]))
+        found.append(hop_levels(plan, x, angle).orders)
     begin, end = at[edges[:-1]], at[edges[1:]]
     counts = np.diff(edges)
     return Vectors(
         excerpt.start_ns + np.round((begin + end) / 2 / excerpt.rate_hz * 1e9).astype(np.int64),
         direction * 2 * np.pi * counts * excerpt.rate_hz / (end - begin),
         counts,
-        np.array([orders for orders, _ in found], dtype=np.complex128).reshape(-1, len(ORDERS), len(channels)),
-        np.array([mean for _, mean in found]).reshape(-1, len(channels)),
+        np.array(found, dtype=np.complex128).reshape(-1, len(ORDERS), len(channels)),
     )
 
 
@@ -127,17 +124,16 @@ def _estimated(stretch: Excerpt, channels: Sequence[Channel], speed_rad_s: float
     si = stretch.samples * np.array([channel.to_si for channel in channels])
     line = rotation_line(si.T, stretch.rate_hz, speed_rad_s, tolerance)
     there = line is not None and line.strength > _STANDS_OUT
-    orders, means, speeds = [], [], []
+    orders, speeds = [], []
     if line is not None and there:
         t_s = np.asarray((np.arange(len(si)) - (len(si) - 1) / 2) / stretch.rate_hz, dtype=np.float64)
         levels = hop_levels(level_plan(channels, stretch.rate_hz, (0.0, stretch.rate_hz)), si, line.angle(t_s))
-        orders, means, speeds = [levels.orders], [levels.sums[0]], [line.speed_rad_s]
+        orders, speeds = [levels.orders], [line.speed_rad_s]
     return Vectors(
         np.array([(stretch.start_ns + stretch.end_ns) // 2] * len(speeds), dtype=np.int64),
         np.array(speeds, dtype=np.float64),
         np.array([round(stretch.length_s * speed / (2 * np.pi)) for speed in speeds], dtype=np.int64),
         np.array(orders, dtype=np.complex128).reshape(-1, len(ORDERS), len(channels)),
-        np.array(means).reshape(-1, len(channels)),
     )
 
 

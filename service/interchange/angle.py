@@ -37,7 +37,7 @@ def pulse_times(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: Map
         if entries.dtype.kind not in "fiu":
             raise SourceError(f"{source.path}: {what} holds {entries.dtype}, expected times of pulses")
         return clock.pulse_times(entries, time_unit_ns(keyphasor.unit))
-    signal = Signal("keyphasor", Reference(keyphasor.column or "", keyphasor.index), 1.0, 0.0, 0, False)
+    signal = Signal(Reference(keyphasor.column or "", keyphasor.index), 1.0, 0.0, 0, False)
     detector = EdgeDetector(keyphasor.threshold or 0.0, keyphasor.hysteresis, rising=keyphasor.edge == "rising")
     found = [np.empty(0)]
     for piece in pieces(source, [signal], clock, mapping, Read()):

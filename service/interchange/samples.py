@@ -18,7 +18,6 @@ from service.interchange.source import Array, Reference, Source, SourceError, as
 class Signal:
     """How a column becomes a channel: sample = number · factor + offset, in the channel's unit."""
 
-    name: str  # channel of the machine
     reference: Reference  # where its numbers are
     factor: float
     offset: float
@@ -75,7 +74,6 @@ def signals_of(source: Source, mapping: Mapping, machine: MachineFile) -> list[S
         si = unit_factor(quantity, unit) / channel.to_si
         found.append(
             Signal(
-                channel.name,
                 reference,
                 column.sign * _scale(source, column) * si,
                 column.sign * column.offset * si,

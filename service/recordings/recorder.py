@@ -119,11 +119,6 @@ class MachineRecorder:
         self._give_up = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"recorder {self.folder}", daemon=True)
 
-    @property
-    def alive(self) -> bool:
-        """Whether the thread runs."""
-        return self._thread.is_alive()
-
     def prepare(self) -> None:
         """Make the folder and take it for this recorder; `start` does it as well, and tries again if it fails.
 

@@ -78,11 +78,6 @@ class SpectralDraws:
         # The segments' whole span, which is half a segment longer than the window.
         self._averages = (self._duration_s + machine.window.segment_s / 2) * self._spacing_hz
 
-    @property
-    def averages(self) -> float:
-        """Degrees of freedom of the untapered spectra."""
-        return self._averages
-
     def draw(self, rng: np.random.Generator, count: int) -> DrawnConditions:
         """Draw machines and conditions: what is expected of their windows."""
         groups = [self._rotor(rng, min(_PER_ROTOR, count - first)) for first in range(0, count, _PER_ROTOR)]

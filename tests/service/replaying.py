@@ -90,7 +90,7 @@ def machine_blocks(
 def recorded(path: Path, seconds: tuple[float, float] | None = None) -> Recorded:
     """What the rotor kit's recording has, all or between two times."""
     source = RecordingSource([path])
-    from_ns, to_ns = source.start_ns, source.end_ns + 1
+    from_ns, to_ns = source.span().start_ns, source.span().end_ns + 1
     if seconds is not None:
         from_ns, to_ns = (START_NS + round(limit * S) for limit in seconds)
     return Recorded(source, LAB.keys, from_ns, to_ns)

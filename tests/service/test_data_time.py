@@ -71,7 +71,7 @@ def stream_of(path: Path) -> Recorded:
 def test_a_source_knows_the_times_of_the_data(quick: Path, tmp_path: Path) -> None:
     for files in ([quick], split(quick, tmp_path, 150)):
         source = RecordingSource(files)
-        assert (source.start_ns, source.end_ns) == (START_NS, START_NS + 40 * S)
+        assert (source.span().start_ns, source.span().end_ns) == (START_NS, START_NS + 40 * S)
         assert starts_s(source, from_ns=START_NS + 12 * S, to_ns=START_NS + 15 * S) == [n / 10 for n in range(120, 150)]
         assert source.between("12", "2026-01-01T00:00:15Z") == (START_NS + 12 * S, START_NS + 15 * S)
 
@@ -94,7 +94,7 @@ def test_reports_without_samples_have_times_of_the_data(tmp_path: Path) -> None:
     ]
     source = RecordingSource([write(tmp_path / "reports.mcap", said)])
     assert list(source.messages(from_ns=START_NS + 60 * S, to_ns=START_NS + 70 * S)) == said[1:]
-    assert source.end_ns == START_NS + 70 * S
+    assert source.span().end_ns == START_NS + 70 * S
 
 
 def test_a_recording_of_two_runs_at_the_same_times(twice: Path) -> None:

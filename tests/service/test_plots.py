@@ -51,7 +51,7 @@ def lines(faulty: Path) -> list[dict[str, object]]:
 def computed(faulty: Path) -> Trend:
     """Its trend, computed from the samples."""
     source = RecordingSource([faulty])
-    return read_trend(Recorded(source, LAB.keys, source.start_ns, source.end_ns + 1))
+    return read_trend(Recorded(source, LAB.keys, source.span().start_ns, source.span().end_ns + 1))
 
 
 def reports_of(lines: list[dict[str, object]]) -> list[Report]:
@@ -244,7 +244,7 @@ def test_correlation_panels_carry_the_figures_of_the_report(
 ) -> None:
     report = [one for one in reports_of(lines) if one.equations][nth]
     source = RecordingSource([faulty])
-    window = latest_window(Recorded(source, LAB.keys, source.start_ns, report.end_ns + S), LAB)
+    window = latest_window(Recorded(source, LAB.keys, source.span().start_ns, report.end_ns + S), LAB)
     found = correlations_of(window, LAB, load_bundle("lab", LAB))
     assert (found.start_ns, found.end_ns) == (report.start_ns, report.end_ns)
     assert [panel.number for panel in found.panels] == [equation.equation for equation in report.equations]
@@ -267,7 +267,7 @@ def test_correlation_panels_carry_the_figures_of_the_report(
 def test_curves_are_labelled_with_their_references(faulty: Path) -> None:
     """Each curve against the window's own correlation of that reference with the target."""
     source = RecordingSource([faulty])
-    window = latest_window(Recorded(source, LAB.keys, source.start_ns, source.end_ns + 1), LAB)
+    window = latest_window(Recorded(source, LAB.keys, source.span().start_ns, source.span().end_ns + 1), LAB)
     panel = correlations_of(window, LAB, load_bundle("lab", LAB)).panels[0]
     lags = window.lags_s >= 0.0099
     for curve in panel.curves:
@@ -279,7 +279,7 @@ def test_curves_are_labelled_with_their_references(faulty: Path) -> None:
 def test_no_full_window_is_said(faulty: Path) -> None:
     source = RecordingSource([faulty])
     with pytest.raises(RotorwatchError, match=r"a window is 60 s, usable data are 30 s"):
-        latest_window(Recorded(source, LAB.keys, source.start_ns, START_NS + 30 * S), LAB)
+        latest_window(Recorded(source, LAB.keys, source.span().start_ns, START_NS + 30 * S), LAB)
 
 
 def test_a_computed_trend_is_that_of_the_reports(computed: Trend, lines: list[dict[str, object]]) -> None:
@@ -330,25 +330,25 @@ def test_a_trend_of_recorded_reports_needs_no_samples(
     source = RecordingSource([path])
     keys = source.machine(reports=True)
     assert keys == LAB.keys
-    recorded = read_trend(Recorded(source, keys, source.start_ns, source.end_ns + 1))
+    recorded = read_trend(Recorded(source, keys, source.span().start_ns, source.span().end_ns + 1))
     assert (recorded.origin, recorded.limits) == ("as recorded", LAB.alarms)
     assert recorded.end_ns.tolist() == computed.end_ns.tolist()
     assert [alarm.time_ns for alarm in recorded.alarms] == [alarm.time_ns for alarm in computed.alarms]
     for one, other in zip(recorded.parameters, computed.parameters, strict=True):
         np.testing.assert_array_equal(one.change, other.change)
         np.testing.assert_array_equal(one.high, other.high)
-    levels = read_trend(Recorded(source, keys, source.start_ns, source.end_ns + 1), levels=True)
+    levels = read_trend(Recorded(source, keys, source.span().start_ns, source.span().end_ns + 1), levels=True)
     assert (levels.parameters, levels.levels[0].title) == ((), "y1   um pp")  # instead of parameters
     assert all(np.isfinite(one.level).all() and np.isnan(one.danger).all() for one in levels.levels)
     with pytest.raises(RotorwatchError, match="no sample blocks to compute them from"):
-        read_trend(Recorded(source, keys, source.start_ns, source.end_ns + 1), "lab")
+        read_trend(Recorded(source, keys, source.span().start_ns, source.span().end_ns + 1), "lab")
     with pytest.raises(MachineFileError, match="machines with reports or sample blocks: demo/lab"):
         source.machine("demo/fan", reports=True)
 
 
 def test_a_trend_of_nothing_says_what_was_looked_for(faulty: Path) -> None:
     source = RecordingSource([faulty])
-    filling = read_trend(Recorded(source, LAB.keys, source.start_ns, START_NS + 30 * S))
+    filling = read_trend(Recorded(source, LAB.keys, source.span().start_ns, START_NS + 30 * S))
     assert (filling.parameters, len(filling.levels)) == ((), 8)
     bare = [Report.model_validate(example(Report) | {"levels": [], "parameters": [], "verdict": None, "reason": ""})]
     with pytest.raises(RotorwatchError, match=r"neither parameter nor level was read .*: 1 reports, while the window"):

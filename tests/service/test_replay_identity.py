@@ -58,8 +58,8 @@ def network(source: RecordingSource, address: str, prefix: str, pace: float | No
         prefix=prefix,
         pace=pace,
         passes=1,
-        from_ns=source.start_ns,
-        to_ns=source.end_ns + 1,
+        from_ns=source.span().start_ns,
+        to_ns=source.span().end_ns + 1,
         wait_for_subscriber_s=20.0,
     )
 

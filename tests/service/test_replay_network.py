@@ -36,8 +36,8 @@ def plan(source: RecordingSource, address: str, prefix: str, **changes: object) 
         "prefix": prefix,
         "pace": None,
         "passes": 1,
-        "from_ns": source.start_ns,
-        "to_ns": source.end_ns + 1,
+        "from_ns": source.span().start_ns,
+        "to_ns": source.span().end_ns + 1,
         "linger_s": 0.3,
     }
     return NetworkPlan(**(fields | changes))  # type: ignore[arg-type]  # fields of many types
@@ -84,7 +84,7 @@ def test_messages_go_out_byte_for_byte(source: RecordingSource, everything: bool
 
 def test_a_stretch_begins_with_the_descriptor_that_held_then(source: RecordingSource) -> None:
     address, heard = endpoint(), Heard()
-    begin_ns, end_ns = source.start_ns + 10**9, source.start_ns + 2 * 10**9
+    begin_ns, end_ns = source.span().start_ns + 10**9, source.span().start_ns + 2 * 10**9
     with session(address, "x") as listener:
         subscriber = listener.declare_subscriber("rotorwatch/**", lambda sample: collect(heard, sample))
         replay_to_network(source, plan(source, address, "x", from_ns=begin_ns, to_ns=end_ns), Control())

@@ -59,7 +59,7 @@ def test_files_are_read_in_the_order_of_time(tmp_path: Path) -> None:
     assert source.paths == (early, late)
     assert times(source) == [at / 10 for at in range(10, 30)]
     assert times(source, from_ns=15 * SECOND // 10, to_ns=22 * SECOND // 10) == [at / 10 for at in range(15, 22)]
-    assert (source.start_ns, source.end_ns) == (SECOND, 29 * SECOND // 10)
+    assert (source.span().start_ns, source.span().end_ns) == (SECOND, 29 * SECOND // 10)
 
 
 def test_what_two_files_both_hold_is_read_once(tmp_path: Path) -> None:

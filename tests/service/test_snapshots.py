@@ -14,12 +14,11 @@ from models.machine import Machine
 from models.physics.excitation import Source, expanded_A, expanded_B
 from models.physics.response import correlation, stationary_covariance
 from models.physics.rotor import STATE_INDEX, changed
-from models.signals.block import SampleBlock
+from models.signals.block import NewestBlocks, SampleBlock
 from models.signals.channels import state_name
 from rotorwatch.records.example import example
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 from service.analysis.prediction import Prediction, predict
-from service.analysis.revolutions import NewestBlocks
 from service.analysis.snapshots import machine as machine_module
 from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.heading import LatestData
@@ -433,8 +432,8 @@ def test_snapshots_as_json(model: type[BaseModel]) -> None:
 
 def test_the_newest_blocks_are_kept_without_a_gap() -> None:
     stream_ = stream(SECONDS, SEED)
-    newest = NewestBlocks(length_s=1.0)
-    assert NewestBlocks().blocks == ()
+    newest = NewestBlocks(round(LAB.rate_hz))
+    assert not NewestBlocks(1).blocks
     for block in stream_[:30]:
         newest.add(block, continuous=True)
     assert newest.blocks == stream_[20:30]

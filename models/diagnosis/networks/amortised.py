@@ -96,7 +96,7 @@ class NetworkDiagnostician:
     by = "network"
 
     def __init__(self, machine: Machine, amortised: AmortisedNetworks) -> None:
-        self._machine, self._amortised = machine, amortised
+        self._amortised = amortised
         self._features = ForceFeatures(machine, amortised.states)
 
     def inputs(self, window: WindowStatistics) -> Float32Array | None:

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Protocol
 
-from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
+from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 from prometheus_client.process_collector import ProcessCollector
 
@@ -22,7 +22,6 @@ from service.delivery.webhooks.webhooks import Webhooks
 from service.history.records import StoreError
 from service.stream.monitored import Monitored
 
-CONTENT_TYPE = CONTENT_TYPE_LATEST
 _PAGE = 1000
 _WEBHOOK_STATES = ("working", "failing", "disabled")
 

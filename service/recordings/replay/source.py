@@ -109,16 +109,6 @@ class RecordingSource:
             raise MachineFileError(f"{place}: no {what} of {wanted}; machines with {what}: {listed}")
         return there[name]
 
-    @property
-    def start_ns(self) -> int:
-        """Earliest data of any machine."""
-        return self.span().start_ns
-
-    @property
-    def end_ns(self) -> int:
-        """End of the latest data of any machine."""
-        return self.span().end_ns
-
     def span(self, *machines: MachineKeys) -> DataSpan:
         """Which data there are of some machines; without any, of all.
 
