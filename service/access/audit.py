@@ -59,20 +59,12 @@ class AuditTrail:
     ----------
     refusals_per_minute : int
         Refused requests of one address that are written down.
-    clock_ns : callable
-        Time of day, nanoseconds since 1970 UTC.
     """
 
     def __init__(
-        self,
-        log: AuditLog,
-        refusals_per_minute: int,
-        *,
-        clock_ns: Callable[[], int] = time.time_ns,
-        monotonic: Callable[[], float] = time.monotonic,
+        self, log: AuditLog, refusals_per_minute: int, *, monotonic: Callable[[], float] = time.monotonic
     ) -> None:
         self._journal = log
-        self._clock_ns = clock_ns
         self._lock = threading.Lock()
         self._latest_ns = 0
         self._by_address = MovingWindow(refusals_per_minute, clock=monotonic)
@@ -82,7 +74,7 @@ class AuditTrail:
     def visit(self, address: str, method: str, path: str) -> Visit:
         """Begin to follow a request; no two have the same time."""
         with self._lock:
-            self._latest_ns = max(self._latest_ns + 1, self._clock_ns())
+            self._latest_ns = max(self._latest_ns + 1, time.time_ns())
             return Visit(self._latest_ns, address, method, path)
 
     def start(self, visit: Visit) -> None:
