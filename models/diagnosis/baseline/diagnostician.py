@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc, ndtr, ndtri
 
+from models.diagnosis.baseline.force import alike, force_spectrum
 from models.diagnosis.baseline.lag_moments import row_window, shared_covariance
 from models.diagnosis.baseline.learned import Baseline, coefficient_slices, learned_rows, positive, unsuitable
 from models.diagnosis.baseline.relation import Relation, RowChange, one_source, read_row
@@ -177,10 +178,11 @@ class BaselineDiagnostician:
                 total = _bordered(total, e.covariance, e.variance)
                 common = _bordered(common, e.common_covariance, e.common_variance)
                 through = np.vstack([through, e.slope])
-        if one_source(window):
+        same = self._as_commissioned(changes)
+        if not same and one_source(window):
             wider = np.array([self._own_of[name].one_source for name in names[: values.size]])
             total, common = total * np.outer(wider, wider), common * np.outer(wider, wider)
-        elsewhere = through @ np.diag(self._elsewhere(bearing.values)) @ through.T
+        elsewhere = through @ np.diag(self._elsewhere(bearing.values, same=same)) @ through.T
         total, common = total + elsewhere, common + elsewhere
         known = [names.index(name) for name in self._parameters if not reasons[name]]
         covariance = positive(total[np.ix_(known, known)])
@@ -208,9 +210,18 @@ class BaselineDiagnostician:
         misfit = suspicion.z if diagnosis.misfit_z is None else max(diagnosis.misfit_z, suspicion.z)
         return replace(diagnosis, misfit_z=misfit, suspect=suspicion.sentence)
 
-    def _elsewhere(self, changes: FloatArray) -> FloatArray:
+    def _as_commissioned(self, changes: Sequence[RowChange | None]) -> bool:
+        """Whether the force that moves the machine, its changes taken into account, is the commissioned one."""
+        seen = [change for change in changes if change is not None]
+        if not self._baseline.force.size or len(seen) < len(changes):
+            return False
+        now = force_spectrum([one.moments.of for one in seen], [one.combination for one in seen])
+        return alike(self._baseline.force, now)
+
+    def _elsewhere(self, changes: FloatArray, *, same: bool) -> FloatArray:
         """Variances of what a relation is off in other conditions; each that it holds in is a witness against it."""
-        errors = np.array([self._own_of[name].elsewhere for name in self._names])
+        own = [self._own_of[name] for name in self._names]
+        errors = np.array([0.0 if same and not one.always else one.elsewhere for one in own])
         return (errors * np.maximum(1 + changes, 1 + _MOST_LOSS)) ** 2 / self._conditions
 
     def _bearing(self, changes: list[RowChange | None]) -> _Bearing:

@@ -2,11 +2,12 @@
 
 import itertools
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import chdtrc, ndtri
 
+from models.diagnosis.baseline.force import force_spectrum
 from models.diagnosis.baseline.lag_moments import (
     LONGEST_LAG_STEP_S,
     LagMoments,
@@ -147,6 +148,9 @@ class Baseline:
     duration_s: float  # healthy data
     # Every healthy window of every row against what the windows of other conditions teach.
     consistency: tuple[LeftOut, ...] = ()
+    # (n_bands, n_rows, n_rows): force that it was learned under (`force_spectrum`); empty where it was not one, or is
+    # not seen in all rows
+    force: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -223,7 +227,19 @@ def learn_baseline(
         rotations=rotations_by_speed([one for one in rotations if one is not None]),
         duration_s=sum(window.duration_s for window in windows),
         consistency=tuple(consistency),
+        **_learned_under(relations, parts, groups),
     )
+
+
+def _learned_under(
+    relations: Sequence[Relation | None], parts: Sequence[list[Contribution]], groups: Sequence[Hashable]
+) -> dict[str, FloatArray]:
+    known = [relation.combination for relation in relations if relation is not None]
+    if len(known) < len(relations) or len(set(groups)) > 1:
+        return {}
+    by_window = zip(*parts, strict=True)
+    found = [force_spectrum([one.moments.of for one in rows], known) for rows in by_window]
+    return {"force": np.mean(found, axis=0)} if len({one.shape for one in found}) == 1 else {}
 
 
 def _learn(

@@ -148,8 +148,10 @@ class Own:
     # finite-element rotors (decision 0012).
     one_source: float = 1.0
     # Standard error of a relative change, from what the row leaves out of the machine, which pulls otherwise where
-    # another force moves it; of a relation learned in one condition (decision 0012).
+    # another force moves it; of a relation learned in one condition (decision 0012). Neither it nor `one_source` is
+    # taken where the force is still the commissioned one, but for a stiffness: a bearing is never quite linear.
     elsewhere: float = 0.0
+    always: bool = False  # whether `elsewhere` is taken there, too
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +206,10 @@ def _bearing(name: str, number: str, plane: str, direction: str) -> Row:
         number=number,
         title=f"bearing and disc, {direction}",
         terms=_bearing_and_disc(plane),
-        own=(Own(f"k_b{plane}", (0,), elsewhere=0.005), Own(f"c_b{plane}", (1,), one_source=1.6, elsewhere=0.03)),
+        own=(
+            Own(f"k_b{plane}", (0,), elsewhere=0.005, always=True),
+            Own(f"c_b{plane}", (1,), one_source=1.6, elsewhere=0.03),
+        ),
     )
 
 

@@ -89,6 +89,8 @@ class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
     rotations: tuple[RotationRecord, ...]  # synchronous vectors by speed
     duration_s: _Positive
     consistency: tuple[_LeftOutRecord, ...] = ()  # healthy windows against each other
+    # Cross-spectra of what the rows leave over, by bands; empty where the healthy recordings had several forces.
+    force: tuple[_Matrix, ...] = ()
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -98,6 +100,8 @@ class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
             if (relation is None) == (reason == ""):
                 raise ValueError("a relation is there, or a reason why not; never both or neither")
         _check_covariance("coefficients", self.covariance, len(self.covariance))
+        for band in self.force:
+            _check_covariance("force", band, len(self.relations))
         return self
 
     @classmethod
@@ -130,6 +134,7 @@ class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
                 LeftOut(**dict(one) | {"agreements": tuple(HeldOutReading(**dict(each)) for each in one.agreements)})
                 for one in self.consistency
             ),
+            force=np.array(self.force, dtype=np.float64) if self.force else np.zeros((0, 0, 0)),
         )
 
 

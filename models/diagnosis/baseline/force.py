@@ -1,0 +1,61 @@
+"""Whether the force that moves the machine is the one that its relations were learned under.
+
+What a relation leaves out of the machine pulls at its coefficients, and pulls the same way for as long as the same
+force moves the machine: in a change it cancels. What every row leaves over is that force, as far as the sensors show
+it. Its cross-spectra by bands say how strong it is, of what colour, and how it is directed.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from models.diagnosis.baseline.lag_moments import RowWindow
+from models.diagnosis.moments import ComplexArray
+from models.signals.block import FloatArray
+
+_BAND_HZ = 8.0
+# Distance up to which two forces count as one. On finite-element rotors (overhung, between bearings; seeds 100 to 105,
+# windows of 30 s, k to -25 % and c to -40 %) the same force is 0.001 to 0.04 off itself, 0.02 in nine windows of ten;
+# forces of the same colour and level in other directions 0.04 to 0.97, below 0.09 in one of ten.
+_ALIKE = 0.03
+
+
+def force_spectrum(windows: Sequence[RowWindow], combinations: Sequence[FloatArray]) -> FloatArray:
+    """Cross-spectra of what the rows of one window leave over, mean of every band, shape (n_bands, n_rows, n_rows).
+
+    Real parts stand on and above the diagonal, imaginary parts below.
+
+    Parameters
+    ----------
+    combinations : sequence of ndarray
+        The force of each row as a combination of its terms.
+    """
+    window = windows[0].window
+    forces = np.stack([one.terms @ combination for one, combination in zip(windows, combinations, strict=True)], axis=1)
+    spectra = forces @ window.spectrum @ forces.conj().transpose(0, 2, 1)
+    f = window.frequencies_hz
+    bands = np.array_split(spectra, max(1, int((f[-1] - f[0]) // _BAND_HZ)))
+    mean = np.stack([band.mean(axis=0) for band in bands])
+    return np.asarray(np.triu(mean.real) + np.tril(mean.imag, -1), dtype=np.float64)
+
+
+def alike(healthy: FloatArray, now: FloatArray) -> bool:
+    """Whether two forces (`force_spectrum`) agree in level, colour and direction.
+
+    Every row counts in units of its own healthy power in a band.
+    """
+    if healthy.size == 0 or healthy.shape != now.shape:
+        return False
+    power = np.einsum("fii->fi", healthy)
+    if not np.all(power > 0):
+        return False
+    root = np.sqrt(power)
+    A, B = (_hermitian(one) / root[:, :, None] / root[:, None, :] for one in (healthy, now))
+    sizes = np.linalg.norm(A), np.linalg.norm(B)
+    return bool(np.linalg.norm(A - B) ** 2 < 2 * _ALIKE * sizes[0] * sizes[1])
+
+
+def _hermitian(packed: FloatArray) -> ComplexArray:
+    real, imaginary = np.triu(packed), np.tril(packed, -1)
+    mirrored = np.triu(packed, 1).transpose(0, 2, 1)
+    return np.asarray(real + mirrored + 1j * (imaginary - imaginary.transpose(0, 2, 1)), dtype=np.complex128)
