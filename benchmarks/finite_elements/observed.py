@@ -215,16 +215,17 @@ def record_run(
     with RecordingWriter(path, overwrite=overwrite) as writer:
         payload = described.model_dump_json().encode()
         writer.write(RecordedMessage(keys.descriptor, payload, b"", JSON_ENCODING, start_ns, start_ns))
-        for block in _blocks(samples, described, block_s, start_ns, run):
+        for block in blocks(samples, described, block_s, start_ns, run):
             data, attachment, encoding = block_message(block, described.schema_hash, "raw")
             writer.write(RecordedMessage(keys.stream, data, attachment, encoding, block.end_ns, block.end_ns))
             count += 1
     return count
 
 
-def _blocks(
-    samples: FloatArray, described: ChannelDescriptor, block_s: float, start_ns: int, run: int
+def blocks(
+    samples: FloatArray, described: ChannelDescriptor, block_s: float = 0.5, start_ns: int = _START_NS, run: int = 1
 ) -> Iterator[SampleBlock]:
+    """The stream that a live machine would have sent of what `sampled` gives."""
     factors = np.array([channel.to_si for channel in described.channels])
     scaled = np.asarray(samples / factors, dtype=np.float32)
     if described.states[-1] == "theta":

@@ -8,6 +8,7 @@ import typer
 
 from benchmarks.studies.ablation import ablation
 from benchmarks.studies.agreement import agreement
+from benchmarks.studies.damping import damping
 from benchmarks.studies.delay import delay
 from benchmarks.studies.evaluate import evaluate
 from benchmarks.studies.level_years import level_years
@@ -26,6 +27,7 @@ STUDIES = {
     "agreement": agreement,
     "peers": peers,
     "unknown": unknown,
+    "damping": damping,
     "sensors": sensors,
     "ablation": ablation,
     "delay": delay,

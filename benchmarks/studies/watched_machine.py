@@ -34,7 +34,7 @@ _ALIKE = (1.35, 1.65)
 """Level of the excitation; as commissioned within a tenth, or levels would rightly alarm before the fault begins."""
 
 
-def _response(equations: Equations, kept: Sequence[int], f: FloatArray) -> ComplexArray:
+def displacement_response(equations: Equations, kept: Sequence[int], f: FloatArray) -> ComplexArray:
     """Displacements at some coordinates under unit forces there, from the modes of the state matrix."""
     roots, shapes = np.linalg.eig(equations.A)
     inputs = np.vstack([np.zeros((len(equations.M), len(kept))), np.linalg.inv(equations.M)[:, kept]])
@@ -138,7 +138,7 @@ class Subject:
 def _of_beam(beam: BeamRotor, ran: RunCondition, seconds: float, seed: list[int]) -> tuple[Rotor, Seen]:
     found = sampled(beam, ran, seconds, seed)
     K, C = beam.bearings[0].coefficients(ran.speed_rad_s)
-    response = partial(_response, assemble(beam, ran.speed_rad_s), list(probed(beam)))
+    response = partial(displacement_response, assemble(beam, ran.speed_rad_s), list(probed(beam)))
     both = float(np.trace(K)) / 2, float(np.trace(C)) / 2
     speed_hz = ran.speed_rad_s / (2 * np.pi)
     return Rotor(speed_hz, RATE_HZ, response, both), Seen(found[:, :4], found[:, 4:8], found[:, 8])
@@ -155,7 +155,7 @@ def _of_shipped(machine: Machine, scenarios: Iterator[Scenario]) -> tuple[Rotor,
     rotor, speed_rad_s = machine.rotor, _speed_rad_s(scenario)
     kept = [STATE_INDEX[name] for name in ("y1", "y2", "z1", "z2")]
     equations = Equations(M_matrix(rotor), P_matrix(rotor, speed_rad_s), Q_matrix(rotor))
-    response = partial(_response, equations, kept)
+    response = partial(displacement_response, equations, kept)
     both = (rotor.k_by_N_per_m + rotor.k_bz_N_per_m) / 2, (rotor.c_by_N_s_per_m + rotor.c_bz_N_s_per_m) / 2
     return Rotor(speed_rad_s / (2 * np.pi), machine.rate_hz, response, both), Seen(motion, rate, angle)
 

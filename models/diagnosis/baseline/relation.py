@@ -139,6 +139,7 @@ def _models(frequencies: bytes) -> tuple[FloatArray, FloatArray]:
 _ITERATIONS = 8
 _FITS = 3.0  # standard deviations of χ² within which a relation is taken to fit
 _LAG_ROUNDS = 2
+_LONGER_LAGS_S = (0.02, 0.028, 0.036, LONGEST_LAG_FROM_S)
 _CONVERGED = 1e-4  # standard errors
 
 
@@ -157,6 +158,7 @@ class Relation:
     # Factor on the variances of every later window, from how well the relation holds in conditions that it was not
     # learned in; at least 1.
     allowance: float = 1.0
+    lag_from_s: float = 0.0  # where it does not fit below this lag, no window is read below it either
 
     @property
     def combination(self) -> FloatArray:
@@ -203,7 +205,7 @@ class Fit:
         return bool(self.chi2 <= self.degrees_of_freedom + _FITS * np.sqrt(2 * self.degrees_of_freedom))
 
 
-def _prior(row: Row, start: FloatArray, *, minimal: bool) -> FloatArray:
+def prior_of(row: Row, start: FloatArray, *, minimal: bool) -> FloatArray:
     """Precision of what is expected of the coefficients, shape (n, n); `minimal` leaves out what can be left out."""
     precision = np.zeros((row.n_coefficients, row.n_coefficients))
     for number, term in enumerate(row.terms[1:]):
@@ -232,12 +234,28 @@ def _start(row: Row, parts: Sequence[LagMoments]) -> FloatArray:
     return b
 
 
-def beyond_memory(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMoments], tuple[Fit, Fit] | None]:
+def beyond_memory(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMoments], tuple[Fit, Fit], float]:
     """Moments of every window beyond its excitation's memory, from first fits; and what `fit_row` makes of them.
 
     The colour of the force is known as well as the relation is. Of the fits without and with the optional terms the one
-    that remembers longer is believed, twice. None if the moments have changed since the last fit.
+    that remembers longer is believed, twice.
+
+    What the row leaves out of the machine may be felt for longer than the force remembers. Where no relation fits,
+    longer lags are tried; the last value is the one at which one does, 0 if none had to be.
     """
+    parts, lags = _beyond_force(row, windows)
+    fits = fit_row(row, parts)
+    if any(fit.fits for fit in fits):
+        return parts, fits, 0.0
+    for longer in _LONGER_LAGS_S:
+        beyond = [window.beyond(max(lag, longer)) for window, lag in zip(windows, lags, strict=True)]
+        again = fit_row(row, beyond)
+        if any(fit.fits for fit in again):
+            return beyond, again, longer
+    return parts, fits, 0.0
+
+
+def _beyond_force(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMoments], list[float]]:
     parts, lags, used = (
         [window.beyond(LAG_FROM_S) for window in windows],
         [0.0] * len(windows),
@@ -250,20 +268,25 @@ def beyond_memory(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMomen
             found = [lag_beyond_memory(window, combination) for window in windows]
             lags = [max(one, other) for one, other in zip(lags, found, strict=True)]
         if lags == used:
-            return parts, fits
+            break
         parts, used = [window.beyond(lag) for window, lag in zip(windows, lags, strict=True)], lags
-    return parts, None
+    return parts, used
 
 
 def fit_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Fit, Fit]:
     """Fit a row without its optional terms and with them."""
     start = _start(row, parts)
-    full = _fit(parts, start, _prior(row, start, minimal=False))
-    return _fit(parts, full.coefficients, _prior(row, start, minimal=True)), full
+    full = _fit(parts, start, prior_of(row, start, minimal=False))
+    return _fit(parts, full.coefficients, prior_of(row, start, minimal=True)), full
 
 
 def learn_row(
-    row: Row, parts: Sequence[LagMoments], fits: tuple[Fit, Fit] | None = None, *, widened: bool = True
+    row: Row,
+    parts: Sequence[LagMoments],
+    fits: tuple[Fit, Fit] | None = None,
+    lag_from_s: float = 0.0,
+    *,
+    widened: bool = True,
 ) -> tuple[Relation, list[Contribution]]:
     """Learn the relation of a row.
 
@@ -273,6 +296,8 @@ def learn_row(
         One of each healthy window; windows do not overlap, each is in one condition, they may differ from each other.
     fits : tuple of Fit, optional
         What `fit_row` makes of them, where that is known.
+    lag_from_s : float
+        Lag that later windows are not to be read below.
     widened : bool
         Whether the covariance is widened to what the windows object to (`flatness`), which takes most of the time.
 
@@ -286,7 +311,7 @@ def learn_row(
     # its covariance says, to where the terms' own noise hides the misfit.
     minimal, full = fit_row(row, parts) if fits is None else fits
     chosen, covariance = full, full.covariance
-    prior = _prior(row, _start(row, parts), minimal=False)
+    prior = prior_of(row, _start(row, parts), minimal=False)
     if minimal.fits:
         chosen = minimal
         covariance = _fit(parts, minimal.coefficients, prior, iterations=1).covariance
@@ -313,6 +338,7 @@ def learn_row(
         covariance=stretch @ covariance @ stretch.T,
         misfit=misfit,
         degrees_of_freedom=chosen.degrees_of_freedom,
+        lag_from_s=lag_from_s,
     )
     contributions = []
     for part in parts:
@@ -363,8 +389,10 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
     EstimationError
         If the window does not determine them.
     """
-    first = change_of(row, relation, window.beyond(LAG_FROM_S))
-    return change_of(row, relation, window.beyond(lag_beyond_memory(window, first.combination)))
+    first = change_of(row, relation, window.beyond(max(LAG_FROM_S, relation.lag_from_s)))
+    return change_of(
+        row, relation, window.beyond(max(relation.lag_from_s, lag_beyond_memory(window, first.combination)))
+    )
 
 
 def change_of(row: Row, relation: Relation, moments: LagMoments) -> RowChange:

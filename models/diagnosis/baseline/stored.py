@@ -35,6 +35,7 @@ class RelationRecord(BaseModel, extra="forbid", frozen=True, strict=True):
     misfit: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     degrees_of_freedom: int = Field(ge=1)
     allowance: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 1.0
+    lag_from_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
 
     @model_validator(mode="after")
     def _square(self) -> Self:
