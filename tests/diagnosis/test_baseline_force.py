@@ -1,0 +1,106 @@
+"""Errors that belong to other conditions, and the lag from which a relation holds."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks.finite_elements.machines import rotor_named
+from benchmarks.finite_elements.observed import RunCondition, WindowSizes, plan, sampled, windows_of
+from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
+from models.commissioning.levels import learned_baseline
+from models.diagnosis.baseline import relation
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
+from models.diagnosis.baseline.force import alike
+from models.diagnosis.baseline.learned import Baseline, learn_baseline
+from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.readings import Diagnosis
+from models.diagnosis.window import WindowStatistics
+
+ROTOR = rotor_named("overhung")
+SIZES = WindowSizes(length_s=30.0, hop_s=2.5, segment_s=2.5)
+
+
+def condition(seed: int, **changes: float) -> RunCondition:
+    return drawn_condition(ROTOR, SourceLayout.ONE_SOURCE, COMMISSIONED, changes, np.random.default_rng(seed))
+
+
+def windows(run: RunCondition, count: int, seed: int) -> list[WindowStatistics]:
+    sizes = plan(ROTOR, SIZES)
+    lead_s = sizes.preamble / sizes.rate_hz + 0.1
+    return windows_of(sampled(ROTOR, run, 30.0 * count + lead_s, seed), sizes)
+
+
+@cache
+def baseline(seed: int) -> Baseline:
+    return learned_baseline(windows(condition(seed), 4, 1), ["one"] * 4)
+
+
+def error_of(diagnosis: Diagnosis, name: str) -> float:
+    return next(one.standard_error or 0.0 for one in diagnosis.evaluable if one.name == name)
+
+
+def test_forces_are_alike_in_level_colour_and_direction_or_not_at_all() -> None:
+    rng = np.random.default_rng(5)
+    factor = rng.standard_normal((6, 2, 2)) + 1j * rng.standard_normal((6, 2, 2))
+    spectra = factor @ factor.conj().transpose(0, 2, 1)
+
+    def packed(matrices: np.ndarray) -> np.ndarray:
+        return np.triu(matrices.real) + np.tril(matrices.imag, -1)
+
+    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
+    healthy = packed(spectra)
+    assert alike(healthy, healthy)
+    assert alike(healthy, 1.15 * healthy)
+    assert not alike(healthy, 2.0 * healthy)
+    assert not alike(healthy, healthy * np.linspace(0.5, 1.5, 6)[:, None, None])
+    assert not alike(healthy, packed(turn @ spectra @ turn.T))
+    assert not alike(healthy, packed(spectra.conj()))
+    assert not alike(np.zeros((0, 0, 0)), healthy)
+    assert not alike(healthy, healthy[:3])
+
+
+@pytest.mark.slow
+def test_damping_is_sharper_while_the_commissioned_force_moves_the_machine() -> None:
+    monitor = BaselineDiagnostician(baseline(3))
+    for changes in ({}, {"c_by": -0.2}, {"c_by": -0.2, "e": 0.2}):
+        (same,), (other,) = (windows(condition(seed, **changes), 1, 7) for seed in (3, 4))
+        here, there = monitor.diagnose(same), monitor.diagnose(other)
+        assert here.elsewhere["c_by"] == 0 < there.elsewhere["c_by"]
+        assert here.elsewhere["k_by"] > 0
+        reading = next(one for one in here.evaluable if one.name == "c_by")
+        assert reading.relative_change == pytest.approx(changes.get("c_by", 0.0), abs=3 * error_of(here, "c_by"))
+
+
+def test_several_healthy_conditions_are_not_one_force() -> None:
+    both = [*windows(condition(3), 2, 1), *windows(condition(4), 2, 2)]
+    assert baseline(3).force.shape == (18, 2, 2)
+    assert learn_baseline(both, ["one", "one", "two", "two"]).force.size == 0
+
+
+def test_a_restored_baseline_knows_its_force() -> None:
+    again = BaselineRecord.model_validate_json(BaselineRecord.of(baseline(3)).model_dump_json())
+    assert np.array_equal(again.baseline().force, baseline(3).force)
+    (window,) = windows(condition(3), 1, 8)
+    assert (
+        again.diagnostician().diagnose(window).parameters
+        == BaselineDiagnostician(baseline(3)).diagnose(window).parameters
+    )
+
+
+@pytest.mark.slow
+def test_where_a_relation_does_not_fit_longer_lags_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    healthy = windows(condition(4), 4, 1)
+    longer = learn_baseline(healthy)
+    monkeypatch.setattr(relation, "_LONGER_LAGS_S", ())
+    before = learn_baseline(healthy)
+    for one, other in zip(longer.relations, before.relations, strict=True):
+        assert one is not None
+        assert other is not None
+        assert other.lag_from_s == 0
+        if one.lag_from_s:
+            assert one.misfit < other.misfit
+    assert any(one is not None and one.lag_from_s for one in longer.relations)
+    again = BaselineRecord.model_validate_json(BaselineRecord.of(longer).model_dump_json()).baseline()
+    lags = [None if one is None else one.lag_from_s for one in longer.relations]
+    assert [None if one is None else one.lag_from_s for one in again.relations] == lags
