@@ -15,8 +15,8 @@ from models.signals.block import FloatArray
 
 _BAND_HZ = 8.0
 # Distance up to which two forces count as one. On finite-element rotors (overhung, between bearings; seeds 100 to 105,
-# windows of 30 s, k to -25 % and c to -40 %) the same force is 0.001 to 0.04 off itself, 0.02 in nine windows of ten;
-# forces of the same colour and level in other directions 0.04 to 0.97, below 0.09 in one of ten.
+# windows of 30 s) the same force is 0.0005 to 0.019 off itself with changes of up to c -40 %, up to 0.038 with k -25 %;
+# forces of the same colour and level in other directions 0.044 to 0.97, one window in ten below 0.09.
 _ALIKE = 0.03
 
 

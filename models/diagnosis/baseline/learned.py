@@ -133,6 +133,7 @@ _SHORTEST_LAG_RANGE_S = 0.1
 # Planes are coupled where the stiffness across is more of that along, and more standard errors, in one of them.
 _COUPLED, _SHOWN = 0.03, 4.0
 _FEWEST_HOPS = 2
+_NO_FORCE: FloatArray = np.zeros((0, 0, 0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,7 +151,12 @@ class Baseline:
     consistency: tuple[LeftOut, ...] = ()
     # (n_bands, n_rows, n_rows): force that it was learned under (`force_spectrum`); empty where it was not one, or is
     # not seen in all rows
-    force: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    force: FloatArray = field(default_factory=_NO_FORCE.copy)
+
+    @property
+    def elsewhere(self) -> "Baseline":
+        """The same without the force: what it reads has the errors of other conditions, whatever moves the machine."""
+        return replace(self, force=_NO_FORCE)
 
     @property
     def states(self) -> tuple[str, ...]:
