@@ -78,6 +78,13 @@ def test_several_healthy_conditions_are_not_one_force() -> None:
     assert learn_baseline(both, ["one", "one", "two", "two"]).force.size == 0
 
 
+def test_a_record_without_a_force_is_written_as_it_was_before_there_was_one() -> None:
+    record = BaselineRecord.of(baseline(3).elsewhere).model_dump(mode="json")
+    assert "force" not in record
+    assert all("lag_from_s" not in relation for relation in record["relations"])
+    assert BaselineRecord.of(baseline(3)).model_dump(mode="json")["force"]
+
+
 def test_a_restored_baseline_knows_its_force() -> None:
     again = BaselineRecord.model_validate_json(BaselineRecord.of(baseline(3)).model_dump_json())
     assert np.array_equal(again.baseline().force, baseline(3).force)

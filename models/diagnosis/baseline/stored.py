@@ -35,7 +35,8 @@ class RelationRecord(BaseModel, extra="forbid", frozen=True, strict=True):
     misfit: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     degrees_of_freedom: int = Field(ge=1)
     allowance: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 1.0
-    lag_from_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    # What older records lack is left out where it says nothing: their commissionings keep their identity.
+    lag_from_s: float = Field(default=0.0, ge=0, allow_inf_nan=False, exclude_if=lambda lag_s: lag_s == 0)
 
     @model_validator(mode="after")
     def _square(self) -> Self:
@@ -91,7 +92,7 @@ class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
     duration_s: _Positive
     consistency: tuple[_LeftOutRecord, ...] = ()  # healthy windows against each other
     # Cross-spectra of what the rows leave over, by bands; empty where the healthy recordings had several forces.
-    force: tuple[_Matrix, ...] = ()
+    force: tuple[_Matrix, ...] = Field(default=(), exclude_if=lambda bands: not bands)
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
