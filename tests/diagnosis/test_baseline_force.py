@@ -14,8 +14,10 @@ from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.force import alike
 from models.diagnosis.baseline.learned import Baseline, learn_baseline
 from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.moments import ComplexArray
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.window import WindowStatistics
+from models.signals.block import FloatArray
 
 ROTOR = rotor_named("overhung")
 SIZES = WindowSizes(length_s=30.0, hop_s=2.5, segment_s=2.5)
@@ -45,8 +47,8 @@ def test_forces_are_alike_in_level_colour_and_direction_or_not_at_all() -> None:
     factor = rng.standard_normal((6, 2, 2)) + 1j * rng.standard_normal((6, 2, 2))
     spectra = factor @ factor.conj().transpose(0, 2, 1)
 
-    def packed(matrices: np.ndarray) -> np.ndarray:
-        return np.triu(matrices.real) + np.tril(matrices.imag, -1)
+    def packed(matrices: ComplexArray) -> FloatArray:
+        return np.asarray(np.triu(matrices.real) + np.tril(matrices.imag, -1), dtype=np.float64)
 
     turn = np.array([[0.8, -0.6], [0.6, 0.8]])
     healthy = packed(spectra)
