@@ -192,7 +192,7 @@ def _with_relations(machine: MachineFile, pieces: Sequence[Piece], progress: Pro
     read: list[Read] = []
     compared: list[Read] = []
     for group, baseline in zip(groups, baselines, strict=True):
-        diagnostician = BaselineDiagnostician(baseline.elsewhere)  # a report holds for other days, too
+        diagnostician = BaselineDiagnostician(baseline.without_force)  # a report holds for other days, too
         for piece in group:
             stated = determined(diagnostician.diagnose(piece.window), piece.window, machine.window_data_s)
             read.append((piece.recording, piece.window.end_ns, stated))
@@ -326,7 +326,7 @@ def _halves(pieces: Sequence[Piece], rows: Sequence[Row]) -> tuple[Read, ...]:
             half = learn_baseline([p.window for p in teaching], [p.recording for p in teaching], rows)
         except EstimationError:
             continue  # half of the data is too little for this machine; the whole may be enough
-        diagnostician = BaselineDiagnostician(half.elsewhere)
+        diagnostician = BaselineDiagnostician(half.without_force)
         found += [(p.recording, p.window.end_ns, diagnostician.diagnose(p.window)) for p in asked]
     return tuple(sorted(found, key=lambda read: read[1]))
 

@@ -15,7 +15,7 @@ from models.levels.limits import (
     PEAK_TO_PEAK,
     Limit,
     RelativeLimits,
-    of_amplitude,
+    level_per_amplitude,
     relative_limits,
     rounded,
     shown_level,
@@ -65,6 +65,9 @@ class LevelJudge:
         self._zones = {ZONES[name].shaft: name for name in settings.zones}
         self._reference: LevelReference | None = None
         self._relatives: dict[tuple[int, bool, int], RelativeLimits] = {}  # they are the same in all full windows
+        self._nearest = lru_cache(maxsize=16 * len(self._channels))(
+            _nearest_limits
+        )  # most are those of the window before
 
     def judge(self, levels: WindowLevels, reference: LevelReference | None) -> tuple[ChannelLevels, ...]:
         """Levels of one window, channel by channel."""
@@ -148,7 +151,7 @@ class LevelJudge:
             if region is not None and levels.vectors is not None:
                 moved = complex(levels.vectors[1, column])
                 if abs(moved - region.centre) > region.radius:
-                    edge = shown_level(channel, "x1", min(abs(moved) * of_amplitude(channel), region.alert))
+                    edge = shown_level(channel, "x1", min(abs(moved) * level_per_amplitude(channel), region.alert))
                     limits["x1"] = (*limits.get("x1", ()), Limit(_TURNED_OUT, False, alert=edge))
             if grown is not None:
                 limits["growth"] = (Limit(relative.source, False, grown.limit),)
@@ -201,7 +204,7 @@ class LevelJudge:
 
     def _limited(self, channel: Channel, name: str, value: float, limits: tuple[Limit, ...], words: str) -> LevelLimits:
         """The nearest limits of a level, and on which side it is."""
-        nearest = _nearest_limits(name, limits)
+        nearest = self._nearest(name, limits)
         danger, alert, fall = nearest.danger, nearest.alert, nearest.fall
         if danger is not None and value >= (danger.danger or math.inf):
             state, decided, what = "danger", danger, f"danger from {danger.danger:.3g} ({danger.source})"
@@ -225,7 +228,6 @@ class LevelJudge:
         )
 
 
-@lru_cache(maxsize=4096)  # most limits are those of the window before
 def _nearest_limits(name: str, limits: tuple[Limit, ...]) -> _Nearest:
     danger = min((one for one in limits if one.danger is not None), key=lambda one: one.danger or 0.0, default=None)
     alert = min((one for one in limits if one.alert is not None), key=lambda one: one.alert or 0.0, default=None)

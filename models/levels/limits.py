@@ -98,14 +98,14 @@ def relative_limits(
 
 
 def _region(channel: Channel, one: ReferenceLevel, centre: complex, alert: float, shorter: float) -> Region:
-    factor = of_amplitude(channel)
+    factor = level_per_amplitude(channel)
     farthest = max(BEYOND_RANGE * one.turned, one.turned + _filling(one, shorter) * one.mean / factor)
     by_chance = ERRORS * one.error * shorter / factor
     return Region(centre, max(_TURNED * abs(centre), farthest, by_chance), alert)
 
 
-def of_amplitude(channel: Channel) -> float:
-    """What makes the level of a line of its amplitude."""
+def level_per_amplitude(channel: Channel) -> float:
+    """Ratio of the level of a line to its amplitude."""
     return 2.0 if channel.quantity in PEAK_TO_PEAK else math.sqrt(0.5)
 
 

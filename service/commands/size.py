@@ -50,14 +50,14 @@ def size(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The figures of all machines, for another program.")] = False,
 ) -> None:
-    """Reckon what a plant will take: processor, memory, disk, network, processes and computers.
+    """Estimate what a plant needs: processor, memory, disk, network, processes and computers.
 
-    From figures that were measured on simulated machines, and a model between them, both told beside the result.
-    How long things are kept is as in the settings, unless it is given. Page, API and other programs come on top.
+    From figures that were measured on simulated machines, and a model between them, both shown with the result.
+    Things are kept as long as they are by default, unless it is given. Page, API and other programs come on top.
 
     [bold]Examples[/bold]
 
-    [cyan]rotorwatch size --machines 200 --channels 12 --rate 4000[/cyan]
+    [cyan]rotorwatch size --machines 200 --channels 12 --rate 4000 --no-networks[/cyan]
     [cyan]rotorwatch size --machines 500 --channels 4 --rate 1000 --levels-only[/cyan]
     """
     prepare_numerics()
@@ -73,9 +73,8 @@ def size(
         RecordingSettings, {n: value for n, value in given.items() if n in RecordingSettings.model_fields}, "arguments"
     )
     costs = load_costs()
-    kind = Kind(
-        channels=channels, rate_hz=rate, hop_s=hop, diagnosed=not levels_only, networks=networks and not levels_only
-    )
+    of_kind = {"channels": channels, "rate_hz": rate, "hop_s": hop, "diagnosed": not levels_only}
+    kind = checked(Kind, of_kind | {"networks": networks and not levels_only}, "arguments")
     found = sized(costs, kind, machines, retention=retention, recording=recording, cores=cores, busy=busy)
     if as_json:
         told = {"kind": kind.model_dump(), **dataclasses.asdict(found), "outside": costs.outside(kind)}
@@ -89,17 +88,19 @@ def _lines(
     costs: "Costs", kind: "Kind", found: "Size", retention: "Retention", cores: int, busy: float
 ) -> Iterator[str]:
     """The result for people, at most 80 characters wide."""
-    made = "levels only" if not kind.diagnosed else "diagnosed, networks" if kind.networks else "diagnosed, no networks"
-    yield f"{kind.channels} channels at {kind.rate_hz:g} Hz, a report every {kind.hop_s:g} s, {made}"
+    diagnosed = "diagnosed, networks" if kind.networks else "diagnosed, no networks"
+    made = diagnosed if kind.diagnosed else "levels only"
+    stream = f"{kind.channels} channel{'s' * (kind.channels > 1)} at {kind.rate_hz:g} Hz"
+    yield f"{stream}, a report every {kind.hop_s:g} s, {made}"
     yield ""
-    yield f"{'':38}{'one machine':>16}{f'{found.machines} machines':>18}"
+    yield f"{'':38}{'one machine':>16}{f'all {found.machines}':>18}"
 
     def row(what: str, of_all: float, unit: str) -> str:
         return f"{what:<38}{_amount(of_all / found.machines, unit):>16}{_amount(of_all, unit):>18}"
 
     history = f"{retention.reports_days:g} and {retention.readings_days:g} days"
     yield row("processor", found.cores, "cores")
-    yield row("  for recorders besides", found.recording_cores, "cores")
+    yield row("  recorders, where one records", found.recording_cores, "cores")
     yield row("memory", found.memory_mb * 1e6, "B")
     yield row("network, samples in", found.network_in_mb_s * 1e6, "B/s")
     yield row("  reports out, each subscriber", found.network_out_mb_s * 1e6, "B/s")
@@ -109,15 +110,16 @@ def _lines(
     yield row(f"  their size ({found.recordings_days:.3g} days)", found.recordings_gb * 1e9, "B")
     yield row("  kept for alarms, at most", found.alarm_recordings_gb * 1e9, "B")
     yield ""
-    yield f"processes     {f'{found.shards} beside the one that serves' if found.shards else 'one'}"
+    yield f"processes     {f'{found.shards} ([shards] count) beside the one that serves' if found.shards else 'one'}"
     yield f"computers     {found.computers} with {cores} cores, {busy:.0%} busy at most in the mean"
-    if found.busiest_core > busy:
-        yield f"The machines of a process take {found.busiest_core:.2f} of the one core that it can use:"
-        yield "set [shards] count to more."
+    if found.machine_core > busy:
+        yield f"One machine takes {found.machine_core:.2g} cores, and a process uses one: choose a longer hop or fewer"
+        yield "channels."
     yield ""
     yield f"Measured on {costs.computer}, {costs.machines} machines in a process,"
     yield f"rotorwatch {costs.version}. From these {len(costs.cases)} kinds of machines the model deviates by at most"
-    yield f"{costs.deviation('processor_ms'):.0%} (processor) and {costs.deviation('memory_mb'):.0%} (memory)."
+    off = {what: f"{costs.deviation(what):.0%}" for what in ("processor_ms", "memory_mb", "written_kb")}
+    yield f"{off['processor_ms']} (processor), {off['memory_mb']} (memory), {off['written_kb']} (written to the disk)."
     for what in costs.outside(kind):
         yield f"OUTSIDE of what was measured: {what}"
 

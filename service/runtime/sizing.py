@@ -42,8 +42,8 @@ class Kind(BaseModel, extra="forbid", frozen=True):
     """How much data come of a machine, and what is made of them."""
 
     channels: int = Field(ge=1, description="channels of the stream, the shaft angle among them")
-    rate_hz: float = Field(gt=0, description="samples per second and channel")
-    hop_s: float = Field(gt=0, description="seconds between reports")
+    rate_hz: float = Field(gt=0, le=1e6, allow_inf_nan=False, description="samples per second and channel")
+    hop_s: float = Field(gt=0, le=_DAY_S, allow_inf_nan=False, description="seconds between reports")
     diagnosed: bool = Field(description="parameters are read; otherwise levels alone are watched")
     networks: bool = Field(description="trained networks beside the likelihood")
 
@@ -117,14 +117,14 @@ class Costs(BaseModel, extra="forbid", frozen=True):
 
     def outside(self, kind: Kind) -> list[str]:
         """In what a kind lies outside of those that were measured, in words; empty if it does not."""
-        like = [case for case in self.cases if case.diagnosed == kind.diagnosed]
+        like = [case for case in self.cases if (case.diagnosed, case.networks) == (kind.diagnosed, kind.networks)]
         told = []
         for name, unit in (("channels", ""), ("rate_hz", " Hz"), ("hop_s", " s")):
             value, found = getattr(kind, name), [getattr(case, name) for case in like]
             if found and not min(found) <= value <= max(found):
                 what = name.partition("_")[0]
                 told.append(f"{what} {value:g}{unit}, measured {min(found):g} to {max(found):g}{unit}")
-        return told or ([] if like else ["diagnosed or not: no such machine was measured"])
+        return told or ([] if like else ["no machine that is diagnosed like that was measured"])
 
 
 _ALL: tuple[Measured, ...] = ("processor_ms", "memory_mb", "written_kb", "reports_kb", "readings_kb", "told_kb")
@@ -137,8 +137,8 @@ class Size:
     machines: int
     cores: float
     recording_cores: float
-    shards: int  # processes beside the serving one
-    busiest_core: float  # what the machines of a process take of the one core that it can use
+    shards: int  # processes beside the serving one, so many that none is busier than asked for
+    machine_core: float  # what one machine takes of the one core that it can use
     computers: int
     memory_mb: float
     network_in_mb_s: float
@@ -190,9 +190,11 @@ def sized(
     recorded_gb_day = stream_mb_s * costs.recording.compressed * _DAY_S / 1e3
     used = machines * costs.of(kind, "processor_ms") / 1e3 / kind.hop_s
     recorders = machines * stream_mb_s * costs.recording.processor_s_per_mb
-    computers = math.ceil((used + recorders) / (busy * cores))
+    computers = min(machines, math.ceil((used + recorders) / (busy * cores)))
     in_fleet, on_one = math.ceil(machines / OF_A_SHARD), max(1, min(cores, machines // OF_A_SHARD))
     processes = in_fleet if computers > 1 else on_one  # as `fleet_count` and `shard_count` say
+    # No process uses more than one core, and none is on two computers: then more than these are needed.
+    processes = min(machines, max(processes, math.ceil(used / busy), computers if computers > 1 else 1))
     shards = processes if processes > 1 else 0
     reports_kb, readings_kb = costs.of(kind, "reports_kb"), costs.of(kind, "readings_kb")
     kept_kb = a_day * (reports_kb * retention.reports_days + readings_kb * retention.readings_days)
@@ -203,12 +205,12 @@ def sized(
         cores=used,
         recording_cores=recorders,
         shards=shards,
-        busiest_core=used / processes,
+        machine_core=used / machines,
         computers=computers,
         memory_mb=costs.process_mb * (1 + shards) + machines * costs.of(kind, "memory_mb"),
         network_in_mb_s=machines * stream_mb_s,
         network_out_mb_s=machines * costs.of(kind, "told_kb") / kind.hop_s / 1e3,
-        history_written_gb_day=machines * costs.of(kind, "written_kb") * a_day / 1e6,
+        history_written_gb_day=machines * max(costs.of(kind, "written_kb"), reports_kb + readings_kb) * a_day / 1e6,
         history_gb=machines * kept_kb / 1e6,
         recorded_gb_day=machines * recorded_gb_day,
         recordings_gb=machines * kept_days * recorded_gb_day,

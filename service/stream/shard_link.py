@@ -30,7 +30,7 @@ class RelaySettings(LinkSettings):
         """As `LinkSettings.zenoh_items`; what a publisher has kept comes at once, and is waited for.
 
         A publisher of several machines waits for the slowest of their shards. One that takes nothing at all is cut off,
-        and gets what it missed from the publishers when it comes again.
+        and gets what it missed when it comes again, from publishers that keep samples.
         """
         items, place = super().zenoh_items(), "transport/link/tx/queue/congestion_control"
         items[f"{place}/drop/wait_before_drop"] = str(_DROPPED_US)

@@ -108,11 +108,10 @@ class MachineWorker:
         self._unevaluated_s = 0.0
         self._monitor, self.restart = self._restored(installed)
         self._snapshot: MachineHealth = self._monitor.health()
-        self._begin_s = clocks.monotonic_s()
         self._latest_data_s: float | None = None
         self._operated_ns = 0
         self._told = self._monitor.next_sequence
-        self._ticked_s = self._held_up_s = clocks.monotonic_s()
+        self._begin_s = self._ticked_s = self._held_up_s = clocks.monotonic_s()
         self._missed = 0
         self._publisher_alive = self._replay_announced = False
         self._mismatch: tuple[str, ...] = ()
@@ -310,9 +309,13 @@ class MachineWorker:
 
     @property
     def _silent(self) -> bool:
-        """Whether no usable block has come for longer than a silence may last, since this program stood still last."""
-        latest_s = self._begin_s if self._latest_data_s is None else self._latest_data_s
-        return self._clocks.monotonic_s() - max(latest_s, self._held_up_s) > self.machine.ingest.no_data_after_s
+        """Whether no usable block has come for longer than a silence may last."""
+        return self._clocks.monotonic_s() - self._heard_s > self.machine.ingest.no_data_after_s
+
+    @property
+    def _heard_s(self) -> float:
+        """When the latest block came, or later, when this program went on after it had stood still."""
+        return max(self._held_up_s, self._begin_s if self._latest_data_s is None else self._latest_data_s)
 
     def _data_now_ns(self) -> int:
         """Data time that has been reached: end of the newest data, and what has passed since."""
@@ -327,21 +330,18 @@ class MachineWorker:
     def _tick(self) -> None:
         self._ticking = False
         now_s, limit_s = self._clocks.monotonic_s(), self.machine.ingest.no_data_after_s
-        if now_s - self._ticked_s > _HELD_UP_S:
-            self._held_up_s = now_s
+        if now_s - self._ticked_s > _HELD_UP_S and self._ticked_s - self._heard_s < limit_s:
+            self._held_up_s = now_s  # a silence that had begun before goes on
         self._ticked_s = now_s
         if news := self.steps.begun_anew():
             self._conclude((), self._monitor.fault(news, self._data_now_ns()), always=True)
         if len(self.inbox):
             return  # time passes with the blocks that wait
         if self._monitor.end_ns is not None:
-            latest_s = self._begin_s if self._latest_data_s is None else self._latest_data_s
-            if now_s - max(latest_s, self._held_up_s) >= limit_s:
+            if now_s - self._heard_s >= limit_s:
                 self._conclude_reports(self._monitor.flush())
-            elif self._latest_data_s is None or now_s - latest_s >= limit_s:
-                # After a restart, or where this program stood still, publishers get as long to be heard again as a
-                # silence may last.
-                return
+            elif self._latest_data_s is None or now_s - self._latest_data_s >= limit_s:
+                return  # publishers get as long to be heard again, after a restart too
         self._conclude((), self._monitor.passed(self._data_now_ns()))
 
     def _catch_up(self, since_ns: int) -> None:

@@ -81,7 +81,7 @@ def test_several_healthy_conditions_are_not_one_force() -> None:
 
 
 def test_a_record_without_a_force_is_written_as_it_was_before_there_was_one() -> None:
-    record = BaselineRecord.of(baseline(3).elsewhere).model_dump(mode="json")
+    record = BaselineRecord.of(baseline(3).without_force).model_dump(mode="json")
     assert "force" not in record
     assert all("lag_from_s" not in relation for relation in record["relations"])
     assert BaselineRecord.of(baseline(3)).model_dump(mode="json")["force"]

@@ -353,6 +353,11 @@ def test_a_program_that_stood_still_calls_nobody_silent(tmp_path: Path) -> None:
             at.tick()
         assert at.worker.health().stream.silent
         assert at.log() == [(0, "raised", STREAM_LOST)]
+        for _ in range(3):  # and goes on being silent, however often the program stands still
+            now_s[0] += 2.5
+            at.tick()
+            assert at.worker.health().stream.silent
+        assert at.log() == [(0, "raised", STREAM_LOST)]
 
 
 def test_a_silence_is_longer_than_a_block() -> None:

@@ -152,9 +152,12 @@ def test_data_and_alarms_are_counted_as_they_came(read: Read, served: tuple[Runt
 
 def test_blocks_that_wait_are_told_as_seconds_of_data(served: tuple[Runtime, str, Read]) -> None:
     worker = served[0].machines()[0]
-    waiting = replace(worker.status(), queue_blocks=40, tally=Tally(blocks=16, data_s=1.4))
-    families = {one.name: one for one in machine_families([Observed(worker, worker.health(), waiting, {})])}
-    assert [one.value for one in families["rotorwatch_lag_seconds"].samples] == [pytest.approx(3.5)]
+    waiting = replace(worker.status(), queue_blocks=40, tally=Tally(blocks=16, data_s=1.4))  # two of them refused
+    health = worker.health()
+    quality = health.quality.model_copy(update={"accepted_blocks": 14})
+    seen = Observed(worker, health.model_copy(update={"quality": quality}), waiting, {})
+    families = {one.name: one for one in machine_families([seen])}
+    assert [one.value for one in families["rotorwatch_lag_seconds"].samples] == [pytest.approx(4.0)]
 
 
 def test_the_service_itself(read: Read, served: tuple[Runtime, str, Read]) -> None:

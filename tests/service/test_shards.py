@@ -13,7 +13,7 @@ import httpx_sse
 import pytest
 
 from models.errors import BundleError, MachineFileError
-from models.machine import load_machine
+from models.machine import IngestSettings, load_machine
 from models.signals.link import LinkSettings
 from rotorwatch.records.alarms import AlarmStates
 from rotorwatch.records.health import Health, HealthState
@@ -25,6 +25,7 @@ from service.runtime.runtime import Runtime, running
 from service.runtime.shards import Shards, shard_count
 from service.runtime.standing import latest_from_bytes, latest_to_bytes
 from service.settings.service import HistorySettings, MachineEntry, ServiceSettings, ShardSettings
+from service.stream.shard_link import RelaySettings
 from simulator.scenario import parse_fault
 from tests.service.live import (
     SHORT,
@@ -287,3 +288,10 @@ def test_a_machine_that_cannot_be_monitored_is_named(tmp_path: Path) -> None:
     with pytest.raises(BundleError, match="nothing: not a bundle"):
         failed.start()
     assert children() == []
+
+
+def test_a_shard_that_takes_nothing_is_cut_off_before_machines_of_others_are_called_silent() -> None:
+    place = "transport/link/tx/queue/congestion_control/block/wait_before_close"
+    cut_off_s = int(RelaySettings().zenoh_items()[place]) / 1e6
+    assert cut_off_s < IngestSettings().no_data_after_s / 2
+    assert place not in RelaySettings(waits=True).zenoh_items()  # there the source is to wait

@@ -61,6 +61,12 @@ def test_what_needs_no_measurement_is_exact() -> None:
 def test_processes_and_computers_are_those_that_would_be_started() -> None:
     assert (size_of(LAB, 29, cores=2).shards, size_of(LAB, 30, cores=2).shards) == (0, 2)
     assert size_of(LAB, 300, cores=64).shards == 20
+    busy = size_of(LAB.model_copy(update={"hop_s": 0.1}), 10, cores=1)
+    assert busy.shards >= busy.computers > 1
+    assert busy.cores / busy.shards <= 0.6
+    one = size_of(LAB.model_copy(update={"channels": 1000, "rate_hz": 1e6}), 1)
+    assert (one.shards, one.computers) == (0, 1)
+    assert one.machine_core > 1
     fleet = size_of(LAB, 3000, cores=4, busy=0.5)
     assert fleet.shards == 200
     assert fleet.computers == pytest.approx((fleet.cores + fleet.recording_cores) / 2, abs=1)
@@ -76,9 +82,11 @@ def test_more_of_anything_costs_no_less() -> None:
 
 
 def test_the_answer_is_told_in_80_columns_and_says_what_was_not_measured() -> None:
-    inside = told("--machines", "200", "--channels", "12", "--rate", "4000", "--hop", "5")
+    asked = ("--machines", "200", "--channels", "12", "--rate", "4000", "--hop", "5")
+    assert "OUTSIDE of what was measured: rate 4000 Hz" in told(*asked)  # networks were measured at 2 kHz
+    inside = told(*asked, "--no-networks")
     assert "OUTSIDE" not in inside
-    assert "200 machines" in inside
+    assert "all 200" in inside
     assert "38.4 MB/s" in inside
     outside = told("--machines", "100000", "--channels", "64", "--rate", "25600", "--levels-only")
     assert "OUTSIDE of what was measured: channels 64" in outside
@@ -92,7 +100,11 @@ def test_another_program_gets_figures() -> None:
     assert found["network_in_mb_s"] == pytest.approx(20 * 8 * 2000 * 4 / 1e6)
 
 
-def test_a_retention_that_no_settings_take_is_refused() -> None:
-    result = CliRunner().invoke(app, ["size", "--machines", "2", "--keep-days", "0"])
+@pytest.mark.parametrize(
+    ("option", "value", "field"),
+    [("--keep-days", "0", "keep_days"), ("--hop", "inf", "hop_s"), ("--rate", "nan", "rate_hz")],
+)
+def test_what_cannot_be_is_refused(option: str, value: str, field: str) -> None:
+    result = CliRunner().invoke(app, ["size", "--machines", "2", option, value])
     assert result.exit_code == 2
-    assert "keep_days" in result.output
+    assert field in result.output

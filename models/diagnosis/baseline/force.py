@@ -1,8 +1,8 @@
 """Whether the force that moves the machine is the one that its relations were learned under.
 
-What a relation leaves out of the machine pulls at its coefficients, and pulls the same way for as long as the same
-force moves the machine: in a change it cancels. What every row leaves over is that force, as far as the sensors show
-it. Its cross-spectra by bands say how strong it is, of what colour, and how it is directed.
+What a relation leaves out of the machine biases its coefficients, and by the same amount for as long as the same force
+moves the machine: in a change the bias cancels. The residual of each row is that force, as far as the sensors show it.
+Its cross-spectra by bands say how strong it is, of what colour, and how it is directed.
 """
 
 from collections.abc import Sequence

@@ -154,7 +154,7 @@ class Baseline:
     force: FloatArray = field(default_factory=_NO_FORCE.copy)
 
     @property
-    def elsewhere(self) -> "Baseline":
+    def without_force(self) -> "Baseline":
         """The same without the force: what it reads has the errors of other conditions, whatever moves the machine."""
         return replace(self, force=_NO_FORCE)
 

@@ -40,7 +40,7 @@ class RelationRecord(BaseModel, extra="forbid", frozen=True, strict=True):
 
     @model_validator(mode="after")
     def _square(self) -> Self:
-        _check_covariance(f"row {self.row}", self.covariance, len(self.coefficients))
+        _check_covariance(f"covariance of row {self.row}", self.covariance, len(self.coefficients))
         return self
 
 
@@ -58,7 +58,7 @@ class RotationRecord(BaseModel, extra="forbid", frozen=True, strict=True):
         size = 2 * len(self.coordinates)
         if len(self.vectors) != size:
             raise ValueError(f"{len(self.vectors)} numbers in vectors, {size} are expected of {len(self.coordinates)}")
-        _check_covariance("rotation", self.covariance, size)
+        _check_covariance("covariance of the rotation", self.covariance, size)
         return self
 
 
@@ -101,9 +101,9 @@ class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
         for relation, reason in zip(self.relations, self.reasons, strict=True):
             if (relation is None) == (reason == ""):
                 raise ValueError("a relation is there, or a reason why not; never both or neither")
-        _check_covariance("coefficients", self.covariance, len(self.covariance))
+        _check_covariance("covariance of the coefficients", self.covariance, len(self.covariance))
         for band in self.force:
-            _check_covariance("force", band, len(self.relations))
+            _check_covariance("spectra of the force", band, len(self.relations))
         return self
 
     @classmethod
@@ -140,11 +140,11 @@ class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
         )
 
 
-def _check_covariance(of: str, matrix: _Matrix, size: int) -> None:
+def _check_covariance(what: str, matrix: _Matrix, size: int) -> None:
     if len(matrix) != size or any(len(row) != size for row in matrix):
-        raise ValueError(f"{of}: covariance is not {size} by {size}")
+        raise ValueError(f"{what}: not {size} by {size}")
     if any(matrix[i][i] < 0 for i in range(size)):
-        raise ValueError(f"{of}: a variance is negative")
+        raise ValueError(f"{what}: a value on the diagonal is negative")
 
 
 def _with_arrays(kind: Callable[..., _Kind], record: BaseModel, *arrays: str) -> _Kind:

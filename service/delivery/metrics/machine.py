@@ -72,9 +72,9 @@ def _state(machine: Observed) -> _Values:
 
 
 def _lag_s(machine: Observed) -> float:
-    """Blocks that wait, of the mean length of those that were taken."""
-    status = machine.status
-    return status.queue_blocks * status.tally.data_s / max(1, status.tally.blocks)
+    """Blocks that wait, of the mean length of those that were accepted."""
+    status, accepted = machine.status, machine.health.quality.accepted_blocks
+    return status.queue_blocks * status.tally.data_s / max(1, accepted)
 
 
 def _recorder_state(machine: Observed) -> _Values:
