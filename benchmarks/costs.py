@@ -96,20 +96,23 @@ def main() -> None:
     former: dict[str, Any] = read_toml(FILE)
     known = {tuple(one[name] for name in _SMALLEST.fields): one for one in former.get("cases", ())}
     base_mb = round(process_mb(), 1)
+    heading = {
+        "computer": computer(),
+        "version": __version__,
+        "machines": asked.machines,
+        "seconds": asked.seconds,
+        "seeds": [asked.seed + one for one in range(min(KINDS, asked.machines))],
+        "process_mb": base_mb,
+    }
+    alike = ("computer", "version", "machines", "seconds", "seeds")
+    if asked.cases and any(former.get(name) != heading[name] for name in alike):
+        parser.error(f"--cases: the others were measured otherwise ({', '.join(alike)}): measure all")
     for number, kind in enumerate(CASES, start=1):
         if asked.cases and number not in asked.cases:
             continue
         print(f"{number} of {len(CASES)}: {kind}", flush=True)
         figures = measure(kind, asked.machines, asked.seed, asked.seconds, 0.0, of_shard=False)
         known[tuple(kind.fields.values())] = case(kind, figures, asked.machines, base_mb)
-        heading = {
-            "computer": computer(),
-            "version": __version__,
-            "machines": asked.machines,
-            "seconds": asked.seconds,
-            "seeds": [asked.seed + one for one in range(min(KINDS, asked.machines))],
-            "process_mb": base_mb,
-        }
         cases = [known[tuple(one.fields.values())] for one in CASES if tuple(one.fields.values()) in known]
         asked.out.write_text(written(heading, former["recording"], cases), encoding="utf-8")
 

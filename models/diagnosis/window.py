@@ -328,6 +328,8 @@ class SlidingWindow:
             self._pending, self._row = [buffer], self._row + self.plan.stride
             self._leave(self.plan.stride)
             yield self._complete(buffer[: self.plan.need], first_ns, block_ns, row)
+        if self._pending and self._pending[0].base is not None:  # a rest would hold all that it is the rest of
+            self._pending[0] = self._pending[0].copy()
 
     def _leave(self, count: int) -> None:
         """Go on so many samples after the first pending one; those that have not come yet are left when they come."""
