@@ -33,7 +33,7 @@ from service.terminal.logs import logger
 
 _CORES_OF_A_MACHINE = 0.025
 _MB_OF_A_PROCESS, _MB_OF_A_MACHINE = 150, 45
-"""What a machine of 13 channels with networks was seen to take, see ``docs/performance.md``."""
+"""What a machine of 13 channels with networks was seen to take, rounded up, see ``docs/performance.md``."""
 _USER = "shard"
 _ANSWER_S = 5.0
 _BALANCE_S = 5.0
