@@ -135,4 +135,5 @@ def test_the_measurement_of_a_plant_still_runs(
 ) -> None:
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     importlib.import_module("page").plant(browser, 5, 1.0)
-    assert re.fullmatch(r"\| 5 \|.*\| 1, 0 \|\n", capsys.readouterr().out)  # the lines of all, asked for together
+    # The lines of all are asked for together, or in two where a busy browser shows some tiles later.
+    assert re.fullmatch(r"\| 5 \|.*\| [12], 0 \|\n", capsys.readouterr().out)
