@@ -18,12 +18,14 @@ async function askTogether() {
     const some = [...waiting].slice(0, TOGETHER);
     for (const one of some) waiting.delete(one);
     if (document.hidden) continue;
+    for (const one of some) one.asked(true);
     try {
       const { trends } = await monitor.ask(`/api/v1/trends?${new URLSearchParams(some.map((one) => ["of", one.of]))}`);
       some.forEach((one, at) => one.draw(trends[at]));
     } catch {
       for (const one of some) one.replaceChildren();
     }
+    for (const one of some) one.asked(false);
     await pause(PACE_MS);
   }
   asking = false;
@@ -39,6 +41,7 @@ const seen = new IntersectionObserver((entries) => {
 class SparkLine extends MachineElement {
   #drawn = -Infinity;
   #visible = false;
+  #asked = false;
 
   connectedCallback() {
     super.connectedCallback();
@@ -61,9 +64,14 @@ class SparkLine extends MachineElement {
   seen(visible) {
     this.#visible = visible;
     waiting.delete(this);
-    if (!visible || performance.now() - this.#drawn < 1000 * REFRESH_S) return;
+    if (!visible || this.#asked || performance.now() - this.#drawn < 1000 * REFRESH_S) return;
     waiting.add(this);
     askTogether();
+  }
+
+  /** Whether its line is on its way: a tile that moves meanwhile is not asked for again. @param {boolean} now */
+  asked(now) {
+    this.#asked = now;
   }
 
   /** @param {import("../monitor/records.js").Trend} trend */
