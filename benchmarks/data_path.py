@@ -24,6 +24,7 @@ from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.levels.judgement import LevelJudge
 from models.levels.measures import WindowLevels, hop_levels
 from models.levels.reference import learn_levels
+from models.signals.waveform import waveform_of
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import load_scenario
 from simulator.stream import blocks
@@ -60,7 +61,7 @@ def main() -> None:
     piece = samples[: plan.preamble + plan.hop]
     level = piece[:, : len(plan.states)].mean(axis=0)
     rows = np.ascontiguousarray(piece.T)  # as the moments have them
-    own, angle, measured = rows[:-1, -plan.hop :].T, rows[-1, -plan.hop :], plan.levels
+    seen, angle, measured = waveform_of(rows[:-1, -plan.hop :].T), rows[-1, -plan.hop :], plan.levels
     assert measured is not None  # noqa: S101  # planned above
     channels = [machine.sensors[column] for column in plan.columns]
     judge = LevelJudge(measured, channels, machine.levels)
@@ -90,8 +91,8 @@ def main() -> None:
     costs = {
         "Fourier transforms alone (yardstick)": median_s(yardstick, 1),
         "moments of a hop": median_s(lambda: hop_moments(plan, piece, level, 0), 1),
-        "  of which levels of the hop": often(lambda: hop_levels(measured, own, angle)),
-        "levels of a window": often(window.levels),
+        "  of which levels of the hop": often(lambda: hop_levels(measured, *seen, angle)),
+        "levels of a window": often(lambda: window.levels(errors=False)),
         "  judged, known machine": often(lambda: judge.judge(measures[-1], None)),
         "  judged against commissioning": often(lambda: judge.judge(measures[-1], healthy)),
         "statistics of a window": median_s(window.statistics, 1),

@@ -34,6 +34,7 @@ from models.levels.measures import (
 from models.levels.reference import learn_levels
 from models.levels.settings import LevelSettings
 from models.signals.block import FloatArray
+from models.signals.waveform import waveform_of
 from rotorwatch.records.levels import ChannelLevels
 
 REFERENCES = ("first windows", "commissioned")
@@ -180,7 +181,7 @@ def _beside(options: Options, case: int, number: int) -> Iterator[dict[str, Valu
         pieces.append(block.samples.astype(np.float64) * to_si)
         if len(pieces) == round(_HOP_S):
             angle = drawing.speed_rad_s * (np.arange(drawing.n_samples) / _KIND.rate_hz + len(hops) * _HOP_S)
-            hops.append(hop_levels(drawing.plan, np.concatenate(pieces), np.mod(angle, 2 * np.pi)))
+            hops.append(hop_levels(drawing.plan, *waveform_of(np.concatenate(pieces)), np.mod(angle, 2 * np.pi)))
             pieces = []
     simulated = list(_windows(drawing.plan, hops, drawing.speed_rad_s))
     both = simulated, list(drawing.windows(own, np.ones(count)))

@@ -24,13 +24,14 @@ import numpy.typing as npt
 from scipy.fft import next_fast_len
 
 from models.checkpoint import checked, prefixed, unprefixed
+from models.diagnosis.motion import MotionPair, motion_pairs, pair_powers
 from models.diagnosis.rotation import RotationLine, followed_speeds, rotation_line
-from models.diagnosis.waveform import MotionPair, Waveform, motion_pairs, pair_powers, waveform_of
 from models.levels.measures import HopLevels, LevelPlan, hop_levels, level_plan
 from models.machine import MachineFile
 from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray
 from models.signals.channels import ACCELERATIONS, parts_seen, state_name
+from models.signals.waveform import Waveform, waveform_of
 
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -197,7 +198,7 @@ class HopMoments:
     # What the samples of each measured state look like and, last, those of the shaft angle if there is one.
     waveform: Waveform
     # (n_pairs, n_bands, 3): powers of the motions that are measured twice, their mean taken out
-    # (`models.diagnosis.waveform.pair_powers`)
+    # (`models.diagnosis.motion.pair_powers`)
     pair_powers: ComplexArray
     levels: HopLevels | None = None
 
@@ -273,14 +274,14 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
         np.sin(theta, out=a[-1])
     segments = _segment_spectra(a, plan)
     own = rows[:, -plan.fresh :].T
-    waveform = waveform_of(own)
-    if plan.angle_column is not None and plan.others:
-        order = [*range(n_states), own.shape[1] - 1, *range(n_states, own.shape[1] - 1)]
-        waveform = waveform_of(own[:, order])
+    waveform, deviations = waveform_of(own)
     levels = None
     if plan.levels is not None:
         turned = None if theta is None or (line is None and plan.angle_column is None) else theta[-plan.fresh :]
-        levels = hop_levels(plan.levels, own[:, : plan.columns.size], turned)
+        levels = hop_levels(plan.levels, waveform, deviations, turned)
+    if plan.angle_column is not None and plan.others:
+        last = own.shape[1] - 1
+        waveform = waveform.of([*range(n_states), last, *range(n_states, last)])
     # The mean leaks from zero frequency into the lowest bins; the rotation obeys v = jωx and stays.
     level_left = (waveform.mean[:n_states] - level) * segments[:, :, n_states, None]
     return HopMoments(
@@ -367,8 +368,9 @@ def rotation_of(plan: Plan, hops: tuple[HopMoments, ...]) -> Rotation:
     """Tell how fast the machine turned in each hop, and whether that was steady."""
     hop_s = plan.hop / plan.rate_hz
     if plan.angle_column is not None:
-        speed = np.array([hop.turned_rad for hop in hops]) / hop_s
-        return Rotation("phase reference", speed, bool(np.ptp(speed) > STEADY * abs(speed.mean())))
+        speeds = [hop.turned_rad / hop_s for hop in hops]
+        by_hop = max(speeds) - min(speeds) > STEADY * abs(sum(speeds) / len(speeds))
+        return Rotation("phase reference", np.array(speeds), by_hop)
     followed = None
     if plan.speed_rad_s is not None:
         followed = followed_speeds(tuple(hop.line for hop in hops), hop_s)

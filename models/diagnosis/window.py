@@ -29,10 +29,10 @@ from models.diagnosis.moments import (
     through,
 )
 from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of
-from models.diagnosis.waveform import Waveform, combined_waveform, stacked_waveform
 from models.errors import CheckpointError
 from models.levels.measures import WindowLevels, window_levels
 from models.signals.block import FloatArray
+from models.signals.waveform import Waveform, combined_waveform, stacked_waveform
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class WindowStatistics:
     # What the samples of each hop look like: of each of `sensors`, those of `states` first.
     waveforms: tuple[Waveform, ...]
     sensors: tuple[str, ...]
-    # (n_pairs, n_bands, 3): powers of the motions that are measured twice, of each hop (`models.diagnosis.waveform`)
+    # (n_pairs, n_bands, 3): powers of the motions that are measured twice, of each hop (`models.diagnosis.motion`)
     pair_powers: tuple[ComplexArray, ...]
     # The same window of the sensors as they are mounted, run-out included, where some of them are at an angle or have a
     # slow-roll vector. `waveforms` and `pair_powers` are those of mounted sensors in either.
@@ -216,8 +216,8 @@ def _turned(window: WindowStatistics, states: tuple[str, ...], turn: FloatArray)
     )
 
 
-def levels_of(plan: Plan, hops: tuple[HopMoments, ...]) -> WindowLevels:
-    """Vibration levels of the window that hops make.
+def levels_of(plan: Plan, hops: tuple[HopMoments, ...], *, errors: bool = True) -> WindowLevels:
+    """Vibration levels of the window that hops make, see `window_levels`.
 
     Raises
     ------
@@ -232,6 +232,7 @@ def levels_of(plan: Plan, hops: tuple[HopMoments, ...]) -> WindowLevels:
         [hop.levels for hop in hops if hop.levels is not None],
         rotation.hop_speed_rad_s,
         phase_reference=rotation.source == "phase reference",
+        errors=errors,
     )
 
 
@@ -481,9 +482,9 @@ class SlidingWindow:
                 f"{hop.segments.shape}, expected {products} and {segments}: it is that of other channels or settings"
             )
 
-    def levels(self) -> WindowLevels | None:
+    def levels(self, *, errors: bool = True) -> WindowLevels | None:
         """Levels of the hops that are there, however few; None without any."""
-        return levels_of(self.plan, tuple(self._hops)) if self._hops else None
+        return levels_of(self.plan, tuple(self._hops), errors=errors) if self._hops else None
 
     def statistics(self, hops: int | None = None) -> WindowStatistics | None:
         """Statistics of the window, or of its latest hops, or None while there are not so many.

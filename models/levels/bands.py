@@ -49,7 +49,7 @@ class BandLevels:
 
     edges_hz: FloatArray  # (n_bands + 1,)
     rms: FloatArray  # (n_bands, n), SI units
-    errors: FloatArray  # (n_bands, n), standard errors by the scatter of the hops
+    errors: FloatArray | None  # (n_bands, n), standard errors by the scatter of the hops, if asked for
     freedom: FloatArray  # (n_bands,), degrees of freedom of a mean square of Gaussian noise
 
 
@@ -68,7 +68,7 @@ class BandReference(BaseModel):
 def learn_bands(windows: Sequence[BandLevels], column: int) -> BandReference:
     """Learn a channel's from healthy windows."""
     rms = np.stack([one.rms[:, column] for one in windows])
-    errors = np.stack([one.errors[:, column] for one in windows])
+    errors = np.stack([one.errors[:, column] for one in windows if one.errors is not None])
     return BandReference(
         edges_hz=_short(windows[0].edges_hz),
         mean=_short(rms.mean(axis=0)),

@@ -1,10 +1,12 @@
 """Levels against their limits: absolute ones, and those relative to a reference."""
 
-import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
+
+import numpy as np
 
 from models.levels.bands import Growth, growth
 from models.levels.gains import place_of, wrong_gain
@@ -15,11 +17,12 @@ from models.levels.limits import (
     PEAK_TO_PEAK,
     Limit,
     RelativeLimits,
-    level_per_amplitude,
+    all_rounded,
     relative_limits,
     rounded,
     shown_level,
     unit_of,
+    unit_size,
 )
 from models.levels.measures import LevelPlan, WindowLevels
 from models.levels.reference import LevelReference
@@ -39,6 +42,13 @@ _WORDS = {
 }  # fmt: skip
 
 
+_MEASURED = tuple(name for name in LEVEL_MEASURES if name != "growth")
+_SHOWN = (*_MEASURED, "growth", "x1_phase_lag_deg", "x2_phase_lag_deg")
+_ROW = {name: row for row, name in enumerate(_SHOWN)}
+_Standard = tuple[str, str, tuple[float, float, float]]
+"""Zones: their name, the measure, boundaries as shown."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Nearest:
     """The nearest of the limits of a level, and what is said of it while it is within all of them."""
@@ -47,6 +57,9 @@ class _Nearest:
     danger: Limit | None
     fall: Limit | None
     normal: LevelLimits
+    # Within them from the one to below the other.
+    low: float
+    high: float
 
 
 class LevelJudge:
@@ -63,19 +76,34 @@ class LevelJudge:
         self._channels = tuple(channels)
         self._settings = settings
         self._zones = {ZONES[name].shaft: name for name in settings.zones}
+        self._units = np.array([[unit_size(channel, name) for channel in channels] for name in _MEASURED])
+        self._blank = [_blank(plan, channel) for channel in channels]
         self._reference: LevelReference | None = None
-        self._relatives: dict[tuple[int, bool, int], RelativeLimits] = {}  # they are the same in all full windows
-        self._nearest = lru_cache(maxsize=16 * len(self._channels))(
-            _nearest_limits
-        )  # most are those of the window before
+        # What most windows have in common with the one before is made once.
+        self._relatives: dict[tuple[int, bool, int], RelativeLimits] = {}
+        self._limits = lru_cache(maxsize=16 * len(self._channels))(self._limits_of)
+        self._growth = lru_cache(maxsize=16 * len(self._channels))(_growth_limit)
 
     def judge(self, levels: WindowLevels, reference: LevelReference | None) -> tuple[ChannelLevels, ...]:
         """Levels of one window, channel by channel."""
-        relative = None if reference is None else self._relative(levels, reference)
+        alike = None if reference is None else self._alike(levels, reference)
+        relative = None if alike is None else self._relatives[alike]
         grown: Sequence[Growth | None] = [None] * len(self._channels)
         if relative is not None and relative.bands is not None and levels.bands is not None:
             grown = growth(levels.bands, relative.bands)
-        return tuple(self._channel(column, levels, relative, of_bands) for column, of_bands in enumerate(grown))
+        values = np.full((len(_SHOWN), len(grown)), np.nan)
+        values[: len(_MEASURED)] = [levels.values[name] for name in _MEASURED]
+        values[: len(_MEASURED)] /= self._units
+        values[len(_MEASURED)] = [np.nan if one is None else one.ratio for one in grown]
+        vectors = levels.vectors
+        if vectors is not None and levels.speed_rad_s is not None:
+            turned = 1.0 if levels.speed_rad_s >= 0 else -1.0
+            values[-2:] = np.degrees(-turned * np.angle(vectors[1:3])) % 360
+        shown = all_rounded(values.T)
+        return tuple(
+            self._channel(column, own, dict(zip(_SHOWN, shown[column], strict=True)), levels, alike, grown[column])
+            for column, own in enumerate(values.T.tolist())
+        )
 
     def foreign(
         self, levels: WindowLevels, judged: Sequence[ChannelLevels], reference: LevelReference | None, *, named: bool
@@ -102,13 +130,13 @@ class LevelJudge:
         state, seen = reference.at(levels.speed_rad_s)
         if not seen:  # at another speed much is otherwise
             return ""
-        twice = [one.limit("x2") for one in judged]
+        kurtosis, twice = levels.random_kurtosis, [one.limit("x2") for one in judged]
         grown = [limits.text for limits in twice if limits and limits.text and not limits.absolute]
-        if grown or levels.random_kurtosis is None:
+        if grown or kurtosis is None:
             return next(iter(grown), "")
         n_errors = _ERRORS_OF_DOUBT if named else ERRORS
         found = [
-            (departure(levels.random_kurtosis[:, column], state.kurtosis[one.name], BEYOND_RANGE, n_errors), one)
+            (departure(kurtosis[:, column], state.kurtosis[one.name], BEYOND_RANGE, n_errors), one)
             for column, one in enumerate(self._channels)
             if one.name in state.kurtosis
         ]
@@ -123,64 +151,72 @@ class LevelJudge:
         )
 
     def _channel(
-        self, column: int, levels: WindowLevels, relative: RelativeLimits | None, grown: Growth | None
+        self,
+        column: int,
+        values: list[float],
+        record: dict[str, Any],
+        levels: WindowLevels,
+        alike: tuple[int, bool, int] | None,
+        grown: Growth | None,
     ) -> ChannelLevels:
-        channel, speed_rad_s = self._channels[column], levels.speed_rad_s
-        values = {
-            name: shown_level(channel, name, float(levels.values[name][column]))
-            for name in LEVEL_MEASURES
-            if name != "growth"
-        }
-        values["growth"] = math.nan if grown is None else grown.ratio
-        zone, limits = "", dict[str, tuple[Limit, ...]]()
+        channel, relative = self._channels[column], None if alike is None else self._relatives[alike]
+        standard = self._standard(channel, levels.speed_rad_s)
+        zone = "" if standard is None else zone_of(values[_ROW[standard[1]]], standard[2])
+        edge, region = None, None if relative is None else relative.regions[column]
+        if region is not None and levels.vectors is not None:
+            moved = complex(levels.vectors[1, column])
+            if abs(moved - region.centre) > region.radius:
+                edge = min(values[_ROW["x1"]], shown_level(channel, "x1", region.alert))  # beyond it in any case
+        limits, words = self._limits(column, alike, standard, zone, edge), _WORDS
+        if grown is not None and relative is not None:
+            limits = limits | {"growth": self._growth(relative.source, grown.limit)}
+            words = {**_WORDS, "growth": f"{grown.band_hz[0]:.3g} to {grown.band_hz[1]:.3g} Hz"}
+        record["zone"] = zone
+        record["limits"] = tuple(
+            [
+                near.normal
+                if near.low <= values[_ROW[name]] < near.high
+                else self._limited(channel, name, values[_ROW[name]], near, words[name])
+                for name, near in limits.items()
+            ]
+        )
+        return self._blank[column].model_copy(update=record)
+
+    def _limits_of(
+        self,
+        column: int,
+        alike: tuple[int, bool, int] | None,
+        standard: _Standard | None,
+        zone: str,
+        edge: float | None,
+    ) -> dict[str, _Nearest]:
+        """The limits of a channel, but for those of bands.
+
+        Parameters
+        ----------
+        zone : str
+            In which the channel is, of the standard.
+        edge : float or None
+            Limit of 1x where its vector is out of its acceptance region.
+        """
+        channel, limits = self._channels[column], dict[str, tuple[Limit, ...]]()
         for own in self._settings.limits:
             if own.channel == channel.name:
                 given = Limit("own limit", True, own.alert, own.danger)
                 limits[own.measure] = (*limits.get(own.measure, ()), given)
-        standard = self._standard(channel, speed_rad_s)
         if standard is not None:
             name, measure, boundaries = standard
-            zone = zone_of(values[measure], boundaries)
             judged = Limit(f"{name}, zone {zone}", True, boundaries[1], boundaries[2], zones=boundaries)
             limits[measure] = (*limits.get(measure, ()), judged)
-        words = _WORDS
-        if relative is not None:
-            for measure, limit in relative.limits[column].items():
+        if alike is not None:
+            for measure, limit in self._relatives[alike].limits[column].items():
                 limits[measure] = (*limits.get(measure, ()), limit)
-            region = relative.regions[column]
-            if region is not None and levels.vectors is not None:
-                moved = complex(levels.vectors[1, column])
-                if abs(moved - region.centre) > region.radius:
-                    edge = shown_level(channel, "x1", min(abs(moved) * level_per_amplitude(channel), region.alert))
-                    limits["x1"] = (*limits.get("x1", ()), Limit(_TURNED_OUT, False, alert=edge))
-            if grown is not None:
-                limits["growth"] = (Limit(relative.source, False, grown.limit),)
-                words = {**_WORDS, "growth": f"{grown.band_hz[0]:.3g} to {grown.band_hz[1]:.3g} Hz"}
-        vectors = levels.vectors
-        lags = {}
-        if vectors is not None and speed_rad_s is not None:
-            turned = 1.0 if speed_rad_s >= 0 else -1.0
-            lags = {
-                f"{name}_phase_lag_deg": math.degrees(-turned * cmath.phase(vectors[row, column])) % 360
-                for name, row in (("x1", 1), ("x2", 2))
-            }
-        casing = channel.quantity in {Quantity.VELOCITY, Quantity.ACCELERATION}
-        return ChannelLevels(
-            channel=channel.name,
-            unit=channel.unit,
-            detection="rms" if casing else "peak to peak",
-            band_hz=self._plan.band_hz if casing else None,
-            **{name: rounded(value) for name, value in (values | lags).items()},
-            zone=zone,
-            limits=tuple(
-                self._limited(channel, name, values[name], found, words[name]) for name, found in limits.items()
-            ),
-        )
+        if edge is not None:
+            limits["x1"] = (*limits.get("x1", ()), Limit(_TURNED_OUT, False, alert=edge))
+        return {name: _nearest_limits(name, found) for name, found in limits.items()}
 
-    def _standard(
-        self, channel: Channel, speed_rad_s: float | None
-    ) -> tuple[str, str, tuple[float, float, float]] | None:
-        """The zones of a standard that apply to a channel: their name, the measure, boundaries as shown."""
+    def _standard(self, channel: Channel, speed_rad_s: float | None) -> _Standard | None:
+        """The zones of a standard that apply to a channel."""
         shaft = channel.quantity is Quantity.DISPLACEMENT
         name = self._zones.get(shaft)
         if name is None or not (shaft or channel.quantity in {Quantity.VELOCITY, Quantity.ACCELERATION}):
@@ -192,19 +228,19 @@ class LevelJudge:
         first, second, third = (shown_level(channel, measure, edge) for edge in boundaries)
         return name, measure, (first, second, third)
 
-    def _relative(self, levels: WindowLevels, reference: LevelReference) -> RelativeLimits:
-        """What a window is judged by, once for all windows alike."""
+    def _alike(self, levels: WindowLevels, reference: LevelReference) -> tuple[int, bool, int]:
+        """Which windows are judged by the same limits relative to the reference, which are made once."""
         if reference is not self._reference:
             self._reference, self._relatives = reference, {}
+            self._limits.cache_clear()
         state, seen = reference.at(levels.speed_rad_s)
         alike = (id(state), seen, levels.hops)  # of the reference that is kept here
         if alike not in self._relatives:
             self._relatives[alike] = relative_limits(levels, reference, self._channels, self._settings)
-        return self._relatives[alike]
+        return alike
 
-    def _limited(self, channel: Channel, name: str, value: float, limits: tuple[Limit, ...], words: str) -> LevelLimits:
-        """The nearest limits of a level, and on which side it is."""
-        nearest = self._nearest(name, limits)
+    def _limited(self, channel: Channel, name: str, value: float, nearest: _Nearest, words: str) -> LevelLimits:
+        """On which side of its limits a level is that is not well within them."""
         danger, alert, fall = nearest.danger, nearest.alert, nearest.fall
         if danger is not None and value >= (danger.danger or math.inf):
             state, decided, what = "danger", danger, f"danger from {danger.danger:.3g} ({danger.source})"
@@ -214,7 +250,7 @@ class LevelJudge:
                 what = "has moved out of its acceptance region"
         elif fall is not None and value < (fall.fall or 0.0):
             state, decided, what = "alert", fall, f"alert below {fall.fall:.3g} ({fall.source})"
-        else:
+        else:  # not a number
             return nearest.normal
         unit = unit_of(channel.unit, name, channel.quantity in PEAK_TO_PEAK)
         said = f"{channel.name} ({channel.location} {channel.direction}) {words}".rstrip()
@@ -226,6 +262,22 @@ class LevelJudge:
                 "text": f"{said} {value:.3g} {unit}, {what}",
             }
         )
+
+
+def _blank(plan: LevelPlan, channel: Channel) -> ChannelLevels:
+    casing = channel.quantity in {Quantity.VELOCITY, Quantity.ACCELERATION}
+    return ChannelLevels(
+        channel=channel.name,
+        unit=channel.unit,
+        detection="rms" if casing else "peak to peak",
+        band_hz=plan.band_hz if casing else None,
+        overall=None,
+        peak=None,
+    )
+
+
+def _growth_limit(source: str, alert: float) -> _Nearest:
+    return _nearest_limits("growth", (Limit(source, False, alert),))
 
 
 def _nearest_limits(name: str, limits: tuple[Limit, ...]) -> _Nearest:
@@ -244,7 +296,8 @@ def _nearest_limits(name: str, limits: tuple[Limit, ...]) -> _Nearest:
         state="normal",
         bounds=tuple(one.bound() for one in limits if one.source != _TURNED_OUT) if several else (),  # that is no level
     )
-    return _Nearest(alert, danger, fall, normal)
+    high = min((alert and alert.alert) or math.inf, (danger and danger.danger) or math.inf)
+    return _Nearest(alert, danger, fall, normal, (fall and fall.fall) or 0.0, high)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,13 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from models.levels.bands import BandLimits, band_limits
 from models.levels.measures import WindowLevels
 from models.levels.reference import LevelReference, OperatingState, ReferenceLevel
 from models.levels.settings import LevelSettings
+from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity
 from rotorwatch.records.levels import LevelBound
 
@@ -98,13 +101,13 @@ def relative_limits(
 
 
 def _region(channel: Channel, one: ReferenceLevel, centre: complex, alert: float, shorter: float) -> Region:
-    factor = level_per_amplitude(channel)
+    factor = _level_per_amplitude(channel)
     farthest = max(BEYOND_RANGE * one.turned, one.turned + _filling(one, shorter) * one.mean / factor)
     by_chance = ERRORS * one.error * shorter / factor
     return Region(centre, max(_TURNED * abs(centre), farthest, by_chance), alert)
 
 
-def level_per_amplitude(channel: Channel) -> float:
+def _level_per_amplitude(channel: Channel) -> float:
     """Ratio of the level of a line to its amplitude."""
     return 2.0 if channel.quantity in PEAK_TO_PEAK else math.sqrt(0.5)
 
@@ -162,11 +165,14 @@ def alerts_of(
 
 def shown_level(channel: Channel, name: str, value: float) -> float:
     """A level in the unit in which it is shown."""
+    return value / unit_size(channel, name)
+
+
+def unit_size(channel: Channel, name: str) -> float:
+    """Size of that unit, SI."""
     if name in {"crest", "kurtosis"}:
-        return value
-    if name == "velocity":
-        return value * 1e3
-    return value / channel.to_si
+        return 1.0
+    return 1e-3 if name == "velocity" else channel.to_si
 
 
 def unit_of(unit: str, name: str, peak_to_peak: bool) -> str:
@@ -185,3 +191,18 @@ def unit_of(unit: str, name: str, peak_to_peak: bool) -> str:
 def rounded(value: float) -> float:
     """Five digits: no sensor has more."""
     return float(f"{value:.5g}")
+
+
+_POWERS_OF_TEN = np.array([float(f"1e{exponent}") for exponent in range(309)])
+
+
+def all_rounded(values: FloatArray) -> list[list[float | None]]:
+    """The same of an array of two dimensions, in rows; None where a value is not finite."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        digits = 4 - np.floor(np.log10(np.abs(values)))
+        power = _POWERS_OF_TEN[np.where(np.isfinite(digits), np.abs(digits), 0).astype(np.intp)]
+        found = np.where(digits < 0, np.rint(values / power) * power, np.rint(values * power) / power)
+    shown = found.astype(object)
+    shown[~np.isfinite(values)] = None
+    rows: list[list[float | None]] = shown.tolist()
+    return rows

@@ -30,7 +30,6 @@ standard error of 1/(2√(BT)) (J. S. Bendat, A. G. Piersol, "Random Data", 4th 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +40,7 @@ from models.levels.bands import BandLevels, band_edges
 from models.levels.kurtosis import random_kurtosis
 from models.signals.block import FloatArray
 from models.signals.channels import LEAST_APART_DEG, Channel, Quantity, apart_deg
+from models.signals.waveform import Waveform
 
 ORDERS = {"x_half": 0.5, "x1": 1.0, "x2": 2.0, "x3": 3.0}
 """Multiples of running speed, by the name of their measure."""
@@ -48,6 +48,7 @@ COMPARED = ("overall", "velocity", "s_max", "x1", "x2", "high", "envelope")
 """Those that are compared with a reference."""
 
 _SUMS = ("mean", "mean_square", "peak", "peak_to_peak", "fourth", "velocity_square", "high_square", "envelope_square")
+_SQUARES = [1, 5, 6, 7]  # those of which a root is shown
 _HIGH_HZ = 1000.0
 NYQUIST_PART = 0.8
 """Part of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
@@ -207,35 +208,29 @@ class HopLevels:
         )
 
 
-def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | None) -> HopLevels:
+def hop_levels(plan: LevelPlan, waveform: Waveform, deviations: FloatArray, angle_rad: FloatArray | None) -> HopLevels:
     """Take the levels of one hop.
 
     Parameters
     ----------
     plan : LevelPlan
-    samples : ndarray, shape (n_samples, n)
-        SI units.
+    waveform : Waveform
+        Of the plan's columns first; others may follow.
+    deviations : ndarray, shape (n, n_samples)
+        From the mean, SI units, see `waveform_of`.
     angle_rad : ndarray, shape (n_samples,), or None
         Shaft angle, or one that turns with it from an unknown zero.
     """
-    rows = samples.T
-    n, n_samples = rows.shape
-    mean = rows @ _shares(n_samples)
-    deviations = np.subtract(rows, mean[:, None], order="C")
-    low, high = deviations.min(axis=1), deviations.max(axis=1)
-    peak = np.maximum(high, -low)
+    n, n_samples = len(plan.quantities), deviations.shape[1]
+    mean, rms, low, high = (one[:n] for one in (waveform.mean, waveform.rms, waveform.minimum, waveform.maximum))
+    peak = np.maximum(high - mean, mean - low)
     # Single precision is enough for what is left without the mean, and quicker. In parts of the peak: fourth powers of
     # metres would leave its range.
     unit = np.where(peak > 0, peak, 1.0)
-    deviations *= 1 / unit[:, None]
-    x = deviations.astype(np.float32)
+    x = np.multiply(deviations[:n], (1 / unit)[:, None], out=np.empty((n, n_samples), np.float32), casting="same_kind")
     square = x * x
     sums = np.full((len(_SUMS), n), np.nan)
-    sums[0] = mean
-    sums[1] = unit**2 * np.vecdot(x, x) / n_samples
-    sums[2] = peak
-    sums[3] = high - low
-    sums[4] = unit**4 * np.vecdot(square, square) / n_samples
+    sums[:5] = mean, rms**2, peak, high - low, unit**4 * np.vecdot(square, square) / n_samples
     # Strong lines must not leak into the low end of a band, where integration would magnify them.
     taper, scale = _taper(n_samples)
     spectrum = scipy.fft.rfft(x * taper, axis=1)
@@ -248,12 +243,13 @@ def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | Non
     bands = (scale * unit**2)[:, None] * np.add.reduceat(parts[:, : 2 * edges[-1]], 2 * edges[:-1], axis=1)
     radius = []
     for (y, z), skew in zip(plan.pairs, plan.skew, strict=True):
-        larger = float(max(unit[y], unit[z]))
-        first, second = float(unit[y] / larger), float(unit[z] / larger)
-        distance = first**2 * square[y] + second**2 * square[z]
+        larger, smaller = (y, z) if unit[y] >= unit[z] else (z, y)
+        ratio = float(unit[smaller] / unit[larger])
+        distance = ratio**2 * square[smaller]
+        distance += square[larger]
         if skew:
-            distance -= 2 * skew * first * second * x[y] * x[z]
-        radius.append(larger * np.sqrt(float(distance.max()) / (1 - skew**2)))
+            distance -= 2 * skew * ratio * x[y] * x[z]
+        radius.append(unit[larger] * np.sqrt(float(distance.max()) / (1 - skew**2)))
     orders = unit * _orders(x, spectrum, angle_rad)
     return HopLevels(n_samples, sums, orders, np.array(radius), np.ascontiguousarray(bands.T))
 
@@ -272,14 +268,14 @@ def _band_squares(
     first = max(first, 1)
     found = np.full((3, casing.size), np.nan)
     band = parts[:, 2 * first : 2 * last + 2]
+    found[0] = scale * (band @ np.ones(band.shape[1], np.float32))[casing]
     accelerations = plan.columns(Quantity.ACCELERATION)
+    if not accelerations.size:
+        return found
     at = casing.searchsorted(accelerations)
-    found[0] = band.sum(axis=1)[casing]
-    if accelerations.size:
-        omega = 2 * np.pi * step_hz * np.arange(first, first + band.shape[1] // 2)
-        found[0, at] = band[accelerations] @ np.repeat(omega**-2, 2)
-    found[0] *= scale
-    if plan.high_hz is not None and accelerations.size:
+    omega = 2 * np.pi * step_hz * np.arange(first, first + band.shape[1] // 2)
+    found[0, at] = scale * (band[accelerations] @ np.repeat(omega**-2, 2))
+    if plan.high_hz is not None:
         first, last = (round(edge / step_hz) for edge in plan.high_hz)
         high = spectrum[accelerations, first : last + 1]
         found[1, at] = scale * np.sum(np.abs(high) ** 2, axis=1)
@@ -327,15 +323,12 @@ def _orders(x: _SingleArray, spectrum: npt.NDArray[np.complex64], angle_rad: Flo
     half = angle / 2
     half[1:] -= np.pi * np.rint((angle[1:] - angle[:-1]) / (2 * np.pi)).cumsum()
     half = (half - 2 * np.pi * np.rint(half / (2 * np.pi))).astype(tapered.dtype)
+    turning = np.empty((len(ORDERS), half.size), np.result_type(half, np.complex64))  # e^{jkθ}
+    turning[0].real, turning[0].imag = np.cos(half), np.sin(half)
+    for row, first, second in ((1, 0, 0), (2, 1, 1), (3, 2, 1)):
+        np.multiply(turning[first], turning[second], out=turning[row])
     regressors = np.empty((1 + 2 * len(ORDERS), half.size), half.dtype)
-    regressors[0], cos, sin = 1, regressors[1::2], regressors[2::2]
-    np.cos(half, out=cos[0])
-    np.sin(half, out=sin[0])
-    for row, first, second in ((1, 0, 0), (2, 1, 1), (3, 2, 1)):  # cos and sin of a sum of angles
-        both = regressors[2 * first + 1 : 2 * first + 3]
-        by_cos, by_sin = both * cos[second], both * sin[second]
-        np.subtract(by_cos[0], by_sin[1], out=cos[row])
-        np.add(by_cos[1], by_sin[0], out=sin[row])
+    regressors[0], regressors[1::2], regressors[2::2] = 1, turning.real, turning.imag
     try:
         solved = np.linalg.solve(
             every * ((regressors * weights) @ regressors.T).astype(np.float64),
@@ -354,14 +347,6 @@ def _taper(size: int) -> tuple[_SingleArray, float]:
     return taper, 2 / (size * float(taper @ taper))
 
 
-@lru_cache(maxsize=8)
-def _shares(size: int) -> FloatArray:
-    """What makes the mean of so many samples."""
-    shares = np.full(size, 1 / size)
-    shares.flags.writeable = False
-    return shares
-
-
 @dataclass(frozen=True, slots=True)
 class WindowLevels:
     """Levels of one window, SI units.
@@ -371,14 +356,15 @@ class WindowLevels:
     values : dict of str to ndarray, shape (n,)
         By measure; nan where a quantity has none, or the rotation is not known.
     errors : dict of str to ndarray, shape (n,)
-        Standard errors by the scatter of the hops, of the measures that are compared with a reference (`COMPARED`).
+        Standard errors by the scatter of the hops, of the measures that are compared with a reference (`COMPARED`);
+        empty if not asked for.
     vectors : ndarray of complex, shape (4, n), or None
         Mean of q of the hops at the orders, with a phase reference.
     speed_rad_s : float or None
         Mean speed; None where it is not known.
     bands : BandLevels or None
-    random_kurtosis : ndarray, shape (n_hops, n), or None
-        See `models.levels.kurtosis`.
+    moments : tuple of ndarray, or None
+        Of each hop, what `random_kurtosis` is made of.
     """
 
     values: Mapping[str, FloatArray]
@@ -387,11 +373,16 @@ class WindowLevels:
     speed_rad_s: float | None = None
     hops: int = 1
     bands: BandLevels | None = None
-    random_kurtosis: FloatArray | None = None
+    moments: tuple[FloatArray, FloatArray, _ComplexArray] | None = None
+
+    @property
+    def random_kurtosis(self) -> FloatArray | None:
+        """See `models.levels.kurtosis`; shape (n_hops, n)."""
+        return None if self.moments is None else random_kurtosis(*self.moments)
 
 
 def window_levels(
-    plan: LevelPlan, hops: Sequence[HopLevels], speeds_rad_s: FloatArray, *, phase_reference: bool
+    plan: LevelPlan, hops: Sequence[HopLevels], speeds_rad_s: FloatArray, *, phase_reference: bool, errors: bool = True
 ) -> WindowLevels:
     """Levels of the window that hops make.
 
@@ -404,83 +395,95 @@ def window_levels(
         Nan where the rotation is not known.
     phase_reference : bool
         Whether the angle is the shaft's own, so that the vectors of the hops can be added up.
+    errors : bool
+        Whether standard errors are wanted; only what learns a reference needs them.
     """
-    sums = np.stack([hop.sums for hop in hops])
-    count, _, n = sums.shape
-    displacements, accelerations = plan.has(Quantity.DISPLACEMENT, Quantity.TILT), plan.has(Quantity.ACCELERATION)
-    mean = sums[:, 0].mean(axis=0)
-    square = (sums[:, 1] + (sums[:, 0] - mean) ** 2).mean(axis=0)
-    rms, peak = np.sqrt(square), sums[:, 2].max(axis=0)
-    hop_rms, velocity, high, envelope = (np.sqrt(sums[:, row]) for row in (1, 5, 6, 7))
+    count, n = len(hops), len(plan.quantities)
+    sums = np.concatenate([hop.sums for hop in hops]).reshape(count, len(_SUMS), n)
+    in_bands = np.concatenate([hop.bands for hop in hops]).reshape(count, -1, n)
+    every_order = np.concatenate([hop.orders for hop in hops]).reshape(count, len(ORDERS), n)
     s_max = np.full((count, n), np.nan)
-    for number, (y, _) in enumerate(plan.pairs):
-        s_max[:, y] = [hop.radius[number] for hop in hops]
+    s_max[:, [y for y, _ in plan.pairs]] = np.concatenate([hop.radius for hop in hops]).reshape(count, -1)
     turning = np.abs(speeds_rad_s) > _STANDS  # not where it is not known
-    every_order = np.stack([hop.orders for hop in hops])
-    orders = every_order[turning]
-    amplitudes, scatter, vectors = _amplitudes(orders, phase_reference=phase_reference)
+    orders = every_order if turning.all() else every_order[turning]
+    speed_rad_s, vectors, amplitudes = None, None, np.full((len(ORDERS), n), np.nan)
+    if len(orders):
+        speed_rad_s = float(speeds_rad_s[turning].mean())
+        amplitudes = np.sqrt((orders.real**2 + orders.imag**2).mean(axis=0))
+        if phase_reference:
+            vectors = orders.mean(axis=0)
+            amplitudes[1:] = np.abs(vectors[1:])
+    displacements = plan.has(Quantity.DISPLACEMENT, Quantity.TILT)
+    shown = np.where(displacements, 2.0, np.sqrt(0.5))
+    scatter: dict[str, FloatArray] = {}
+    if errors:
+        root = np.sqrt(max(1, count - 1))
+        by_hop = _compared(plan, sums[:, _SQUARES].swapaxes(0, 1), sums[:, 3], s_max)
+        scatter = {name: each.std(axis=0) / root for name, each in by_hop.items()}
+        scatter |= dict(zip(ORDERS, shown * _order_errors(orders, vectors), strict=True))
     measured_1x = amplitudes[1]
-    speed_rad_s = float(speeds_rad_s[turning].mean()) if turning.any() else None
     if plan.runout is not None and vectors is not None and speed_rad_s is not None:
         vectors, amplitudes = vectors.copy(), amplitudes.copy()
         vectors[1] -= plan.runout if speed_rad_s >= 0 else plan.runout.conj()
         amplitudes[1] = np.where(plan.runout == 0, amplitudes[1], np.abs(vectors[1]))
-    shown = np.where(displacements, 2.0, np.sqrt(0.5))
-    by_hop = {
-        "overall": np.where(displacements, sums[:, 3], np.where(accelerations, hop_rms, velocity)),
+    # Peak to peak is a mean of the hops, what is rms that of the whole window.
+    average = sums.mean(axis=0)
+    square = average[1] + ((sums[:, 0] - average[0]) ** 2).mean(axis=0)
+    peak = sums[:, 2].max(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = {
+            **_compared(plan, average[_SQUARES], average[3], s_max.mean(axis=0)),
+            **dict(zip(ORDERS, shown * amplitudes, strict=True)),
+            "peak": peak,
+            "not_x1": np.sqrt(np.maximum(square - measured_1x**2 / 2, 0.0)),
+            "mean": np.where(displacements, average[0], np.nan),
+            "crest": peak / np.sqrt(square),
+            "kurtosis": average[4] / average[1] ** 2,
+        }
+    edges_hz, freedom = _band_grid(plan.rate_hz, hops[0].n_samples, count)
+    bands = BandLevels(
+        edges_hz,
+        np.sqrt(in_bands.mean(axis=0)),
+        np.sqrt(in_bands).std(axis=0) / np.sqrt(max(1, count - 1)) if errors else None,
+        freedom,
+    )
+    moments = sums[:, 1], sums[:, 4], every_order[:, 1:]
+    return WindowLevels(values, scatter, vectors, speed_rad_s, count, bands, moments)
+
+
+def _compared(
+    plan: LevelPlan, mean_squares: FloatArray, peak_to_peak: FloatArray, s_max: FloatArray
+) -> dict[str, FloatArray]:
+    """Levels but for the orders, of a window or of each hop, of those sums that `_SQUARES` are."""
+    accelerations = plan.has(Quantity.ACCELERATION)
+    rms, velocity, high, envelope = np.sqrt(mean_squares)
+    return {
+        "overall": np.where(
+            plan.has(Quantity.DISPLACEMENT, Quantity.TILT), peak_to_peak, np.where(accelerations, rms, velocity)
+        ),
         "velocity": np.where(accelerations, velocity, np.nan),
         "s_max": s_max,
         "high": high,
         "envelope": envelope,
     }
-    # Peak to peak is a mean of the hops, what is rms that of the whole window.
-    rms_of: dict[str, Any] = {
-        "overall": ~displacements,
-        "velocity": True,
-        "s_max": False,
-        "high": True,
-        "envelope": True,
-    }
-    every = np.stack(list(by_hop.values()))
-    means, squares = every.mean(axis=1), (every**2).mean(axis=1)
-    taken = {
-        name: np.where(rms_of[name], np.sqrt(power), level)
-        for name, level, power in zip(by_hop, means, squares, strict=True)
-    }
-    with np.errstate(divide="ignore", invalid="ignore"):
-        values = taken | {
-            **{name: shown * amplitudes[number] for number, name in enumerate(ORDERS)},
-            "peak": peak,
-            "not_x1": np.sqrt(np.maximum(square - measured_1x**2 / 2, 0.0)),
-            "mean": np.where(displacements, mean, np.nan),
-            "crest": peak / rms,
-            "kurtosis": sums[:, 4].mean(axis=0) / sums[:, 1].mean(axis=0) ** 2,
-        }
-    errors = dict(zip(by_hop, every.std(axis=1) / np.sqrt(max(1, count - 1)), strict=True))
-    errors |= {name: shown * scatter[number] for number, name in enumerate(ORDERS) if name in COMPARED}
-    in_bands = np.sqrt(np.stack([hop.bands for hop in hops]))
-    edges = band_edges(hops[0].n_samples, NYQUIST_PART) - 0.5  # halfway between bins
-    bands = BandLevels(
-        np.asarray(edges * (plan.rate_hz / hops[0].n_samples), dtype=np.float64),
-        np.sqrt((in_bands**2).mean(axis=0)),
-        in_bands.std(axis=0) / np.sqrt(max(1, count - 1)),
-        2 * count * np.maximum(1.0, np.diff(edges) / _HANN_BINS),
-    )
-    kurtosis = random_kurtosis(sums[:, 1], sums[:, 4], every_order[:, 1:])
-    return WindowLevels(values, errors, vectors, speed_rad_s, count, bands, kurtosis)
 
 
-def _amplitudes(orders: _ComplexArray, *, phase_reference: bool) -> tuple[FloatArray, FloatArray, _ComplexArray | None]:
-    """Amplitudes at the orders over some hops, their standard errors, and vectors; shape (4, n) each."""
-    count = orders.shape[0]
+def _order_errors(orders: _ComplexArray, vectors: _ComplexArray | None) -> FloatArray:
+    """Standard errors of the amplitudes at the orders, shape (4, n)."""
+    count, *shape = orders.shape
     if not count:
-        nothing = np.full(orders.shape[1:], np.nan)
-        return nothing, nothing, None
-    amplitudes = np.sqrt((np.abs(orders) ** 2).mean(axis=0))
-    scatter = np.abs(orders).std(axis=0) / np.sqrt(max(1, count - 1))
-    if not phase_reference:
-        return amplitudes, scatter, None
-    vectors = orders.mean(axis=0)
-    amplitudes[1:] = np.abs(vectors[1:])
-    scatter[1:] = np.sqrt((np.abs(orders - vectors) ** 2).mean(axis=0)[1:] / max(1, count - 1))
-    return amplitudes, scatter, vectors
+        return np.full(shape, np.nan)
+    scatter = np.abs(orders).std(axis=0)
+    if vectors is not None:
+        scatter[1:] = np.sqrt((np.abs(orders - vectors) ** 2).mean(axis=0)[1:])
+    return np.asarray(scatter / np.sqrt(max(1, count - 1)), dtype=np.float64)
+
+
+@lru_cache(maxsize=64)
+def _band_grid(rate_hz: float, n_samples: int, count: int) -> tuple[FloatArray, FloatArray]:
+    """Edges of the bands, Hz, and degrees of freedom of mean squares in them, of windows of so many hops."""
+    edges = band_edges(n_samples, NYQUIST_PART) - 0.5  # halfway between bins
+    edges_hz = np.asarray(edges * (rate_hz / n_samples), dtype=np.float64)
+    freedom = 2 * count * np.maximum(1.0, np.diff(edges) / _HANN_BINS)
+    edges_hz.flags.writeable = freedom.flags.writeable = False
+    return edges_hz, freedom

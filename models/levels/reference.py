@@ -181,7 +181,7 @@ class FirstWindows:
             return
         self._end_ns = end_ns
         # Only diagnosis needs a healthy kurtosis, and a machine that is diagnosed is commissioned.
-        self._seen.append(replace(levels, random_kurtosis=None))
+        self._seen.append(replace(levels, moments=None))
         if len(self._seen) == self._count:
             self.reference = learn_levels("the first windows", self._channels, self._seen)
             self._seen = []

@@ -14,6 +14,7 @@ from models.levels.measures import hop_levels, window_levels
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from models.signals.recording import RecordedMessage
+from models.signals.waveform import waveform_of
 from models.signals.wire import decode_block
 from service.analysis.revolutions import Excerpt
 from service.monitor.descriptor import descriptor_mismatch
@@ -96,9 +97,8 @@ def _of_samples(machine: MachineFile, blocks: Sequence[SampleBlock], troubles: l
     if plan.levels is None:
         return lines
     vibration = samples[:, : plan.columns.size]
-    found = window_levels(
-        plan.levels, [hop_levels(plan.levels, vibration, angle)], np.array([speed]), phase_reference=angle is not None
-    )
+    hop = hop_levels(plan.levels, *waveform_of(vibration), angle)
+    found = window_levels(plan.levels, [hop], np.array([speed]), phase_reference=angle is not None, errors=False)
     watch = LevelWatch(plan, machine, Installed(machine))
     lines += [f"  {channel.text}" for channel in watch.judged(found)]
     for column, name in enumerate(machine.sensors[at].name for at in plan.columns):

@@ -12,6 +12,7 @@ from models.errors import MachineFileError, RotorwatchError
 from models.levels.measures import ORDERS, hop_levels, level_plan
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
+from models.signals.waveform import waveform_of
 from service.analysis.recorded import Sampled, begins_again
 from service.analysis.revolutions import Excerpt, pulses
 
@@ -54,7 +55,7 @@ def vectors_of(excerpt: Excerpt, channels: Sequence[Channel], revolutions: int) 
         x, angle = si[rows], excerpt.angle_rad[rows]
         if last - first == 1:  # seen twice: in one revolution half an order cannot be told from the others
             x, angle = np.concatenate([x, x[1:]]), np.concatenate([angle, angle[1:]])
-        found.append(hop_levels(plan, x, angle).orders)
+        found.append(hop_levels(plan, *waveform_of(x), angle).orders)
     begin, end = at[edges[:-1]], at[edges[1:]]
     counts = np.diff(edges)
     return Vectors(
@@ -127,7 +128,8 @@ def _estimated(stretch: Excerpt, channels: Sequence[Channel], speed_rad_s: float
     orders, speeds = [], []
     if line is not None and there:
         t_s = np.asarray((np.arange(len(si)) - (len(si) - 1) / 2) / stretch.rate_hz, dtype=np.float64)
-        levels = hop_levels(level_plan(channels, stretch.rate_hz, (0.0, stretch.rate_hz)), si, line.angle(t_s))
+        plan = level_plan(channels, stretch.rate_hz, (0.0, stretch.rate_hz))
+        levels = hop_levels(plan, *waveform_of(si), line.angle(t_s))
         orders, speeds = [levels.orders], [line.speed_rad_s]
     return Vectors(
         np.array([(stretch.start_ns + stretch.end_ns) // 2] * len(speeds), dtype=np.int64),

@@ -62,7 +62,7 @@ class LevelWatch:
 
     def take(self, window: SlidingWindow) -> None:
         """Take the levels of the window as it is after a hop."""
-        found = window.levels()
+        found = window.levels(errors=self._takes_first and self.reference is None)
         if found is None:
             return
         self.latest = self.judged(found)

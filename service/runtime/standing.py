@@ -8,9 +8,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from models.checkpoint import from_bytes, to_bytes
-from models.diagnosis.waveform import Waveform
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import SampleBlock
+from models.signals.waveform import Waveform
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import Health
 from rotorwatch.records.windows import Parameter

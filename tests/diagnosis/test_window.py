@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import Plan, hop_moments, plan_for
-from models.diagnosis.waveform import Waveform, combined_waveform, stacked_waveform, waveform_of
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import load_machine
 from models.signals.block import FloatArray
+from models.signals.waveform import Waveform, combined_waveform, stacked_waveform, waveform_of
 from simulator.scenario import Event, NamedSource, Scenario, Sensors
 from simulator.stream import blocks
 
@@ -230,7 +230,7 @@ def test_plan_of_a_machine_names_its_states_in_the_order_of_the_theory() -> None
 
 def test_waveform_is_its_definition() -> None:
     x = np.array([[0.0, 1, 1, 2, 2, 2, -1, -1, 0, 2], [3.0] * 10, [0.5, 1.5, 0.25, 4, 3, 2, 1, 0, -1, -2]]).T
-    seen = waveform_of(x)
+    seen, _ = waveform_of(x)
     np.testing.assert_allclose(seen.mean, x.mean(axis=0))
     np.testing.assert_allclose(seen.rms, x.std(axis=0))
     np.testing.assert_array_equal(seen.minimum, [-1, 3, -2])
@@ -245,8 +245,8 @@ def test_waveforms_of_hops_make_that_of_the_window() -> None:
     rng = np.random.default_rng(4)
     x = np.round(2 * rng.standard_normal((600, 2)) + [5, -3]) / 2
     x[:, 1] = np.clip(x[:, 1], -4, -2)
-    hops = stacked_waveform([waveform_of(x[start : start + 100]) for start in range(0, 600, 100)])
-    both, whole = combined_waveform(hops), waveform_of(x)
+    hops = stacked_waveform([waveform_of(x[start : start + 100])[0] for start in range(0, 600, 100)])
+    both, whole = combined_waveform(hops), waveform_of(x)[0]
     for name in ("mean", "rms", "minimum", "maximum", "step"):
         np.testing.assert_allclose(getattr(both, name), getattr(whole, name), err_msg=name)
     assert both.n_samples == 600

@@ -11,6 +11,7 @@ from models.levels.reference import FirstWindows, LevelReference, learn_levels
 from models.levels.settings import LevelSettings
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
+from models.signals.waveform import waveform_of
 from rotorwatch.records.levels import ChannelLevels
 
 RATE_HZ, HOP_S, HOPS = 2560.0, 5.0, 4
@@ -23,7 +24,8 @@ T = np.arange(round(HOPS * HOP_S * RATE_HZ)) / RATE_HZ
 
 def window(samples: FloatArray, count: int = HOPS) -> WindowLevels:
     """Of a machine whose speed is not known; of its first hops."""
-    hops: list[HopLevels] = [hop_levels(PLAN, part[:, None], None) for part in np.split(samples, HOPS)[:count]]
+    parts = np.split(samples, HOPS)[:count]
+    hops: list[HopLevels] = [hop_levels(PLAN, *waveform_of(part[:, None]), None) for part in parts]
     return window_levels(PLAN, hops, np.full(count, np.nan), phase_reference=False)
 
 

@@ -12,6 +12,7 @@ from models.levels.gains import GainReference, learn_gains, wrong_gain
 from models.levels.measures import hop_levels, level_plan, window_levels
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
+from models.signals.waveform import waveform_of
 
 RATE_HZ, HOP_S, HOPS = 1000.0, 5.0, 12
 PLACES = ("bearing y", "disc y", "disc z")
@@ -40,7 +41,7 @@ def window(
         force = shared + 0.1 * rng.standard_normal(n)
         columns.append(gain * lfilter([1.0], [1, -2 * root.real, abs(root) ** 2], force))
     samples: FloatArray = 1e-6 * np.column_stack(columns)
-    hops = [hop_levels(PLAN, part, None) for part in np.split(samples, HOPS)]
+    hops = [hop_levels(PLAN, *waveform_of(part), None) for part in np.split(samples, HOPS)]
     found = window_levels(PLAN, hops, np.full(HOPS, np.nan), phase_reference=False).bands
     assert found is not None
     return found

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from models.levels.judgement import LevelJudge, channel_state
+from models.levels.limits import all_rounded
 from models.levels.measures import COMPARED, WindowLevels, level_plan
 from models.levels.reference import FirstWindows, LevelReference, learn_levels
 from models.levels.settings import LevelSettings
@@ -141,6 +142,22 @@ def test_a_1x_vector_that_turns_leaves_its_acceptance_region_at_the_same_size() 
     assert [one.source for one in turned.bounds] == ["commissioned"]
     without_reference_of_phase = judged(SHAFT, replace(window(x1=-10e-6), vectors=None), healthy)
     assert limits(without_reference_of_phase)["x1"].state == "normal"
+
+
+def test_a_vector_out_of_its_region_is_told_whichever_way_its_size_was_rounded() -> None:
+    healthy = reference(*(window(x1=10e-6 * np.exp(1j * turn)) for turn in (-0.05, 0.0, 0.05)), channel=SHAFT)
+    turned = window(x1=-10e-6)
+    for side in (0.0, np.inf):
+        rounded_size = {"x1": np.nextafter(turned.values["x1"], side)}
+        found = limits(judged(SHAFT, replace(turned, values={**turned.values, **rounded_size}), healthy))["x1"]
+        assert (found.state, found.source) == ("alert", "1x vector")
+
+
+def test_levels_are_shown_in_five_digits_as_python_formats_them() -> None:
+    values = np.random.default_rng(20261125).standard_normal((100, 30)) * 10.0 ** np.arange(-14, 16)
+    values[0, :4] = 0.0, np.nan, np.inf, -np.inf
+    shown = [[float(f"{one:.5g}") if np.isfinite(one) else None for one in row] for row in values.tolist()]
+    assert all_rounded(values) == shown
 
 
 def test_every_operating_state_has_levels_of_its_own() -> None:

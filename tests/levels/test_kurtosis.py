@@ -7,6 +7,7 @@ from models.levels.kurtosis import KurtosisReference, departure, learn_kurtosis
 from models.levels.measures import LevelPlan, WindowLevels, hop_levels, level_plan, window_levels
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
+from models.signals.waveform import waveform_of
 
 RATE_HZ, HOP_S, HOPS = 1000.0, 5.0, 12
 Y = Channel.model_validate(
@@ -24,7 +25,7 @@ def noise(seed: int) -> FloatArray:
 def window(samples: FloatArray, *, turning: bool = True) -> WindowLevels:
     angles = np.split(THETA, HOPS) if turning else [None] * HOPS
     hops = [
-        hop_levels(PLAN, 1e-6 * part[:, None], angle)
+        hop_levels(PLAN, *waveform_of(1e-6 * part[:, None]), angle)
         for part, angle in zip(np.split(samples, HOPS), angles, strict=True)
     ]
     speed = 2 * np.pi * 23.0 if turning else np.nan

@@ -6,6 +6,7 @@ import pytest
 from models.levels.measures import LevelPlan, WindowLevels, hop_levels, level_plan, window_levels
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity
+from models.signals.waveform import waveform_of
 
 RATE_HZ = 25_600.0
 
@@ -34,7 +35,7 @@ def taken(
     """Levels of a window of equal hops."""
     pieces = np.split(samples, hops)
     angles = [None] * hops if angle_rad is None else np.split(angle_rad, hops)
-    found = [hop_levels(sizes, piece, angle) for piece, angle in zip(pieces, angles, strict=True)]
+    found = [hop_levels(sizes, *waveform_of(piece), angle) for piece, angle in zip(pieces, angles, strict=True)]
     speed = np.nan if angle_rad is None else float(np.diff(np.unwrap(angle_rad)).mean() * sizes.rate_hz)
     return window_levels(sizes, found, np.full(hops, speed), phase_reference=phase)
 
@@ -118,7 +119,7 @@ def test_orders_are_those_of_a_fit_to_every_sample(n_samples: int, turns_hz: tup
     taper = np.hanning(n_samples + 1)[:-1]
     exact = np.linalg.solve((regressors * taper) @ regressors.T, (regressors * taper) @ x)
     sizes = plan("displacement", "displacement", rate_hz=rate_hz)
-    found = hop_levels(sizes, x, np.mod(theta, 2 * np.pi)).orders
+    found = hop_levels(sizes, *waveform_of(x), np.mod(theta, 2 * np.pi)).orders
     error = np.sqrt(1.5 * 2 / n_samples)  # of a vector's parts, Hann's taper and noise of one
     assert np.abs(found - (exact[1::2] - 1j * exact[2::2]))[1:] == pytest.approx(0, abs=0.02 * error)
 
@@ -146,7 +147,7 @@ def test_an_angle_that_jumps_and_stands_between_ends_like_any_other(slope: float
     n_samples = 10_000
     angle = slope * np.arange(n_samples) + 4.0 * (np.arange(n_samples) // 100)
     x = np.random.default_rng(98).standard_normal((n_samples, 1))
-    found = hop_levels(plan("displacement", rate_hz=2000.0), x, angle)
+    found = hop_levels(plan("displacement", rate_hz=2000.0), *waveform_of(x), angle)
     assert np.isfinite(found.sums[0]).all()
 
 
@@ -184,7 +185,7 @@ def test_a_band_ends_where_the_sampling_rate_ends_it() -> None:
 def test_a_hop_goes_into_arrays_and_comes_back() -> None:
     sizes = plan("acceleration", "displacement")
     x = np.random.default_rng(86).standard_normal((12_800, 2))
-    hop = hop_levels(sizes, x, 2 * np.pi * 25 * times(0.5))
+    hop = hop_levels(sizes, *waveform_of(x), 2 * np.pi * 25 * times(0.5))
     again = type(hop).restored(hop.checkpoint())
     np.testing.assert_array_equal(again.sums, hop.sums)
     np.testing.assert_array_equal(again.orders, hop.orders)
@@ -215,9 +216,10 @@ def test_whatever_the_size_of_a_vibration_its_levels_have_all_their_digits(size:
     seen = np.column_stack([3 * np.cos(theta), 2 * np.sin(theta + 0.4)])
     probes = [channel("displacement", way, "disc") for way in "yz"]
     sizes = level_plan(probes, 2000.0, (10.0, 1000.0))
-    one, scaled = (hop_levels(sizes, scale * seen, theta) for scale in (1.0, size))
+    one, scaled = (hop_levels(sizes, *waveform_of(scale * seen), theta) for scale in (1.0, size))
     assert scaled.orders[1] == pytest.approx(size * one.orders[1], rel=1e-6)
     assert scaled.radius == pytest.approx(size * one.radius, rel=1e-6)
     assert scaled.sums[1:5] == pytest.approx(size ** np.array([[2], [1], [1], [4]]) * one.sums[1:5], rel=1e-6)
     with np.errstate(over="ignore"):  # nobody's vibration, but somebody's stream
-        assert hop_levels(sizes, 1e200 * seen, theta).radius == pytest.approx(1e200 * one.radius, rel=1e-6)
+        largest = hop_levels(sizes, *waveform_of(1e200 * seen), theta)
+        assert largest.radius == pytest.approx(1e200 * one.radius, rel=1e-6)

@@ -2,13 +2,13 @@
 
 from collections.abc import Iterable
 
+from models.diagnosis.motion import motion_pairs
 from models.diagnosis.sensors.disagreement import BROKEN, gain_and_delay, suspect_pairs, swapped
 from models.diagnosis.sensors.kinematics import PairReading, banded, read_pair
 from models.diagnosis.sensors.level import clipped, gain_jump, offset, stuck
 from models.diagnosis.sensors.noise import noisy
 from models.diagnosis.sensors.phase import phase_faults
 from models.diagnosis.sensors.reference import Naming, SensorReference, implicated
-from models.diagnosis.waveform import motion_pairs
 from models.diagnosis.window import WindowStatistics
 from models.signals.channels import Channel
 from rotorwatch.records.sensor_faults import FaultKind

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.waveform import MotionPair, motion_pairs, pair_bands
+from models.diagnosis.motion import MotionPair, motion_pairs, pair_bands
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 

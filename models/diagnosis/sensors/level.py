@@ -10,8 +10,8 @@ import re
 
 import numpy as np
 
+from models.diagnosis.motion import motion_pairs
 from models.diagnosis.sensors.reference import Naming, SensorReference
-from models.diagnosis.waveform import motion_pairs
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind

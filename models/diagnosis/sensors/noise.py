@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from models.diagnosis.motion import MotionPair
 from models.diagnosis.sensors.kinematics import Banded, PairReading
 from models.diagnosis.sensors.reference import (
     ChannelNoise,
@@ -23,7 +24,6 @@ from models.diagnosis.sensors.reference import (
     pair_noise,
     single,
 )
-from models.diagnosis.waveform import MotionPair
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind

@@ -14,8 +14,8 @@ import numpy as np
 from pydantic import BaseModel, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from models.diagnosis.moments import ComplexArray
+from models.diagnosis.motion import MotionPair, motion_pairs, pair_bands
 from models.diagnosis.sensors.kinematics import Banded, PairReading, banded, read_pair, same
-from models.diagnosis.waveform import MotionPair, motion_pairs, pair_bands
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray

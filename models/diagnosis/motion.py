@@ -1,0 +1,82 @@
+"""Two channels of one motion, before anything is averaged.
+
+What holds between displacement, velocity and acceleration of one motion is kinematics, not the machine: v = jωx. Per
+hop the powers and the cross-power of jωx and v are kept in a few bands, so that a gain or a delay that drifts shows
+within a window.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from models.signals.block import FloatArray
+
+N_BANDS = 24  # bands in which the powers of a hop are kept
+_ComplexArray = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class MotionPair:
+    """Two columns that measure one motion."""
+
+    # Column of the motion and of its derivative.
+    first: int
+    second: int
+    order: int  # 1 for the first derivative, 2 for the second
+
+
+def motion_pairs(states: tuple[str, ...]) -> tuple[MotionPair, ...]:
+    """Pairs among measured states.
+
+    Examples
+    --------
+    >>> motion_pairs(("y1", "y2", "y1_dot"))
+    (MotionPair(first=0, second=2, order=1),)
+    >>> motion_pairs(("y1", "y1_ddot"))
+    (MotionPair(first=0, second=1, order=2),)
+    """
+    column = {name: number for number, name in enumerate(states)}
+    pairs = []
+    for name in states:
+        if name.endswith(("_dot", "_ddot")):
+            continue
+        places = [column.get(name + end) for end in ("", "_dot", "_ddot")]
+        there = [(order, place) for order, place in enumerate(places) if place is not None]
+        pairs += [MotionPair(a, b, j - i) for (i, a), (j, b) in pairwise(there)]
+    pairs += [
+        MotionPair(at, column[name.replace("_dot", "_ddot")], 1)
+        for name, at in column.items()
+        if name.endswith("_dot") and name[: -len("_dot")] not in column and name.replace("_dot", "_ddot") in column
+    ]
+    return tuple(pairs)
+
+
+def pair_bands(n_bins: int) -> npt.NDArray[np.intp]:
+    """First bin of each band; shape (n_bands,)."""
+    return np.unique(np.linspace(0, n_bins, min(N_BANDS, n_bins), endpoint=False).astype(np.intp))
+
+
+def pair_powers(segments: _ComplexArray, frequencies_hz: FloatArray, pairs: tuple[MotionPair, ...]) -> _ComplexArray:
+    """Sum powers over segments and the bins of each band.
+
+    Parameters
+    ----------
+    segments : ndarray, shape (n_segments, n_bins, n)
+        Fourier coefficients.
+    frequencies_hz : ndarray, shape (n_bins,)
+
+    Returns
+    -------
+    ndarray, shape (n_pairs, n_bands, 3)
+        With z = (jω)ᵒʳᵈᵉʳ x: Σ|z|², Σ z* v, Σ|v|².
+    """
+    edges = pair_bands(frequencies_hz.size)
+    powers = np.zeros((len(pairs), edges.size, 3), dtype=np.complex128)
+    jw = 2j * np.pi * frequencies_hz
+    for number, pair in enumerate(pairs):
+        z, v = segments[:, :, pair.first] * jw**pair.order, segments[:, :, pair.second]
+        for column, product in enumerate((z.conj() * z, z.conj() * v, v.conj() * v)):
+            powers[number, :, column] = np.add.reduceat(product.sum(axis=0), edges)
+    return powers
