@@ -104,6 +104,7 @@ class Plant:
     sent_s: dict[tuple[str, int], float] = field(default_factory=dict)  # of every block, by its number
     heard: list[tuple[float, float]] = field(default_factory=list)  # when, and how late
     windows: dict[str, list[tuple[float, int]]] = field(default_factory=lambda: defaultdict(list))  # when, and end
+    skipped: list[bool] = field(default_factory=list)  # whether each report is of a window that was not evaluated
     told_bytes: int = 0
     behind_s: float = 0.0
 
@@ -113,6 +114,7 @@ class Plant:
         report = json.loads(payload)
         self.told_bytes += len(payload)
         last = -(-(report["end_ns"] - self.start_ns) // round(BLOCK_S * 1e9)) - 1
+        self.skipped.append(report.get("skipped", False))
         self.heard.append((now_s, now_s - self.sent_s[report["machine"], last]))
         self.windows[report["machine"]].append((now_s, report["end_ns"] - self.start_ns))
 
@@ -249,7 +251,7 @@ def measure(kind: MachineKind, count: int, seed: int, length_s: float, stall_s: 
                 late = np.array([one for _, one in plant.heard[first:]])
                 told_bytes, memory_mb = plant.told_bytes - told_bytes, process.memory_mb()
                 now = held_bytes(folder / "history.sqlite")
-                (missing, missing_s, raised), skipped = lost(url, machines), _skipped(plant)
+                (missing, missing_s, raised), untold = lost(url, machines), _untold(plant)
     expected = count * took_s / window.hop_s
     reports, report_bytes, readings_bytes = (last - first for last, first in zip(now, held, strict=True))
     figures = Figures(
@@ -269,16 +271,18 @@ def measure(kind: MachineKind, count: int, seed: int, length_s: float, stall_s: 
         f"{memory_mb:.0f} MB ({idle_mb:.0f} before data), "
         f"{figures.written_kb:.0f} kB written a hop, "
         f"{figures.reports_kb + figures.readings_kb:.1f} kept; "
-        f"{late.size} reports of {expected:.0f}, late by {np.median(late):.2f} s (median), "
+        f"{late.size} reports of {expected:.0f}, {sum(plant.skipped[first:])} of them skipped, "
+        f"late by {np.median(late):.2f} s (median), "
         f"{np.quantile(late, 0.99):.2f} (99 %), {late.max():.2f} (most); {missing} blocks lost; "
         f"this process {(time.process_time() - before[2]) / took_s:.2f} cores, {plant.behind_s:.2f} s behind",
         flush=True,
     )
+    for alarm, where in sorted(raised.items()):
+        print(f"     {alarm} raised {len(where)} times, of {len(set(where))} machines", flush=True)
     if again_s is not None:
-        alarms = "; ".join(f"{name} of {', '.join(where)}" for name, where in sorted(raised.items())) or "none"
         print(
             f"     after {stall_s:g} s without a processor, reports were in time again after {again_s:.1f} s; "
-            f"{missing_s:.1f} s of data missing, {skipped} hops without a report; alarms raised: {alarms}",
+            f"{missing_s:.1f} s of data missing, {untold} hops without a report",
             flush=True,
         )
     return figures
@@ -302,7 +306,7 @@ def _stalled(process: Process, plant: Plant, stall_s: float, most_s: float, *, o
     return max((at_s - again_s for at_s, late_s in plant.heard if at_s > again_s and late_s > IN_TIME_S), default=0.0)
 
 
-def _skipped(plant: Plant) -> int:
+def _untold(plant: Plant) -> int:
     """Hops between the first and the latest report of a machine that no report is about."""
     hop_ns = round(plant.machines[0].window.hop_s * 1e9)
     ends = ({end_ns for _, end_ns in found} for found in plant.windows.values())

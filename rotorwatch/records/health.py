@@ -86,6 +86,13 @@ class Report(OfMachine):
         description="where the state is unchanged or watching: what growth of the levels would have raised an alert",
         examples=[None],
     )
+    skipped: bool = Field(
+        default=False,
+        exclude_if=lambda value: not value,
+        description="true where the window was not evaluated because the monitor could not keep up, and only its "
+        "levels and sensors were judged; left out otherwise",
+        examples=[False],
+    )
     reason: Reason = ""
     bundle: BundleIdentity
     machine_hash: MachineHash
@@ -113,6 +120,9 @@ class Quality(Record):
     missing_s: float = Field(default=0.0, description="data time the gaps cost", examples=[0.3])
     queue_dropped_blocks: int = Field(
         default=0, description="blocks dropped because the monitor could not keep up", examples=[0]
+    )
+    skipped_windows: int = Field(
+        default=0, description="windows not evaluated because the monitor could not keep up", examples=[0]
     )
     link_missed_blocks: int = Field(
         default=0, description="blocks lost on the way, as far as the link knows", examples=[0]

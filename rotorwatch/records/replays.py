@@ -39,6 +39,9 @@ class OfflineSummary(Record):
     )
     machine_hash: str = Field(description="changes with the machine file's content", examples=["9a0c41d27be8"])
     windows: int = Field(description="window reports", examples=[119])
+    skipped_windows: int = Field(
+        default=0, description="windows not evaluated, as by the monitor when they were recorded", examples=[0]
+    )
     alarms: int = Field(description="alarm events", examples=[1])
     raised: tuple[str, ...] = Field(description="alarms raised at the end", examples=[["k_by"]])
     blocks: int = Field(description="blocks accepted", examples=[6000])

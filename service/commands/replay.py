@@ -317,6 +317,8 @@ def summary_lines(summary: "OfflineSummary") -> list[str]:
         f"{summary.blocks} blocks accepted, refused: {refused or 'none'}"
         + (f"; latest reason: {summary.last_refusal}" if refused else ""),
     ]
+    if summary.skipped_windows:
+        lines.append(f"{summary.skipped_windows} windows not evaluated, as by the monitor that could not keep up")
     if summary.gaps:
         lines.append(f"{summary.gaps} gaps, {summary.missing_s:.1f} s missing")
     if summary.stopped:

@@ -11,7 +11,7 @@ into another one, which goes on as if nothing had happened.
 """
 
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +33,7 @@ from models.ingest import Admission, Gate, Reason
 from models.levels.judgement import growth_seen
 from models.signals.block import NewestBlocks, SampleBlock
 from models.signals.wire import decode_block
-from rotorwatch.records.alarms import Evidence, Severity
+from rotorwatch.records.alarms import Evidence
 from rotorwatch.records.health import HealthState, Quality, Report
 from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import AlarmBook
@@ -46,6 +46,7 @@ from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, 
 
 _RPM = 30 / np.pi
 _NEWEST_SAMPLES = 20_000
+_SKIPPED = "not evaluated: this computer cannot keep up; levels and sensors were judged"
 _ONLY_LEVELS = {HealthState.UNCHANGED, HealthState.WATCHING}
 """States in which little is claimed, and what would have been seen has to be said."""
 
@@ -53,16 +54,23 @@ _ONLY_LEVELS = {HealthState.UNCHANGED, HealthState.WATCHING}
 class MachineMonitor:
     """Monitors one machine.
 
+    Parameters
+    ----------
+    skips : callable
+        Takes the end of a hop and says whether its window is not to be evaluated: live, because the computer cannot
+        keep up; in a replay, because the live monitor did not.
+
     Attributes
     ----------
     used : bool
         Whether the latest message was itself used at once, and not one that waited for it.
     """
 
-    def __init__(self, installed: Installed) -> None:
+    def __init__(self, installed: Installed, skips: Callable[[int], bool] = lambda _: False) -> None:
         self.machine = machine = installed.machine
         self._name = f"{machine.site}/{machine.name}"
         self.identity = identity_of(installed)
+        self._skips = skips
         self._evaluator = evaluator_for(installed)
         self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
         self._watching = installed.watching
@@ -84,10 +92,9 @@ class MachineMonitor:
         self._end_ns: int | None = None
         self._reached_ns: int | None = None
         self._kept_is_valid = True
-        self._not_recalled = 0
+        self._not_recalled = self._dropped = 0
         self._held: list[tuple[bytes, bytes, str]] = []
         self._drops: dict[tuple[int, int], int] = {}
-        self._dropped = 0
         self._fault = ""
         self._defect: Exception | None = None
         self._statistics: WindowStatistics | None = None
@@ -360,9 +367,8 @@ class MachineMonitor:
     def health(self) -> MachineHealth:
         """Where the machine stands now."""
         # What operators did since the latest window counts at once.
-        state = self._state(HealthState.NOT_EVALUABLE if self._fault else self._calm)
         return MachineHealth(
-            state,
+            self._state(HealthState.NOT_EVALUABLE if self._fault else self._calm),
             self._window.filled,
             self._latest,
             self._alarms.alarms,
@@ -397,18 +403,22 @@ class MachineMonitor:
     def _evaluate(self, end_ns: int) -> Report:
         """Evaluate the window as it is after a completed hop; a defect is a reason why it cannot be."""
         self._fault = ""
+        skipped = self._skips(end_ns) and self._window.filled == 1
         try:
-            report = self._evaluated(end_ns)
+            report = self._evaluated(end_ns, skipped=skipped)
         except Exception as error:
             self._failed(error, end_ns)
             state = self._state(HealthState.NOT_EVALUABLE)
             report = Report(**self._window_now(end_ns, end_ns, state), reason=self._fault)
+        if skipped:
+            report, count = report.model_copy(update={"skipped": True}), self._quality.skipped_windows + 1
+            self._quality = self._quality.model_copy(update={"skipped_windows": count})
         self._latest = report
         self._alarms.suppress(None, end_ns)
         return report
 
-    def _evaluated(self, end_ns: int) -> Report:
-        self._data_path.hop(end_ns)
+    def _evaluated(self, end_ns: int, *, skipped: bool) -> Report:
+        self._data_path.hop(end_ns, skipped=skipped)
         self._data_path.conflict(self._senders.conflict, end_ns)
         self._levels.take(self._window)
         statistics = self._statistics = self._window.statistics()
@@ -419,29 +429,28 @@ class MachineMonitor:
         self._alarms.suppress(float(speed_rad_s * _RPM) if np.isfinite(speed_rad_s) else None, end_ns)
         findings = sensor_findings(statistics, self._sensors, self.machine.sensors)
         self._data_path.sensors(findings, statistics)
-        faulty = implicated(findings)
+        start_ns, faulty = statistics.start_ns, implicated(findings)
+
+        def unread(state: HealthState, reason: str, *, explained: bool = False) -> Report:
+            """Of the levels and the sensors alone."""
+            self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=explained)
+            return Report(**self._window_now(start_ns, end_ns, self._state(state)), sensors=findings, reason=reason)
+
         # A fault of a channel elsewhere says nothing of the equations, but it is all there is where they are none.
         if findings and (not self._plan.states or faulty - set(self._plan.others)):
-            self._levels.tell(self._alarms, end_ns, faulty=faulty)
-            state = self._state(HealthState.DATA_HEALTH)
-            return Report(
-                **self._window_now(statistics.start_ns, end_ns, state),
-                sensors=findings,
-                reason="; ".join(each.text for each in findings),
-            )
-        short = {hops: self._window.statistics(hops) for hops in self._test.wanted()}
-        present = {hops: latest for hops, latest in short.items() if latest is not None}
+            return unread(HealthState.DATA_HEALTH, "; ".join(each.text for each in findings))
+        if skipped:
+            return unread(HealthState.NOT_EVALUABLE, _SKIPPED, explained=bool(self._test.state.findings))
+        present = {hops: one for hops in self._test.wanted() if (one := self._window.statistics(hops)) is not None}
         try:
             evaluation = self._evaluator.evaluate(statistics, present)
         except EstimationError as error:
-            self._levels.tell(self._alarms, end_ns, faulty=faulty)
-            state = self._state(HealthState.WATCHING if self._watching else HealthState.NOT_EVALUABLE)
-            return Report(**self._window_now(statistics.start_ns, end_ns, state), sensors=findings, reason=str(error))
+            return unread(HealthState.WATCHING if self._watching else HealthState.NOT_EVALUABLE, str(error))
         foreign = self._levels.foreign(self._window, statistics, named=bool(self._test.state.findings))
         evaluation = evaluation.named(self.machine.sensors, foreign)
         looks = {hops: stretch_of(short, present[hops].start_ns, end_ns) for hops, short in evaluation.short.items()}
         whole = self._test.settings.window_hops
-        looks[whole] = stretch_of(evaluation.deciding, statistics.start_ns, end_ns)
+        looks[whole] = stretch_of(evaluation.deciding, start_ns, end_ns)
         verdict = self._test.update(looks, foreign=foreign != "")
         self._alarms.found(verdict, self._test.unexplained, evaluation.deciding.suspect, end_ns)
         explained = bool(verdict.changed) and not verdict.outside_model
@@ -451,14 +460,14 @@ class MachineMonitor:
         if not unexplained and not evaluation.deciding.evaluable:
             reason = evaluation.why_nothing
         if evaluation.shapes:
-            changed = evaluation.unlike_healthy
-            evidence = Evidence(start_ns=statistics.start_ns, end_ns=end_ns)
+            changed, evidence = evaluation.unlike_healthy, Evidence(start_ns=start_ns, end_ns=end_ns)
             self._alarms.update_state(SHAPE, changed != "", end_ns, changed, evidence=evidence)
+        look, length_s = looks[whole].complete(), self.machine.window.length_s
         calm = evaluation.calm(outside=verdict.outside_model)
         if not self._plan.states and self._levels.reference is not None:
             calm, reason = HealthState.UNCHANGED, ""
         return Report(
-            **self._window_now(statistics.start_ns, end_ns, self._state(calm)),
+            **self._window_now(start_ns, end_ns, self._state(calm)),
             speed_rad_s=evaluation.speed_rad_s,
             parameters=evaluation.readings,
             equations=evaluation.equations,
@@ -467,11 +476,7 @@ class MachineMonitor:
             suspect=evaluation.deciding.suspect if verdict.outside_model and not unexplained else "",
             verdict=verdict,
             sensors=findings,
-            detectable=()
-            if unexplained
-            else detectable_changes(
-                looks[whole].complete(), self._test.thresholds(whole), self.machine.window.length_s
-            ),
+            detectable=() if unexplained else detectable_changes(look, self._test.thresholds(whole), length_s),
             reason=reason,
             shapes=evaluation.shapes,
         )
@@ -491,10 +496,5 @@ class MachineMonitor:
     def _state(self, otherwise: HealthState) -> HealthState:
         """A raised alarm outranks warming and not-evaluable: missing data clears nothing."""
         self._calm = otherwise
-        match self._alarms.severity:
-            case Severity.DANGER:
-                return HealthState.DANGER
-            case Severity.ALERT:
-                return HealthState.ALERT
-            case None:
-                return otherwise
+        severity = self._alarms.severity
+        return otherwise if severity is None else HealthState[severity.name]

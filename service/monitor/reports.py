@@ -106,7 +106,7 @@ class MachineHealth:
 class Tally:
     """What a worker has done since it started, for whoever measures the service."""
 
-    # Windows evaluated, blocks taken.
+    # Windows evaluated, those that were skipped left out; blocks taken.
     windows: int = 0
     blocks: int = 0
     step_s: float = 0.0  # time spent in the monitor altogether

@@ -5,10 +5,9 @@ anything published.
 """
 
 import threading
-import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from models.commissioning.commissioned import Installed
 from models.signals.recording import RecordedMessage
@@ -30,10 +29,12 @@ from service.monitor.reports import MachineHealth, MonitorReport, Tally, identit
 from service.recordings.recorder import MachineRecorder
 from service.settings.service import QueueSettings
 from service.stream.checkpoints import StepWriter, recorded_after, recorded_since_ns, restored
+from service.stream.clocks import COMPUTER, Clocks
 from service.stream.inbox import Inbox, RawBlock
 from service.stream.liveness import Pulse
 from service.stream.monitored import MachineStatus
 from service.stream.outlet import Outlet
+from service.stream.shedding import LoadShedding
 from service.terminal.logs import Limiter, logger
 
 _OPERATION_S = 10.0
@@ -41,14 +42,6 @@ _HELD_UP_S = 2.0
 """Time passes in steps of a fraction of this; if not, the program itself stood still."""
 _LATEST = 100
 _LONGEST_ERROR = 500
-
-
-@dataclass(frozen=True, slots=True)
-class Clocks:
-    """The computer's clocks; a test puts others in."""
-
-    monotonic_s: Callable[[], float] = time.monotonic  # seconds that only pass
-    utc_ns: Callable[[], int] = time.time_ns  # time of day
 
 
 class MachineWorker:
@@ -77,7 +70,7 @@ class MachineWorker:
         installed: Installed,
         queue: QueueSettings,
         history: MachineStore,
-        clocks: Clocks = Clocks(),  # immutable
+        clocks: Clocks = COMPUTER,
         on_events: Callable[[], None] = lambda: None,
         recorded: Callable[[int], Iterable[RecordedMessage]] = lambda _: (),
     ) -> None:
@@ -104,8 +97,9 @@ class MachineWorker:
         self._limiter = Limiter(clocks.monotonic_s)
         self.steps = StepWriter(history, self.identity)
         self._unpublished: tuple[StoredEvent, ...] = ()
-        self._asleep_s = 0.0
-        self._unevaluated_s = 0.0
+        self._asleep_s = self._unevaluated_s = 0.0
+        self._shedding: LoadShedding | None = None
+        self._sheds = queue.when_full == "drop" and not installed.watching
         self._monitor, self.restart = self._restored(installed)
         self._snapshot: MachineHealth = self._monitor.health()
         self._latest_data_s: float | None = None
@@ -127,11 +121,11 @@ class MachineWorker:
         last = self.history.last_sequence()
         checkpoint = self.history.restore()
         if checkpoint is None:
-            monitor = MachineMonitor(installed)
+            monitor = MachineMonitor(installed, self._skips)
             if last >= 0:
                 monitor.restore_alarms(NO_ALARMS, last + 1)
             return monitor, ""
-        monitor, text = restored(lambda: MachineMonitor(installed), self.identity, checkpoint, last + 1)
+        monitor, text = restored(lambda: MachineMonitor(installed, self._skips), self.identity, checkpoint, last + 1)
         self.steps.keeps(tuple(name for name, _ in checkpoint.parts))
         self.history.go_on_from(monitor.next_sequence - 1)
         self._asleep_s = max(0.0, (self._clocks.utc_ns() - checkpoint.head.recorded_ns) / 1e9)
@@ -344,6 +338,10 @@ class MachineWorker:
                 return  # publishers get as long to be heard again, after a restart too
         self._conclude((), self._monitor.passed(self._data_now_ns()))
 
+    def _skips(self, _: int) -> bool:
+        shedding, to_hop = self._shedding, self._monitor.blocks_to_hop
+        return shedding is not None and shedding.skips(len(self.inbox), to_hop, self._clocks.monotonic_s())
+
     def _catch_up(self, since_ns: int) -> None:
         """Take from the recording what the window lacks, and what came after the latest step that was committed."""
         for message in recorded_after(self._monitor, self._recorded(since_ns)):
@@ -358,6 +356,7 @@ class MachineWorker:
                 self._catch_up(self._recorded_since_ns)
         except Exception as error:  # what it brought to light must not end the monitoring of the machine
             self._failed(error)
+        self._shedding = LoadShedding() if self._sheds else None  # what was recorded has been evaluated
         while (item := self.inbox.get(self._monitor.blocks_to_hop)) is not None:
             try:
                 if isinstance(item, RawBlock):
@@ -452,7 +451,9 @@ class MachineWorker:
             self._warn("history", "the history cannot be written; what happened waits in memory and is published")
         tally = self.tally
         self.tally = replace(
-            tally, windows=tally.windows + len(windows), commit_s=tally.commit_s + self._clocks.monotonic_s() - begin_s
+            tally,
+            windows=tally.windows + sum(not one.skipped for one in windows),
+            commit_s=tally.commit_s + self._clocks.monotonic_s() - begin_s,
         )
         return reports, told
 

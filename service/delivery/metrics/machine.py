@@ -128,6 +128,8 @@ _FAMILIES = (
     _Family("gauge", "window_filled_ratio", "Fraction of a full window that is there",
             _one(lambda machine: machine.health.filled)),
     _Family("counter", "windows_total", "Windows evaluated", _one(lambda machine: machine.status.tally.windows)),
+    _Family("counter", "windows_skipped_total", "Windows not evaluated because the monitor could not keep up",
+            _one(lambda machine: machine.health.quality.skipped_windows)),
     _Family("counter", "commit_seconds_total", "Time spent waiting for the history",
             _one(lambda machine: machine.status.tally.commit_s)),
     _Family("gauge", "history_waiting_steps", "Steps that are not in the history yet",

@@ -18,7 +18,8 @@ class DataPathAlarms:
         self._gap_s = machine.alarms.gap_s
         self._silence_s = machine.ingest.no_data_after_s
         self._silence_ns = round(self._silence_s * 1e9)
-        self._unseen_blocks, self._unseen_s = 0, 0.0
+        self._hop_ns = round(machine.window.hop_s * 1e9)
+        self._unseen_windows, self._unseen_blocks, self._unseen_s = 0, 0, 0.0
 
     def accepted(self, verdict: Admission, start_ns: int, dropped: int) -> None:
         """A block was accepted.
@@ -36,7 +37,7 @@ class DataPathAlarms:
             self._lost(before_ns)
         book.update_state(STREAM_LOST, False, self._found_again_ns(start_ns), at_once=True)
         if overloaded:
-            note = self._unseen(dropped, verdict.gap_s)
+            note = self._unseen(blocks=dropped, gap_s=verdict.gap_s)
             book.update_state(OVERLOADED, True, start_ns, note, evidence=missing, at_once=True)
         elif verdict.gap_s > 0 and verdict.gap_s >= self._gap_s:
             book.update_state(GAP, True, start_ns, verdict.text, evidence=missing, at_once=True)
@@ -53,10 +54,20 @@ class DataPathAlarms:
         """Publishers contradict each other, or do not; `text` says which."""
         self._book.update_state(CONFLICT, bool(text), time_ns, text, at_once=at_once)
 
-    def hop(self, end_ns: int) -> None:
-        """A hop is complete, without a gap: what could have spoiled it is over, unless it is found again."""
-        for name in (GAP, CLOCK, FAULT, OVERLOADED):
+    def hop(self, end_ns: int, *, skipped: bool) -> None:
+        """A hop is complete, without a gap: what could have spoiled it is over, unless it is found again.
+
+        Parameters
+        ----------
+        skipped : bool
+            Whether its window is not evaluated, because the monitor cannot keep up.
+        """
+        for name in (GAP, CLOCK) if skipped else (GAP, CLOCK, FAULT, OVERLOADED):
             self._book.update_state(name, False, end_ns)
+        if skipped:
+            evidence = Evidence(start_ns=end_ns - self._hop_ns, end_ns=end_ns)
+            note = self._unseen(windows=1)
+            self._book.update_state(OVERLOADED, True, end_ns, note, evidence=evidence, at_once=True)
 
     def sensors(self, findings: tuple[SensorFault, ...], statistics: WindowStatistics) -> None:
         """One alarm for each kind of fault, with a sentence for each channel it is found in."""
@@ -74,15 +85,16 @@ class DataPathAlarms:
         """The monitor itself is at fault; that is over once a hop has been evaluated for the off-delay."""
         self._book.update_state(FAULT, True, time_ns, what, at_once=True)
 
-    def _unseen(self, blocks: int, gap_s: float) -> str:
-        """What has not been evaluated since the alarm on it was raised, with what was dropped just now."""
+    def _unseen(self, *, windows: int = 0, blocks: int = 0, gap_s: float = 0.0) -> str:
+        """What has not been evaluated since the alarm on it was raised, with what is added just now."""
         if not self._book.present(OVERLOADED):
-            self._unseen_blocks, self._unseen_s = 0, 0.0
+            self._unseen_windows, self._unseen_blocks, self._unseen_s = 0, 0, 0.0
+        self._unseen_windows += windows
         self._unseen_blocks += blocks
         self._unseen_s += gap_s
-        return (
-            f"this computer cannot keep up; not evaluated: {self._unseen_blocks} blocks, {self._unseen_s:.6g} s of data"
-        )
+        skipped = f"; windows skipped: {self._unseen_windows}" if self._unseen_windows else ""
+        lost = f"; not evaluated: {self._unseen_blocks} blocks, {self._unseen_s:.6g} s of data"
+        return f"this computer cannot keep up{skipped}{lost if self._unseen_blocks else ''}"
 
     def _lost(self, end_ns: int) -> None:
         """Raise the alarm on silence, at the time at which it was due: then live and replay say the same."""

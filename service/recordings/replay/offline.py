@@ -1,17 +1,20 @@
 """Recordings straight through the monitor's data path, at full speed, without network or clock.
 
-The blocks meet the same `MachineMonitor` as they would live, so the reports are the same to the last bit.
+The blocks meet the same `MachineMonitor` as they would live, so the reports are the same to the last bit. Windows that
+the live monitor skipped, because it could not keep up, are skipped here as well: its recorded reports say which.
 """
 
 import hashlib
 import json
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 from models.commissioning.commissioned import Installed
 from models.physics.rotor import PARAMETERS
 from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage
+from rotorwatch.records.health import Report
 from rotorwatch.records.replays import OfflineSummary, ParameterLimits, ReplayProgress
 from service.monitor.alarm_conversion import alarm_cloud_event
 from service.monitor.descriptor import descriptor_mismatch
@@ -30,6 +33,17 @@ def result_lines(identity: Identity, keys: MachineKeys, report: MonitorReport) -
     ]
     ordered = sorted(timed, key=lambda entry: entry[:2])  # stable: several events of one window keep their order
     return [f'{{"topic": {json.dumps(topic)}, "message": {text}}}' for _, _, topic, text in ordered]
+
+
+def skipped_windows(source: RecordingSource, keys: MachineKeys) -> frozenset[int]:
+    """Ends of the windows that the monitor skipped when they were recorded, as far as its reports were recorded."""
+    found: set[int] = set()
+    for message in source.messages({keys.report}):
+        if b'"skipped":true' in message.payload:
+            with suppress(ValueError):  # anybody may have sent it
+                report = Report.model_validate_json(message.payload)
+                found |= {report.end_ns} if report.skipped else set()
+    return frozenset(found)
 
 
 class OfflineReplay:
@@ -62,7 +76,7 @@ class OfflineReplay:
         span = source.span(keys)
         self._from_ns = span.start_ns if from_ns is None else from_ns
         self._to_ns = span.end_ns + 1 if to_ns is None else to_ns
-        self._monitor = MachineMonitor(installed)
+        self._monitor = MachineMonitor(installed, skipped_windows(source, keys).__contains__)
         self.identity = self._monitor.identity
         self._digest = hashlib.sha256()
         self._windows = self._alarms = self._messages = 0
@@ -151,6 +165,7 @@ class OfflineReplay:
         return OfflineSummary(
             **self.identity,
             windows=self._windows,
+            skipped_windows=quality.skipped_windows,
             alarms=self._alarms,
             raised=tuple(alarm.name for alarm in health.alarms if alarm.raised),
             blocks=quality.accepted_blocks,

@@ -30,6 +30,7 @@ class DataQuality extends MachineElement {
       ["gaps", `${quality.gaps}${quality.missing_s ? `, ${figure(quality.missing_s)} s missing` : ""}`],
       ["last gap", quality.last_gap],
       ["dropped", quality.queue_dropped_blocks > 0 && `${quality.queue_dropped_blocks} blocks, the monitor could not keep up`],
+      ["not evaluated", quality.skipped_windows > 0 && `${quality.skipped_windows} windows, the monitor could not keep up`],
       ["lost on the way", quality.link_missed_blocks > 0 && `${quality.link_missed_blocks} blocks`],
       ["publisher", stream.publisher_alive ? "announced" : "not announced"],
       ["replay", stream.replay_announced && "somebody announces a replay on the machine's own keys; it is not evaluated"],

@@ -1,0 +1,42 @@
+"""When a machine's worker evaluates less often, because the computer cannot keep up."""
+
+import math
+
+_LASTING_S = 30.0
+
+
+class LoadShedding:
+    """Says which windows are skipped.
+
+    A worker is behind if, when it completes a hop, all blocks of the next one wait already. After a stall or a restart
+    they become fewer from hop to hop, and every window is evaluated. Where they have not become fewer for
+    `_LASTING_S`, the computer is too small for what it is to do: then every window is skipped at whose end a quarter of
+    the next hop waits, until none has been for as long.
+    """
+
+    def __init__(self) -> None:
+        self._fewest: float = math.inf  # blocks that have waited since the worker fell behind
+        self._fewer_s = math.inf  # when they last became fewer
+        self._skipped_s = -math.inf  # when a window was last skipped
+
+    def skips(self, waiting: int, to_hop: int, now_s: float) -> bool:
+        """Whether the window that a hop has completed is skipped.
+
+        Parameters
+        ----------
+        waiting : int
+            Blocks that wait.
+        to_hop : int
+            Blocks that complete the next hop.
+        now_s : float
+            Monotonic time.
+        """
+        if waiting < to_hop:
+            self._fewest, self._fewer_s = math.inf, now_s
+        elif waiting < self._fewest:
+            self._fewest, self._fewer_s = waiting, now_s
+        lately = now_s - self._skipped_s < _LASTING_S and 4 * waiting >= to_hop
+        skips = lately or now_s - self._fewer_s >= _LASTING_S
+        if skips:
+            self._skipped_s = now_s
+        return skips
