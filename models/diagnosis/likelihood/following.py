@@ -74,7 +74,8 @@ class Linearised:
     ) -> None:
         self.model, self.weights, self.derivatives = model, weights, derivatives
         self.theta = searched.theta
-        self._searched, self._point, self._left, self._fitted = searched, point, left, fitted
+        self._point, self._left, self._fitted = point, left, fitted
+        self._searched_rad_s = searched.speed_rad_s  # no more of it: its receptances are a megabyte
         self._L_inverse = inverse_factor(searched.S)
         self._S = np.einsum("fii->fi", searched.S).real.copy()
         self._pull = weights.pull
@@ -101,7 +102,7 @@ class Linearised:
             "point": self._point.theta,
             "point_levels": self._point.C,
             "speeds_rad_s": np.array(
-                [self._searched.speed_rad_s, self._point.speed_rad_s, self.derivatives.speed_rad_s], dtype=np.float64
+                [self._searched_rad_s, self._point.speed_rad_s, self.derivatives.speed_rad_s], dtype=np.float64
             ),
             "information": np.diag(self.derivatives.information),
             "left": self._left,
