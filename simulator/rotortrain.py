@@ -31,7 +31,8 @@ MachineOption = Annotated[
 ProcessesOption = Annotated[int, typer.Option(min=1, help="Worker processes.")]
 WindowsOption = Annotated[int, typer.Option(min=20, help="Simulated training windows per relation network.")]
 DrawsOption = Annotated[
-    int, typer.Option(min=2000, help="Random machines and conditions drawn for the amortised networks.")
+    int,
+    typer.Option(min=2000, help="Machines and conditions drawn for the amortised networks, and half as many again."),
 ]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 
@@ -119,7 +120,7 @@ def commission(
     ] = None,
     why: Annotated[str, typer.Option(help="Why the machine is commissioned again; kept in the bundle.")] = "",
     networks: Annotated[
-        bool, typer.Option(help="Train the networks, too, where the parameters are known (some ten minutes).")
+        bool, typer.Option(help="Train the networks, too, where the parameters are known (a quarter of an hour).")
     ] = True,
     windows: WindowsOption = _WINDOWS,
     draws: DrawsOption = _DRAWS,

@@ -1,19 +1,22 @@
 """What ``rotortrain train`` does: simulate, train, and have calibrated."""
 
 import platform
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 from rich.progress import Progress, TaskID
 
-from models.diagnosis.networks.amortised import AmortisedNetworks
+from models.diagnosis.networks.amortised import NEAR, AmortisedNetworks, NearNetworks
 from models.diagnosis.networks.bundle import Training
 from models.diagnosis.networks.equations import EQUATIONS, missing
 from models.diagnosis.networks.features import ForceFeatures
 from models.diagnosis.networks.relation import EquationNetwork
 from models.diagnosis.networks.training import train_network, train_networks
 from models.machine import Machine
+from models.physics.rotor import PARAMETERS
 from rotorwatch import __version__
 from simulator.commands import bars
 from simulator.training.calibration import calibrate_for, rig_for
@@ -31,7 +34,7 @@ def train_for(machine: Machine, out: Path, n_windows: int, n_draws: int, seed: i
     n_windows : int
         Simulated training windows per relation network; those of the calibration go with them.
     n_draws : int
-        Random machines and conditions for the amortised networks.
+        Random machines and conditions for the first reading of the amortised networks, half as many for the second.
 
     Raises
     ------
@@ -59,7 +62,10 @@ def train_for(machine: Machine, out: Path, n_windows: int, n_draws: int, seed: i
                 "amortised networks: left out: they need a phase reference (theta) and a measured equation"
             )
         else:
-            amortised = _train_amortised(machine, n_draws, seed, processes, bar)
+            amortised = _train_amortised(machine, n_draws, seed, processes, bar, near=False)
+            near = _train_amortised(machine, n_draws // 2, seed, processes, bar, near=True)  # what is left is simpler
+            basis = replace(near.basis, precision_factor=near.basis.precision_factor[:, :0])
+            amortised = replace(amortised, near=NearNetworks(basis, near.networks))
     versions = {name: version(name) for name in ("numpy", "torch")} | {
         "rotorwatch": __version__,
         "python": platform.python_version(),
@@ -70,12 +76,15 @@ def train_for(machine: Machine, out: Path, n_windows: int, n_draws: int, seed: i
     calibrate_for(machine, tuple(networks), amortised, made, out, processes)
 
 
-def _train_amortised(machine: Machine, n_draws: int, seed: int, processes: int, bar: Progress) -> AmortisedNetworks:
+def _train_amortised(
+    machine: Machine, n_draws: int, seed: int, processes: int, bar: Progress, near: bool
+) -> AmortisedNetworks:
     """Amortised networks of all equations, trained on windows drawn as spectra by the worker processes."""
     per_batch = min(_CONDITIONS_PER_BATCH, max(1, n_draws // 8))
     n_batches = max(1, n_draws // per_batch)
-    draws, features = FeatureDraws.for_machine(machine, seed, per_batch), ForceFeatures(machine)
-    task = bar.add_task("amortised: drawing and training", total=n_batches * draws.windows)
+    draws, features = FeatureDraws.for_machine(machine, seed, per_batch, near), ForceFeatures(machine)
+    label = f"amortised, {'second' if near else 'first'} reading: drawing and training"
+    task = bar.add_task(label, total=n_batches * draws.windows)
     return train_networks(
         machine,
         features.states,
@@ -83,7 +92,7 @@ def _train_amortised(machine: Machine, n_draws: int, seed: int, processes: int, 
         draws.n_common,
         batches(draws, n_batches, processes),
         n_batches * draws.windows,
-        LOG_RATIO,
+        np.array([NEAR[name] for name in PARAMETERS]) if near else LOG_RATIO,
         seed,
         partial(bar.advance, task),
     )

@@ -24,12 +24,14 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from models.diagnosis.moments import ComplexArray, plan_for
+from models.diagnosis.networks.amortised import NEAR, around
 from models.diagnosis.networks.features import Float32Array, ForceFeatures, principal_directions
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS, STATE_INDEX, H_matrix, M_matrix, P_matrix, Q_matrix, changed
@@ -40,6 +42,7 @@ _Complex = TypeVar("_Complex", npt.NDArray[np.complex64], npt.NDArray[np.complex
 # Every parameter is drawn log-uniformly from -42 % to +73 %: wide, continuous, and without a peak at healthy, which
 # would teach the network to answer "healthy" to everything small.
 LOG_RATIO = 0.55
+_CHANGED_BEFORE = 0.25  # how often a parameter of a centre is not nominal
 _PER_ROTOR = 3  # windows that share a rotor and a speed; excitation, noise, unbalance and realisation are their own
 _HANN = (np.float32(1 / 6), np.float32(4 / 6), np.float32(1 / 6))
 
@@ -49,6 +52,7 @@ class DrawnConditions:
     """A batch of random machines in random conditions."""
 
     log_ratio: FloatArray  # (n_windows, 6), logarithm of each of `PARAMETERS` over nominal
+    centre: FloatArray  # (n_windows, 6), the same of the machine through which spectra are taken back
     speed_rad_s: FloatArray  # (n_windows,)
     # (n_windows, n_bins, n, n): expected cross-spectra of the segments, as `WindowStatistics.spectrum` estimates them,
     # SI²/Hz
@@ -61,13 +65,14 @@ class DrawnConditions:
 class SpectralDraws:
     """Draws windows of one machine in random conditions and with random parameters.
 
-    The excitation is drawn more broadly than the diagnosis assumes: mostly one second-order low-pass for all sources,
-    as in the simulator, but also other slopes and a cutoff per source, and sensor noise that differs between channels.
+    With `near`, parameters are drawn around a centre as the first reading leaves them, each centre mostly nominal. The
+    excitation is drawn more broadly than the diagnosis assumes: mostly one second-order low-pass for all sources, as in
+    the simulator, but also other slopes and a cutoff per source, and sensor noise that differs between channels.
     """
 
-    def __init__(self, machine: Machine) -> None:
+    def __init__(self, machine: Machine, near: bool = False) -> None:
         plan = plan_for(machine)
-        self._machine = machine
+        self._machine, self._near = machine, near
         self._duration_s = plan.hops * plan.hop / plan.rate_hz
         self._spacing_hz = plan.rate_hz / plan.segment
         band = plan.frequencies_hz
@@ -117,13 +122,16 @@ class SpectralDraws:
 
     def _rotor(
         self, rng: np.random.Generator, n: int
-    ) -> tuple[FloatArray, FloatArray, ComplexArray, ComplexArray, ComplexArray]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray, ComplexArray, ComplexArray, ComplexArray]:
         """Machines that share a rotor."""
         machine, condition = self._machine, self._machine.condition
-        shared = rng.uniform(-LOG_RATIO, LOG_RATIO, len(PARAMETERS))
-        log_ratio = np.tile(shared, (n, 1))
+        centre, apart = np.zeros(len(PARAMETERS)), np.full(len(PARAMETERS), LOG_RATIO)
+        if self._near:
+            apart = np.array([NEAR[name] for name in PARAMETERS])
+            centre = rng.uniform(-LOG_RATIO, LOG_RATIO, centre.size) * (rng.random(centre.size) < _CHANGED_BEFORE)
+        log_ratio = np.tile(centre + rng.uniform(-apart, apart), (n, 1))
         unbalance = PARAMETERS.index("e")
-        log_ratio[:, unbalance] = rng.uniform(-LOG_RATIO, LOG_RATIO, n)
+        log_ratio[:, unbalance] = centre[unbalance] + rng.uniform(-1, 1, n) * apart[unbalance]
         rotor = changed(machine.rotor, dict(zip(PARAMETERS, np.expm1(log_ratio[0]), strict=True)))
         tolerance = machine.operation.speed_tolerance
         speed = machine.operation.speed_rad_s * float(rng.uniform(1 - tolerance, 1 + tolerance))
@@ -152,7 +160,7 @@ class SpectralDraws:
             S[number] *= factor
             S[number] += self._noise(rng, power * factor + synchronous, frequencies)
         scatter = _factor(S[:, -1] * (4 / self._duration_s))
-        return log_ratio, np.full(n, speed), self._mixed(S[:, :-1]), q, scatter
+        return log_ratio, np.tile(centre, (n, 1)), np.full(n, speed), self._mixed(S[:, :-1]), q, scatter
 
     def _sources(self, rng: np.random.Generator, frequencies: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Directions of the sources, shape (6, n_sources), and their spectra, shape (n_frequencies, n_sources)."""
@@ -209,6 +217,7 @@ def _complex_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> npt.NDA
 
 
 KEPT = 28  # principal components of every function of frequency; the next ones vary less than the sampling error
+_KEPT_NEAR = 9
 _STREAM = 50  # keeps the random numbers apart from those of the relation networks' training windows
 _BASIS_DRAWS = 1500
 _AT_ONCE = 24  # conditions worked on together: more do not fit into a processor's cache and take twice the time
@@ -230,17 +239,19 @@ class FeatureDraws:
     # Principal directions, see `models.diagnosis.networks.features`.
     mean: Float32Array
     directions: Float32Array
+    near: bool = False  # for the networks that read again: parameters over those of the centre
 
     @classmethod
-    def for_machine(cls, machine: Machine, seed: int, conditions: int) -> "FeatureDraws":
+    def for_machine(cls, machine: Machine, seed: int, conditions: int, near: bool = False) -> "FeatureDraws":
         """Find the principal directions from expected spectra and make the recipe."""
-        draws, features = SpectralDraws(machine), ForceFeatures(machine)
-        rng = np.random.default_rng([seed, Purpose.TRAINING, _STREAM, 0])
-        parts = [
-            features.series(features.force(draws.draw(rng, _AT_ONCE).spectrum))
-            for _ in range(0, _BASIS_DRAWS, _AT_ONCE)
-        ]
-        return cls(machine, seed, conditions, *principal_directions(np.concatenate(parts, axis=1), KEPT))
+        draws = SpectralDraws(machine, near)
+        rng = np.random.default_rng([seed, Purpose.TRAINING, _STREAM + near, 0])
+        parts = []
+        for _ in range(0, _BASIS_DRAWS, _AT_ONCE):
+            drawn = draws.draw(rng, _AT_ONCE)
+            parts += [one.series(one.force(drawn.spectrum[own])) for own, one in _through(machine, drawn.centre, near)]
+        kept = _KEPT_NEAR if near else KEPT
+        return cls(machine, seed, conditions, *principal_directions(np.concatenate(parts, axis=1), kept), near)
 
     @property
     def windows(self) -> int:
@@ -250,39 +261,52 @@ class FeatureDraws:
     @property
     def n_common(self) -> int:
         """Inputs that all networks share, without those of equation 29."""
-        features = ForceFeatures(self.machine)
-        return features.n_series * int(self.directions.shape[2]) + features.n_consistency
+        features = ForceFeatures(self.machine, near=self.near)
+        centre = len(PARAMETERS) if self.near else 0
+        return features.n_series * int(self.directions.shape[2]) + centre + features.n_consistency
 
     def batch(self, number: int) -> Batch:
         """Make one batch."""
-        draws, features = SpectralDraws(self.machine), ForceFeatures(self.machine)
-        rng = np.random.default_rng([self.seed, Purpose.TRAINING, _STREAM, number + 1])
+        draws = SpectralDraws(self.machine, self.near)
+        rng = np.random.default_rng([self.seed, Purpose.TRAINING, _STREAM + self.near, number + 1])
         inputs: list[Float32Array] = []
         targets: list[Float32Array] = []
         for first in range(0, self.conditions, _AT_ONCE):
             conditions = draws.draw(rng, min(_AT_ONCE, self.conditions - first))
-            inputs += self._windows(rng, draws, features, conditions)
-            targets += [conditions.log_ratio.astype(np.float32)] * _REALISATIONS
+            inputs += self._windows(rng, draws, conditions)
+            targets += [(conditions.log_ratio - conditions.centre).astype(np.float32)] * _REALISATIONS
         return np.concatenate(inputs), np.concatenate(targets)
 
     def _windows(
-        self, rng: np.random.Generator, draws: SpectralDraws, features: ForceFeatures, conditions: DrawnConditions
+        self, rng: np.random.Generator, draws: SpectralDraws, conditions: DrawnConditions
     ) -> list[Float32Array]:
         speed, n_kept = conditions.speed_rad_s, self.directions.shape[2]
+        through = list(_through(self.machine, conditions.centre, self.near))
+        features = through[0][1]
+        expected = np.concatenate([one.force(conditions.spectrum[own]) for own, one in through])
+        centre = conditions.centre.astype(np.float32)[:, : len(PARAMETERS) if self.near else 0]
         agreement = features.consistency(conditions.spectrum, speed)
         n_speed = 1
         windows: list[Float32Array] = []
-        for force in draws.realisations(rng, features.force(conditions.spectrum), speed, _REALISATIONS):
+        for force in draws.realisations(rng, expected, speed, _REALISATIONS):
             series = (features.series(force) - self.mean) @ self.directions
             scores = series.transpose(1, 0, 2).reshape(speed.size, features.n_series * n_kept)
             seen = agreement.copy()
             seen[:, n_speed:] += _CONSISTENCY_ERROR * rng.standard_normal(seen[:, n_speed:].shape, dtype=np.float32)
-            parts: list[Float32Array] = [np.asarray(scores, dtype=np.float32), seen]
+            parts: list[Float32Array] = [np.asarray(scores, dtype=np.float32), centre, seen]
             if features.has_angle:
                 vectors = draws.scattered_vectors(rng, conditions)
-                parts.append(features.unbalance(conditions.spectrum, vectors, speed))
+                seen_1x = [one.unbalance(conditions.spectrum[own], vectors[own], speed[own]) for own, one in through]
+                parts.append(np.concatenate(seen_1x))
             windows.append(np.concatenate(parts, axis=1))
         return windows
+
+
+def _through(machine: Machine, centre: FloatArray, near: bool) -> Iterator[tuple[slice, ForceFeatures]]:
+    """Windows of one centre after the other, and the features of the machine there."""
+    starts = [0, *(np.flatnonzero(np.any(np.diff(centre, axis=0) != 0, axis=1)) + 1), len(centre)]
+    for first, end in pairwise(starts):
+        yield slice(first, end), ForceFeatures(around(machine, centre[first]), near=near)
 
 
 def batches(draws: FeatureDraws, count: int, processes: int) -> Iterator[Batch]:

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from models.diagnosis.networks.amortised import AmortisedNetworks, NetworkDiagnostician
+from models.diagnosis.networks.amortised import NEAR, AmortisedNetworks, NetworkDiagnostician, around
 from models.diagnosis.networks.bundle import Training, load_bundle, save_bundle
 from models.diagnosis.networks.features import ForceFeatures
 from models.diagnosis.networks.relation import EquationNetwork, RelationDiagnostician, read_equation
@@ -45,9 +46,18 @@ def test_round_trip(tmp_path: Path) -> None:
     assert loaded is not None
     assert loaded.calibration == shipped.amortised.calibration
     assert (loaded.coherent, loaded.coherence_limit) == (shipped.amortised.coherent, shipped.amortised.coherence_limit)
-    x = np.random.default_rng(SEED).standard_normal((3, loaded.networks[0].direct.shape[0])).astype(np.float32)
-    for part, expected in zip(loaded.networks[0](x), shipped.amortised.networks[0](x), strict=True):
-        np.testing.assert_array_equal(part, expected)
+    assert loaded.near is not None
+    assert shipped.amortised.near is not None
+    for read, expected in ((loaded, shipped.amortised), (loaded.near, shipped.amortised.near)):
+        x = np.random.default_rng(SEED).standard_normal((3, read.networks[0].direct.shape[0])).astype(np.float32)
+        for part, of in zip(read.networks[0](x), expected.networks[0](x), strict=True):
+            np.testing.assert_array_equal(part, of)
+    once = replace(shipped.amortised, near=None)
+    save_bundle(tmp_path / "once", LAB, shipped.networks, MADE, once)
+    assert "near" not in json.loads((tmp_path / "once" / "manifest.json").read_text())["amortised"]
+    read_once = load_bundle(tmp_path / "once", LAB).amortised
+    assert read_once is not None
+    assert read_once.near is None
     uncalibrated = replace(shipped.amortised, calibration={})
     with pytest.raises(BundleError, match="the amortised networks are not calibrated"):
         save_bundle(tmp_path / "other", LAB, shipped.networks, MADE, uncalibrated)
@@ -127,6 +137,8 @@ def flip_a_byte(directory: Path) -> None:
         (edit_weights(lambda a: a.pop("basis.centre")), "basis.centre is missing, expected finite float32"),
         (edit_weights(lambda a: a.update({"basis.scale": np.ones(3)})), r"basis.scale is float64\(3,\), expected"),
         (edit_manifest(lambda m: m["amortised"].update(layers=[8])), r"layers are \(8,\), this program expects"),
+        (edit_weights(lambda a: a.pop("near.amortised.28.b1")), "near.amortised.28.b1 is missing"),
+        (edit_manifest(lambda m: m["amortised"]["near"].update(e=0.5)), "remainders are .*0.5.*, this program expects"),
         (edit_manifest(lambda m: m["amortised"]["calibration"].pop("e")), "calibrated are .* expected .*'e'"),
         (
             edit_manifest(lambda m: m["amortised"]["calibration"]["e"].update(log_deviation=[-1.0, -2.0, -3.0])),
@@ -231,6 +243,61 @@ def test_forces_of_the_nominal_machine_are_those_of_its_sources() -> None:
     assert np.all(np.abs(series[4:]) <= 1 + 1e-5)  # coherences
     louder = features.series(features.force(49.0 * one.spectrum))
     np.testing.assert_allclose(louder, series, atol=1e-4)  # levels drop out
+
+
+def test_forces_of_a_changed_machine_are_those_of_its_sources_once_it_is_known() -> None:
+    draws, rng = SpectralDraws(LAB, near=True), np.random.default_rng(SEED_OF_AMORTISED + 2)
+    # One source: through the right machine all forces are in phase, but for what its tilting moment leaves.
+    while True:
+        one = draws.draw(rng, 1)
+        apart = one.log_ratio - one.centre
+        assert np.all(np.abs(apart) <= [NEAR[name] for name in PARAMETERS])
+        nominal = ForceFeatures(LAB)
+        if np.abs(one.centre[0, 0]) > 0.3 and nominal.coherence(nominal.force(one.spectrum)) > 0.5:
+            break
+    lag = {}
+    for name, machine in (
+        ("nominal", LAB),
+        ("near", around(LAB, one.centre[0])),
+        ("true", around(LAB, one.log_ratio[0])),
+    ):
+        features = ForceFeatures(machine, near=True)
+        series = features.series(features.force(one.spectrum))
+        assert series.shape == (features.n_series, 1, one.spectrum.shape[1])
+        np.testing.assert_allclose(series[1:5].sum(axis=0), 0, atol=1e-4)  # contrasts of levels
+        lag[name] = float(np.abs(series[-6:]).mean())  # imaginary parts of squared coherences
+    assert lag["true"] < 0.3 * lag["nominal"]
+    assert lag["near"] < lag["nominal"]
+
+
+@pytest.mark.slow
+def test_the_second_reading_is_sharper() -> None:
+    twice, once = (NetworkDiagnostician(LAB, one) for one in (shipped(), replace(shipped(), near=None)))
+    errors, stated = [], []
+    for layout, parameter, number in product(Layout, ("k_by", "k_bz"), range(4)):
+        seen = window(parameter, number, layout)
+        inputs = once.inputs(seen)
+        assert inputs is not None
+        read = [one.stated(seen, inputs) for one in (once, twice)]
+        for equation, name in (("28", "k_by"), ("31", "k_bz")):
+            true = np.log1p(FAULTS[name]) if name == parameter else 0.0
+            errors.append([abs(one[equation][0][0] - true) for one in read])
+            stated.append([one[equation][1][0, 0] for one in read])
+    for first, second in (np.median(errors, axis=0), np.median(stated, axis=0)):
+        assert second < 0.8 * first
+
+
+def test_the_first_reading_stands_where_the_second_was_not_trained() -> None:
+    healthy, vague = window("", 0), shipped().networks[0]
+    deaf = replace(vague, biases=(*vague.biases[:-1], vague.biases[-1] + np.array([0, 0, 5, 5, 0], dtype=np.float32)))
+    amortised = replace(shipped(), networks=(deaf, *shipped().networks[1:]))
+    reader = NetworkDiagnostician(LAB, amortised)
+    inputs = reader.inputs(healthy)
+    assert inputs is not None
+    stated = reader.stated(healthy, inputs)
+    first = NetworkDiagnostician(LAB, replace(amortised, near=None)).stated(healthy, inputs)
+    for name, (mean, _) in stated.items():
+        np.testing.assert_array_equal(mean, first[name][0])
 
 
 @pytest.mark.slow

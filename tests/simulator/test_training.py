@@ -74,6 +74,8 @@ def test_a_bundle_holds_both_networks_of_every_equation_and_says_how_they_were_t
     assert {one.equation.number for one in bundle.networks} == {"28", "29", "30", "31"}
     assert bundle.amortised is not None
     assert {one.equation for one in bundle.amortised.networks} == {"28", "29", "30", "31"}
+    assert bundle.amortised.near is not None
+    assert {one.equation for one in bundle.amortised.near.networks} == {"28", "29", "30", "31"}
     assert bundle.amortised.coherent != bundle.amortised.calibration  # of windows with one source, and with several
     made = bundle.manifest.training
     assert (made.seed, made.training_windows, made.calibration_windows, made.drawn_conditions) == (SEED, 2, 5, DRAWS)

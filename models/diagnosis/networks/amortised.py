@@ -18,10 +18,13 @@ from models.diagnosis.networks.features import FeatureBasis, Float32Array, Force
 from models.diagnosis.readings import Diagnosis, beyond, no_reading, parameter_reading
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
+from models.physics.rotor import PARAMETERS, changed
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Parameter
 
 OWN = {"28": ("k_by", "c_by"), "29": ("e",), "30": ("EI",), "31": ("k_bz", "c_bz")}  # own parameters of each equation
+# Largest remainders, in logarithms, that the second reading is trained for: five times what the first leaves or more.
+NEAR = {"k_by": 0.12, "c_by": 0.25, "k_bz": 0.12, "c_bz": 0.25, "EI": 0.08, "e": 0.25}
 LAYERS = (256, 128, 64)  # neurons of the hidden layers
 LIMIT = 8.0  # inputs are clipped here, in units of their usual deviation
 # Displacement and rate of one place may differ by this in the band where they agree best: one gain is wrong beyond it.
@@ -72,6 +75,14 @@ class Calibration(BaseModel, extra="forbid", frozen=True):
 
 
 @dataclass(frozen=True, slots=True)
+class NearNetworks:
+    """The second reading: spectra are taken through the machine as read first, and the small remainder is read."""
+
+    basis: FeatureBasis  # does not judge novelty: the first reading's has
+    networks: tuple[AmortisedNetwork, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class AmortisedNetworks:
     """All amortised networks of one machine."""
 
@@ -84,10 +95,17 @@ class AmortisedNetworks:
     # In windows whose forces are as coherent as those of one source; empty: as in all others.
     coherent: dict[str, Calibration] = field(default_factory=dict)
     coherence_limit: float = 1.0  # mean squared coherence of the forces beyond which a window is one of these
+    near: NearNetworks | None = None
 
     def calibration_at(self, coherence: float) -> dict[str, Calibration]:
         """Calibration of a window."""
         return self.coherent if self.coherent and coherence > self.coherence_limit else self.calibration
+
+
+def around(machine: Machine, log_ratio: FloatArray) -> Machine:
+    """The machine with its parameters at these logarithmic ratios to nominal, in the order of `PARAMETERS`."""
+    changes = dict(zip(PARAMETERS, np.expm1(log_ratio).tolist(), strict=True))
+    return machine.model_copy(update={"rotor": changed(machine.rotor, changes)})
 
 
 class NetworkDiagnostician:
@@ -96,7 +114,7 @@ class NetworkDiagnostician:
     by = "network"
 
     def __init__(self, machine: Machine, amortised: AmortisedNetworks) -> None:
-        self._amortised = amortised
+        self._machine, self._amortised = machine, amortised
         self._features = ForceFeatures(machine, amortised.states)
 
     def inputs(self, window: WindowStatistics) -> Float32Array | None:
@@ -106,13 +124,46 @@ class NetworkDiagnostician:
         """
         if any(name not in window.states for name in self._amortised.states):
             return None
+        return self._standardised(window, self._amortised.basis, self._features, np.empty((1, 0), dtype=np.float32))
+
+    def _standardised(
+        self, window: WindowStatistics, basis: FeatureBasis, features: ForceFeatures, centre: Float32Array
+    ) -> Float32Array:
         spectrum, synchronous = self._measured(window)
-        basis, features, speed = self._amortised.basis, self._features, np.array([window.speed_rad_s])
+        speed = np.array([window.speed_rad_s])
         with np.errstate(divide="ignore", invalid="ignore"):  # a dead channel shows as novelty
-            parts = [basis.condensed(features.series(features.force(spectrum))), features.consistency(spectrum, speed)]
+            parts = [basis.condensed(features.series(features.force(spectrum))), centre]
+            parts.append(features.consistency(spectrum, speed))
             if synchronous is not None and basis.centre.size > basis.n_common:
                 parts.append(features.unbalance(spectrum, synchronous[None], speed))
             return basis.standardised(np.concatenate(parts, axis=1))
+
+    def stated(self, window: WindowStatistics, inputs: Float32Array) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Mean and Cholesky factor of the logarithmic ratios, not calibrated, of every equation that has its inputs.
+
+        Those of the second reading, unless a parameter is too vague in the first, or out of range in either.
+
+        Parameters
+        ----------
+        inputs : ndarray, shape (1, n_inputs)
+            From `inputs`.
+        """
+        first, near = _stated(self._amortised.networks, inputs), self._amortised.near
+        if near is None:
+            return first
+        centre, own = np.zeros(len(PARAMETERS)), {name: [PARAMETERS.index(one) for one in OWN[name]] for name in first}
+        trained = np.array([NEAR[name] for name in PARAMETERS])
+        for equation, (mean, factor) in first.items():
+            too_vague = np.any(np.linalg.norm(factor, axis=1) > trained[own[equation]])
+            if too_vague or np.any(np.abs(mean) > self._amortised.log_range):
+                return first
+            centre[own[equation]] = mean
+        features = ForceFeatures(around(self._machine, centre), self._amortised.states, near=True)
+        again = self._standardised(window, near.basis, features, centre[None].astype(np.float32))
+        remainder = _stated(near.networks, again)
+        if any(np.any(np.abs(mean) > trained[own[name]]) for name, (mean, _) in remainder.items()):
+            return first
+        return {name: (centre[own[name]] + mean, factor) for name, (mean, factor) in remainder.items()}
 
     def coherence(self, window: WindowStatistics) -> float:
         """Mean squared coherence of the forces on the nominal machine, over all pairs and frequencies, 0 to 1."""
@@ -145,13 +196,12 @@ class NetworkDiagnostician:
         readings: list[Parameter] = []
         blocks: list[FloatArray] = []
         calibration = amortised.calibration_at(self.coherence(window) if amortised.coherent else 0.0)
+        stated = self.stated(window, inputs)
         for network in amortised.networks:
-            n_inputs = network.direct.shape[0]
-            if inputs.shape[1] < n_inputs:
+            if network.equation not in stated:
                 readings += [no_reading(name, self.by, "no phase reference") for name in OWN[network.equation]]
                 continue
-            mean, factor = network(np.clip(inputs[:, :n_inputs], -LIMIT, LIMIT))
-            read, covariance = self._read(network.equation, mean[0], factor[0], calibration)
+            read, covariance = self._read(network.equation, *stated[network.equation], calibration)
             readings += read
             blocks.append(covariance)
         freedom = {name: one.freedom for name, one in calibration.items() if one.freedom is not None}
@@ -202,6 +252,16 @@ class NetworkDiagnostician:
     def _refused(self, reason: str) -> Diagnosis:
         names = [name for network in self._amortised.networks for name in OWN[network.equation]]
         return Diagnosis(self.by, tuple(no_reading(name, self.by, reason) for name in names))
+
+
+def _stated(networks: tuple[AmortisedNetwork, ...], inputs: Float32Array) -> dict[str, tuple[FloatArray, FloatArray]]:
+    found: dict[str, tuple[FloatArray, FloatArray]] = {}
+    for network in networks:
+        n_inputs = network.direct.shape[0]
+        if inputs.shape[1] >= n_inputs:
+            mean, factor = network(np.clip(inputs[:, :n_inputs], -LIMIT, LIMIT))
+            found[network.equation] = mean[0], factor[0]
+    return found
 
 
 def _block_diagonal(blocks: list[FloatArray]) -> FloatArray:

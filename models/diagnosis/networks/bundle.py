@@ -5,7 +5,8 @@
     lab/
     ├── manifest.json        machine, equations, units, seeds, versions, healthy spread, hash of the weights
     └── weights.safetensors  relation networks, float64: 28.input_scale, 28.W1, …
-                             amortised networks, float32: basis.mean, …, amortised.28.W1, …
+                             amortised networks, float32: basis.mean, …, amortised.28.W1, …;
+                             those of the second reading: near.basis.mean, …
 
 Loading refuses a bundle that is damaged or was trained for another machine, and says what differs.
 """
@@ -23,7 +24,15 @@ from pydantic import BaseModel, Field, ValidationError
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from models.diagnosis.networks.amortised import LAYERS, OWN, AmortisedNetwork, AmortisedNetworks, Calibration
+from models.diagnosis.networks.amortised import (
+    LAYERS,
+    NEAR,
+    OWN,
+    AmortisedNetwork,
+    AmortisedNetworks,
+    Calibration,
+    NearNetworks,
+)
 from models.diagnosis.networks.features import FeatureBasis
 from models.diagnosis.networks.relation import HIDDEN, EquationNetwork, Healthy, Network, equation_by_number
 from models.errors import BundleError
@@ -66,6 +75,12 @@ class AmortisedEntry(BaseModel, extra="forbid", frozen=True):
     calibration_windows: int = Field(ge=1)
     novelty_limit: float = Field(gt=0, allow_inf_nan=False)
     log_range: float = Field(gt=0, allow_inf_nan=False)
+    # Left out where there is none: bundles of one reading keep their identity.
+    near: dict[str, float] | None = Field(
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="largest remainders that a second reading was trained for; none: there is no second reading",
+    )
 
 
 class Training(BaseModel, extra="forbid", frozen=True):
@@ -75,7 +90,9 @@ class Training(BaseModel, extra="forbid", frozen=True):
     training_windows: int
     calibration_windows: int
     network_calibration_windows: int = Field(default=0, description="the same for the amortised networks")
-    drawn_conditions: int = Field(default=0, description="random machines and conditions of the amortised networks")
+    drawn_conditions: int = Field(
+        default=0, description="random machines and conditions of each reading of the amortised ones"
+    )
     versions: dict[str, str]
 
 
@@ -150,6 +167,8 @@ def save_bundle(
         if set(amortised.calibration) != {name for network in amortised.networks for name in OWN[network.equation]}:
             raise BundleError(f"{directory}: the amortised networks are not calibrated: calibrate them before saving")
         arrays |= _amortised_arrays(amortised)
+        if amortised.near is not None:
+            arrays |= _amortised_arrays(amortised.near, "near.")
         entry = _amortised_entry(amortised, training)
     weights = save(arrays)
     manifest = Manifest(
@@ -268,10 +287,10 @@ def _finite(array: _Array | None, kind: np.dtype[Any], shape: tuple[int, ...], w
     return array
 
 
-def _amortised_arrays(amortised: AmortisedNetworks) -> _Arrays:
-    arrays: _Arrays = {f"basis.{name}": np.ascontiguousarray(getattr(amortised.basis, name)) for name in _BASIS}
+def _amortised_arrays(amortised: AmortisedNetworks | NearNetworks, stage: str = "") -> _Arrays:
+    arrays: _Arrays = {f"{stage}basis.{name}": np.ascontiguousarray(getattr(amortised.basis, name)) for name in _BASIS}
     for network in amortised.networks:
-        where = f"amortised.{network.equation}"
+        where = f"{stage}amortised.{network.equation}"
         for number, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True), start=1):
             arrays[f"{where}.W{number}"], arrays[f"{where}.b{number}"] = weight, bias
         arrays[f"{where}.direct"] = network.direct
@@ -290,6 +309,7 @@ def _amortised_entry(amortised: AmortisedNetworks, training: Training) -> Amorti
             "calibration_windows": training.network_calibration_windows or training.calibration_windows,
             "novelty_limit": amortised.novelty_limit,
             "log_range": amortised.log_range,
+            "near": None if amortised.near is None else NEAR,
         }
     )
 
@@ -306,37 +326,12 @@ def _amortised(directory: Path, entry: AmortisedEntry, arrays: _Arrays) -> Amort
     for name, one in (*entry.calibration.items(), *entry.coherent.items()):
         if len(one.log_deviation) != len(one.z_scale) or list(one.log_deviation) != sorted(one.log_deviation):
             raise BundleError(f"{where}: calibration of {name}: expected ascending log_deviation, one z_scale for each")
-    n_inputs = arrays.get("basis.centre", np.empty(0)).size
-    n_common = arrays.get("basis.precision_factor", np.empty((0, 0))).shape[0]
-    n_series, n_bins, n_kept = arrays.get("basis.directions", np.empty((0, 0, 0))).shape
-    shapes: dict[str, tuple[int, ...]] = {
-        "basis.mean": (n_series, 1, n_bins),
-        "basis.directions": (n_series, n_bins, n_kept),
-        "basis.centre": (n_inputs,),
-        "basis.scale": (n_inputs,),
-        "basis.precision_factor": (n_common, n_common),
-    }
-    for number in entry.equations:
-        own = len(OWN[number])
-        first = n_inputs if number == "29" else n_common
-        sizes = (first, *LAYERS, 2 * own + own * (own - 1) // 2)
-        for layer, (n_in, n_out) in enumerate(pairwise(sizes), start=1):
-            shapes[f"amortised.{number}.W{layer}"] = (n_in, n_out)
-            shapes[f"amortised.{number}.b{layer}"] = (n_out,)
-        shapes[f"amortised.{number}.direct"] = (first, own)
-    for name, shape in shapes.items():
-        _finite(arrays.get(name), np.dtype(np.float32), shape, f"{where}: {name}")
-    basis = FeatureBasis(*(arrays[f"basis.{name}"] for name in _BASIS))
-    layers = range(1, len(LAYERS) + 2)
-    networks = tuple(
-        AmortisedNetwork(
-            number,
-            tuple(arrays[f"amortised.{number}.W{layer}"] for layer in layers),
-            tuple(arrays[f"amortised.{number}.b{layer}"] for layer in layers),
-            arrays[f"amortised.{number}.direct"],
-        )
-        for number in entry.equations
-    )
+    basis, networks = _stage(where, entry, arrays, "")
+    near = None
+    if entry.near is not None:
+        if entry.near != NEAR:
+            raise BundleError(f"{where}: remainders are {entry.near}, this program expects {NEAR}")
+        near = NearNetworks(*_stage(where, entry, arrays, "near."))
     return AmortisedNetworks(
         entry.channels,
         basis,
@@ -346,6 +341,47 @@ def _amortised(directory: Path, entry: AmortisedEntry, arrays: _Arrays) -> Amort
         entry.log_range,
         entry.coherent,
         entry.coherence_limit,
+        near,
+    )
+
+
+def _stage(
+    where: str, entry: AmortisedEntry, arrays: _Arrays, stage: str
+) -> tuple[FeatureBasis, tuple[AmortisedNetwork, ...]]:
+    """Basis and networks of one reading."""
+    n_inputs = arrays.get(f"{stage}basis.centre", np.empty(0)).size
+    n_common = arrays.get(f"{stage}basis.precision_factor", np.empty((0, 0))).shape[0]
+    n_series, n_bins, n_kept = arrays.get(f"{stage}basis.directions", np.empty((0, 0, 0))).shape
+    shapes: dict[str, tuple[int, ...]] = {
+        "basis.mean": (n_series, 1, n_bins),
+        "basis.directions": (n_series, n_bins, n_kept),
+        "basis.centre": (n_inputs,),
+        "basis.scale": (n_inputs,),
+        # What is unlike the training is refused once, before the first reading.
+        "basis.precision_factor": (n_common, 0 if stage else n_common),
+    }
+    for number in entry.equations:
+        own = len(OWN[number])
+        first = n_inputs if number == "29" else n_common
+        sizes = (first, *LAYERS, 2 * own + own * (own - 1) // 2)
+        for layer, (n_in, n_out) in enumerate(pairwise(sizes), start=1):
+            shapes[f"amortised.{number}.W{layer}"] = (n_in, n_out)
+            shapes[f"amortised.{number}.b{layer}"] = (n_out,)
+        shapes[f"amortised.{number}.direct"] = (first, own)
+    own_arrays = {
+        name: _finite(arrays.get(f"{stage}{name}"), np.dtype(np.float32), shape, f"{where}: {stage}{name}")
+        for name, shape in shapes.items()
+    }
+    basis = FeatureBasis(*(own_arrays[f"basis.{name}"] for name in _BASIS))
+    layers = range(1, len(LAYERS) + 2)
+    return basis, tuple(
+        AmortisedNetwork(
+            number,
+            tuple(own_arrays[f"amortised.{number}.W{layer}"] for layer in layers),
+            tuple(own_arrays[f"amortised.{number}.b{layer}"] for layer in layers),
+            own_arrays[f"amortised.{number}.direct"],
+        )
+        for number in entry.equations
     )
 
 

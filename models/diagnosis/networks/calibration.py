@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from scipy.special import ndtri, stdtrit
 from scipy.stats import t as student
 
-from models.diagnosis.networks.amortised import LIMIT, OWN, AmortisedNetworks, Calibration, NetworkDiagnostician
+from models.diagnosis.networks.amortised import OWN, AmortisedNetworks, Calibration, NetworkDiagnostician
 from models.diagnosis.networks.relation import EquationNetwork, Healthy, read_equation
 from models.diagnosis.readings import Z95
 from models.diagnosis.window import WindowStatistics
@@ -144,15 +144,10 @@ def calibrate_networks(
             if inputs is None:
                 continue
             seen.append(reader.coherence(window))
-            for network in trained.networks:
-                n_inputs = network.direct.shape[0]
-                if inputs.shape[1] < n_inputs:
-                    continue
-                mean, factor = network(np.clip(inputs[:, :n_inputs], -LIMIT, LIMIT))
-                deviation = np.sqrt(np.einsum("ij,ij->i", factor[0], factor[0]))
-                for position, name in enumerate(OWN[network.equation]):
-                    error = float(mean[0, position] - np.log1p(changes.get(name, 0.0)))
-                    errors.setdefault(name, []).append((error, float(deviation[position])))
+            for equation, (mean, factor) in reader.stated(window, inputs).items():
+                for name, value, deviation in zip(OWN[equation], mean, np.linalg.norm(factor, axis=1), strict=True):
+                    error = float(value - np.log1p(changes.get(name, 0.0)))
+                    errors.setdefault(name, []).append((error, float(deviation)))
         calibrated.append({name: _calibration(np.array(pairs)) for name, pairs in errors.items()})
         coherences.append(seen)
     # Midway between nearly all of either kind.

@@ -37,13 +37,17 @@ class ForceFeatures:
     ----------
     states : tuple of str or None
         Measured states to look at; None takes all that the machine measures.
+    near : bool
+        Make `series` for machines that are nearly nominal. With one source, all forces at a frequency share their
+        sampling error, and it drops out of contrasts of their levels; the imaginary part of a squared coherence shows
+        whether forces lag behind each other, whichever sign they have to each other.
     """
 
-    def __init__(self, machine: Machine, states: tuple[str, ...] | None = None) -> None:
+    def __init__(self, machine: Machine, states: tuple[str, ...] | None = None, near: bool = False) -> None:
         plan = plan_for(machine)
         self.states, self.frequencies_hz = plan.states if states is None else states, plan.frequencies_hz
         self.has_angle = plan.angle_column is not None
-        self._machine = machine
+        self._machine, self._near = machine, near
         self._duration_s = plan.hops * plan.hop / plan.rate_hz
         index = np.array([STATE_INDEX[name] for name in self.states])
         self._dofs = sorted(set(index % 6))
@@ -62,7 +66,7 @@ class ForceFeatures:
     @property
     def n_series(self) -> int:
         """Number of functions of frequency: force spectra, and real and imaginary parts of their coherences."""
-        return len(self._dofs) + 2 * len(self._pairs)
+        return len(self._dofs) + 2 * len(self._pairs) + (1 + len(self._pairs) if self._near else 0)
 
     @property
     def n_consistency(self) -> int:
@@ -127,14 +131,17 @@ class ForceFeatures:
         """Functions of frequency, shape (n_series, n_windows, n_bins), of the cross-spectra of the forces."""
         m = len(self._dofs)
         power = np.maximum(np.einsum("bfii->ibf", force).real, np.finfo(np.float32).tiny)
-        out = np.empty((self.n_series, *force.shape[:2]), dtype=np.float32)
+        out = np.empty((m + 2 * len(self._pairs), *force.shape[:2]), dtype=np.float32)
         out[:m] = np.log(power)
         out[:m] -= out[:m].mean(axis=(0, 2), keepdims=True)
         amplitude = np.sqrt(power)
         for k, (i, j) in enumerate(self._pairs):
             coherence = force[:, :, i, j] / (amplitude[i] * amplitude[j])
             out[m + 2 * k], out[m + 2 * k + 1] = coherence.real, coherence.imag
-        return out
+        if not self._near:
+            return out
+        level = out[:m].mean(axis=0, keepdims=True)
+        return np.concatenate([level, out[:m] - level, out[m:], 2 * out[m::2] * out[m + 1 :: 2]])
 
     def coherence(self, force: npt.NDArray[np.complexfloating]) -> float:
         """Mean squared coherence over all windows, frequencies and pairs of forces; 0 where there is no pair."""

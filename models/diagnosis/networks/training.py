@@ -23,6 +23,7 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS
+from models.signals.block import FloatArray
 
 _ROUNDS = 40
 _STEPS_PER_ROUND = 25
@@ -97,16 +98,16 @@ _BUFFER = 160_000
 _WARM_UP = 24_000  # windows in the buffer before the first step: they standardise the inputs
 _RATE, _RATE_RISES_OVER = 2e-3, 100
 _WEIGHT_DECAY = 2e-2
-_USUAL = 0.3  # standard deviation of the drawn logarithmic ratios, about: the networks work in units of it
 _NOVELTY_QUANTILE, _NOVELTY_MARGIN = 0.999, 1.25
 
 
 class _Learner:
     """One equation's network while it learns."""
 
-    def __init__(self, equation: str, n_inputs: int, generator: torch.Generator) -> None:
+    def __init__(self, equation: str, n_inputs: int, usual: Float32Array, generator: torch.Generator) -> None:
         self.equation = equation
         self.targets = [PARAMETERS.index(name) for name in OWN[equation]]
+        self._usual = usual[self.targets]
         self.n_inputs = n_inputs
         p = len(self.targets)
         sizes = (n_inputs, *LAYERS, 1 + 1 if p == 1 else 5)
@@ -125,7 +126,7 @@ class _Learner:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         self.optimiser.zero_grad()
-        loss = self._loss(inputs[:, : self.n_inputs], log_ratio[:, self.targets] / _USUAL)
+        loss = self._loss(inputs[:, : self.n_inputs], log_ratio[:, self.targets] / torch.from_numpy(self._usual))
         loss.backward()  # type: ignore[no-untyped-call]  # torch annotates it only in part
         torch.nn.utils.clip_grad_norm_(self.parts, 1.0)
         self.optimiser.step()
@@ -149,10 +150,10 @@ class _Learner:
         p = len(self.targets)
         weights = [_array(weight) for weight in self.weights]
         biases = [_array(bias) for bias in self.biases]
-        weights[-1][:, :p] *= _USUAL
-        biases[-1][:p] *= _USUAL
-        biases[-1][p : 2 * p] += np.log(_USUAL).astype(np.float32)
-        return AmortisedNetwork(self.equation, tuple(weights), tuple(biases), _array(self.direct) * np.float32(_USUAL))
+        weights[-1][:, :p] *= self._usual
+        biases[-1][:p] *= self._usual
+        biases[-1][p : 2 * p] += np.log(self._usual)
+        return AmortisedNetwork(self.equation, tuple(weights), tuple(biases), _array(self.direct) * self._usual)
 
 
 def train_networks(
@@ -162,7 +163,7 @@ def train_networks(
     n_common: int,
     batches: Iterable[tuple[Float32Array, Float32Array]],
     expected_windows: int,
-    log_range: float,
+    log_range: float | FloatArray,
     seed: int,
     progress: Callable[[int], None] = lambda _: None,
 ) -> AmortisedNetworks:
@@ -180,8 +181,8 @@ def train_networks(
         Condensed features, shape (n_windows, n_features), and targets, shape (n_windows, 6).
     expected_windows : int
         Windows in all batches together: it sets the course of the learning rate.
-    log_range : float
-        Largest drawn logarithmic ratio.
+    log_range : float or ndarray, shape (6,)
+        Largest drawn logarithmic ratio of each of `PARAMETERS`.
     seed : int
         Of initial weights and of the choice from the buffer.
     progress : callable
@@ -199,6 +200,8 @@ def train_networks(
     total_steps = max(1, int(_PASSES * (expected_windows - warm_up) / _BATCH))
     basis: FeatureBasis | None = None
     learners: list[_Learner] = []
+    # Standard deviation of what is drawn: the networks work in units of it.
+    usual = np.broadcast_to(np.float32(log_range) / np.float32(3**0.5), len(PARAMETERS))
     step = 0
     for features, log_ratio in batches:
         buffer.add(features, log_ratio)
@@ -209,7 +212,8 @@ def train_networks(
             basis = fit_basis(*principal, buffer.features[: buffer.filled], n_common)
             n_all = features.shape[1]
             equations = [number for number in OWN if number != "29" or n_all > n_common]
-            learners = [_Learner(number, n_all if number == "29" else n_common, generator) for number in equations]
+            sizes = {number: n_all if number == "29" else n_common for number in equations}
+            learners = [_Learner(number, size, usual, generator) for number, size in sizes.items()]
         due = int(_PASSES * (buffer.seen - warm_up) / _BATCH)
         while step < min(due, total_steps):
             chosen = torch.randint(buffer.filled, (_BATCH,), generator=generator).numpy()
@@ -226,7 +230,7 @@ def train_networks(
         raise EstimationError(f"{machine.name}: training of the amortised networks diverged")
     novelty = basis.novelty(basis.standardised(buffer.features[: buffer.filled]))
     limit = float(np.quantile(novelty, _NOVELTY_QUANTILE)) * _NOVELTY_MARGIN
-    return AmortisedNetworks(states, basis, networks, {}, limit, log_range)
+    return AmortisedNetworks(states, basis, networks, {}, limit, float(np.max(log_range)))
 
 
 class _Buffer:
