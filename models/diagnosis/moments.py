@@ -445,18 +445,14 @@ def divided(values: ComplexArray, by: int | FloatArray) -> ComplexArray:
     return values
 
 
-def relative_vectors(vectors: ComplexArray) -> tuple[ComplexArray, int]:
-    """Turn each hop's vectors so that the channel with the clearest line is at angle zero.
+def relative_vectors(vectors: ComplexArray) -> ComplexArray:
+    """Turn each hop's vectors, shape (n_hops, n), so that the channel with the clearest line is at angle zero.
 
-    Returns
-    -------
-    vectors : ndarray, shape (n_hops, n)
-    channel : int
-        The one at angle zero: its amplitude varies least from hop to hop, relative.
+    Its amplitude varies least from hop to hop, relative.
     """
     size = np.abs(vectors)
     mean = size.mean(axis=0)
     spread = size.std(axis=0) / np.where(mean > 0, mean, np.nan)
     channel = int(np.nanargmin(spread)) if np.any(np.isfinite(spread)) else 0
     turn = np.exp(-1j * np.angle(vectors[:, channel]))
-    return np.asarray(vectors * turn[:, None], dtype=np.complex128), channel
+    return np.asarray(vectors * turn[:, None], dtype=np.complex128)

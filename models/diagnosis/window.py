@@ -32,7 +32,7 @@ from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of
 from models.errors import CheckpointError
 from models.levels.measures import WindowLevels, window_levels
 from models.signals.block import FloatArray
-from models.signals.waveform import Waveform, combined_waveform, stacked_waveform
+from models.signals.waveform import Waveform, stacked_waveform
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,10 @@ class WindowStatistics:
     frequencies_hz: FloatArray  # (n_bins,), their frequencies
     synchronous: ComplexArray | None  # (n,), q of x_n = Re{q e^{jθ}} over the window; None without a phase reference
     hop_synchronous: ComplexArray | None  # (n_hops, n), the same of every hop alone
-    # (n_hops, n): where the speed is estimated: the same of every hop, from an angle at which `zero_angle_state` is
+    # (n_hops, n): where the speed is estimated: the same of every hop, from an angle at which one state is
     # largest. Lengths and angles between channels hold, the angle to the shaft is unknown; zero in hops without a
     # speed.
     relative_synchronous: ComplexArray | None
-    zero_angle_state: str  # the state whose angle is zero there; empty otherwise
     # ``phase reference``, ``estimated`` (from the line in the vibration), or ``unknown``: the rotation was not taken
     # out then
     speed_source: SpeedSource
@@ -85,11 +84,6 @@ class WindowStatistics:
         return self if self.mounted is None else self.mounted
 
     @property
-    def phase_reference(self) -> bool:
-        """Whether the shaft angle is measured."""
-        return self.speed_source == "phase reference"
-
-    @property
     def rotation_vectors(self) -> ComplexArray | None:
         """Rotation-synchronous vectors of each hop, from an angle that may be another one in each; None if unknown."""
         return self.hop_synchronous if self.relative_synchronous is None else self.relative_synchronous
@@ -98,11 +92,6 @@ class WindowStatistics:
     def hop_waveform(self) -> Waveform:
         """The waveforms hop by hop, shape (n_hops, n)."""
         return stacked_waveform(self.waveforms)
-
-    @property
-    def waveform(self) -> Waveform:
-        """The waveforms of the whole window, shape (n,)."""
-        return combined_waveform(self.hop_waveform)
 
 
 def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool = True) -> WindowStatistics:
@@ -124,7 +113,6 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
     for hop in products[1:]:  # one by one, in order: the sum must not depend on how numpy would pair them
         total += hop
     synchronous = hop_synchronous = relative_synchronous = None
-    zero_angle_state = ""
     if rotation.by_hop:
         phase_reference = rotation.source == "phase reference"
         level = regression(total[0] if phase_reference else total[0][: n + 1, : n + 1], n)
@@ -136,9 +124,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         if phase_reference:
             synchronous = _synchronous(level)
         elif plan.states:
-            vectors = np.stack([_synchronous(coefficients) for coefficients in own.hops])
-            relative_synchronous, zero_angle = relative_vectors(vectors)
-            zero_angle_state = plan.mounted[zero_angle]
+            relative_synchronous = relative_vectors(np.stack([_synchronous(one) for one in own.hops]))
     else:
         beta = regression(total[0], n)
         remove = np.hstack([np.eye(n), -beta])
@@ -166,7 +152,6 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         synchronous=synchronous,
         hop_synchronous=hop_synchronous,
         relative_synchronous=relative_synchronous,
-        zero_angle_state=zero_angle_state,
         speed_source=rotation.source,
         speed_rad_s=speed_rad_s,
         speed_range=speed_range,
@@ -198,10 +183,7 @@ def _turned(window: WindowStatistics, states: tuple[str, ...], turn: FloatArray)
     def vectors(mounted: ComplexArray | None) -> ComplexArray | None:
         return None if mounted is None else np.asarray(mounted @ turn.T, dtype=np.complex128)
 
-    relative, zero_angle_state = vectors(window.relative_synchronous), ""
-    if relative is not None:
-        relative, zero_angle = relative_vectors(relative)
-        zero_angle_state = states[zero_angle]
+    relative = vectors(window.relative_synchronous)
     return replace(
         window,
         states=states,
@@ -210,8 +192,7 @@ def _turned(window: WindowStatistics, states: tuple[str, ...], turn: FloatArray)
         spectrum=turn @ window.spectrum @ turn.T,
         synchronous=vectors(window.synchronous),
         hop_synchronous=vectors(window.hop_synchronous),
-        relative_synchronous=relative,
-        zero_angle_state=zero_angle_state,
+        relative_synchronous=None if relative is None else relative_vectors(relative),
         mounted=window.as_mounted,
     )
 

@@ -102,25 +102,3 @@ def stacked_waveform(hops: Sequence[Waveform]) -> Waveform:
     """Put hops of equal length below each other, shape (n_hops, n_channels)."""
     _, *names = (one.name for one in fields(Waveform))
     return Waveform(hops[0].n_samples, *(np.stack([getattr(hop, name) for hop in hops]) for name in names))
-
-
-def combined_waveform(hops: Waveform) -> Waveform:
-    """Take the hops of a window together, shape (n_channels,).
-
-    Flat tops count where they are the window's own: at its minimum or maximum. A run that goes on into the next hop
-    counts as two.
-    """
-    minimum, maximum = hops.minimum.min(axis=0), hops.maximum.max(axis=0)
-    mean = hops.mean.mean(axis=0)
-    step = np.where(np.isnan(hops.step), np.inf, hops.step).min(axis=0)
-    return Waveform(
-        n_samples=hops.n_samples * hops.mean.shape[0],
-        mean=mean,
-        rms=np.sqrt((hops.rms**2 + (hops.mean - mean) ** 2).mean(axis=0)),
-        minimum=minimum,
-        maximum=maximum,
-        at_minimum=np.where(hops.minimum == minimum, hops.at_minimum, 0).sum(axis=0),
-        at_maximum=np.where(hops.maximum == maximum, hops.at_maximum, 0).sum(axis=0),
-        longest_run=hops.longest_run.max(axis=0),
-        step=np.where(np.isinf(step), np.nan, step),
-    )

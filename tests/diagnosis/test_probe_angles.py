@@ -173,10 +173,12 @@ def test_without_a_phase_reference_vectors_are_turned_hop_by_hop() -> None:
         window_of(one, [replace(block, samples=block.samples[:, columns]) for block in simulated(of)])
         for one, of in ((machine, API_670), (plain, LAB))
     )
-    assert found.relative_synchronous is not None
-    assert expected.relative_synchronous is not None
-    assert found.zero_angle_state == expected.zero_angle_state
-    assert np.abs(found.relative_synchronous) == pytest.approx(np.abs(expected.relative_synchronous), rel=0.01)
+    turned, same = found.relative_synchronous, expected.relative_synchronous
+    assert turned is not None
+    assert same is not None
+    # the channel at angle zero is the same
+    assert np.abs(turned.imag).max(axis=0).argmin() == np.abs(same.imag).max(axis=0).argmin()
+    assert np.abs(turned) == pytest.approx(np.abs(same), rel=0.01)
 
 
 def test_machine_files_without_angles_are_as_they_were() -> None:
