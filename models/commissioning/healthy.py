@@ -8,7 +8,7 @@ from pathlib import Path
 
 from models.diagnosis.lines import KnownLine, Line, steady_lines
 from models.diagnosis.moments import HopMoments, Plan, plan_for
-from models.diagnosis.window import SlidingWindow, WindowStatistics, window_statistics
+from models.diagnosis.window import SlidingWindow, window_statistics
 from models.errors import RecordingError, WireError
 from models.ingest import Gate
 from models.machine import MachineFile
@@ -38,21 +38,6 @@ class HealthyRecording:
     def duration_s(self) -> float:
         """Usable data, s."""
         return len(self.hops) * self.plan.fresh / self.plan.rate_hz
-
-    def windows(self, hops: int | None = None) -> tuple[WindowStatistics, ...]:
-        """Windows that do not overlap, gaps left out.
-
-        Parameters
-        ----------
-        hops : int, optional
-            Length of each; a full window without it.
-        """
-        length = self.plan.hops if hops is None else hops
-        return tuple(
-            window_statistics(self.plan, stretch[start : start + length])
-            for stretch in self.stretches
-            for start in range(0, len(stretch) - length + 1, length)
-        )
 
 
 def healthy_from_blocks(

@@ -76,13 +76,6 @@ def synchronous_response(rotor: RotorParameters, speed_rad_s: float) -> tuple[Fl
     return x.real.copy(), -x.imag
 
 
-def synchronous_correlation(q1: FloatArray, q2: FloatArray, angle_rad: float) -> FloatArray:
-    """Contribution of the unbalance to R(τ) at shaft angle Ωτ, time-averaged; shape (n, n)."""
-    cosine = np.outer(q1, q1) + np.outer(q2, q2)
-    sine = np.outer(q1, q2) - np.outer(q2, q1)
-    return np.asarray(0.5 * (cosine * np.cos(angle_rad) + sine * np.sin(angle_rad)), dtype=np.float64)
-
-
 @dataclass(frozen=True, slots=True)
 class DiscreteSystem:
     """x[k+1] = F x[k] + G w[k], w standard normal."""

@@ -217,14 +217,14 @@ class RecordingWriter:
 
 
 def read_recording(
-    path: Path, *, keys: Collection[str] | None = None, from_ns: int | None = None, to_ns: int | None = None
+    path: Path, *, keys: Collection[str] | None = None, from_ns: int | None = None
 ) -> Iterator[RecordedMessage]:
     """Read messages in the order in which they were written.
 
     Parameters
     ----------
-    from_ns, to_ns : int, optional
-        Only log times from `from_ns` up to, and without, `to_ns`.
+    from_ns : int, optional
+        Only log times from this one on.
 
     Raises
     ------
@@ -240,15 +240,14 @@ def read_recording(
         wanted = {number for number, channel in summary.channels.items() if keys is None or channel.topic in keys}
         for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
             early = from_ns is not None and index.message_end_time < from_ns
-            late = to_ns is not None and index.message_start_time >= to_ns
             held = index.message_index_offsets
-            if early or late or (held and not wanted & held.keys()):
+            if early or (held and not wanted & held.keys()):
                 continue
             file.seek(index.chunk_start_offset + _RECORD_HEAD)
             for record in breakup_chunk(Chunk.read(ReadDataStream(file)), validate_crc=True):
                 if not isinstance(record, Message) or record.channel_id not in wanted:
                     continue
-                if (from_ns is None or record.log_time >= from_ns) and (to_ns is None or record.log_time < to_ns):
+                if from_ns is None or record.log_time >= from_ns:
                     yield unpacked(summary.channels[record.channel_id], record)
 
 
@@ -272,13 +271,7 @@ def summarize_recording(path: Path) -> RecordingSummary:
 
 
 def unpacked(channel: Channel, message: Message) -> RecordedMessage:
-    """Take a message out of the form in which the file keeps it.
-
-    Raises
-    ------
-    ValueError
-        If it is not in that form.
-    """
+    """Take a message out of the form in which the file keeps it. Raises ValueError if it is not in that form."""
     framing = channel.metadata.get("framing", _PLAIN)
     encoding = channel.metadata.get("encoding", "")
     attachment, payload = b"", message.data

@@ -9,6 +9,7 @@ import numpy as np
 from models.commissioning.commission import Commissioning, commission
 from models.commissioning.commissioned import RecordingEntry
 from models.commissioning.healthy import HealthyRecording, healthy_from_blocks
+from models.diagnosis.window import WindowStatistics, window_statistics
 from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import FloatArray, SampleBlock
 from simulator.scenario import Event, load_scenario
@@ -57,6 +58,16 @@ def with_samples(stream_: Sequence[SampleBlock], samples: FloatArray) -> list[Sa
 def recording(machine: MachineFile, stream_: Sequence[SampleBlock], name: str = "healthy.mcap") -> HealthyRecording:
     """What a recording of these blocks gives."""
     return healthy_from_blocks(name, machine, ((block, "") for block in stream_))
+
+
+def windows_of(recorded: HealthyRecording) -> tuple[WindowStatistics, ...]:
+    """Full windows that do not overlap, gaps left out."""
+    length = recorded.plan.hops
+    return tuple(
+        window_statistics(recorded.plan, stretch[start : start + length])
+        for stretch in recorded.stretches
+        for start in range(0, len(stretch) - length + 1, length)
+    )
 
 
 def healthy(machine: MachineFile, duration_s: float, seed: int, name: str = "healthy.mcap") -> HealthyRecording:

@@ -10,7 +10,7 @@ from models.commissioning.healthy import HealthyRecording
 from rotorwatch.records.windows import Parameter
 from service.monitor.evaluation import Evaluation, evaluator_for
 from simulator.scenario import Event
-from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, stream
+from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, stream, windows_of
 
 SLOW = LAB.operation.speed_rpm
 FAST = 1.15 * SLOW
@@ -33,7 +33,7 @@ def at(speed_rpm: float) -> Event:
 
 def evaluated(made: Commissioning, seed: int, *events: Event) -> Evaluation:
     """A later window as the monitor evaluates it."""
-    (window,) = recording(NOTHING, stream(66.0, seed, *events)).windows()
+    (window,) = windows_of(recording(NOTHING, stream(66.0, seed, *events)))
     return evaluator_for(Installed(NOTHING, None, made.commissioned)).evaluate(window, {})
 
 

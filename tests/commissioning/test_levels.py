@@ -23,7 +23,7 @@ from models.errors import BundleError
 from models.machine import MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETERS
 from simulator.scenario import Event
-from tests.commissioning.rotor_kit import LAB, NOTHING, PARTIAL, commissioned, healthy, recording, stream
+from tests.commissioning.rotor_kit import LAB, NOTHING, PARTIAL, commissioned, healthy, recording, stream, windows_of
 
 HEALTHY_S = 90.0
 MACHINES = {"full": LAB, "partial": PARTIAL, "none": NOTHING}
@@ -80,7 +80,7 @@ def test_what_was_commissioned_comes_back_from_its_file(level: str, tmp_path: Pa
     installed = install(machine, tmp_path)
     assert installed.identity == again.identity
     assert (installed.known is None) == (level == "none")
-    (window,) = healthy(machine, 66.0, 43).windows()
+    (window,) = windows_of(healthy(machine, 66.0, 43))
     for fresh, restored in zip(made.commissioned.baselines, again.baselines, strict=True):
         first, second = (one.baseline.diagnostician().diagnose(window) for one in (fresh, restored))
         assert first.parameters == second.parameters
@@ -117,14 +117,14 @@ def test_a_bundle_is_refused_for_another_machine_or_when_damaged(tmp_path: Path)
 
 
 def test_outside_the_commissioned_conditions_is_said_so() -> None:
-    windows = healthy(NOTHING, HEALTHY_S, 41).windows()
+    windows = windows_of(healthy(NOTHING, HEALTHY_S, 41))
     conditions = OperatingRange.of(windows)
     assert all(conditions.outside(window) == "" for window in windows)
     faster = Event(at_s=0.0, speed_rpm=1.12 * LAB.operation.speed_rpm)
-    (window,) = recording(NOTHING, stream(66.0, 44, faster)).windows()
+    (window,) = windows_of(recording(NOTHING, stream(66.0, 44, faster)))
     assert conditions.outside(window).startswith("speed is 1478 rpm, commissioned is 1320 rpm")
     quiet = Event(at_s=0.0, excitation_level=0.01)
-    (window,) = recording(NOTHING, stream(66.0, 45, quiet)).windows()
+    (window,) = windows_of(recording(NOTHING, stream(66.0, 45, quiet)))
     assert conditions.outside(window).startswith("random vibration of")
 
 

@@ -270,7 +270,8 @@ def test_a_restored_test_goes_on_as_if_nothing_had_happened() -> None:
     hops = gaussian(SEED + 9)
     going = SequentialTest(SETTINGS)
     play(going, hops, (60, true()), (30, true(c_by=-0.15)))
-    restored = SequentialTest(SETTINGS, again(going.state))
+    restored = SequentialTest(SETTINGS)
+    restored.state = again(going.state)
     for _ in range(30):
         looks = hops.looks(true(c_by=-0.15))
         assert restored.update(looks) == going.update(looks)

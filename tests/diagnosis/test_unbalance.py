@@ -17,7 +17,7 @@ from models.signals.channels import Channel, Quantity
 from rotorwatch.records.windows import Parameter
 from simulator.scenario import Event
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
-from tests.commissioning.rotor_kit import LAB, recording, samples_of, stream, with_samples
+from tests.commissioning.rotor_kit import LAB, recording, samples_of, stream, windows_of, with_samples
 
 SEED = 7_700_021
 MACHINE = load_machine("lab")
@@ -124,7 +124,7 @@ def read(seed: int, ramp: float, *events: Event) -> Diagnosis:
         Event(at_s=0.0, speed_rpm=rpm * (1 - ramp / 2)),
         Event(at_s=0.01, ramp_s=65.9, speed_rpm=rpm * (1 + ramp / 2)),
     )
-    (window,) = recording(LAB, stream(66.0, seed, *rise, *events)).windows()
+    (window,) = windows_of(recording(LAB, stream(66.0, seed, *rise, *events)))
     assert window.removed_by_hop
     assert window.speed_range[1] > window.speed_range[0] * (1 + 0.8 * ramp)
     return LikelihoodFit(LAB).diagnose(window)
@@ -179,13 +179,13 @@ def differentiated(samples: FloatArray, rng: np.random.Generator) -> FloatArray:
 def window() -> WindowStatistics:
     blocks = stream(70.0, SEED_OF_INTEGRATED)
     samples = differentiated(samples_of(blocks), np.random.default_rng(SEED_OF_INTEGRATED))
-    return recording(accelerometers(), with_samples(blocks, samples)).windows()[0]
+    return windows_of(recording(accelerometers(), with_samples(blocks, samples)))[0]
 
 
 def test_accelerations_become_velocities(window: WindowStatistics) -> None:
     found = integrated(window)
     assert found.states == ("y1_dot", "y2_dot", "z1_dot", "z2_dot")
-    true = recording(LAB, stream(70.0, SEED_OF_INTEGRATED)).windows()[0]
+    true = windows_of(recording(LAB, stream(70.0, SEED_OF_INTEGRATED)))[0]
     at = [true.states.index(name) for name in found.states]
     inside = true.frequencies_hz > 10
     ratio = found.spectrum[inside].real.diagonal(axis1=1, axis2=2) / (true.spectrum[inside][:, at, at].real)

@@ -21,7 +21,6 @@ from models.physics.response import (
     discretise,
     stationary_covariance,
     stochastic_covariance,
-    synchronous_correlation,
     synchronous_response,
 )
 from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix, system_A
@@ -95,16 +94,6 @@ def test_synchronous_response_satisfies_the_equation_of_motion() -> None:
         balance = -(W**2) * M_matrix(rotor) @ xi + P_matrix(rotor, W) @ rate + Q_matrix(rotor) @ xi
         np.testing.assert_allclose(balance, force, atol=1e-9 * np.abs(force).max())
         np.testing.assert_allclose(q1[6:] * np.cos(angle) + q2[6:] * np.sin(angle), rate, rtol=1e-12)
-
-
-def test_synchronous_correlation_is_the_time_average() -> None:
-    rng = np.random.default_rng(3)
-    q1, q2 = rng.standard_normal((2, 4))
-    angles = np.arange(360) * 2 * np.pi / 360
-    x = np.outer(np.cos(angles), q1) + np.outer(np.sin(angles), q2)
-    lag = 25
-    average = x.T @ np.roll(x, -lag, axis=0) / 360
-    np.testing.assert_allclose(synchronous_correlation(q1, q2, angles[lag]), average, atol=1e-12)
 
 
 def test_stiffness_has_the_pattern_of_the_paper() -> None:

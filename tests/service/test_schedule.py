@@ -28,6 +28,7 @@ from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MonitorReport
 from simulator.scenario import Event, load_scenario
 from simulator.stream import DEFAULT_START_NS, blocks
+from tests.commissioning.rotor_kit import windows_of
 from tests.service.live import LAB, scenario_blocks
 
 SECOND = 10**9
@@ -218,7 +219,7 @@ def test_a_monitor_stopped_between_or_in_snapshots_goes_on_to_the_last_bit(at: i
 
 def test_healthy_snapshots_make_windows_and_none_is_lost() -> None:
     found = healthy_from_blocks("kit", KIT, ((one, "") for one in stream()[:480]))
-    assert (len(found.hops), len(found.windows()), found.gaps) == (12, 2, 0)
+    assert (len(found.hops), len(windows_of(found)), found.gaps) == (12, 2, 0)
     assert found.duration_s == 12 * ON_S
 
 

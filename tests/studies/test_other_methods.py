@@ -10,7 +10,7 @@ from models.diagnosis.moments import plan_for
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.excitation import expanded_A, expanded_B
-from models.physics.response import correlation, stationary_covariance, synchronous_correlation, synchronous_response
+from models.physics.response import correlation, stationary_covariance, synchronous_response
 from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray
 from simulator.stream import blocks
@@ -87,9 +87,26 @@ def test_hotellings_limit_is_that_of_gaussian_features() -> None:
 _SEED = 4711
 
 
+def synchronous_correlation(q1: FloatArray, q2: FloatArray, angle_rad: float) -> FloatArray:
+    """Contribution of the unbalance to R(τ) at shaft angle Ωτ, time-averaged; shape (n, n)."""
+    cosine = np.outer(q1, q1) + np.outer(q2, q2)
+    sine = np.outer(q1, q2) - np.outer(q2, q1)
+    return np.asarray(0.5 * (cosine * np.cos(angle_rad) + sine * np.sin(angle_rad)), dtype=np.float64)
+
+
 @pytest.fixture(scope="module")
 def rig() -> Machine:
     return with_tilt(load_machine("lab"))
+
+
+def test_synchronous_correlation_is_the_time_average() -> None:
+    rng = np.random.default_rng(3)
+    q1, q2 = rng.standard_normal((2, 4))
+    angles = np.arange(360) * 2 * np.pi / 360
+    x = np.outer(np.cos(angles), q1) + np.outer(np.sin(angles), q2)
+    lag = 25
+    average = x.T @ np.roll(x, -lag, axis=0) / 360
+    np.testing.assert_allclose(synchronous_correlation(q1, q2, angles[lag]), average, atol=1e-12)
 
 
 def test_full_correlation_is_theory_with_the_unbalance_in_it(rig: Machine) -> None:

@@ -5,7 +5,6 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import chdtrc, ndtri
 
 from models.diagnosis.baseline.force import force_spectrum
 from models.diagnosis.baseline.lag_moments import (
@@ -53,12 +52,6 @@ class LeftOut:
     agreements: tuple[HeldOutReading, ...]  # one for each of the row's own parameters
     misfit: float  # χ² of what is left per degree of freedom
     degrees_of_freedom: int
-
-    @property
-    def misfit_z(self) -> float:
-        """The misfit as a standard normal variable."""
-        tail = float(chdtrc(self.degrees_of_freedom, self.misfit * self.degrees_of_freedom))
-        return -float(ndtri(np.clip(tail, 1e-300, 1 - 1e-16)))
 
 
 def left_out(row: Row, parts: Sequence[LagMoments], conditions: Sequence[Hashable]) -> tuple[LeftOut, ...]:

@@ -249,9 +249,7 @@ def parameters_of(rows: Sequence[Row] = ROWS) -> tuple[str, ...]:
     return tuple(name for name in PARAMETERS if name in read)
 
 
-def evaluable_rows(
-    states: Sequence[str], has_phase_reference: bool, rows: Sequence[Row] = ROWS
-) -> list[tuple[Row, str]]:
+def evaluable_rows(states: Sequence[str], has_phase_reference: bool) -> list[tuple[Row, str]]:
     """Say of every row whether it can be evaluated with these sensors.
 
     Parameters
@@ -265,7 +263,7 @@ def evaluable_rows(
         Each row with the reason why it cannot be evaluated; empty if it can.
     """
     found = []
-    for row in rows:
+    for row in ROWS:
         reasons = [not_measured(row.motions, tuple(states))]
         if row.needs_speed and not has_phase_reference:
             reasons.append(_NO_PHASE)

@@ -29,7 +29,7 @@ import numpy.typing as npt
 from models.diagnosis.moments import ComplexArray, divided
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
-from models.physics.rotor import COORDINATES, STATE_INDEX, system_A
+from models.physics.rotor import STATE_INDEX, system_A
 from models.signals.block import FloatArray
 from models.signals.channels import ACCELERATIONS
 
@@ -184,11 +184,6 @@ class Motions:
     def n(self) -> int:
         """Number of motions."""
         return self.dofs.size
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Coordinate of every motion."""
-        return tuple(COORDINATES[dof] for dof in self.dofs)
 
     def _r(self, w: FloatArray) -> FloatArray:
         """How many times stronger the velocity's share is, shape (…, n): 0 for a displacement alone."""

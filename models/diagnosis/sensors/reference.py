@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.motion import MotionPair, motion_pairs, pair_bands
+from models.diagnosis.motion import motion_pairs, pair_bands
 from models.diagnosis.sensors.kinematics import Banded, PairReading, banded, read_pair, same
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
@@ -73,7 +73,6 @@ _SMOOTHED = 3
 class PairNoise:
     """Noise of two sensors of one motion, in bands."""
 
-    pair: MotionPair
     density: FloatArray  # (n_bands,), power of their difference as the second shows it, two-sided, SI²/Hz
     leakage: FloatArray  # (n_bands,), the part of it that two perfect sensors would show in segments of this length
     # (n_bands,): power of the difference, times 1 Hz, if each sensor had white noise of its own rms in 1 Hz, SI²
@@ -136,7 +135,7 @@ def pair_noise(window: WindowStatistics, bands: Banded, reading: PairReading) ->
     # window of length T the last term has 1 / 3 (2π / ωT)² of the power.
     step_rad_s = 2 * np.pi * (window.frequencies_hz[1] - window.frequencies_hz[0])
     leakage = _LEAKAGE * v * (pair.order * step_rad_s / bands.w) ** 2 / 3
-    return PairNoise(pair, np.asarray(density, dtype=np.float64), np.asarray(leakage, dtype=np.float64), scale)
+    return PairNoise(np.asarray(density, dtype=np.float64), np.asarray(leakage, dtype=np.float64), scale)
 
 
 def channel_noise(window: WindowStatistics, columns: Sequence[int]) -> list[ChannelNoise]:

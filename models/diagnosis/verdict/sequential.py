@@ -96,22 +96,15 @@ class SequentialSettings:
 class SequentialTest:
     """Looks at one hop after the other.
 
-    Parameters
-    ----------
-    state : SequentialState, optional
-        Where an earlier test stood.
-
     Attributes
     ----------
     unexplained : str
         Why nothing can be said of parameters at the latest hop, see `Diagnosis`: then none is named, and none is read.
     """
 
-    def __init__(
-        self, settings: SequentialSettings, state: SequentialState | None = None, by: str = "likelihood"
-    ) -> None:
+    def __init__(self, settings: SequentialSettings, by: str = "likelihood") -> None:
         self.settings = settings
-        self.state = SequentialState() if state is None else state
+        self.state = SequentialState()
         self.unexplained = ""
         self._by = by
         self._thresholds = {hops: settings.thresholds(hops) for hops in settings.lengths}
