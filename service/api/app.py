@@ -15,11 +15,10 @@ from rotorwatch.records.monitor import Alive, Readiness
 from service.access.guard import Guard
 from service.access.problems import add_problems, problem_answer, responses
 from service.api.description import DescribedApp, only_known_arguments
-from service.api.routes.docs import add_docs_routes
 from service.api.routes.events import add_event_routes
 from service.api.routes.history import add_history_routes
 from service.api.routes.operations import add_operation_routes
-from service.api.routes.page import add_page_routes
+from service.api.routes.page import add_docs_routes, add_page_routes
 from service.api.routes.plots import add_plot_routes
 from service.api.routes.recordings import add_recording_routes
 from service.api.routes.replays import add_replay_routes
@@ -89,7 +88,7 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
         openapi_tags=_TAGS,
         dependencies=[guard.gate, Depends(only_known_arguments)],
         openapi_url=None,  # the guard serves it
-        docs_url=None,  # the usual pages load their scripts from elsewhere; `service.api.routes.docs` does not
+        docs_url=None,  # the usual pages load their scripts from elsewhere; `add_docs_routes` does not
         redoc_url=None,
     )
     add_problems(app)

@@ -13,8 +13,7 @@ from fastapi import Depends, HTTPException, Query
 
 from models.errors import RotorwatchError
 from rotorwatch.records.replays import ReplayJob
-from service.analysis.held import Held
-from service.analysis.recorded import Recorded, Sampled
+from service.analysis.recorded import Held, Recorded, Sampled
 from service.analysis.recorded_window import recorded_window
 from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.machine import MachineSnapshots
@@ -78,13 +77,7 @@ class Chosen:
 
 
 def _chosen_window(recording: Recordings = _NONE, replay: _Replay = None, until_ns: _End = None) -> Chosen:
-    """What a window is to be of, as query arguments.
-
-    Raises
-    ------
-    HTTPException
-        422 if they contradict each other.
-    """
+    """What a window is to be of, as query arguments. Raises HTTPException 422 if they contradict each other."""
     return _chosen_samples(recording, replay, None, until_ns)
 
 

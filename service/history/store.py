@@ -15,19 +15,25 @@ whoever waits is told.
 import time
 from collections.abc import Callable
 
-from sqlalchemy import select, text
+from sqlalchemy import Column, Table, func, select, text
 
+from rotorwatch.records.monitor import HistorySpan, HistoryStatus
 from service.history.claim import Claim
 from service.history.database import Database
-from service.history.holdings import Holdings
 from service.history.machine import MachineStore
 from service.history.records import Dropped, Retention, StoreError
 from service.history.reduction import Reduction
 from service.history.shared import AlarmLog, AuditLog, TokenStore, WebhookCursors
-from service.history.tables import machines
+from service.history.tables import alarm_events, buckets, machines, reports, windows
 from service.history.writer import Writer
 
 _PROBE_S = 3.0
+_OLDEST: tuple[tuple[Table, Column[int]], ...] = (
+    (alarm_events, alarm_events.c.time_ns),
+    (reports, reports.c.end_ns),
+    (windows, windows.c.end_ns),
+    (buckets, buckets.c.start_ns),
+)
 
 
 class Store:
@@ -82,7 +88,7 @@ class Store:
         self._shared = shared
         self._reduction = Reduction(self._database, retention, now_ns)
         self._now_ns = now_ns
-        self.holdings = Holdings(self._database, retention)
+        self._retention = retention
         self.alarms = AlarmLog(self._database)
         self.tokens = TokenStore(self._database)
         self.audit = AuditLog(self._database)
@@ -174,6 +180,37 @@ class Store:
             raise StoreError(f"{self.shown}: there is no history of {site}/{name}")
         claim = Claim(site, name, most_reports=0, machine_id=found[0][0])
         return MachineStore(self._database, self._writer, claim, self._now_ns, self._bucket_ns)
+
+    def status(self) -> HistoryStatus:
+        """How large the history is, and how far back it goes. Raises StoreError if the database fails."""
+        # One entry of an index each, however long the history is.
+        oldest = [
+            select(func.min(column)).where(table.c.machine_id == machines.c.machine_id).scalar_subquery()
+            for table, column in _OLDEST
+        ]
+        query = select(machines.c.site, machines.c.name, *oldest).order_by(machines.c.site, machines.c.name)
+        with self._database.reading() as connection:
+            if self._database.is_sqlite:
+                pages, size = (connection.scalar(text(f"PRAGMA {what}")) for what in ("page_count", "page_size"))
+                size_bytes = pages * size
+            else:
+                size_bytes = connection.scalar(text("SELECT pg_database_size(current_database())"))
+            rows = connection.execute(query).all()
+        return HistoryStatus(
+            database="in memory, until the monitor ends" if self._database.in_memory else self._database.shown,
+            size_bytes=size_bytes,
+            machines=tuple(
+                HistorySpan(
+                    site=site,
+                    machine=name,
+                    oldest_event_ns=event,
+                    oldest_report_ns=report,
+                    oldest_reading_ns=min((one for one in readings if one is not None), default=None),
+                )
+                for site, name, event, report, *readings in rows
+            ),
+            **self._retention.model_dump(exclude={"bucket_s"}),
+        )
 
     def retain(self, now_ns: int) -> Dropped:
         """Drop and reduce what is too old at a time of the computer; happens by itself every few minutes.

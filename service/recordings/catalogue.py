@@ -11,15 +11,20 @@ Names sort by time. The files' own indexes say everything else, so that files ma
 
 import json
 import re
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
 from pydantic import Field
 
 from models.errors import RecordingError
-from models.signals.recording import summarize_recording
+from models.signals.recording import RecordedMessage, read_recording, summarize_recording
+from models.signals.salvage import salvaged_messages
+from models.signals.wire import REPLAY_MARK
 from rotorwatch.records.recordings import RecordingEntry
+from service.terminal.logs import logger
 
+_log = logger(part="recordings")
 SUFFIX = ".mcap"
 PART = ".part"
 KEPT = "kept.json"
@@ -129,8 +134,6 @@ def name_of(start_ns: int, number: int = 1) -> str:
 
     Parameters
     ----------
-    start_ns : int
-        Nanoseconds since 1970-01-01 UTC.
     number : int
         2 and more for further files of the same second; the names still sort in the order of writing.
 
@@ -184,3 +187,39 @@ def _entries(folder: Path) -> list[Path]:
         return sorted(folder.iterdir())
     except OSError:
         return []
+
+
+def recorded_files(folder: Path) -> tuple[Path, ...]:
+    """Recordings of one machine, complete or left by a crash, oldest first."""
+    return tuple(sorted((*folder.glob(f"*{SUFFIX}"), *folder.glob(f"*{SUFFIX}{PART}"))))
+
+
+def recent_messages(files: Sequence[Path], key: str, since_ns: int) -> Iterator[RecordedMessage]:
+    """Messages on a key, replays left out, in the order in which they came.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        Oldest first. What a crash left may be completed, and so get another name, at the same time.
+    """
+    for path in files:
+        try:
+            for message in _messages(path, key, since_ns):
+                mine = message.key == key and not message.encoding.endswith(REPLAY_MARK)
+                if mine and message.log_time_ns >= since_ns:
+                    yield message
+        except RecordingError as error:
+            _log.warning("the window cannot be made again from a recording", why=str(error))
+
+
+def _messages(path: Path, key: str, since_ns: int) -> Iterator[RecordedMessage]:
+    complete = path.with_name(path.name.removesuffix(PART))
+    if path != complete:
+        try:
+            yield from salvaged_messages(path)
+            return
+        except RecordingError:
+            if path.exists():
+                raise
+    if complete.exists() and complete.stat().st_mtime_ns >= since_ns:
+        yield from read_recording(complete, keys={key}, from_ns=since_ns)

@@ -30,7 +30,7 @@ from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.health import Health
 from service.history.store import Store
-from service.recordings.recent import recent_messages, recorded_files
+from service.recordings.catalogue import recent_messages, recorded_files
 from service.recordings.recorder import MachineRecorder
 from service.settings.service import ServiceSettings
 from service.stream.evidence import EvidenceCollector
@@ -78,13 +78,7 @@ class LocalMachines:
         return self._link is not None and self._link.is_open
 
     def connect(self, undo: ExitStack) -> None:
-        """Open the session.
-
-        Raises
-        ------
-        LinkError
-            If the Zenoh endpoints cannot be used.
-        """
+        """Open the session. Raises LinkError if the Zenoh endpoints cannot be used."""
         self._link = Link(self._settings.link)
         undo.callback(self._link.close)
 

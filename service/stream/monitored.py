@@ -1,4 +1,4 @@
-"""A machine that is monitored, as others see it: in this process, or from another one."""
+"""A machine that is monitored, as others see it, in this process or from another one; and where it publishes."""
 
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -73,3 +73,16 @@ class Monitored(Protocol):
 
     def operate(self, operation: OperatorAction) -> tuple[AlarmCloudEvent, ...]:
         """Do what an operator asks for, and say what happened; raises as `AlarmBook.operate`, `NotInTime`."""
+
+
+class Outlet(Protocol):
+    """Where a worker publishes; `service.stream.transport.MachineLink` is one."""
+
+    def publish_report(self, text: str) -> None:
+        """Publish a window report."""
+
+    def publish_alarm_event(self, text: str) -> None:
+        """Publish an alarm event."""
+
+    def publish_alarm_state(self, text: str) -> None:
+        """Publish the alarms as they are now."""

@@ -32,8 +32,7 @@ from service.stream.checkpoints import StepWriter, recorded_after, recorded_sinc
 from service.stream.clocks import COMPUTER, Clocks
 from service.stream.inbox import Inbox, RawBlock
 from service.stream.liveness import Pulse
-from service.stream.monitored import MachineStatus
-from service.stream.outlet import Outlet
+from service.stream.monitored import MachineStatus, Outlet
 from service.stream.shedding import LoadShedding
 from service.terminal.logs import Limiter, logger
 

@@ -16,9 +16,8 @@ from rotorwatch.records.plots import (
     WaveformSnapshot,
 )
 from rotorwatch.records.recordings import RecordingList
-from service.analysis.held import Held
 from service.analysis.past import Past
-from service.analysis.recorded import Sampled
+from service.analysis.recorded import Held, Sampled
 from service.analysis.snapshots.run_up import centreline_series, vector_series
 from service.analysis.snapshots.samples import full_spectrum_snapshot, waterfall_snapshot, waveform_snapshot
 from service.api import samples

@@ -17,8 +17,15 @@ from models.signals.salvage import salvaged_messages
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
 from service.history.records import StoredEvent, StoreError
-from service.recordings.catalogue import PART, Catalogue, Recording, kept_reasons, name_of
-from service.recordings.recent import recent_messages, recorded_files
+from service.recordings.catalogue import (
+    PART,
+    Catalogue,
+    Recording,
+    kept_reasons,
+    name_of,
+    recent_messages,
+    recorded_files,
+)
 from service.recordings.recorder import MachineRecorder
 from service.recordings.retention import AlarmMark, alarm_mark, decide
 from service.runtime.runtime import Runtime, running
@@ -450,5 +457,5 @@ def test_a_part_that_is_completed_meanwhile_is_read(tmp_path: Path, monkeypatch:
     if when == "before":
         part.rename(complete)
     else:
-        monkeypatch.setattr("service.recordings.recent.salvaged_messages", completed)
+        monkeypatch.setattr("service.recordings.catalogue.salvaged_messages", completed)
     assert list(recent_messages(files, LAB.keys.stream, 0)) == expected

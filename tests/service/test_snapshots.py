@@ -23,7 +23,7 @@ from service.analysis.snapshots import machine as machine_module
 from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
-from service.api.answers import WindowAnswers
+from service.api.routes.snapshots import WindowAnswers
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, stream
 from tests.service.snapshotting import (

@@ -249,14 +249,14 @@ def test_retention_is_bounded(fields: dict[str, float]) -> None:
 def test_it_is_told_how_far_back_the_history_goes(store: Store, clock: Clock) -> None:
     lab, idle = store.machine("demo", "lab"), store.machine("demo", "idle")
     assert idle.last_sequence() == -1
-    empty = store.holdings.read()
+    empty = store.status()
     assert [one.machine for one in empty.machines] == ["idle", "lab"]
     assert all(one.oldest_reading_ns is None for one in empty.machines)
     first, reported = T0 + HOP, T0 + 20 * DAY
     reading, report = StoredReading(first, "parameter", "e", 1.0, None), StoredReport(0, reported, "healthy", 1.0, "{}")
     assert lab.commit(Step(readings=(reading,), events=(alarm_event(0),)))
     assert lab.commit(Step(reports=(report,)))
-    found = store.holdings.read()
+    found = store.status()
     told = found.machines[1]
     assert (told.oldest_event_ns, told.oldest_report_ns) == (T0, reported)
     assert told.oldest_reading_ns is not None

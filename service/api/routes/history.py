@@ -208,7 +208,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
     @app.get("/api/v1/history", tags=["service"], dependencies=[guard.configure], responses=responses(HistoryStatus))
     def history() -> HistoryStatus:
         """How large the history is, how far back it goes, and for how long things are kept."""
-        return service.store.holdings.read()
+        return service.store.status()
 
 
 def _trend(service: ServiceView, of: str, hours: int, points: int) -> Trend:

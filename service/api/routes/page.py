@@ -1,18 +1,20 @@
-"""The page for people: files that ask the API for everything they show, and so are anybody's.
+"""The page for people: files that ask the API for everything they show, and so are anybody's; and the API as a page.
 
-They are served below the digest of all of them, so that a browser keeps them for good and never mixes two versions.
+Files are served below the digest of all of them, so that a browser keeps them for good and never mixes two versions.
 """
 
+import base64
 import hashlib
 from importlib.metadata import distribution
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import FastAPI, HTTPException, Response
 from fastapi import Path as InPath
-from fastapi.responses import HTMLResponse
+from fastapi.responses import FileResponse, HTMLResponse
 
+from service.access.guard import Guard
 from service.access.routes import PAGE_FILES
 
 _FOLDER = Path(str(files("service"))) / "api" / "page"
@@ -22,6 +24,21 @@ _CHARTS = ("uPlot.iife.js", "uPlot.min.css")
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_ASSETS = Path(str(files("fastapi_offline"))) / "static"
+_SCRIPT = (
+    'SwaggerUIBundle({url: "/openapi.json", dom_id: "#api", deepLinking: true, validatorUrl: null, '
+    "tryItOutEnabled: true, defaultModelsExpandDepth: 0})"
+)
+_DOCS = (
+    '<!doctype html><html lang="en"><meta charset="utf-8"><title>rotorwatch: HTTP API</title>'
+    '<link rel="icon" href="data:,"><link rel="stylesheet" href="/docs/swagger-ui.css"><div id="api"></div>'
+    f'<script src="/docs/swagger-ui-bundle.js"></script><script>{_SCRIPT}</script></html>'
+)
+_HASH = base64.b64encode(hashlib.sha256(_SCRIPT.encode()).digest()).decode()
+_DOCS_POLICY = (
+    f"default-src 'none'; script-src 'self' 'sha256-{_HASH}'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 
 
@@ -56,3 +73,19 @@ def add_page_routes(app: FastAPI) -> None:
         # What runs as a worker goes by the policy it comes with.
         keep = {"Content-Security-Policy": _POLICY, "Cache-Control": "public, max-age=31536000, immutable"}
         return Response(found[name], media_type=_TYPES[Path(name).suffix], headers=keep)
+
+
+def add_docs_routes(app: FastAPI, guard: Guard) -> None:
+    """Add the page and its assets."""
+
+    @app.get("/docs", dependencies=[guard.read], include_in_schema=False, response_class=HTMLResponse)
+    def docs() -> HTMLResponse:
+        """Show the API."""
+        return HTMLResponse(_DOCS, headers={"Content-Security-Policy": _DOCS_POLICY})
+
+    @app.get("/docs/{name}", dependencies=[guard.read], include_in_schema=False)
+    def docs_asset(
+        name: Annotated[Literal["swagger-ui-bundle.js", "swagger-ui.css"], InPath(description="of the file")],
+    ) -> FileResponse:
+        """Serve what the page loads."""
+        return FileResponse(_ASSETS / name, headers={"Cache-Control": "private, max-age=86400"})

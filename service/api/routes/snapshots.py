@@ -1,19 +1,29 @@
-"""Windows over HTTP, the latest one or one that was recorded: correlations and spectra beside theory, and orbits."""
+"""Windows over HTTP, the latest one or one that was recorded: correlations and spectra beside theory, and orbits.
 
+An answer is made once for all who ask the same: many pages show the same machine.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.responses import JSONResponse, Response
+from pydantic import BaseModel
 
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
 from service.access.guard import Guard
 from service.access.problems import problem_answer, responses
 from service.analysis.snapshots.channels import SnapshotError
+from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
-from service.api.answers import WindowAnswers
 from service.api.samples import ChosenWindow, SampleReader
 from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
 
+_MOST = 64
+_SAMPLES_HOLD_S = 1.0
 _NONE: list[str] = []
 
 _First = Annotated[list[str], Query(max_length=64, description="channel i of a pair, by name; may be repeated")]
@@ -26,6 +36,54 @@ _Units = Annotated[Units, Query(description="of the values: the channels' own, o
 _Revolutions = Annotated[
     int, Query(ge=0, le=MOST_REVOLUTIONS, description="newest revolutions to show sample by sample as well")
 ]
+
+
+@dataclass(slots=True)
+class _Kept:
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    body: bytes | None = None
+    mark: object = None  # of what it was made
+    newest_ns: int | None = None  # and the newest samples then
+    made_s: float = 0.0
+
+
+class WindowAnswers:
+    """Answers that hold until another window is evaluated; any thread may ask."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._kept: dict[Hashable, _Kept] = {}  # in the order in which they were asked for
+
+    def of(
+        self, question: Hashable, data: LatestData, make: Callable[[], BaseModel], *, of_samples: bool = False
+    ) -> Response:
+        """What is kept if it still holds, else what is made.
+
+        Parameters
+        ----------
+        of_samples : bool
+            Whether the newest samples are in it: then it holds for a second only, and not across a gap.
+        """
+        with self._lock:
+            kept = self._kept[question] = self._kept.pop(question) if question in self._kept else _Kept()
+            while len(self._kept) > _MOST:
+                del self._kept[next(iter(self._kept))]
+        with kept.lock:
+            now_s, mark = self._clock(), data.mark()
+            holds = kept.mark == mark and not (of_samples and self._is_late(kept, data, now_s))
+            if kept.body is None or not holds:
+                kept.body = make().model_dump_json().encode()
+                kept.mark, kept.made_s = mark, now_s
+                kept.newest_ns = data.blocks[-1].start_ns if data.blocks else None
+            return Response(kept.body, media_type="application/json")
+
+    @staticmethod
+    def _is_late(kept: _Kept, data: LatestData, now_s: float) -> bool:
+        oldest_ns = data.blocks[0].start_ns if data.blocks else None
+        if now_s - kept.made_s > _SAMPLES_HOLD_S or kept.newest_ns is None or oldest_ns is None:
+            return True
+        return oldest_ns > kept.newest_ns
 
 
 def add_snapshot_routes(app: FastAPI, service: ServiceView, reader: SampleReader, guard: Guard) -> None:
