@@ -151,14 +151,11 @@ class Arrivals:
         elif len(copies) <= self._bound:
             copies.append(copies[0])  # takes no memory, and the gate can count it
         found = self._continued()
-        if self._held() > self._bound:
+        held = sum(len({id(one) for one in copies}) for copies in self._waiting.values())  # blocks in memory
+        if held > self._bound:
             self._next = min(self._waiting)
             found += self._continued()
         return tuple(found)
-
-    def _held(self) -> int:
-        """Blocks in memory."""
-        return sum(len({id(one) for one in copies}) for copies in self._waiting.values())
 
     def _continued(self) -> list[Arrived]:
         """Hand on blocks from the next one up to a hole."""

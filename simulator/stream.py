@@ -54,13 +54,11 @@ class TruthRecord(BaseModel, extra="forbid", frozen=True):
         ...             relative_changes={"k_by": -0.2}, sensor_faults={}, ramping=()).text
         'k_by -20 %'
         """
-        parts = [f"{name} {change:+.3g} %" for name, change in self._percent() if change]
+        changes = [(name, round(100 * change, 6)) for name, change in self.relative_changes.items()]
+        parts = [f"{name} {change:+.3g} %" for name, change in changes if change]
         parts += [f"{kind.replace('_', ' ')} {100 * size:.3g} %" for kind, size in self.anomalies.items()]
         parts += [f"{channel} {'+'.join(faults)}" for channel, faults in self.sensor_faults.items()]
         return ", ".join(parts) or "no fault"
-
-    def _percent(self) -> list[tuple[str, float]]:
-        return [(name, round(100 * change, 6)) for name, change in self.relative_changes.items()]
 
 
 JSON_ENCODING = "application/json"

@@ -36,10 +36,6 @@ class AlarmTopics:
 
     Parameters
     ----------
-    session : zenoh.Session
-        Open, and open for as long as this is.
-    machines : sequence of str
-        ``<site>/<machine>``, where ``*`` stands for any.
     hear : callable
         Takes each message, on a thread of Zenoh's: be short. Latest states and events that monitors still have come at
         once, possibly out of order and more than once.

@@ -55,14 +55,7 @@ class _Use:
 
 
 class Database:
-    """Connections to one database; for any thread.
-
-    Parameters
-    ----------
-    url : str
-        ``sqlite:////folder/file``, ``sqlite:///:memory:`` or ``postgresql://user:password@host/database``.
-    timeout_s : float
-        How long to wait for a connection, or for a lock that another program holds, in seconds.
+    """Connections to one database, of the URL and time limit of a `service.history.store.Store`; for any thread.
 
     Attributes
     ----------

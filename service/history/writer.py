@@ -37,14 +37,8 @@ class Writer:
 
     Parameters
     ----------
-    retry_s : float
-        Time between attempts while the database fails, in seconds.
-    most_reports : int
-        Reports of one machine that wait meanwhile, and steps whose readings do.
     bucket_ns : int
         Length of the buckets that readings are added to.
-    shared : bool
-        Another process looks after the database: one that was deleted, replaced or damaged is not begun anew here.
     """
 
     def __init__(

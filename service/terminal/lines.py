@@ -28,7 +28,10 @@ def report_line(report: Report) -> str:
     """
     verdict = report.verdict
     if report.parameters:
-        parts = ["  ".join(_parameter(parameter) for parameter in _shown(report)) or _TOO_LITTLE]
+        parts = [
+            "  ".join(_change(one.name, one.relative_change, one.standard_error) for one in _shown(report))
+            or _TOO_LITTLE
+        ]
         parts += [] if verdict is None else [_verdict(verdict)]
         parts += [_opinion(opinion) for opinion in report.opinions]
         tail = "  |  ".join(parts)
@@ -157,10 +160,6 @@ def _opinion(opinion: Opinion) -> str:
 
 def _clock(time_ns: int) -> str:
     return datetime.fromtimestamp(time_ns // 10**9, UTC).strftime("%H:%M:%S")
-
-
-def _parameter(parameter: Parameter) -> str:
-    return _change(parameter.name, parameter.relative_change, parameter.standard_error)
 
 
 def _change(name: str, change: float | None, standard_error: float | None) -> str:
