@@ -22,7 +22,7 @@ _NO_FAULT: SensorFaults = {}
 _AHEAD = 8192
 
 
-class Sensor:
+class SimulatedSensor:
     """One channel: (value + noise) · gain + offset, clipped, rounded to a step, in the channel's unit.
 
     A delay shifts the true value by whole samples, the nearest number; before the first sample it was what it is then.
@@ -129,7 +129,7 @@ class SensorBank:
         self._dtype = np.dtype(machine.dtype)
         self._faults = faults
         self._sensors = [
-            Sensor(
+            SimulatedSensor(
                 channel,
                 sensors.settings(channel),
                 _reference(channel, moments),

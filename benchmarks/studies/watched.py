@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from models.commissioning.commission import commission
-from models.commissioning.commissioned import Installed, RecordingEntry
+from models.commissioning.commissioned import HealthyEntry, Installed
 from models.commissioning.healthy import healthy_from_blocks
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
@@ -43,7 +43,7 @@ def commissioned(file: MachineFile, *streams: Iterable[SampleBlock]) -> Installe
         healthy, name = list(stream), f"healthy {number}"
         recordings.append(healthy_from_blocks(name, file, [(block, "") for block in healthy]))
         entries.append(
-            RecordingEntry(
+            HealthyEntry(
                 name=name, sha256=f"{number:064d}", start_ns=healthy[0].start_ns, end_ns=healthy[-1].end_ns,
                 used_s=recordings[-1].duration_s, gaps=0,
             )

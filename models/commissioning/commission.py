@@ -12,14 +12,14 @@ from scipy.special import ndtri
 from models.commissioning.checks import Check, check_data, check_lines, check_sensors_of, check_steady
 from models.commissioning.commissioned import (
     Commissioned,
+    HealthyEntry,
     KnowledgeLevel,
     OperatingRange,
-    RecordingEntry,
     described,
     knowledge_of,
 )
 from models.commissioning.healthy import HealthyRecording, known_lines
-from models.commissioning.levels import LEVELS, NO_SUCH_ROTOR, Learned, Piece, Progress, pieces_of
+from models.commissioning.levels import LEVELS, NO_SUCH_ROTOR, HealthyPiece, Learned, Progress, pieces_of
 from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.networks.equations import EQUATIONS, missing
 from models.diagnosis.readings import Diagnosis
@@ -237,7 +237,7 @@ class Commissioning:
 def commission(
     machine: MachineFile,
     recordings: Sequence[HealthyRecording],
-    entries: Sequence[RecordingEntry],
+    entries: Sequence[HealthyEntry],
     *,
     wished: float | None = None,
     replaces: Commissioned | None = None,
@@ -328,7 +328,7 @@ def _report(
     checks: Sequence[Check],
     learned: Learned,
     commissioned: Commissioned | None,
-    pieces: Sequence[Piece],
+    pieces: Sequence[HealthyPiece],
     wished: float | None,
 ) -> CommissioningReport:
     knowledge = knowledge_of(machine)
@@ -406,7 +406,7 @@ def _summary(verdict: str, checks: Sequence[Check], evaluable: Sequence[str]) ->
     return read
 
 
-def _equations(machine: MachineFile, learned: Learned, pieces: Sequence[Piece]) -> tuple[EquationRow, ...]:
+def _equations(machine: MachineFile, learned: Learned, pieces: Sequence[HealthyPiece]) -> tuple[EquationRow, ...]:
     """The whole table: what is compared with theory where the rotor is known, and what is learned where it is not."""
     states = machine.descriptor.states
     known = learned.machine is not None

@@ -158,7 +158,7 @@ _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _DESCRIBED = {"sensors", "rate_hz", "window", "rotor", "operation", "condition", "schedule"}
 
 
-class RecordingEntry(BaseModel, extra="forbid", frozen=True):
+class HealthyEntry(BaseModel, extra="forbid", frozen=True):
     """One healthy recording that was used."""
 
     name: str
@@ -209,7 +209,7 @@ class Commissioned(BaseModel, extra="forbid", frozen=True):
     version: int = Field(ge=1)
     replaces: str | None = Field(default=None, description="identity of the version before")
     why: str = Field(default="", description="why it was commissioned again")
-    recordings: tuple[RecordingEntry, ...] = Field(min_length=1)
+    recordings: tuple[HealthyEntry, ...] = Field(min_length=1)
     conditions: OperatingRange
     identified: IdentifiedRecord | None = Field(default=None, description="level partial")
     baselines: tuple[ConditionBaseline, ...] = Field(

@@ -66,7 +66,7 @@ class Learned:
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class HealthyPiece:
     """A healthy window and where it comes from."""
 
     recording: str
@@ -75,7 +75,7 @@ class Piece:
     levels: WindowLevels
 
 
-def pieces_of(recordings: Sequence[HealthyRecording]) -> list[Piece]:
+def pieces_of(recordings: Sequence[HealthyRecording]) -> list[HealthyPiece]:
     """Windows that do not overlap, none longer than the monitor's, at least two of every stretch that allows it."""
     found = []
     for recording in recordings:
@@ -87,13 +87,13 @@ def pieces_of(recordings: Sequence[HealthyRecording]) -> list[Piece]:
             cuts = np.linspace(0, len(stretch), count + 1).round().astype(int)
             parts = [stretch[a:b] for a, b in pairwise(cuts.tolist())]
             found += [
-                Piece(recording.name, 2 * number >= count, window_statistics(plan, part), levels_of(plan, part))
+                HealthyPiece(recording.name, 2 * number >= count, window_statistics(plan, part), levels_of(plan, part))
                 for number, part in enumerate(parts)
             ]
     return found
 
 
-def _read_known(machine: Machine, pieces: Sequence[Piece], progress: Progress) -> tuple[Read, ...]:
+def _read_known(machine: Machine, pieces: Sequence[HealthyPiece], progress: Progress) -> tuple[Read, ...]:
     found = []
     for number, piece in enumerate(pieces):
         diagnosis = LikelihoodFit(machine).diagnose(piece.window)
@@ -102,7 +102,7 @@ def _read_known(machine: Machine, pieces: Sequence[Piece], progress: Progress) -
     return tuple(found)
 
 
-def _learn_full(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
+def _learn_full(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
     assert isinstance(machine, Machine)  # noqa: S101  # the level says so
     read = _read_known(machine, pieces, progress)
     check = check_agreement([each for _, _, each in read], "the parameters in the machine file")
@@ -122,7 +122,7 @@ NO_SUCH_ROTOR = (
 )
 
 
-def _learn_partial(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
+def _learn_partial(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
     windows = [piece.window for piece in pieces]
     identified = identify(machine, windows, partial(progress, "identifying the rotor"))
     read = tuple(
@@ -141,7 +141,7 @@ def _learn_partial(machine: MachineFile, pieces: Sequence[Piece], progress: Prog
     return Learned((check,), read, read, identified.machine, record, notes=notes)
 
 
-def _learn_none(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
+def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
     windows = [piece.window for piece in pieces]
     wrong = unsuitable(windows[0])
     if wrong:
@@ -175,7 +175,7 @@ _LINEAR = (
 )
 
 
-def _with_relations(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
+def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
     """Learn the relations, in one baseline or in one for each speed.
 
     Raises
@@ -262,7 +262,7 @@ def _differentiated(baseline: Baseline, band_to_hz: float) -> str:
     )
 
 
-def _integrated(pieces: Sequence[Piece], machine: Machine) -> tuple[str, ...]:
+def _integrated(pieces: Sequence[HealthyPiece], machine: Machine) -> tuple[str, ...]:
     """How accelerations are used, in a sentence; none where none is measured."""
     if not any(name in ACCELERATIONS for name in pieces[0].window.states):
         return ()
@@ -270,11 +270,11 @@ def _integrated(pieces: Sequence[Piece], machine: Machine) -> tuple[str, ...]:
     return (f"Accelerations are integrated to velocities in the spectrum, valid from {low:g} to {high:g} Hz.",)
 
 
-def _baseline(pieces: Sequence[Piece]) -> Baseline:
+def _baseline(pieces: Sequence[HealthyPiece]) -> Baseline:
     return learned_baseline([piece.window for piece in pieces], [piece.recording for piece in pieces])
 
 
-def _speeds(pieces: Sequence[Piece]) -> dict[str, float]:
+def _speeds(pieces: Sequence[HealthyPiece]) -> dict[str, float]:
     """Mean speed of each recording, rad/s; nan where it is not known."""
     return {
         name: float(np.mean([piece.window.speed_rad_s for piece in pieces if piece.recording == name]))
@@ -282,10 +282,10 @@ def _speeds(pieces: Sequence[Piece]) -> dict[str, float]:
     }
 
 
-def _by_speed(pieces: Sequence[Piece]) -> list[list[Piece]]:
+def _by_speed(pieces: Sequence[HealthyPiece]) -> list[list[HealthyPiece]]:
     """Pieces in groups of one speed, slowest first."""
     speeds = _speeds(pieces)
-    groups: list[list[Piece]] = []
+    groups: list[list[HealthyPiece]] = []
     last = -np.inf
     for name in sorted(speeds, key=speeds.__getitem__):
         if speeds[name] > last * (1 + SAME_SPEED) or not groups:
@@ -314,7 +314,7 @@ def _without_equations(machine: MachineFile, shape: HealthyShape | None, no_shap
     return Learned((equations, check_shapes(machine, powers, shape.windows)), shape=shape)
 
 
-def _halves(pieces: Sequence[Piece], rows: Sequence[Row]) -> tuple[Read, ...]:
+def _halves(pieces: Sequence[HealthyPiece], rows: Sequence[Row]) -> tuple[Read, ...]:
     """Every window read against what the other halves of the recordings teach."""
     found: list[Read] = []
     for late in (False, True):
@@ -331,7 +331,7 @@ def _halves(pieces: Sequence[Piece], rows: Sequence[Row]) -> tuple[Read, ...]:
     return tuple(sorted(found, key=lambda read: read[1]))
 
 
-LEVELS: Mapping[KnowledgeLevel, Callable[[MachineFile, Sequence[Piece], Progress], Learned]] = MappingProxyType(
+LEVELS: Mapping[KnowledgeLevel, Callable[[MachineFile, Sequence[HealthyPiece], Progress], Learned]] = MappingProxyType(
     {KnowledgeLevel.FULL: _learn_full, KnowledgeLevel.PARTIAL: _learn_partial, KnowledgeLevel.NONE: _learn_none}
 )
 """How to learn at each level."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from models.errors import MachineFileError
-from service.settings.access import AccessSettings, TlsSettings
+from service.settings.access import AccessSettings, HttpTlsSettings
 
 _READABLE_BY_OTHERS = 0o004
 
@@ -30,7 +30,7 @@ def server_arguments(access: AccessSettings) -> dict[str, Any]:
     return arguments
 
 
-def tls_context(tls: TlsSettings) -> ssl.SSLContext:
+def tls_context(tls: HttpTlsSettings) -> ssl.SSLContext:
     """Load certificate and key; TLS 1.2 or newer, and a certificate from clients where `client_ca` is set.
 
     Raises
@@ -70,7 +70,7 @@ def _check_readable(name: str, path: Path) -> None:
         raise MachineFileError(f"{path}: tls.{name} cannot be read: {error.strerror or error}") from error
 
 
-def _pair_text(tls: TlsSettings, error: ssl.SSLError | ValueError) -> str:
+def _pair_text(tls: HttpTlsSettings, error: ssl.SSLError | ValueError) -> str:
     if isinstance(error, ssl.SSLError) and error.reason == "KEY_VALUES_MISMATCH":
         return f"{tls.key}: tls.key is not the key of tls.certificate {tls.certificate}"
     if b"ENCRYPTED" in tls.key.read_bytes():

@@ -50,7 +50,7 @@ class LevelTrend:
 
 
 @dataclass(frozen=True, slots=True)
-class Trend:
+class TrendSeries:
     """Reports and alarm events of one machine."""
 
     name: str  # ``site/machine``
@@ -65,7 +65,7 @@ class Trend:
     origin: str  # where the reports come from, in words
 
 
-def past_trend(data: Past, *, levels: bool = False) -> Trend:
+def past_trend(data: Past, *, levels: bool = False) -> TrendSeries:
     """What the history holds of a machine.
 
     Raises
@@ -77,7 +77,7 @@ def past_trend(data: Past, *, levels: bool = False) -> Trend:
     return trend_of([_slim(one) for one in data.reports], alarms, data.machine.alarms, "of the history", levels=levels)
 
 
-def read_trend(data: Recorded, machine: str | None = None, *, levels: bool = False) -> Trend:
+def read_trend(data: Recorded, machine: str | None = None, *, levels: bool = False) -> TrendSeries:
     """The recorded reports; or, without any or with another machine file, those of an offline replay.
 
     Parameters
@@ -127,7 +127,7 @@ def trend_of(
     origin: str,
     *,
     levels: bool = False,
-) -> Trend:
+) -> TrendSeries:
     """Reports as series, in the order in which they were recorded.
 
     While a window straddles a change, the readings are those of the data since the change: a mean of before and after
@@ -156,7 +156,7 @@ def trend_of(
         reasons = dict.fromkeys(report.reason for report in ordered if report.reason)
         why = "; ".join(reasons) or f"{len(ordered)} reports, while the window was filling"
         raise RotorwatchError(f"neither parameter nor level was read in this stretch of time: {why}")
-    return Trend(
+    return TrendSeries(
         name=f"{ordered[-1].site}/{ordered[-1].machine}",
         end_ns=np.array([report.end_ns for report in ordered], dtype=np.int64),
         states=tuple(report.state for report in ordered),
@@ -215,7 +215,7 @@ def _limits(keys: MachineKeys, report: Report) -> AlarmSettings | None:
     return machine.alarms if machine_hash(machine) == report.machine_hash else None
 
 
-def _computed(data: Recorded, installed: Installed, levels: bool) -> Trend:
+def _computed(data: Recorded, installed: Installed, levels: bool) -> TrendSeries:
     """Reports of an offline replay, the same to the last bit as those of ``rotorwatch replay``."""
     machine = installed.machine
     reports: list[Report] = []

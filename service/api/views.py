@@ -9,7 +9,7 @@ from pydantic import AfterValidator
 
 from models.alarm_names import ALARMS, LEVEL, is_alarm
 from rotorwatch.records.monitor import Readiness
-from service.api.routes.replays import ReplayDesk
+from service.api.routes.replays import ReplayRequests
 from service.delivery.event_feed import EventFeed
 from service.delivery.metrics.collector import Metrics
 from service.delivery.webhooks.webhooks import Webhooks
@@ -58,7 +58,7 @@ class ServiceView(Protocol):
     feed: EventFeed
     store: Store
     catalogue: Catalogue | None  # None if no directory for recordings is set
-    replays: ReplayDesk
+    replays: ReplayRequests
 
 
 def found_machine(service: ServiceView, site: str, name: str) -> Monitored:

@@ -37,7 +37,7 @@ class PackedReport(NamedTuple):
 
 
 @dataclass(slots=True)
-class Bundle:
+class StepBundle:
     """Steps of one machine as one step: in order, written whole or not at all."""
 
     reports: deque[PackedReport] = field(default_factory=deque)
@@ -77,8 +77,8 @@ class Claim:
     trouble: str = ""  # why the database, which works, does not take what waits; empty if it does
     retry_s: float = 0.0  # when that is tried again, by the monotonic clock
     generation: int = 0  # goes up when the history goes on in another file, which may lack what was written before
-    waiting: Bundle = field(default_factory=Bundle)
-    attempt: Bundle | None = None
+    waiting: StepBundle = field(default_factory=StepBundle)
+    attempt: StepBundle | None = None
     dropped_reports: int = 0
     dropped_readings: int = 0
 
@@ -120,10 +120,10 @@ class Claim:
         while len(waiting.readings) > self.most_reports:
             self.dropped_readings += len(waiting.readings.popleft()[1])
 
-    def take(self) -> Bundle | None:
+    def take(self) -> StepBundle | None:
         """What is to be written next: what was tried before, unchanged, or else everything that waits."""
         if self.attempt is None and self.waiting.steps:
-            self.attempt, self.waiting = self.waiting, Bundle()
+            self.attempt, self.waiting = self.waiting, StepBundle()
         return self.attempt
 
     def put_off(self) -> None:

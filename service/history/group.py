@@ -10,7 +10,7 @@ import numpy as np
 import zstandard
 from sqlalchemy import Connection, Table, bindparam, delete, insert, or_, select, update
 
-from service.history.claim import Bundle, Claim
+from service.history.claim import Claim, StepBundle
 from service.history.database import Database
 from service.history.records import StoredEvent, StoreError
 from service.history.tables import alarm_events, checkpoint_parts, checkpoints, machines, reports, series, windows
@@ -134,7 +134,7 @@ def _new_events(connection: Connection, claim: Claim, events: Sequence[StoredEve
 
 
 def _add_series(
-    connection: Connection, machine_id: int, bundle: Bundle, numbers: MutableMapping[tuple[int, str, str], int]
+    connection: Connection, machine_id: int, bundle: StepBundle, numbers: MutableMapping[tuple[int, str, str], int]
 ) -> None:
     """Look up the numbers of the bundle's series, and give numbers to new ones."""
     wanted = {(machine_id, each.quantity, each.name) for _, step in bundle.readings for each in step}
@@ -149,7 +149,7 @@ def _add_series(
 
 
 def _new_windows(
-    machine_id: int, bundle: Bundle, number: int, numbers: Mapping[tuple[int, str, str], int]
+    machine_id: int, bundle: StepBundle, number: int, numbers: Mapping[tuple[int, str, str], int]
 ) -> list[dict[str, Any]]:
     """Readings of one time are a window, numbered from `number` on; one of a series that is in it begins another."""
     made: list[tuple[dict[str, int], dict[int, tuple[float, float]]]] = []
@@ -168,7 +168,7 @@ def _new_windows(
     ]
 
 
-def _write_checkpoint(connection: Connection, machine_id: int, bundle: Bundle) -> None:
+def _write_checkpoint(connection: Connection, machine_id: int, bundle: StepBundle) -> None:
     if bundle.head is None:
         return
     values = asdict(bundle.head) | {"alarms": zstandard.compress(bundle.head.alarms.encode())}

@@ -18,7 +18,7 @@ from rotorwatch.records.monitor import MachineReadiness, Readiness
 from service.access.guard import Guard
 from service.api.app import create_app
 from service.api.readiness import readiness_of
-from service.api.routes.replays import ReplayDesk
+from service.api.routes.replays import ReplayRequests
 from service.api.server import HttpError, HttpServer
 from service.delivery.event_feed import EventFeed
 from service.delivery.metrics.collector import Metrics
@@ -65,7 +65,7 @@ class Runtime:
         self.feed = EventFeed()
         directory = settings.recording.directory
         self.catalogue = None if directory is None else Catalogue(Path(directory))
-        self.replays = ReplayDesk(settings, self.catalogue)
+        self.replays = ReplayRequests(settings, self.catalogue)
         self._machines: LocalMachines | Shards
         if ray_address is not None:
             from service.runtime.fleet import Fleet, fleet_count  # noqa: PLC0415  # needs what few have installed

@@ -9,7 +9,7 @@ from models.errors import MachineFileError
 from models.signals.link import is_loopback
 
 
-class TlsSettings(BaseModel, extra="forbid", frozen=True):
+class HttpTlsSettings(BaseModel, extra="forbid", frozen=True):
     """Certificate and key of the HTTP API, PEM files relative to the settings file; TLS 1.2 or newer."""
 
     certificate: Path = Field(description="the service's certificate, followed by those that lead to its authority")
@@ -46,7 +46,7 @@ class AccessSettings(BaseModel, extra="forbid", frozen=True):
     proxies: tuple[str, ...] = Field(
         default=(), description="addresses of proxies that are believed when they say who the caller is"
     )
-    tls: TlsSettings | None = Field(default=None, description="certificate; plain HTTP without it")
+    tls: HttpTlsSettings | None = Field(default=None, description="certificate; plain HTTP without it")
     limits: LimitSettings = Field(default=LimitSettings(), description="how much one caller may ask for")
 
     @field_validator("proxies")

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from models.commissioning.commission import Commissioning, CommissioningReport, ParameterSummary, commission
-from models.commissioning.commissioned import FILE, Commissioned, RecordingEntry, load_commissioned
+from models.commissioning.commissioned import FILE, Commissioned, HealthyEntry, load_commissioned
 from models.commissioning.healthy import HealthyRecording, read_healthy
 from models.errors import BundleError, MachineFileError
 from models.machine import MachineFile, load_machine_file
@@ -184,11 +184,11 @@ def _before(out: Path, machine: MachineFile, why: str) -> Commissioned | None:
     return before
 
 
-def _entry(path: Path, recording: HealthyRecording) -> RecordingEntry:
+def _entry(path: Path, recording: HealthyRecording) -> HealthyEntry:
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     hops = recording.hops
-    return RecordingEntry(
+    return HealthyEntry(
         name=path.name,
         sha256=digest,
         start_ns=hops[0].start_ns,

@@ -30,7 +30,7 @@ _COMPARED = {
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class ReportPicture:
     """A picture and what stands below it."""
 
     title: str
@@ -40,7 +40,7 @@ class Picture:
 
 def pictures_of(
     report: CommissioningReport, names: Sequence[str], portraits: Sequence[Portrait]
-) -> tuple[Picture, ...]:
+) -> tuple[ReportPicture, ...]:
     """Draw all that there is something to draw of.
 
     Parameters
@@ -72,7 +72,7 @@ def pictures_of(
             ("levels", "Speed and level over time", lambda: draw_levels(portraits), _levels_caption(portraits)),
         ]
     pictures = ((title, inline_svg(name, title, paint), caption) for name, title, paint, caption in drawn)
-    return tuple(Picture(title, svg, caption) for title, svg, caption in pictures if svg is not None)
+    return tuple(ReportPicture(title, svg, caption) for title, svg, caption in pictures if svg is not None)
 
 
 def _spectra_caption(portraits: Sequence[Portrait]) -> str:

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 
 from models.commissioning.commission import Commissioning, commission
-from models.commissioning.commissioned import RecordingEntry
+from models.commissioning.commissioned import HealthyEntry
 from models.commissioning.healthy import HealthyRecording, healthy_from_blocks
 from models.diagnosis.window import WindowStatistics, window_statistics
 from models.machine import Machine, MachineFile, load_machine
@@ -78,7 +78,7 @@ def healthy(machine: MachineFile, duration_s: float, seed: int, name: str = "hea
 def commissioned(machine: MachineFile, *recordings: HealthyRecording, wished: float | None = None) -> Commissioning:
     """Commission on recordings that are in no file."""
     entries = [
-        RecordingEntry(
+        HealthyEntry(
             name=one.name,
             sha256="0" * 64,
             start_ns=one.hops[0].start_ns,

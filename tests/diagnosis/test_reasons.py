@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.likelihood.goodness import Alternative, Goodness
+from models.diagnosis.likelihood.goodness import AlternativeTest, Goodness
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import load_bundle
 from models.diagnosis.readings import Diagnosis, beyond, parameter_reading, possible_reading
@@ -160,7 +160,7 @@ def test_a_suspect_that_cannot_be_is_none() -> None:
     """Nor is one named whose one-step size only says that it is not small; the name may stand then."""
 
     def suspect(name: str, change: float, z: float = 20.0) -> str:
-        return Goodness(9.0, (Alternative(name, z, change), Alternative("gain of y1", 6.0, 0.1)), 2).suspect
+        return Goodness(9.0, (AlternativeTest(name, z, change), AlternativeTest("gain of y1", 6.0, 0.1)), 2).suspect
 
     assert suspect("mass of the disc", -4.7) == ""
     assert suspect("gain of z2", -1.372) == ""

@@ -17,7 +17,7 @@ from service.access.scopes import ANONYMOUS, Scope
 from service.access.tls import server_arguments, tls_context
 from service.access.tokens import masked, new_token, parse_token, token_is_valid
 from service.history.records import TokenRecord
-from service.settings.access import AccessSettings, TlsSettings, check_access
+from service.settings.access import AccessSettings, HttpTlsSettings, check_access
 from tests.service.guarded import guarded
 
 DAY_NS = 86_400 * 10**9
@@ -198,9 +198,9 @@ def test_settings_refuse_what_they_do_not_know() -> None:
 
 
 def test_certificates_are_beside_the_settings_file() -> None:
-    tls = TlsSettings(certificate=Path("c.pem"), key=Path("/keys/k.pem"), client_ca=Path("ca.pem"))
+    tls = HttpTlsSettings(certificate=Path("c.pem"), key=Path("/keys/k.pem"), client_ca=Path("ca.pem"))
     found = in_folder(AccessSettings(tls=tls), Path("/etc/rotorwatch")).tls
-    assert found == TlsSettings(
+    assert found == HttpTlsSettings(
         certificate=Path("/etc/rotorwatch/c.pem"), key=Path("/keys/k.pem"), client_ca=Path("/etc/rotorwatch/ca.pem")
     )
     assert in_folder(AccessSettings(), Path("/x")) == AccessSettings()
@@ -211,14 +211,14 @@ def authority() -> trustme.CA:
     return trustme.CA(key_type=trustme.KeyType.ECDSA)
 
 
-def files(folder: Path, authority: trustme.CA, *, client_ca: bool = False) -> TlsSettings:
+def files(folder: Path, authority: trustme.CA, *, client_ca: bool = False) -> HttpTlsSettings:
     issued = authority.issue_cert("127.0.0.1", key_type=trustme.KeyType.ECDSA)
     certificate, key, ca = folder / "certificate.pem", folder / "key.pem", folder / "ca.pem"
     certificate.write_bytes(b"".join(part.bytes() for part in issued.cert_chain_pems))
     key.write_bytes(issued.private_key_pem.bytes())
     key.chmod(0o600)
     authority.cert_pem.write_to_path(str(ca))
-    return TlsSettings(certificate=certificate, key=key, client_ca=ca if client_ca else None)
+    return HttpTlsSettings(certificate=certificate, key=key, client_ca=ca if client_ca else None)
 
 
 def trusting(authority: trustme.CA) -> ssl.SSLContext:
@@ -261,7 +261,7 @@ def test_without_tls_plain_http_and_no_proxy_is_believed() -> None:
     }  # fmt: skip
 
 
-def refused(tls: TlsSettings) -> str:
+def refused(tls: HttpTlsSettings) -> str:
     with pytest.raises(MachineFileError) as caught:
         server_arguments(AccessSettings(tls=tls))
     return str(caught.value)

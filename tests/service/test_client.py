@@ -35,7 +35,7 @@ from rotorwatch import (
 from rotorwatch.client import errors
 from service.access.scopes import Scope
 from service.runtime.runtime import Runtime, running
-from service.settings.access import AccessSettings, TlsSettings
+from service.settings.access import AccessSettings, HttpTlsSettings
 from service.settings.service import HistorySettings, HttpSettings, ServiceSettings
 from service.stream.worker import MachineWorker
 from tests.service.live import ROOT, Feed, endpoint, machine_file, open_session, settings, until
@@ -285,7 +285,7 @@ def test_encrypted(tmp_path: Path) -> None:
     key.write_bytes(issued.private_key_pem.bytes())
     key.chmod(0o600)
     authority.cert_pem.write_to_path(str(ca))
-    tls = TlsSettings(certificate=certificate, key=key)
+    tls = HttpTlsSettings(certificate=certificate, key=key)
     with running(plan(tmp_path, access=AccessSettings(tls=tls))) as runtime:
         text = token(runtime)
         with Client(runtime.http_url, text, ca=ca) as plant:

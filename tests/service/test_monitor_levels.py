@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from models.commissioning.commission import commission
-from models.commissioning.commissioned import FILE, Installed, RecordingEntry, install
+from models.commissioning.commissioned import FILE, HealthyEntry, Installed, install
 from models.commissioning.healthy import healthy_from_blocks
 from models.diagnosis.moments import plan_for
 from models.machine import AlarmSettings, MachineFile, Operation
@@ -156,7 +156,7 @@ def test_a_monitor_that_is_restarted_goes_on_to_the_last_bit() -> None:
 
 def test_commissioned_levels_are_the_reference_and_say_what_is_unchanged(tmp_path: Path) -> None:
     healthy = healthy_from_blocks("healthy.mcap", FAN, [(block, "") for block in blocks(6, 150)])
-    entry = RecordingEntry(
+    entry = HealthyEntry(
         name="healthy.mcap", sha256="0" * 64, start_ns=START_NS, end_ns=START_NS + 150 * 10**9, used_s=145.0, gaps=0
     )
     made = commission(FAN, [healthy], [entry])

@@ -21,7 +21,7 @@ from service.analysis.figures.style import Look
 from service.analysis.orbit import phase_lag_deg, read_orbits
 from service.analysis.recorded import Recorded
 from service.analysis.spectrum import read_spectrum, read_waterfall, shown_as
-from service.analysis.trend import Trend, read_trend, trend_of
+from service.analysis.trend import TrendSeries, read_trend, trend_of
 from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.source import RecordingSource
 from simulator.scenario import load_scenario, parse_fault
@@ -48,7 +48,7 @@ def lines(faulty: Path) -> list[dict[str, object]]:
 
 
 @pytest.fixture(scope="module")
-def computed(faulty: Path) -> Trend:
+def computed(faulty: Path) -> TrendSeries:
     """Its trend, computed from the samples."""
     source = RecordingSource([faulty])
     return read_trend(Recorded(source, LAB.keys, source.span().start_ns, source.span().end_ns + 1))
@@ -282,7 +282,7 @@ def test_no_full_window_is_said(faulty: Path) -> None:
         latest_window(Recorded(source, LAB.keys, source.span().start_ns, START_NS + 30 * S), LAB)
 
 
-def test_a_computed_trend_is_that_of_the_reports(computed: Trend, lines: list[dict[str, object]]) -> None:
+def test_a_computed_trend_is_that_of_the_reports(computed: TrendSeries, lines: list[dict[str, object]]) -> None:
     found, reports = computed, reports_of(lines)
     assert found.end_ns.tolist() == [report.end_ns for report in reports]
     assert found.states == tuple(report.state for report in reports)
@@ -318,7 +318,7 @@ def test_a_trend_of_a_publisher_that_was_started_again_earlier_shows_the_later_r
 
 
 def test_a_trend_of_recorded_reports_needs_no_samples(
-    tmp_path: Path, computed: Trend, lines: list[dict[str, object]]
+    tmp_path: Path, computed: TrendSeries, lines: list[dict[str, object]]
 ) -> None:
     """Recorded reports are shown as they are; a machine file asks for new ones, and needs the samples."""
     messages = []

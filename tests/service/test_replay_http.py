@@ -16,7 +16,7 @@ from pydantic import BaseModel
 import models.machine
 from rotorwatch.records.recordings import RecordingDetail, RecordingList
 from rotorwatch.records.replays import ReplayAlarmList, ReplayJob, ReplayList, ReplayReportList
-from service.api.routes.replays import ReplayDesk
+from service.api.routes.replays import ReplayRequests
 from service.runtime.runtime import Runtime, running
 from service.settings.service import HttpSettings, RecordingSettings, ReplaySettings, ServiceSettings
 from simulator.scenario import parse_fault
@@ -372,7 +372,7 @@ def test_switched_off_nothing_can_be_started(directory: Path) -> None:
 )
 def test_started_by_default_only_on_loopback(host: str, enabled: bool | None, expected: bool) -> None:
     asked = plan(None, enabled=enabled).model_copy(update={"http": HttpSettings(host=host)})
-    assert ReplayDesk(asked, None).enabled is expected
+    assert ReplayRequests(asked, None).enabled is expected
 
 
 def test_the_service_ends_its_replays_and_old_results_make_room(directory: Path) -> None:

@@ -10,7 +10,7 @@ from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from simulator.plant import PlantSamples
 from simulator.scenario import ChannelSettings, Sensors, SensorSettings
-from simulator.sensors import Sensor, SensorBank
+from simulator.sensors import SensorBank, SimulatedSensor
 from simulator.timeline import SensorFaults
 
 RATE_HZ = 2000.0
@@ -19,8 +19,8 @@ DISPLACEMENT = Channel.model_validate(
 )
 
 
-def _sensor(settings: SensorSettings, seed: int = 0, rms_SI: float = 1e-5) -> Sensor:
-    return Sensor(DISPLACEMENT, settings, rms_SI, RATE_HZ, np.random.default_rng(seed))
+def _sensor(settings: SensorSettings, seed: int = 0, rms_SI: float = 1e-5) -> SimulatedSensor:
+    return SimulatedSensor(DISPLACEMENT, settings, rms_SI, RATE_HZ, np.random.default_rng(seed))
 
 
 def _machine(*channels: dict[str, str], dtype: str = "float64") -> Machine:

@@ -34,7 +34,7 @@ _LEAST_INFORMATION = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
-class Alternative:
+class AlternativeTest:
     """One thing outside the model, tried on a window."""
 
     name: str
@@ -52,7 +52,7 @@ class Goodness:
     """How well the theory explains a window."""
 
     excess_z: float  # total squared excess of the whitened spectra over its expectation, in standard deviations
-    alternatives: tuple[Alternative, ...]  # everything tried
+    alternatives: tuple[AlternativeTest, ...]  # everything tried
     tests: int  # how many of them, and the total, say something of their own
 
     @property
@@ -106,7 +106,7 @@ def goodness_of_fit(
     alone = np.einsum("af,af->a", weighted, slopes.reshape(len(names), -1))
     left = alone - np.einsum("ap,ap->a", projection, cross)
     alternatives = tuple(
-        Alternative(name, float(s / np.sqrt(i)), float(s / i))
+        AlternativeTest(name, float(s / np.sqrt(i)), float(s / i))
         for name, s, i, a in zip(names, score, left, alone, strict=True)
         if i > _LEAST_INFORMATION * a
     )
@@ -117,13 +117,13 @@ def goodness_of_fit(
     return Goodness(_excess_z(model, weights, found), (*alternatives, *pairs), tests)
 
 
-def _named(mismatch: Mismatch, alternatives: dict[str, Alternative]) -> Alternative:
+def _named(mismatch: Mismatch, alternatives: dict[str, AlternativeTest]) -> AlternativeTest:
     """Displacement and velocity disagree: which of them deviates is the one whose gain explains the window better."""
     x, v = (f"gain of {state}" for state in mismatch.states)
     z_x, z_v = (abs(alternatives[name].z) if name in alternatives else 0.0 for name in (x, v))
     if z_x > z_v:
-        return Alternative(x, mismatch.z, 1 / (1 + mismatch.change) - 1)
-    return Alternative(v, mismatch.z, mismatch.change)
+        return AlternativeTest(x, mismatch.z, 1 / (1 + mismatch.change) - 1)
+    return AlternativeTest(v, mismatch.z, mismatch.change)
 
 
 def _excess_z(model: SpectralModel, weights: Weights, found: Maximum) -> float:

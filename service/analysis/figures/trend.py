@@ -33,7 +33,7 @@ from service.analysis.figures.style import (
 )
 from service.analysis.past import Past
 from service.analysis.recorded import Recorded
-from service.analysis.trend import LevelTrend, ParameterTrend, Trend, past_trend, read_trend
+from service.analysis.trend import LevelTrend, ParameterTrend, TrendSeries, past_trend, read_trend
 
 _GAP = 2.5
 _DASHES = (0, (4, 3))
@@ -49,7 +49,7 @@ def trend(data: Recorded | Past, machine: str | None, *, levels: bool) -> Paint:
     return partial(_paint, past_trend(data, levels=levels))
 
 
-def _paint(trend: Trend, look: Look) -> Figure:
+def _paint(trend: TrendSeries, look: Look) -> Figure:
     """Small multiples over one time axis."""
     count = len(trend.parameters)
     measures = [name for name in MEASURES if trend.parameters or np.isfinite(trend.measures[name]).any()]
@@ -92,7 +92,7 @@ def _paint(trend: Trend, look: Look) -> Figure:
     return figure
 
 
-def _legend(trend: Trend) -> list[Patch | Line2D]:
+def _legend(trend: TrendSeries) -> list[Patch | Line2D]:
     handles: list[Patch | Line2D] = []
     if trend.parameters:
         handles.append(Patch(color=COLOURS[0], alpha=0.28, linewidth=0, label="95 % interval"))
@@ -112,7 +112,7 @@ def _legend(trend: Trend) -> list[Patch | Line2D]:
     return handles
 
 
-def _states(axes: Axes, trend: Trend, step_ns: int) -> None:
+def _states(axes: Axes, trend: TrendSeries, step_ns: int) -> None:
     """A strip: what the monitor said of the machine, from each report on to the next."""
     after = np.minimum(np.diff(trend.end_ns, append=trend.end_ns[-1] + step_ns), round(_GAP * step_ns))
     for begin, end, state in zip(as_dates(trend.end_ns), as_dates(trend.end_ns + after), trend.states, strict=True):
@@ -150,7 +150,7 @@ def _name_alarms(axes: Axes, alarms: list[AlarmEventData]) -> None:
         )
 
 
-def _parameter(axes: Axes, parameter: ParameterTrend, trend: Trend, step_ns: int) -> None:
+def _parameter(axes: Axes, parameter: ParameterTrend, trend: TrendSeries, step_ns: int) -> None:
     time, low, high, change = _with_gaps(
         trend.end_ns, step_ns, 100 * parameter.low, 100 * parameter.high, 100 * parameter.change
     )
@@ -191,7 +191,7 @@ def _limits(axes: Axes, parameter: ParameterTrend, alarms: AlarmSettings | None)
     return drawn[-1][0]
 
 
-def _level(axes: Axes, level: LevelTrend, trend: Trend, step_ns: int) -> None:
+def _level(axes: Axes, level: LevelTrend, trend: TrendSeries, step_ns: int) -> None:
     """A level and the limits that held, those far above it left out of the picture."""
     time, values, alert, danger = _with_gaps(trend.end_ns, step_ns, level.level, level.alert, level.danger)
     axes.plot(time, values, color=COLOURS[0], linewidth=1.2)
@@ -203,7 +203,7 @@ def _level(axes: Axes, level: LevelTrend, trend: Trend, step_ns: int) -> None:
         axes.set_ylim(0, 1.6 * float(known.max()) or 1.0)
 
 
-def _measure(axes: Axes, name: str, trend: Trend, step_ns: int) -> None:
+def _measure(axes: Axes, name: str, trend: TrendSeries, step_ns: int) -> None:
     unit = MEASURES[name][1].unit
     scale, shown = (30 / np.pi, "rpm") if unit == "rad/s" else (1.0, "" if unit == "1" else unit)
     time, values = _with_gaps(trend.end_ns, step_ns, trend.measures[name] * scale)

@@ -52,7 +52,7 @@ class NoOrder(Record):
     """An empty object: that a request is sent as JSON shows that no page from elsewhere has sent it."""
 
 
-class ReplayDesk:
+class ReplayRequests:
     """Takes requests for replays and turns them into jobs.
 
     Parameters
@@ -232,7 +232,7 @@ def _check_changes(request: ReplayRequest, machine: str | None) -> None:
         raise HTTPException(422, re.sub(r"(?m)^[^:\n]*\.toml: ", "changes: ", str(error))) from error
 
 
-def add_replay_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
+def add_replay_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> None:
     """Add the routes."""
     _add_reading_routes(app, desk, guard)
     _add_changing_routes(app, desk, guard)
@@ -244,7 +244,7 @@ _Every = Annotated[int, Query(ge=1, le=100_000, description="of those that are l
 _Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many")]
 
 
-def _add_reading_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
+def _add_reading_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> None:
     common: dict[str, Any] = {"tags": ["replays"], "dependencies": [guard.read]}
 
     @app.get(_PLACE, responses=responses(ReplayList), **common)
@@ -287,7 +287,7 @@ def _add_reading_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
         )
 
 
-def _add_changing_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
+def _add_changing_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> None:
     common: dict[str, Any] = {"tags": ["replays"], "dependencies": [guard.operate, Depends(_switch(desk))]}
     problems = (400, 404, 413, 415, 422)
 
@@ -329,7 +329,7 @@ def _shown(summary: str, model: type[BaseModel]) -> Any:
     return {"example": {"summary": summary, "value": example(model)}}
 
 
-def _switch(desk: ReplayDesk) -> Callable[[], None]:
+def _switch(desk: ReplayRequests) -> Callable[[], None]:
     """Refuse everything if replays are switched off."""
 
     def check() -> None:
@@ -339,14 +339,14 @@ def _switch(desk: ReplayDesk) -> Callable[[], None]:
     return check
 
 
-def _found(desk: ReplayDesk, replay_id: str) -> RunningJob:
+def _found(desk: ReplayRequests, replay_id: str) -> RunningJob:
     found = desk.jobs.find(replay_id)
     if found is None:
         raise HTTPException(404, f"no replay {replay_id}; they are forgotten when the service stops")
     return found
 
 
-def _order(desk: ReplayDesk, replay_id: str, order: str) -> ReplayJob:
+def _order(desk: ReplayRequests, replay_id: str, order: str) -> ReplayJob:
     found = _found(desk, replay_id)
     if found.view.mode != "paced":
         raise HTTPException(409, "an offline replay has no pace: only paced replays can be paused or moved")
@@ -357,7 +357,7 @@ def _order(desk: ReplayDesk, replay_id: str, order: str) -> ReplayJob:
 
 
 def _results(
-    desk: ReplayDesk, replay_id: str, topic: str, offset: int, limit: int, every: int = 1
+    desk: ReplayRequests, replay_id: str, topic: str, offset: int, limit: int, every: int = 1
 ) -> tuple[list[str], int | None]:
     """Messages of one topic, and where those that follow begin."""
     job = _found(desk, replay_id)
