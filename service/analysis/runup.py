@@ -36,16 +36,10 @@ class RunUp:
         """1 if the shaft turns from y to z, -1 if from z to y."""
         return 1 if np.median(self.speed_rad_s) >= 0 else -1
 
-    def check_speeds(self, what: str) -> None:
-        """Refuse speeds that are all the same.
-
-        Raises
-        ------
-        RotorwatchError
-            Naming them.
-        """
+    def check_speeds(self) -> None:
+        """Refuse speeds that are all the same. Raises RotorwatchError, which names them."""
         if text := steady(self.speed_rad_s):
-            raise RotorwatchError(f"{what} needs a run-up or coast-down: {text}")
+            raise RotorwatchError(f"a Bode plot needs a run-up or coast-down: {text}")
 
 
 def past_run_up(data: Past, channels: tuple[Channel, ...], order: int) -> RunUp:

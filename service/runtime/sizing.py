@@ -151,17 +151,9 @@ class Size:
     alarm_recordings_gb: float  # at most
 
 
-def load_costs(file: Path = _FIGURES) -> Costs:
-    """What was measured.
-
-    Raises
-    ------
-    MachineFileError
-        If the file cannot be read.
-    ValidationError
-        If it is not what `Costs` says.
-    """
-    return Costs.model_validate(read_toml(file))
+def load_costs() -> Costs:
+    """What was measured."""
+    return Costs.model_validate(read_toml(_FIGURES))
 
 
 def sized(

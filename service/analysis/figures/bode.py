@@ -49,7 +49,7 @@ def bode(  # what may be asked for
 ) -> Paint:
     """Amplitude and phase lag at an order over the speed."""
     found = _read(data, channels, order, revolutions, slow_roll_rpm, between_rpm)
-    found.check_speeds("a Bode plot")
+    found.check_speeds()
     return partial(_paint_bode, found, data.name)
 
 
