@@ -7,16 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from models.errors import RotorwatchError
-from service.commands import access as access_commands
-from service.commands import history as history_commands
-from service.commands import installation as installation_commands
-from service.commands import interchange as interchange_commands
-from service.commands import plot as plot_commands
-from service.commands import record as record_commands
-from service.commands import replay as replay_commands
-from service.commands import size as size_commands
-from service.commands import watching as watching_commands
-from service.commands import webhook as webhook_commands
+from service.commands import access, history, installation, interchange, plot, record, replay, size, watching, webhook
 from service.commands.replay import NamespaceOption, in_namespace
 from service.commands.running import (
     ENDPOINT,
@@ -153,7 +144,7 @@ def _serve(settings: "ServiceSettings", config: Path | None, ray_address: str | 
                 typer.echo(f"Zenoh {what} {', '.join(ends)}")
         typer.echo(f"HTTP API {service.http_url}")
         if not settings.access.open_on_loopback and not service.store.tokens.all():
-            typer.echo(access_commands.creation_hint(config, settings.history))
+            typer.echo(access.creation_hint(config, settings.history))
         sys.stdout.flush()
         stop.wait()
 
@@ -323,16 +314,8 @@ def _checked(file: Path) -> str:
 
 
 # After the commands of this module, which are the first in the list.
-installation_commands.register(app)
-size_commands.register(app)
-watching_commands.register(app)
-access_commands.register(app)
-webhook_commands.register(app)
-history_commands.register(app)
-record_commands.register(app)
-replay_commands.register(app)
-interchange_commands.register(app)
-plot_commands.register(app)
+for group in (installation, size, watching, access, webhook, history, record, replay, interchange, plot):
+    group.register(app)
 
 
 if __name__ == "__main__":

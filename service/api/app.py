@@ -116,13 +116,9 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     return app
 
 
-def _configuration_example() -> dict[str, object]:
-    """A configuration of the shipped machine ``lab``."""
-    return {**example(MachineConfiguration), "file": load_machine("lab").model_dump(mode="json")}
-
-
 def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
     common: dict[str, Any] = {"tags": ["machines"], "dependencies": [guard.read]}
+    lab = {**example(MachineConfiguration), "file": load_machine("lab").model_dump(mode="json")}
 
     @app.get("/api/v1/machines", responses=responses(MachineList), **common)
     def machines() -> MachineList:
@@ -134,11 +130,7 @@ def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         """One machine: stream, channels, keys, state."""
         return found_machine(service, site, machine).description()
 
-    @app.get(
-        f"{PLACE}/configuration",
-        responses=responses(MachineConfiguration, 404, 422, shown=_configuration_example()),
-        **common,
-    )
+    @app.get(f"{PLACE}/configuration", responses=responses(MachineConfiguration, 404, 422, shown=lab), **common)
     def configuration(site: SiteName, machine: MachineName) -> MachineConfiguration:
         """The machine file as it is in use, defaults filled in, and what was trained or commissioned for it."""
         view = found_machine(service, site, machine)
