@@ -29,7 +29,6 @@ from service.analysis.figures.style import (
     rotation_text,
     speeds_text,
     spread_marks,
-    stretch_text,
 )
 from service.analysis.past import Past
 from service.analysis.recorded import Recorded
@@ -173,18 +172,10 @@ def _trace(axes: PolarAxes, found: RunUp, number: int) -> None:
 
 
 def _heading(figure: Figure, look: Look, found: RunUp, title: str) -> None:
-    heading(
-        figure,
-        look,
-        title,
-        (
-            stretch_text(int(found.time_ns[0]), int(found.time_ns[-1])),
-            speeds_text(found.speed_rad_s),
-            _points_text(found),
-            f"less slow roll up to {found.slow_roll_rpm:g} rpm" if found.slow_roll_rpm is not None else "",
-            "" if found.estimated else rotation_text(found.direction),
-        ),
-    )
+    span = int(found.time_ns[0]), int(found.time_ns[-1])
+    slow_roll = "" if found.slow_roll_rpm is None else f"less slow roll up to {found.slow_roll_rpm:g} rpm"
+    turns = "" if found.estimated else rotation_text(found.direction)
+    heading(figure, look, title, span, speeds_text(found.speed_rad_s), _points_text(found), slow_roll, turns)
 
 
 def _points_text(found: RunUp) -> str:

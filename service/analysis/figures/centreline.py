@@ -23,7 +23,6 @@ from service.analysis.figures.style import (
     plane_labels,
     speeds_text,
     spread_marks,
-    stretch_text,
 )
 from service.analysis.orbit import planes_of, recorded_pairs
 from service.analysis.past import Past
@@ -63,16 +62,8 @@ def _paint(found: Centreline, name: str, clearance_um: float | None, look: Look)
         axes.set_title(f"{pair[0].location}", fontweight="bold")
     bar = figure.colorbar(lines, ax=list(panels), pad=0.02, aspect=32, shrink=0.9)
     bar.set_label(unit)
-    heading(
-        figure,
-        look,
-        f"{name}: shaft centreline",
-        (
-            stretch_text(int(found.time_ns[0]), int(found.time_ns[-1])),
-            speeds_text(found.speed_rad_s),
-            f"means over {found.each_s:.3g} s",
-        ),
-    )
+    span, text = (int(found.time_ns[0]), int(found.time_ns[-1])), f"means over {found.each_s:.3g} s"
+    heading(figure, look, f"{name}: shaft centreline", span, speeds_text(found.speed_rad_s), text)
     return figure
 
 

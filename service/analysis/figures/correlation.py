@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 
 from models.errors import MachineFileError
 from service.analysis.correlation import Correlations, Panel, correlations_of, latest_window
-from service.analysis.figures.style import COLOURS, GREY, INK, Look, Paint, heading, rpm, stretch_text
+from service.analysis.figures.style import COLOURS, GREY, INK, Look, Paint, heading, rpm
 from service.analysis.recorded import Recorded
 from service.recordings.replay.machine import choose_machine
 
@@ -49,12 +49,8 @@ def _paint(found: Correlations, name: str, networks: str, look: Look) -> Figure:
         loc="outside lower center",
         ncols=2,
     )
-    heading(
-        figure,
-        look,
-        f"{name}: correlations against the networks' prediction",
-        (stretch_text(found.start_ns, found.end_ns), rpm(found.speed_rad_s), f"networks {networks}"),
-    )
+    title, span = f"{name}: correlations against the networks' prediction", (found.start_ns, found.end_ns)
+    heading(figure, look, title, span, rpm(found.speed_rad_s), f"networks {networks}")
     return figure
 
 

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from service.analysis.figures.spectrum import Lines
-from service.analysis.figures.style import COLOURS, INK, Look, Paint, heading, rpm, stretch_text
+from service.analysis.figures.style import COLOURS, INK, Look, Paint, heading, rpm
 from service.analysis.orbit import recorded_pairs
 from service.analysis.recorded import Recorded
 from service.analysis.spectrum import FullSpectrum, lowest_hz, read_full_spectrum
@@ -48,17 +48,8 @@ def _paint(found: FullSpectrum, name: str, lines: Lines, look: Look) -> Figure:
         _marks(axes, found, values, shown)
     panels[-1].set_xlim(-to, to)
     panels[-1].set_xlabel("order" if found.orders else "frequency, Hz")
-    unit = "orders" if found.orders else "Hz"
-    heading(
-        figure,
-        look,
-        f"{name}: full spectrum",
-        (
-            stretch_text(found.start_ns, found.end_ns),
-            rpm(found.speed_rad_s),
-            f"{found.resolution:.3g} {unit}, Hann, {found.averages} averages",
-        ),
-    )
+    text = f"{found.resolution:.3g} {'orders' if found.orders else 'Hz'}, Hann, {found.averages} averages"
+    heading(figure, look, f"{name}: full spectrum", (found.start_ns, found.end_ns), rpm(found.speed_rad_s), text)
     return figure
 
 

@@ -7,18 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from service.analysis.figures.style import (
-    COLOURS,
-    GREY,
-    INK,
-    Look,
-    Paint,
-    heading,
-    plane_labels,
-    rotation_text,
-    rpm,
-    stretch_text,
-)
+from service.analysis.figures.style import COLOURS, GREY, INK, Look, Paint, heading, plane_labels, rotation_text, rpm
 from service.analysis.orbit import Orbit, Orbits, phase_lag_deg, read_orbits
 from service.analysis.recorded import Recorded
 
@@ -51,12 +40,8 @@ def _paint(found: Orbits, name: str, look: Look) -> Figure:
         ],
         loc="outside lower center",
     )
-    heading(
-        figure,
-        look,
-        f"{name}: orbits of {found.revolutions} revolutions",
-        (stretch_text(found.start_ns, found.end_ns), rpm(found.speed_rad_s), rotation_text(found.direction)),
-    )
+    span, turns = (found.start_ns, found.end_ns), rotation_text(found.direction)
+    heading(figure, look, f"{name}: orbits of {found.revolutions} revolutions", span, rpm(found.speed_rad_s), turns)
     return figure
 
 

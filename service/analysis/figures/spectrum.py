@@ -24,7 +24,6 @@ from service.analysis.figures.style import (
     place_text,
     rpm,
     speeds_text,
-    stretch_text,
     time_axis,
 )
 from service.analysis.recorded import Recorded
@@ -89,16 +88,9 @@ def paint_spectrum(found: Spectrum, name: str, look: Look, lines: Lines) -> Figu
         _orders(axes, found, values, frequency, channel)
     panels[-1].set_xlim(limits_hz)
     panels[-1].set_xlabel("frequency, Hz")
-    heading(
-        figure,
-        look,
-        f"{name}: " + ("power spectral density" if found.scaling == "density" else "amplitude spectrum"),
-        (
-            stretch_text(found.start_ns, found.end_ns),
-            rpm(found.speed_rad_s),
-            f"{found.resolution_hz:.3g} Hz, Hann, {found.averages} averages",
-        ),
-    )
+    title = f"{name}: " + ("power spectral density" if found.scaling == "density" else "amplitude spectrum")
+    text = f"{found.resolution_hz:.3g} Hz, Hann, {found.averages} averages"
+    heading(figure, look, title, (found.start_ns, found.end_ns), rpm(found.speed_rad_s), text)
     return figure
 
 
@@ -197,16 +189,10 @@ def _cascade(axes: Axes, found: Waterfall, shown: npt.NDArray[np.bool_], *, over
 
 
 def _waterfall_heading(figure: Figure, look: Look, found: Waterfall, name: str) -> None:
-    heading(
-        figure,
-        look,
-        f"{name}: spectra of {found.channel.name}, {place_text(found.channel)}",
-        (
-            stretch_text(int(found.start_ns[0]), int(found.end_ns[-1])),
-            speeds_text(found.speed_rad_s),
-            f"{found.values.shape[0]} spectra, {found.resolution_hz:.3g} Hz, Hann",
-        ),
-    )
+    title = f"{name}: spectra of {found.channel.name}, {place_text(found.channel)}"
+    span = int(found.start_ns[0]), int(found.end_ns[-1])
+    text = f"{found.values.shape[0]} spectra, {found.resolution_hz:.3g} Hz, Hann"
+    heading(figure, look, title, span, speeds_text(found.speed_rad_s), text)
 
 
 def _rows_in_time(found: Waterfall, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -117,12 +117,14 @@ def write_figure(figure: Figure, path: Path, dpi: float) -> None:
         raise RotorwatchError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
-def heading(figure: Figure, look: Look, title: str, details: Iterable[str]) -> None:
-    """Title, and a line on what is shown."""
+def heading(figure: Figure, look: Look, title: str, span_ns: tuple[int, int], *details: str) -> None:
+    """Title, and a line on what is shown: from when to when, UTC, the date once if it is the same, and `details`."""
+    first, last = (clock(time_ns) for time_ns in span_ns)
+    when = f"{first} to {last[11:] if last[:10] == first[:10] else last} UTC"
     figure.suptitle(look.title or title, x=0.012, y=0.995, ha="left", va="top", fontsize=11.5, fontweight="bold")
     height = figure.get_figheight()
     figure.text(
-        0.012, 1 - 0.27 / height, "   ·   ".join(text for text in details if text), ha="left", va="top", color=GREY
+        0.012, 1 - 0.27 / height, "   ·   ".join(filter(None, (when, *details))), ha="left", va="top", color=GREY
     )
     engine = figure.get_layout_engine()
     if isinstance(engine, ConstrainedLayoutEngine):
@@ -190,12 +192,6 @@ def spread_marks(along: FloatArray, places: npt.NDArray[Any], apart: float) -> l
         if all(abs(places[at] - places[one]) > apart for one in chosen):
             chosen.append(at)
     return chosen
-
-
-def stretch_text(start_ns: int, end_ns: int) -> str:
-    """From when to when, UTC; the date once if it is the same."""
-    first, last = clock(start_ns), clock(end_ns)
-    return f"{first} to {last[11:] if last[:10] == first[:10] else last} UTC"
 
 
 def as_dates(time_ns: npt.NDArray[np.int64]) -> FloatArray:

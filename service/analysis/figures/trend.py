@@ -28,7 +28,6 @@ from service.analysis.figures.style import (
     as_date,
     as_dates,
     heading,
-    stretch_text,
     time_axis,
 )
 from service.analysis.past import Past
@@ -79,16 +78,9 @@ def _paint(trend: TrendSeries, look: Look) -> Figure:
     figure.legend(handles=_legend(trend), loc="outside lower center", ncols=5, fontsize=8)
     speed = trend.measures["speed"]
     speeds = speed[np.isfinite(speed)] * 30 / np.pi
-    heading(
-        figure,
-        look,
-        f"{trend.name}: changes from nominal" if trend.parameters else f"{trend.name}: vibration levels",
-        (
-            stretch_text(int(trend.end_ns[0]), int(trend.end_ns[-1])),
-            f"{np.median(speeds):.0f} rpm" if speeds.size else "",
-            f"reports {trend.origin}",
-        ),
-    )
+    title = f"{trend.name}: changes from nominal" if trend.parameters else f"{trend.name}: vibration levels"
+    span, median = (int(trend.end_ns[0]), int(trend.end_ns[-1])), f"{np.median(speeds):.0f} rpm" if speeds.size else ""
+    heading(figure, look, title, span, median, f"reports {trend.origin}")
     return figure
 
 

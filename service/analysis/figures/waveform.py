@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 
 from models.errors import RotorwatchError
 from models.signals.channels import Channel
-from service.analysis.figures.style import COLOURS, GREY, Look, Paint, heading, place_text, rpm, stretch_text
+from service.analysis.figures.style import COLOURS, GREY, Look, Paint, heading, place_text, rpm
 from service.analysis.recorded import Recorded
 from service.analysis.revolutions import Excerpt, pulses
 from service.analysis.spectrum import unit_shown
@@ -72,14 +72,7 @@ def _paint(found: Sequence[Excerpt], channels: Sequence[Channel], name: str, loo
         pulse = Line2D([], [], marker="o", linestyle="", color=COLOURS[1], label="keyphasor pulse")
         figure.legend(handles=[pulse], loc="outside lower center")
     lengths = [stretch.length_s for stretch in found]
-    heading(
-        figure,
-        look,
-        f"{name}: waveform",
-        (
-            stretch_text(start_ns, found[-1].end_ns),
-            rpm(float(np.average([stretch.speed_rad_s for stretch in found], weights=lengths))),
-            f"{found[0].rate_hz:g} samples per second",
-        ),
-    )
+    speed_rad_s = float(np.average([stretch.speed_rad_s for stretch in found], weights=lengths))
+    span, text = (start_ns, found[-1].end_ns), f"{found[0].rate_hz:g} samples per second"
+    heading(figure, look, f"{name}: waveform", span, rpm(speed_rad_s), text)
     return figure
