@@ -20,8 +20,8 @@ from models.commissioning.commissioned import (
 )
 from models.commissioning.healthy import HealthyRecording, known_lines
 from models.commissioning.levels import LEVELS, NO_SUCH_ROTOR, HealthyPiece, Learned, Progress, pieces_of
-from models.diagnosis.baseline.rows import evaluable_rows
-from models.diagnosis.networks.equations import EQUATIONS, missing
+from models.diagnosis.baseline.rows import Row, evaluable_rows
+from models.diagnosis.networks.equations import EQUATIONS, Equation, SynchronousEquation, missing
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import learn_sensor_reference
@@ -411,30 +411,19 @@ def _equations(machine: MachineFile, learned: Learned, pieces: Sequence[HealthyP
     states = machine.descriptor.states
     known = learned.machine is not None
     has_speed = "theta" in states or any(np.isfinite(piece.window.speed_rad_s) for piece in pieces)
-    found = []
+    found: list[EquationRow] = []
+
+    def add(of: Equation | SynchronousEquation | Row, parameters: tuple[str, ...], reason: str) -> None:
+        used = not reason
+        found.append(EquationRow(number=of.number, title=of.title, parameters=parameters, used=used, reason=reason))
+
     for equation in EQUATIONS:
         lacking = missing(equation, states)
         reason = f"not measured: {', '.join(lacking)}" if lacking else ""
         if not known:
             reason = "; ".join(filter(None, [reason, "needs the rotor's masses and shaft"]))
-        found.append(
-            EquationRow(
-                number=equation.number,
-                title=equation.title,
-                parameters=equation.parameters,
-                used=not reason,
-                reason=reason,
-            )
-        )
+        add(equation, equation.parameters, reason)
     for row, reason in evaluable_rows(states, has_speed):
         why = "the rotor is known: theory says more" if known and not reason else reason
-        found.append(
-            EquationRow(
-                number=row.number,
-                title=row.title,
-                parameters=tuple(own.parameter for own in row.own),
-                used=not why,
-                reason=why,
-            )
-        )
+        add(row, tuple(own.parameter for own in row.own), why)
     return tuple(found)

@@ -76,15 +76,8 @@ def healthy_from_blocks(
             hop = window.latest_hop
             if hop is not None:
                 stretches[-1].append(hop)
-    return HealthyRecording(
-        name,
-        plan,
-        tuple(tuple(stretch) for stretch in stretches if stretch),
-        gaps,
-        missing_s,
-        tuple(sorted(refused.items())),
-        last_refusal,
-    )
+    filled = tuple(tuple(stretch) for stretch in stretches if stretch)
+    return HealthyRecording(name, plan, filled, gaps, missing_s, tuple(sorted(refused.items())), last_refusal)
 
 
 def read_healthy(path: Path, machine: MachineFile, until_s: float | None = None) -> HealthyRecording:

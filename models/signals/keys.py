@@ -173,15 +173,8 @@ def access_control(grants: Sequence[Grant], known_by: Literal["usernames", "cert
     for grant in grants:
         begin = len(rules)
         for flow, messages, keys in _rules(grant):
-            rules.append(
-                {
-                    "id": f"rule {len(rules)}",
-                    "permission": "allow",
-                    "flows": [flow],
-                    "messages": list(messages),
-                    "key_exprs": list(keys),
-                }
-            )
+            allows = {"permission": "allow", "flows": [flow], "messages": list(messages), "key_exprs": list(keys)}
+            rules.append({"id": f"rule {len(rules)}", **allows})
         for name in grant.who:
             allowed.setdefault(name, []).extend(f"rule {number}" for number in range(begin, len(rules)))
     # One subject for each name: of several that fit a partner, Zenoh would take one.

@@ -238,21 +238,8 @@ def _write(store: "Store", action: str, reason: str) -> None:
         user = getpass.getuser()
     except (KeyError, OSError):  # a container whose user has no name
         user = f"user {os.getuid()}"
-    store.audit.append(
-        AuditEntry(
-            number=0,
-            at_ns=time.time_ns(),
-            actor=user,
-            address="",
-            method="command",
-            path="rotorwatch token",
-            status=200,
-            action=action,
-            machine="",
-            alarm="",
-            reason=reason,
-        )
-    )
+    said = {"action": action, "reason": reason}
+    store.audit.append(AuditEntry(0, time.time_ns(), user, "", "command", "rotorwatch token", status=200, **said))
 
 
 def _state(record: "TokenRecord", now_ns: int) -> str:

@@ -120,10 +120,10 @@ class AuditEntry:
     method: str
     path: str
     status: int
-    action: str
-    machine: str
-    alarm: str
-    reason: str
+    action: str = ""
+    machine: str = ""
+    alarm: str = ""
+    reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -142,16 +142,9 @@ def _of_pairs(
         )
         if guilty is None:
             text += "; which of the two it is does not show"
-        scatter = float(np.hypot(_PAIR_SCATTER, np.sqrt(1 / own.averages.min())))
-        findings.append(
-            SensorFault(
-                states=states,
-                kind=FaultKind.NOISE,
-                text=text,
-                value=sizes[column] / float(rms[column]),
-                z=float(rise[row].max()) / scatter,
-            )
-        )
+        z = float(rise[row].max()) / float(np.hypot(_PAIR_SCATTER, np.sqrt(1 / own.averages.min())))
+        value = sizes[column] / float(rms[column])
+        findings.append(SensorFault(states=states, kind=FaultKind.NOISE, text=text, value=value, z=z))
     return findings
 
 
@@ -235,13 +228,6 @@ def _of_single(
                 f"{factor:.3g} times the healthy one, expected less than {np.sqrt(FLOOR_RISE):.2g} times: "
                 "cable, earthing or amplifier"
             )
-            findings.append(
-                SensorFault(
-                    states=(state,),
-                    kind=FaultKind.NOISE,
-                    text=text,
-                    value=size / own,
-                    z=float(rise[row]) / _FLOOR_SCATTER,
-                )
-            )
+            z = float(rise[row]) / _FLOOR_SCATTER
+            findings.append(SensorFault(states=(state,), kind=FaultKind.NOISE, text=text, value=size / own, z=z))
     return findings

@@ -91,13 +91,5 @@ def _empty(axes: Axes, panel: Panel) -> None:
     axes.set_yticks([])
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
-    axes.text(
-        0.5,
-        0.5,
-        f"not evaluable\n{panel.reading.reason}",
-        transform=axes.transAxes,
-        ha="center",
-        va="center",
-        color=GREY,
-        wrap=True,
-    )
+    text = f"not evaluable\n{panel.reading.reason}"
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=GREY, wrap=True)

@@ -27,19 +27,9 @@ def _paint(found: Orbits, name: str, look: Look) -> Figure:
     for row, orbit in zip(figure.subplots(rows, 2, squeeze=False), found.orbits, strict=True):
         _raw(row[0], orbit)
         _running_speed(row[1], orbit, found)
-    figure.legend(
-        handles=[
-            Line2D(
-                [],
-                [],
-                marker="o",
-                linestyle="",
-                color=COLOURS[1],
-                label="keyphasor pulse (on 1×, the gap comes before it)",
-            )
-        ],
-        loc="outside lower center",
-    )
+    text = "keyphasor pulse (on 1×, the gap comes before it)"
+    pulse = Line2D([], [], marker="o", linestyle="", color=COLOURS[1], label=text)
+    figure.legend(handles=[pulse], loc="outside lower center")
     span, turns = (found.start_ns, found.end_ns), rotation_text(found.direction)
     heading(figure, look, f"{name}: orbits of {found.revolutions} revolutions", span, rpm(found.speed_rad_s), turns)
     return figure

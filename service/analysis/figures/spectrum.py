@@ -176,16 +176,8 @@ def _cascade(axes: Axes, found: Waterfall, shown: npt.NDArray[np.bool_], *, over
     axes.annotate(
         "", (right * 0.985, base[-1]), (right * 0.985, base[-1] + scale), arrowprops={"arrowstyle": "|-|", "color": INK}
     )
-    axes.text(
-        right * 0.975,
-        base[-1] + scale / 2,
-        f"{full}, 3 decades" if log else full,
-        ha="right",
-        va="center",
-        fontsize=8,
-        zorder=400,
-        bbox=PLATE,
-    )
+    full += ", 3 decades" if log else ""
+    axes.text(right * 0.975, base[-1] + scale / 2, full, ha="right", va="center", fontsize=8, zorder=400, bbox=PLATE)
 
 
 def _waterfall_heading(figure: Figure, look: Look, found: Waterfall, name: str) -> None:

@@ -130,16 +130,9 @@ def _name_alarms(axes: Axes, alarms: list[AlarmEventData]) -> None:
     """Events of a parameter in the line of its title; those of the model over the states."""
     for alarm in alarms[:8]:
         axes.annotate(
-            alarm_text(alarm),
-            (as_date(alarm.time_ns), 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(0, 3),
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            fontsize=8,
-            color=INK,
-        )
+            alarm_text(alarm), (as_date(alarm.time_ns), 1.0), xycoords=("data", "axes fraction"), xytext=(0, 3),
+            textcoords="offset points", ha="center", va="bottom", fontsize=8, color=INK,
+        )  # fmt: skip
 
 
 def _parameter(axes: Axes, parameter: ParameterTrend, trend: TrendSeries, step_ns: int) -> None:
