@@ -19,7 +19,6 @@ from models.signals.channels import state_name
 from rotorwatch.records.example import example
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 from service.analysis.prediction import Prediction, predict
-from service.analysis.snapshots import machine as machine_module
 from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
@@ -364,7 +363,7 @@ def test_the_theory_of_a_window_is_computed_once(monkeypatch: pytest.MonkeyPatch
         asked.append(window)
         return predict(known, window, *rest)  # type: ignore[arg-type]  # handed on as they came
 
-    monkeypatch.setattr(machine_module, "predict", counted)
+    monkeypatch.setattr("service.analysis.prediction.predict", counted)
     made = snapshots_of(LAB)
     first = made.correlations(latest())
     made.spectra(latest())

@@ -1,17 +1,20 @@
-"""Where a machine's snapshots are asked for: what is known of it, and the theory of its latest window."""
+"""Where a machine's snapshots are asked for: what is known of it, and the theory of its latest window.
+
+What makes them is imported when somebody asks: a process that only evaluates machines does without.
+"""
 
 import threading
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from models.commissioning.commissioned import Installed
 from models.diagnosis.window import WindowStatistics
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
-from service.analysis.prediction import NO_PARAMETERS, Prediction, predict
-from service.analysis.snapshots.correlation import correlation_snapshot
 from service.analysis.snapshots.heading import LatestData, Subject
-from service.analysis.snapshots.orbit import orbit_snapshot
-from service.analysis.snapshots.spectrum import spectrum_snapshot
 from service.monitor.reports import Identity
+
+if TYPE_CHECKING:
+    from service.analysis.prediction import Prediction
 
 _NO_WINDOW = "there is no window yet"
 
@@ -38,6 +41,8 @@ class MachineSnapshots:
         self, data: LatestData, first: Sequence[str] = (), second: Sequence[str] = (), units: Units = "channel"
     ) -> CorrelationSnapshot:
         """Correlation functions of the latest window, see `correlation_snapshot`."""
+        from service.analysis.snapshots.correlation import correlation_snapshot  # noqa: PLC0415
+
         return correlation_snapshot(self._subject, data, self._theory(data), first, second, units)
 
     def spectra(
@@ -50,13 +55,19 @@ class MachineSnapshots:
         units: Units = "channel",
     ) -> SpectrumSnapshot:
         """Power spectral densities of the latest window, see `spectrum_snapshot`."""
+        from service.analysis.snapshots.spectrum import spectrum_snapshot  # noqa: PLC0415
+
         return spectrum_snapshot(self._subject, data, self._theory(data), channels, first, second, band_hz, units)
 
     def orbits(self, data: LatestData, revolutions: int = 0, units: Units = "channel") -> OrbitSnapshot:
         """Orbits of the latest window and the newest revolutions, see `orbit_snapshot`."""
+        from service.analysis.snapshots.orbit import orbit_snapshot  # noqa: PLC0415
+
         return orbit_snapshot(self._subject, data, revolutions, units)
 
-    def _theory(self, data: LatestData) -> Prediction:
+    def _theory(self, data: LatestData) -> "Prediction":
+        from service.analysis.prediction import NO_PARAMETERS, Prediction, predict  # noqa: PLC0415
+
         if data.window is None:
             known = self._subject.known
             reason = NO_PARAMETERS if known is None else _NO_WINDOW
