@@ -28,31 +28,10 @@ from service.stream.worker import MachineWorker
 from simulator.publisher import PublishSettings, publish
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
-from tests.loopback import endpoint
+from tests import loopback
 from tests.service.preloaded import Preloaded
 
-__all__ = [
-    "IN_MEMORY",
-    "LAB",
-    "OPEN",
-    "PATIENT",
-    "ROOT",
-    "SHORT",
-    "START_NS",
-    "Feed",
-    "Program",
-    "endpoint",
-    "machine_file",
-    "open_session",
-    "program",
-    "scenario_blocks",
-    "send",
-    "service",
-    "settings",
-    "until",
-    "until_subscribed",
-]
-
+endpoint = loopback.endpoint
 ROOT = Path(__file__).parents[2]
 LAB = load_machine("lab")
 START_NS = 1_767_225_600_000_000_000
