@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import chdtrc, ndtr, ndtri
 
 from models.diagnosis.baseline.force import alike, force_spectrum
+from models.diagnosis.baseline.growth import motion_power
 from models.diagnosis.baseline.lag_moments import row_window, shared_covariance
 from models.diagnosis.baseline.learned import Baseline, coefficient_slices, learned_rows, positive, unsuitable
 from models.diagnosis.baseline.relation import Relation, RowChange, one_source, read_row
@@ -97,6 +98,9 @@ _RPM = 30 / math.pi
 _GONE = -0.95  # a loss beyond this is no loss of a bearing
 _LOST = 0.5  # standard error of a stiffness beyond which the relation does not hold in the window at all
 _SURELY_OUTSIDE = 8.0
+# Factor on standard errors in windows of another force, of a relation learned in one condition: its error is not normal
+# (decision 0012).
+_OTHER_FORCE = 1.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,10 +183,15 @@ class BaselineDiagnostician:
                 common = _bordered(common, e.common_covariance, e.common_variance)
                 through = np.vstack([through, e.slope])
         same = self._as_commissioned(changes)
-        if not same and one_source(window):
-            wider = np.array([self._own_of[name].one_source for name in names[: values.size]])
+        if not same:
+            least = _OTHER_FORCE if self._conditions == 1 else 1.0
+            alone = one_source(window)
+            own = [self._own_of[name] for name in names[: values.size]]
+            wider = np.array([max(least, one.one_source if alone else 1.0) for one in own])
             total, common = total * np.outer(wider, wider), common * np.outer(wider, wider)
         elsewhere = through @ np.diag(self._elsewhere(bearing.values, same=same)) @ through.T
+        # A stiffness that grew with the motion has changed, and the unbalance is rightly read with it.
+        elsewhere[range(values.size), range(values.size)] += self._grown(changes, values.size, same=same)
         total, common = total + elsewhere, common + elsewhere
         known = [names.index(name) for name in self._parameters if not reasons[name]]
         covariance = positive(total[np.ix_(known, known)])
@@ -206,7 +215,7 @@ class BaselineDiagnostician:
             return replace(diagnosis, misfit_z=max(_SURELY_OUTSIDE, diagnosis.misfit_z or 0.0), suspect=impossible)
         suspicion = gain_suspicion(diagnosis, self._rows, self._baseline.relations) if known else None
         if suspicion is None:
-            return diagnosis
+            return diagnosis if same else replace(diagnosis, unexplained=_unexplained(diagnosis.misfit_z))
         misfit = suspicion.z if diagnosis.misfit_z is None else max(diagnosis.misfit_z, suspicion.z)
         return replace(diagnosis, misfit_z=misfit, suspect=suspicion.sentence)
 
@@ -223,6 +232,16 @@ class BaselineDiagnostician:
         own = [self._own_of[name] for name in self._names]
         errors = np.array([0.0 if same and not one.always else one.elsewhere for one in own])
         return (errors * np.maximum(1 + changes, 1 + _MOST_LOSS)) ** 2 / self._conditions
+
+    def _grown(self, changes: Sequence[RowChange | None], size: int, *, same: bool) -> FloatArray:
+        """Variances of stiffnesses that grow with the motion, of another power than in the healthy recording."""
+        found = np.zeros(size)
+        known = zip(self._rows, self._own, self._baseline.relations, self._baseline.growth, changes, strict=False)
+        for row, at, relation, growth, change in known:
+            if relation is not None and growth is not None and change is not None:
+                power = float(motion_power(row, relation, change.moments.of.window).mean())
+                found[at] += [growth.variance(power, same_force=same) if 0 in own.terms else 0.0 for own in row.own]
+        return found
 
     def _bearing(self, changes: list[RowChange | None]) -> _Bearing:
         n = len(self._names)
@@ -325,6 +344,17 @@ class BaselineDiagnostician:
         if healthy.absolute and now.absolute:
             return healthy, now
         return healthy.turned(healthy.largest), now.turned(healthy.largest)
+
+
+def _unexplained(misfit_z: float | None) -> str:
+    """Why nothing is named in a window of another force that the relations do not hold in; empty where they may."""
+    if misfit_z is None or misfit_z <= _SURELY_OUTSIDE:
+        return ""
+    text, limit = beyond(misfit_z, _SURELY_OUTSIDE)
+    return (
+        f"the relations that were learned do not hold under this force: what they leave over is {text} standard errors "
+        f"more than chance leaves, read is at most {limit}; record a healthy condition like this one"
+    )
 
 
 def _impossible(diagnosis: Diagnosis) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from models.diagnosis.baseline.force import force_spectrum
+from models.diagnosis.baseline.growth import Growth, growth_of
 from models.diagnosis.baseline.lag_moments import (
     LONGEST_LAG_STEP_S,
     LagMoments,
@@ -145,6 +146,8 @@ class Baseline:
     # (n_bands, n_rows, n_rows): force that it was learned under (`force_spectrum`); empty where it was not one, or is
     # not seen in all rows
     force: FloatArray = field(default_factory=_NO_FORCE.copy)
+    # How the stiffness of each learned row grows with the motion; None where that is not known, empty in older records.
+    growth: tuple[Growth | None, ...] = ()
 
     @property
     def without_force(self) -> "Baseline":
@@ -204,10 +207,11 @@ def learn_baseline(
     learned = learned_rows(rows)
     groups = ("",) * len(windows) if conditions is None else tuple(conditions)
     relations: list[Relation | None] = []
-    reasons, parts = [], []
+    reasons, parts, growth = [], [], []
     consistency: list[LeftOut] = []
     for row in learned:
         relation, contributions, reason = _learn(row, windows, states)
+        growth.append(None if relation is None else growth_of(row, relation, [one.moments for one in contributions]))
         if relation is not None:
             found = left_out(row, [one.moments for one in contributions], groups)
             relation = replace(relation, allowance=allowance_of(found))
@@ -226,6 +230,7 @@ def learn_baseline(
         rotations=rotations_by_speed([one for one in rotations if one is not None]),
         duration_s=sum(window.duration_s for window in windows),
         consistency=tuple(consistency),
+        growth=tuple(growth),
         **_learned_under(relations, parts, groups),
     )
 

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import BaseModel, Field, model_validator
 
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
+from models.diagnosis.baseline.growth import Growth
 from models.diagnosis.baseline.learned import Baseline, HeldOutReading, LeftOut
 from models.diagnosis.baseline.relation import Relation
 from models.diagnosis.baseline.unbalance import SynchronousVectors
@@ -81,6 +82,14 @@ class _LeftOutRecord(BaseModel, extra="forbid", frozen=True, strict=True):
     degrees_of_freedom: int = Field(ge=1)
 
 
+class GrowthRecord(BaseModel, extra="forbid", frozen=True, strict=True):
+    """How a row's stiffness grows with the motion."""
+
+    power: _Positive
+    slope: _Number
+    standard_error: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
 class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
     """What was learned on a healthy machine, as plain numbers."""
 
@@ -93,6 +102,8 @@ class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
     consistency: tuple[_LeftOutRecord, ...] = ()  # healthy windows against each other
     # Cross-spectra of what the rows leave over, by bands; empty where the healthy recordings had several forces.
     force: tuple[_Matrix, ...] = Field(default=(), exclude_if=lambda bands: not bands)
+    # Of each learned row, or null; empty in older records.
+    growth: tuple[GrowthRecord | None, ...] = Field(default=(), exclude_if=lambda rows: not rows)
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -101,6 +112,8 @@ class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
         for relation, reason in zip(self.relations, self.reasons, strict=True):
             if (relation is None) == (reason == ""):
                 raise ValueError("a relation is there, or a reason why not; never both or neither")
+        if self.growth and len(self.growth) != len(self.relations):
+            raise ValueError(f"{len(self.relations)} relations have {len(self.growth)} growths")
         _check_covariance("covariance of the coefficients", self.covariance, len(self.covariance))
         for band in self.force:
             _check_covariance("spectra of the force", band, len(self.relations))
@@ -137,6 +150,7 @@ class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
                 for one in self.consistency
             ),
             force=np.array(self.force, dtype=np.float64) if self.force else np.zeros((0, 0, 0)),
+            growth=tuple(None if one is None else Growth(**dict(one)) for one in self.growth),
         )
 
 

@@ -1,0 +1,75 @@
+"""How a bearing's stiffness grows with its displacement, as far as the hops of the healthy recording show it.
+
+A relation is linear, and reads the stiffness that the motion of its own window meets. Where that grows with the motion,
+a force of another direction or level meets another one, which is no fault: errors of the stiffness know it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.baseline.lag_moments import LagMoments
+from models.diagnosis.baseline.relation import Relation, change_of
+from models.diagnosis.baseline.rows import Row
+from models.diagnosis.window import WindowStatistics
+from models.signals.block import FloatArray
+
+_CHANCE = 4.0  # square of the growth over its error up to which it is taken for chance
+# Growth that a bearing may have all the same, of motions up to e times as strong or as weak; where it is known better
+# than that, its error.
+_UNSEEN = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """Growth of the scale of a row with the power of the motion that it resists."""
+
+    power: float  # mean of the healthy windows
+    slope: float  # relative change of the scale where the power changes by `power`
+    standard_error: float  # of the slope
+
+    def variance(self, power: float, *, same_force: bool) -> float:
+        """Variance of the relative change of the scale where the motion has another power.
+
+        A stiffness that falls as the motion grows is taken for chance. Where the force is still the commissioned one,
+        motions differ by what has changed, and only a growth that was seen counts.
+        """
+        ratio = power / self.power
+        seen = max(0.0, self.slope**2 - _CHANCE * self.standard_error**2) if self.slope > 0 else 0.0
+        unseen = 0.0 if same_force else min(_UNSEEN, self.standard_error) * min(1.0, abs(math.log(ratio)))
+        return seen * (ratio - 1) ** 2 + unseen**2
+
+
+def growth_of(row: Row, relation: Relation, parts: Sequence[LagMoments]) -> Growth | None:
+    """Regress what the hops of healthy windows read of a row's scale on the power of its motion.
+
+    Every window counts against its own mean. None where the row reads no scale, or hops do not differ.
+    """
+    at = next((number for number, own in enumerate(row.own) if 0 in own.terms), None)
+    powers = [motion_power(row, relation, part.of.window) for part in parts]
+    power = float(np.mean(np.concatenate(powers)))
+    freedom = sum(one.size - 1 for one in powers) - 1
+    if at is None or freedom < 1 or not power > 0:
+        return None
+    levels, found = [], []
+    for part, own in zip(parts, powers, strict=True):
+        change = change_of(row, relation, part)
+        hops = part.hop_values @ change.combination @ change.projection[at]
+        levels.append((own - own.mean()) / power)
+        found.append(hops - hops.mean())
+    x, y = np.concatenate(levels), np.concatenate(found)
+    if not x @ x > 0:
+        return None
+    slope = float(x @ y / (x @ x))
+    rest = y - slope * x
+    return Growth(power, slope, float(np.sqrt(rest @ rest / freedom / (x @ x))))
+
+
+def motion_power(row: Row, relation: Relation, window: WindowStatistics) -> FloatArray:
+    """Power of the motion that a row's scale resists, in every hop, shape (n_hops,)."""
+    coordinate = row.terms[0].motions[0].coordinate
+    state = next(name for name in relation.references if name.split("_")[0] == coordinate)
+    at = window.states.index(state)
+    return np.asarray(window.hop_correlation[:, 0, at, at], dtype=np.float64)

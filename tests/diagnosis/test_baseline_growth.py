@@ -1,0 +1,75 @@
+"""A bearing that stiffens with its displacement, and windows that the relations do not hold in."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks.studies.subjects import subject_named
+from models.commissioning.levels import learned_baseline
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
+from models.diagnosis.baseline.growth import Growth
+from models.diagnosis.baseline.learned import Baseline
+from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.verdict.isolation import isolate_window
+from models.diagnosis.window import WindowStatistics
+
+_SEED = 6101
+
+
+@cache
+def baseline(name: str, commissioning: int) -> Baseline:
+    return learned_baseline(subject_named(name).healthy(_SEED, commissioning, 6), ["one"] * 6)
+
+
+def later(name: str, commissioning: int, number: int) -> WindowStatistics:
+    return subject_named(name).later(_SEED, commissioning, 0, number, {})[0]
+
+
+def test_a_stiffness_that_grew_is_expected_to_differ_by_as_much_and_any_other_by_two_per_cent() -> None:
+    grown, chance, falls = Growth(4e-12, 0.03, 0.005), Growth(4e-12, 0.01, 0.03), Growth(4e-12, -0.03, 0.005)
+    assert grown.variance(4e-12, same_force=False) == 0
+    shown = 0.03**2 - 4 * 0.005**2
+    assert grown.variance(2e-12, same_force=False) == pytest.approx(shown / 4 + (0.005 * np.log(2)) ** 2)
+    assert grown.variance(16e-12, same_force=True) == pytest.approx(9 * shown)
+    assert np.sqrt(chance.variance(400e-12, same_force=False)) == pytest.approx(0.02)
+    assert chance.variance(400e-12, same_force=True) == 0
+    assert np.sqrt(falls.variance(1e-14, same_force=False)) == pytest.approx(0.005)
+
+
+@pytest.mark.slow
+def test_what_a_stiffening_bearing_does_under_another_force_is_no_change_of_it() -> None:
+    learned, window = baseline("stiffening", 1), later("stiffening", 1, 4)
+    assert all(one is not None and one.slope > 2 * one.standard_error for one in learned.growth)
+    monitor = BaselineDiagnostician(learned)
+    reading = next(one for one in monitor.diagnose(window).evaluable if one.name == "k_by")
+    assert reading.relative_change is not None
+    assert reading.relative_change < -0.02  # the weaker motion meets a softer bearing
+    assert isolate_window(monitor.diagnose(window), 0.01).changed == ()
+    again = BaselineRecord.model_validate_json(BaselineRecord.of(learned).model_dump_json())
+    assert again.baseline().growth == learned.growth
+    assert again.diagnostician().diagnose(window).parameters == monitor.diagnose(window).parameters
+    older = BaselineRecord.of(replace(learned, growth=()))  # as it was before there was one
+    assert "growth" not in older.model_dump(mode="json")
+    assert older.baseline().growth == ()
+    before = next(one for one in older.diagnostician().diagnose(window).evaluable if one.name == "k_by")
+    now = next(one for one in monitor.diagnose(window).evaluable if one.name == "k_by")
+    assert before.relative_change == now.relative_change
+    assert before.standard_error is not None
+    assert now.standard_error is not None
+    assert now.standard_error > 2 * before.standard_error
+
+
+@pytest.mark.slow
+def test_a_window_of_another_force_that_the_relations_do_not_hold_in_names_nothing() -> None:
+    # One source hid in both planes that the film couples them.
+    monitor = BaselineDiagnostician(baseline("fluid-film", 4))
+    diagnosis = monitor.diagnose(later("fluid-film", 4, 3))
+    assert diagnosis.misfit_z is not None
+    assert diagnosis.misfit_z > 8
+    assert "record a healthy condition like this one" in diagnosis.unexplained
+    verdict = isolate_window(diagnosis, 0.01)
+    assert verdict.outside
+    assert verdict.changed == ()
+    assert BaselineDiagnostician(baseline("overhung", 0)).diagnose(later("overhung", 0, 3)).unexplained == ""
