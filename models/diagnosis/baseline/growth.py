@@ -14,6 +14,7 @@ from models.diagnosis.baseline.lag_moments import LagMoments
 from models.diagnosis.baseline.relation import Relation, change_of
 from models.diagnosis.baseline.rows import Row
 from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
 from models.signals.block import FloatArray
 
 _CHANCE = 4.0  # square of the growth over its error up to which it is taken for chance
@@ -45,7 +46,7 @@ class Growth:
 def growth_of(row: Row, relation: Relation, parts: Sequence[LagMoments]) -> Growth | None:
     """Regress what the hops of healthy windows read of a row's scale on the power of its motion.
 
-    Every window counts against its own mean. None where the row reads no scale, or hops do not differ.
+    Every window counts against its own mean. None where the row reads no scale, or the hops do not tell.
     """
     at = next((number for number, own in enumerate(row.own) if 0 in own.terms), None)
     powers = [motion_power(row, relation, part.of.window) for part in parts]
@@ -55,7 +56,10 @@ def growth_of(row: Row, relation: Relation, parts: Sequence[LagMoments]) -> Grow
         return None
     levels, found = [], []
     for part, own in zip(parts, powers, strict=True):
-        change = change_of(row, relation, part)
+        try:
+            change = change_of(row, relation, part)
+        except (EstimationError, np.linalg.LinAlgError):
+            return None
         hops = part.hop_values @ change.combination @ change.projection[at]
         levels.append((own - own.mean()) / power)
         found.append(hops - hops.mean())
