@@ -238,9 +238,12 @@ class BaselineDiagnostician:
         found = np.zeros(size)
         known = zip(self._rows, self._own, self._baseline.relations, self._baseline.growth, changes, strict=False)
         for row, at, relation, growth, change in known:
-            if relation is not None and growth is not None and change is not None:
-                power = float(motion_power(row, relation, change.moments.of.window).mean())
-                found[at] += [growth.variance(power, same_force=same) if 0 in own.terms else 0.0 for own in row.own]
+            if relation is None or growth is None or change is None:
+                continue
+            powers = motion_power(row, relation, change.moments.of.window)
+            if powers is not None and powers.mean() > 0:
+                variance = growth.variance(float(powers.mean()), same_force=same)
+                found[at] += [variance if 0 in own.terms else 0.0 for own in row.own]
         return found
 
     def _bearing(self, changes: list[RowChange | None]) -> _Bearing:

@@ -49,11 +49,11 @@ def growth_of(row: Row, relation: Relation, parts: Sequence[LagMoments]) -> Grow
     Every window counts against its own mean. None where the row reads no scale, or the hops do not tell.
     """
     at = next((number for number, own in enumerate(row.own) if 0 in own.terms), None)
-    powers = [motion_power(row, relation, part.of.window) for part in parts]
-    power = float(np.mean(np.concatenate(powers)))
+    powers = [one for part in parts if (one := motion_power(row, relation, part.of.window)) is not None]
     freedom = sum(one.size - 1 for one in powers) - 1
-    if at is None or freedom < 1 or not power > 0:
+    if at is None or freedom < 1 or len(powers) < len(parts):
         return None
+    power = float(np.mean(np.concatenate(powers)))
     levels, found = [], []
     for part, own in zip(parts, powers, strict=True):
         try:
@@ -61,19 +61,19 @@ def growth_of(row: Row, relation: Relation, parts: Sequence[LagMoments]) -> Grow
         except (EstimationError, np.linalg.LinAlgError):
             return None
         hops = part.hop_values @ change.combination @ change.projection[at]
-        levels.append((own - own.mean()) / power)
+        levels.append(own - own.mean())
         found.append(hops - hops.mean())
     x, y = np.concatenate(levels), np.concatenate(found)
-    if not x @ x > 0:
+    if not (power > 0 and x @ x > 0):
         return None
+    x /= power
     slope = float(x @ y / (x @ x))
     rest = y - slope * x
     return Growth(power, slope, float(np.sqrt(rest @ rest / freedom / (x @ x))))
 
 
-def motion_power(row: Row, relation: Relation, window: WindowStatistics) -> FloatArray:
-    """Power of the motion that a row's scale resists, in every hop, shape (n_hops,)."""
+def motion_power(row: Row, relation: Relation, window: WindowStatistics) -> FloatArray | None:
+    """Power of the motion that a row's scale resists, in every hop, shape (n_hops,); None where it is not measured."""
     coordinate = row.terms[0].motions[0].coordinate
-    state = next(name for name in relation.references if name.split("_")[0] == coordinate)
-    at = window.states.index(state)
-    return np.asarray(window.hop_correlation[:, 0, at, at], dtype=np.float64)
+    at = [window.states.index(name) for name in relation.references if name in window.states and name[:2] == coordinate]
+    return np.asarray(window.hop_correlation[:, 0, at[0], at[0]], dtype=np.float64) if at else None
