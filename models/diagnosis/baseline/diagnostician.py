@@ -98,9 +98,9 @@ _RPM = 30 / math.pi
 _GONE = -0.95  # a loss beyond this is no loss of a bearing
 _LOST = 0.5  # standard error of a stiffness beyond which the relation does not hold in the window at all
 _SURELY_OUTSIDE = 8.0
-# Factor on standard errors in windows of another force, of a relation learned in one condition: its error is not normal
-# (decision 0012).
-_OTHER_FORCE = 1.3
+# Factor on standard errors of the bearing in windows of another force, of a relation learned in one condition: its
+# error is not normal (decision 0012).
+_OTHER_FORCE = 1.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,11 +187,13 @@ class BaselineDiagnostician:
             least = _OTHER_FORCE if self._conditions == 1 else 1.0
             alone = one_source(window)
             own = [self._own_of[name] for name in names[: values.size]]
-            wider = np.array([max(least, one.one_source if alone else 1.0) for one in own])
+            wider = np.array([max(least if one.terms else 1.0, one.one_source if alone else 1.0) for one in own])
             total, common = total * np.outer(wider, wider), common * np.outer(wider, wider)
         elsewhere = through @ np.diag(self._elsewhere(bearing.values, same=same)) @ through.T
-        # A stiffness that grew with the motion has changed, and the unbalance is rightly read with it.
-        elsewhere[range(values.size), range(values.size)] += self._grown(changes, values.size, same=same)
+        # A stiffness that grew with the motion has changed, and the unbalance is rightly read with it. Where the force
+        # is the commissioned one, motions differ by what has changed, and what was not seen to grow has not grown.
+        seen, unseen = self._grown(changes)
+        elsewhere[range(seen.size), range(seen.size)] += seen if same else seen + unseen
         total, common = total + elsewhere, common + elsewhere
         known = [names.index(name) for name in self._parameters if not reasons[name]]
         covariance = positive(total[np.ix_(known, known)])
@@ -233,18 +235,18 @@ class BaselineDiagnostician:
         errors = np.array([0.0 if same and not one.always else one.elsewhere for one in own])
         return (errors * np.maximum(1 + changes, 1 + _MOST_LOSS)) ** 2 / self._conditions
 
-    def _grown(self, changes: Sequence[RowChange | None], size: int, *, same: bool) -> FloatArray:
-        """Variances of stiffnesses that grow with the motion, of another power than in the healthy recording."""
-        found = np.zeros(size)
+    def _grown(self, changes: Sequence[RowChange | None]) -> tuple[FloatArray, FloatArray]:
+        """Variances of stiffnesses whose motion has another power, from growth that was seen and that was not."""
+        found = np.zeros((2, len(self._names)))
         known = zip(self._rows, self._own, self._baseline.relations, self._baseline.growth, changes, strict=False)
         for row, at, relation, growth, change in known:
             if relation is None or growth is None or change is None:
                 continue
             powers = motion_power(row, relation, change.moments.of.window)
             if powers is not None and powers.mean() > 0:
-                variance = growth.variance(float(powers.mean()), same_force=same)
-                found[at] += [variance if 0 in own.terms else 0.0 for own in row.own]
-        return found
+                power, scale = float(powers.mean()), [0 in own.terms for own in row.own]
+                found[:, at] = np.outer([growth.seen_variance(power), growth.unseen_variance(power)], scale)
+        return found[0], found[1]
 
     def _bearing(self, changes: list[RowChange | None]) -> _Bearing:
         n = len(self._names)

@@ -19,8 +19,8 @@ from models.signals.block import FloatArray
 
 _CHANCE = 4.0  # square of the growth over its error up to which it is taken for chance
 # Growth that a bearing may have all the same, of motions up to e times as strong or as weak; where it is known better
-# than that, its error.
-_UNSEEN = 0.02
+# than that, its error. A stiffness carries half a per cent in any case (`rows.py`).
+_UNSEEN, _CARRIED = 0.02, 0.005
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,16 +31,18 @@ class Growth:
     slope: float  # relative change of the scale where the power changes by `power`
     standard_error: float  # of the slope
 
-    def variance(self, power: float, *, same_force: bool) -> float:
-        """Variance of the relative change of the scale where the motion has another power.
+    def seen_variance(self, power: float) -> float:
+        """Variance of the scale's relative change where the motion has another power, from a growth beyond chance.
 
-        A stiffness that falls as the motion grows is taken for chance. Where the force is still the commissioned one,
-        motions differ by what has changed, and only a growth that was seen counts.
+        A stiffness that falls as the motion grows is taken for chance.
         """
-        ratio = power / self.power
         seen = max(0.0, self.slope**2 - _CHANCE * self.standard_error**2) if self.slope > 0 else 0.0
-        unseen = 0.0 if same_force else min(_UNSEEN, self.standard_error) * min(1.0, abs(math.log(ratio)))
-        return seen * (ratio - 1) ** 2 + unseen**2
+        return seen * (power / self.power - 1) ** 2
+
+    def unseen_variance(self, power: float) -> float:
+        """The same of a growth that chance may have hidden, beyond what every stiffness carries."""
+        hidden = max(0.0, min(_UNSEEN, self.standard_error) ** 2 - _CARRIED**2)
+        return hidden * min(1.0, abs(math.log(power / self.power))) ** 2
 
 
 def growth_of(row: Row, relation: Relation, parts: Sequence[LagMoments]) -> Growth | None:
