@@ -34,6 +34,7 @@ from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth
 _ERRORS_OF_DOUBT = 4.0
 """Where it decides whether to believe what else has been found, not whether anything has happened."""
 _TURNED_OUT = "1x vector"
+_MOST_KEPT = 16  # sets of limits of a channel: of its zones, of operating states, of a window that fills
 _DEADBAND = 0.9
 _WORDS = {
     "overall": "overall", "velocity": "velocity", "s_max": "S_max", "x_half": "0.5x", "x1": "1x", "x2": "2x",
@@ -81,7 +82,7 @@ class LevelJudge:
         self._reference: LevelReference | None = None
         # What most windows have in common with the one before is made once.
         self._relatives: dict[tuple[int, bool, int], RelativeLimits] = {}
-        self._limits = lru_cache(maxsize=16 * len(self._channels))(self._limits_of)
+        self._limits: dict[tuple[object, ...], dict[str, _Nearest]] = {}
         self._growth = lru_cache(maxsize=16 * len(self._channels))(_growth_limit)
 
     def judge(self, levels: WindowLevels, reference: LevelReference | None) -> tuple[ChannelLevels, ...]:
@@ -167,7 +168,12 @@ class LevelJudge:
             moved = complex(levels.vectors[1, column])
             if abs(moved - region.centre) > region.radius:
                 edge = min(values[_ROW["x1"]], shown_level(channel, "x1", region.alert))  # beyond it in any case
-        limits, words = self._limits(column, alike, standard, zone, edge), _WORDS
+        key, words = (column, alike, standard, zone, edge), _WORDS
+        limits = self._limits.get(key)
+        if limits is None:
+            if len(self._limits) >= _MOST_KEPT * len(self._channels):
+                self._limits.clear()
+            limits = self._limits[key] = self._limits_of(column, alike, standard, zone, edge)
         if grown is not None and relative is not None:
             limits = limits | {"growth": self._growth(relative.source, grown.limit)}
             words = {**_WORDS, "growth": f"{grown.band_hz[0]:.3g} to {grown.band_hz[1]:.3g} Hz"}
@@ -232,7 +238,7 @@ class LevelJudge:
         """Which windows are judged by the same limits relative to the reference, which are made once."""
         if reference is not self._reference:
             self._reference, self._relatives = reference, {}
-            self._limits.cache_clear()
+            self._limits.clear()
         state, seen = reference.at(levels.speed_rad_s)
         alike = (id(state), seen, levels.hops)  # of the reference that is kept here
         if alike not in self._relatives:
@@ -250,7 +256,7 @@ class LevelJudge:
                 what = "has moved out of its acceptance region"
         elif fall is not None and value < (fall.fall or 0.0):
             state, decided, what = "alert", fall, f"alert below {fall.fall:.3g} ({fall.source})"
-        else:  # not a number
+        else:  # not a number, or a gap on the other side of zero
             return nearest.normal
         unit = unit_of(channel.unit, name, channel.quantity in PEAK_TO_PEAK)
         said = f"{channel.name} ({channel.location} {channel.direction}) {words}".rstrip()

@@ -200,7 +200,7 @@ def all_rounded(values: FloatArray) -> list[list[float | None]]:
     """The same of an array of two dimensions, in rows; None where a value is not finite."""
     with np.errstate(divide="ignore", invalid="ignore"):
         digits = 4 - np.floor(np.log10(np.abs(values)))
-        power = _POWERS_OF_TEN[np.where(np.isfinite(digits), np.abs(digits), 0).astype(np.intp)]
+        power = _POWERS_OF_TEN[np.where(np.isfinite(digits), np.minimum(np.abs(digits), 308), 0).astype(np.intp)]
         found = np.where(digits < 0, np.rint(values / power) * power, np.rint(values * power) / power)
     shown = found.astype(object)
     shown[~np.isfinite(values)] = None

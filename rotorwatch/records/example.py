@@ -15,7 +15,9 @@ def example(model: type[BaseModel]) -> dict[str, object]:
 
 @cache
 def _example_json(model: type[BaseModel]) -> str:
-    return json.dumps({name: _field_example(one.examples, one.annotation) for name, one in model.model_fields.items()})
+    found = {name: _field_example(one.examples, one.annotation) for name, one in model.model_fields.items()}
+    left_out = {name for name, one in model.model_fields.items() if one.exclude_if and one.exclude_if(found[name])}
+    return json.dumps({name: value for name, value in found.items() if name not in left_out})
 
 
 def _field_example(examples: list[object] | None, annotation: object) -> object:

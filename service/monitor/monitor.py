@@ -431,16 +431,16 @@ class MachineMonitor:
         self._data_path.sensors(findings, statistics)
         start_ns, faulty = statistics.start_ns, implicated(findings)
 
-        def unread(state: HealthState, reason: str, *, explained: bool = False) -> Report:
+        def unread(state: HealthState, reason: str) -> Report:
             """Of the levels and the sensors alone."""
-            self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=explained)
+            self._levels.tell(self._alarms, end_ns, faulty=faulty)
             return Report(**self._window_now(start_ns, end_ns, self._state(state)), sensors=findings, reason=reason)
 
         # A fault of a channel elsewhere says nothing of the equations, but it is all there is where they are none.
         if findings and (not self._plan.states or faulty - set(self._plan.others)):
             return unread(HealthState.DATA_HEALTH, "; ".join(each.text for each in findings))
         if skipped:
-            return unread(HealthState.NOT_EVALUABLE, _SKIPPED, explained=bool(self._test.state.findings))
+            return unread(HealthState.NOT_EVALUABLE, _SKIPPED)
         present = {hops: one for hops in self._test.wanted() if (one := self._window.statistics(hops)) is not None}
         try:
             evaluation = self._evaluator.evaluate(statistics, present)

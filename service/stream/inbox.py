@@ -69,6 +69,7 @@ class Inbox:
         self._changed = threading.Condition()
         self._closed = False
         self._enough = 1
+        self._ready = False
         self._dropped = self._unread = 0
 
     @property
@@ -80,6 +81,15 @@ class Inbox:
     def unread(self) -> int:
         """Messages that could be no blocks, or came from others, thrown away because too many of them came."""
         return self._unread
+
+    @property
+    def behind(self) -> int:
+        """Blocks of the publisher that is followed which wait; 0 where all had been taken since this was asked last.
+
+        Blocks that come many at a time wait for a worker that has long been ready for them.
+        """
+        ready, self._ready = self._ready, False
+        return 0 if ready else len(self._blocks)
 
     def __len__(self) -> int:
         return len(self._blocks) + len(self._others) + len(self._odd)
@@ -162,6 +172,7 @@ class Inbox:
         """
         with self._changed:
             if not (self._calls or len(self)):
+                self._ready = True
                 self._enough = min(enough, max(1, self._bound // 4))
                 self._changed.wait_for(self._is_worth_it, _PATIENCE_S)
                 self._enough = 1

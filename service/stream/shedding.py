@@ -9,9 +9,9 @@ class LoadShedding:
     """Says which windows are skipped.
 
     A worker is behind if, when it completes a hop, all blocks of the next one wait already. After a stall or a restart
-    they become fewer from hop to hop, and every window is evaluated. Where they have not become fewer for
-    `_LASTING_S`, the computer is too small for what it is to do: then every window is skipped at whose end a quarter of
-    the next hop waits, until none has been for as long.
+    they become fewer from hop to hop, and every window is evaluated, unless it stands still once more before that.
+    Where they have not become fewer for `_LASTING_S`, the computer is too small for what it is to do: then every window
+    is skipped at whose end a quarter of the next hop waits, until none has been for as long.
     """
 
     def __init__(self) -> None:
@@ -25,7 +25,7 @@ class LoadShedding:
         Parameters
         ----------
         waiting : int
-            Blocks that wait.
+            Own blocks that wait, see `Inbox.behind`.
         to_hop : int
             Blocks that complete the next hop.
         now_s : float

@@ -339,7 +339,7 @@ class MachineWorker:
 
     def _skips(self, _: int) -> bool:
         shedding, to_hop = self._shedding, self._monitor.blocks_to_hop
-        return shedding is not None and shedding.skips(len(self.inbox), to_hop, self._clocks.monotonic_s())
+        return shedding is not None and shedding.skips(self.inbox.behind, to_hop, self._clocks.monotonic_s())
 
     def _catch_up(self, since_ns: int) -> None:
         """Take from the recording what the window lacks, and what came after the latest step that was committed."""
@@ -403,7 +403,7 @@ class MachineWorker:
                 self.tally = replace(self.tally, data_s=self.tally.data_s + report.data_s)
             if report.fault is not None:
                 self._failed(report.fault)
-            evaluated = report.windows and report.fault is None
+            evaluated = any(not one.skipped for one in report.windows) and report.fault is None
             self._unevaluated_s = 0.0 if evaluated else self._unevaluated_s + report.data_s
         self._conclude(
             tuple(window for report in reports for window in report.windows),

@@ -69,7 +69,7 @@ def test_a_window_of_another_force_that_the_relations_do_not_hold_in_names_nothi
     diagnosis = monitor.diagnose(later("fluid-film", 4, 3))
     assert diagnosis.misfit_z is not None
     assert diagnosis.misfit_z > 8
-    assert "record a healthy condition like this one" in diagnosis.unexplained
+    assert "(record a healthy condition like this one then)" in diagnosis.unexplained
     verdict = isolate_window(diagnosis, 0.01)
     assert verdict.outside
     assert verdict.changed == ()

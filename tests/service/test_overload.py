@@ -2,6 +2,7 @@
 
 import json
 import math
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +12,12 @@ import pytest
 
 from models.alarm_names import FAULT, LEVEL, OVERLOADED
 from models.commissioning.commissioned import Installed, install
+from models.errors import RecordingError
+from models.levels.settings import LevelSettings
 from models.machine import load_machine
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
+from models.signals.recording import RecordedMessage, RecordingWriter
 from models.signals.wire import encode_block
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
@@ -22,6 +26,7 @@ from service.recordings.replay.source import RecordingSource
 from service.runtime.runtime import running
 from service.settings.service import MachineEntry, RecordingSettings
 from service.stream import shedding
+from service.stream.inbox import Inbox, RawBlock
 from service.stream.shedding import LoadShedding
 from service.stream.worker import MachineWorker
 from simulator.scenario import parse_fault
@@ -216,6 +221,56 @@ def test_a_monitor_goes_on_from_between_skipped_windows_as_if_nothing_had_happen
     assert before + list(fed(second, stream[at:])) == list(fed(MachineMonitor(kit, every_third), stream))
 
 
+def test_what_grows_beside_a_named_change_is_heard_in_skipped_windows(kit: Installed) -> None:
+    """A skipped window does not know whether the change still explains the growth."""
+    levels = LevelSettings(reference="first windows", reference_windows=2)
+    monitor = MachineMonitor(
+        install(kit.machine.model_copy(update={"levels": levels}), None), lambda end_ns: end_ns > START_NS + 160 * S
+    )
+    gain = np.array([1.7] * 8 + [1.0], np.float32)
+    told = {}
+    for block in scenario_blocks(230.0, parse_fault("k_by=-0.15@60")):
+        louder = replace(block, samples=block.samples * gain) if block.start_ns >= START_NS + 170 * S else block
+        for event in monitor.step(louder).events:
+            told[f"{event.kind.value} {event.alarm.name}"] = (event.time_ns - START_NS) / S
+    assert told["raised k_by"] < 160
+    assert 170 < told[f"raised {LEVEL}y1"] < 200
+
+
+# Which blocks say that it is behind
+
+
+def message(number: int, source: str) -> RawBlock:
+    return RawBlock(*encode_block(scenario_blocks(10.0)[number], ""), source=source)
+
+
+def test_blocks_of_others_and_bursts_for_an_idle_worker_are_no_reason_to_skip() -> None:
+    inbox = Inbox(1000, "drop")
+    inbox.put(message(0, "own"))
+    first = inbox.get()
+    assert isinstance(first, RawBlock)
+    inbox.follow(first)
+    for number in range(1, 41):
+        inbox.put(message(number, "other"))
+    assert inbox.behind == 0
+    for number in range(1, 41):
+        inbox.put(message(number, "own"))
+    assert inbox.behind == 40
+    while len(inbox):
+        inbox.get()
+
+    def send() -> None:
+        for number in range(41, 81):
+            inbox.put(message(number, "own"))
+
+    burst = threading.Timer(0.1, send)
+    burst.start()
+    inbox.get(40)  # waits for them
+    burst.join()
+    assert inbox.behind == 0
+    assert inbox.behind == 39  # until all are taken again
+
+
 # A running service
 
 
@@ -280,3 +335,24 @@ def test_an_overloaded_service_loses_no_sample_says_so_and_is_replayed_to_the_sa
         OfflineReplay(source, machine.keys, install(machine, None), found.append).run()
         assert found == said[machine.name]
         assert sum(json.loads(one)["message"].get("skipped", False) for one in found) >= 5
+
+
+def test_what_was_recorded_before_damage_is_replayed(tmp_path: Path) -> None:
+    machine, blocks, files = load_machine(short_machine(tmp_path)), scenario_blocks(60.0), []
+    keys, installed = machine.keys, install(machine, None)
+    for number, part in enumerate((blocks[:300], blocks[300:])):
+        files.append(tmp_path / f"{number}.mcap")
+        with RecordingWriter(files[-1]) as writer:
+            for block in part:
+                at_ns = block.start_ns
+                writer.write(RecordedMessage(keys.stream, *encode_block(block, ""), at_ns, at_ns))
+            writer.write(RecordedMessage(keys.report, b"{}", b"", "application/json", at_ns, at_ns))
+    data = files[1].read_bytes()
+    half = len(data) // 2
+    files[1].write_bytes(data[:half] + bytes(50) + data[half + 50 :])
+    found: list[str] = []
+    with pytest.raises(RecordingError):
+        OfflineReplay(RecordingSource(files), keys, installed, found.append).run()
+    assert len(found) > 5
+    first = OfflineReplay(RecordingSource(files), keys, installed, found.append, to_ns=START_NS + 25 * S)
+    assert first.run().blocks == 250

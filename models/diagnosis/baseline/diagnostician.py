@@ -184,7 +184,7 @@ class BaselineDiagnostician:
                 through = np.vstack([through, e.slope])
         same = self._as_commissioned(changes)
         if not same:
-            least = _OTHER_FORCE if self._conditions == 1 else 1.0
+            least = _OTHER_FORCE if self._alone else 1.0
             alone = one_source(window)
             own = [self._own_of[name] for name in names[: values.size]]
             wider = np.array([max(least if one.terms else 1.0, one.one_source if alone else 1.0) for one in own])
@@ -217,9 +217,15 @@ class BaselineDiagnostician:
             return replace(diagnosis, misfit_z=max(_SURELY_OUTSIDE, diagnosis.misfit_z or 0.0), suspect=impossible)
         suspicion = gain_suspicion(diagnosis, self._rows, self._baseline.relations) if known else None
         if suspicion is None:
-            return diagnosis if same else replace(diagnosis, unexplained=_unexplained(diagnosis.misfit_z))
+            abstains = self._alone and not same
+            return replace(diagnosis, unexplained=_unexplained(diagnosis.misfit_z)) if abstains else diagnosis
         misfit = suspicion.z if diagnosis.misfit_z is None else max(diagnosis.misfit_z, suspicion.z)
         return replace(diagnosis, misfit_z=misfit, suspect=suspicion.sentence)
+
+    @property
+    def _alone(self) -> bool:
+        """Whether nothing but one condition says how far the relations hold; older records read as they did."""
+        return self._conditions == 1 and bool(self._baseline.growth)
 
     def _as_commissioned(self, changes: Sequence[RowChange | None]) -> bool:
         """Whether the force that moves the machine, its changes taken into account, is the commissioned one."""
@@ -357,8 +363,9 @@ def _unexplained(misfit_z: float | None) -> str:
         return ""
     text, limit = beyond(misfit_z, _SURELY_OUTSIDE)
     return (
-        f"the relations that were learned do not hold under this force: what they leave over is {text} standard errors "
-        f"more than chance leaves, read is at most {limit}; record a healthy condition like this one"
+        f"the relations that were learned do not hold here: what they leave over is {text} standard errors more than "
+        f"chance leaves, read is at most {limit}; either another force moves the machine than when it was commissioned "
+        "(record a healthy condition like this one then), or something has changed that no parameter describes"
     )
 
 

@@ -75,7 +75,10 @@ def growth_of(row: Row, relation: Relation, parts: Sequence[LagMoments]) -> Grow
 
 
 def motion_power(row: Row, relation: Relation, window: WindowStatistics) -> FloatArray | None:
-    """Power of the motion that a row's scale resists, in every hop, shape (n_hops,); None where it is not measured."""
+    """Power of the random motion that a row's scale resists, in every hop, shape (n_hops,); None if it is not measured.
+
+    What is at running speed is not in it: an unbalance that grows takes a stiffening bearing elsewhere unseen.
+    """
     coordinate = row.terms[0].motions[0].coordinate
     at = [window.states.index(name) for name in relation.references if name in window.states and name[:2] == coordinate]
     return np.asarray(window.hop_correlation[:, 0, at[0], at[0]], dtype=np.float64) if at else None

@@ -154,14 +154,14 @@ class NetworkDiagnostician:
         centre, own = np.zeros(len(PARAMETERS)), {name: [PARAMETERS.index(one) for one in OWN[name]] for name in first}
         trained = np.array([NEAR[name] for name in PARAMETERS])
         for equation, (mean, factor) in first.items():
-            too_vague = np.any(np.linalg.norm(factor, axis=1) > trained[own[equation]])
-            if too_vague or np.any(np.abs(mean) > self._amortised.log_range):
+            sharp = np.all(np.linalg.norm(factor, axis=1) <= trained[own[equation]])
+            if not (sharp and np.all(np.abs(mean) <= self._amortised.log_range)):  # nor what is not a number
                 return first
             centre[own[equation]] = mean
         features = ForceFeatures(around(self._machine, centre), self._amortised.states, near=True)
         again = self._standardised(window, near.basis, features, centre[None].astype(np.float32))
         remainder = _stated(near.networks, again)
-        if any(np.any(np.abs(mean) > trained[own[name]]) for name, (mean, _) in remainder.items()):
+        if not all(np.all(np.abs(mean) <= trained[own[name]]) for name, (mean, _) in remainder.items()):
             return first
         return {name: (centre[own[name]] + mean, factor) for name, (mean, factor) in remainder.items()}
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from models.commissioning.commissioned import Installed
+from models.errors import RecordingError
 from models.physics.rotor import PARAMETERS
 from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage
@@ -36,13 +37,14 @@ def result_lines(identity: Identity, keys: MachineKeys, report: MonitorReport) -
 
 
 def skipped_windows(source: RecordingSource, keys: MachineKeys) -> frozenset[int]:
-    """Ends of the windows that the monitor skipped when they were recorded, as far as its reports were recorded."""
+    """Ends of the windows that the monitor skipped when they were recorded, as far as its reports can be read."""
     found: set[int] = set()
-    for message in source.messages({keys.report}):
-        if b'"skipped":true' in message.payload:
-            with suppress(ValueError):  # anybody may have sent it
-                report = Report.model_validate_json(message.payload)
-                found |= {report.end_ns} if report.skipped else set()
+    with suppress(RecordingError):  # what is damaged is told where its blocks are read
+        for message in source.messages({keys.report}):
+            if b'"skipped":true' in message.payload:
+                with suppress(ValueError):  # anybody may have sent it
+                    report = Report.model_validate_json(message.payload)
+                    found |= {report.end_ns} if report.skipped else set()
     return frozenset(found)
 
 
