@@ -222,7 +222,8 @@ class Diagnosis:
     # nothing stands out or there is no such test.
     suspect: str = ""
     # Why nothing that is read here should be believed: the window is so far from all the model can explain that
-    # parameters fitted to it mean nothing. Empty where the model explains it, however significant a misfit is.
+    # parameters fitted to it mean nothing, or another force moves the machine than the one that a single condition
+    # was learned under, and the relations do not hold. Empty otherwise, however significant a misfit is.
     unexplained: str = ""
     steps: int = 0  # search steps it took (0 where there is no search)
 
