@@ -53,6 +53,7 @@ def train_network(
     EstimationError
         If the fit does not come out finite.
     """
+    torch.set_num_threads(1)  # sums keep their order, whatever ran before in this process
     rows = [equation.rows(window_view(window, machine), machine) for window in windows]
     inputs = np.concatenate([row.inputs / row.norm for row in rows])
     target = np.concatenate([row.target / row.norm for row in rows])
