@@ -223,9 +223,9 @@ def test_simulated_windows_look_like_drawn_ones() -> None:
     novelty = []
     for number in range(3):
         for layout in Layout:
-            inputs = reader.inputs(window("", number, layout))
-            assert inputs is not None
-            novelty.append(float(shipped().basis.novelty(inputs)[0]))
+            seen = reader.inputs(window("", number, layout))
+            assert seen is not None
+            novelty.append(float(shipped().basis.novelty(seen[0])[0]))
     # Training windows are one on average; the evaluation's are drawn less broadly.
     assert 0.2 < np.median(novelty) < 1.5
     assert max(novelty) < shipped().novelty_limit
@@ -253,7 +253,7 @@ def test_forces_of_a_changed_machine_are_those_of_its_sources_once_it_is_known()
         apart = one.log_ratio - one.centre
         assert np.all(np.abs(apart) <= [NEAR[name] for name in PARAMETERS])
         nominal = ForceFeatures(LAB)
-        if np.abs(one.centre[0, 0]) > 0.3 and nominal.coherence(nominal.force(one.spectrum)) > 0.5:
+        if np.abs(one.centre[0, 0]) > 0.3 and nominal.coherence(nominal.series(nominal.force(one.spectrum))) > 0.5:
             break
     lag = {}
     for name, machine in (
@@ -276,9 +276,9 @@ def test_the_second_reading_is_sharper() -> None:
     errors, stated = [], []
     for layout, parameter, number in product(Layout, ("k_by", "k_bz"), range(4)):
         seen = window(parameter, number, layout)
-        inputs = once.inputs(seen)
-        assert inputs is not None
-        read = [one.stated(seen, inputs) for one in (once, twice)]
+        looked_at = once.inputs(seen)
+        assert looked_at is not None
+        read = [one.stated(seen, looked_at[0]) for one in (once, twice)]
         for equation, name in (("28", "k_by"), ("31", "k_bz")):
             true = np.log1p(FAULTS[name]) if name == parameter else 0.0
             errors.append([abs(one[equation][0][0] - true) for one in read])
@@ -292,10 +292,10 @@ def test_the_first_reading_stands_where_the_second_was_not_trained() -> None:
     deaf = replace(vague, biases=(*vague.biases[:-1], vague.biases[-1] + np.array([0, 0, 5, 5, 0], dtype=np.float32)))
     amortised = replace(shipped(), networks=(deaf, *shipped().networks[1:]))
     reader = NetworkDiagnostician(LAB, amortised)
-    inputs = reader.inputs(healthy)
-    assert inputs is not None
-    stated = reader.stated(healthy, inputs)
-    first = NetworkDiagnostician(LAB, replace(amortised, near=None)).stated(healthy, inputs)
+    seen = reader.inputs(healthy)
+    assert seen is not None
+    stated = reader.stated(healthy, seen[0])
+    first = NetworkDiagnostician(LAB, replace(amortised, near=None)).stated(healthy, seen[0])
     for name, (mean, _) in stated.items():
         np.testing.assert_array_equal(mean, first[name][0])
 

@@ -187,7 +187,9 @@ def test_calibration_finds_the_true_size_of_the_errors_and_tells_one_source_from
     reader = NetworkDiagnostician(SHORT, calibrated)
     for group, expected in ((one, calibrated.coherent), (several, calibrated.calibration)):
         for window, _ in group[1:]:
-            assert calibrated.calibration_at(reader.coherence(window)) is expected
+            seen = reader.inputs(window)
+            assert seen is not None
+            assert calibrated.calibration_at(seen[1]) is expected
     doubled = Calibration(bias=0.0, log_deviation=(-5.0, -3.0), z_scale=(2.0, 4.0))
     np.testing.assert_allclose(doubled.scale(np.exp([-9.0, -4.0, 0.0])), [2.0, 3.0, 4.0])
 

@@ -116,27 +116,36 @@ class NetworkDiagnostician:
     def __init__(self, machine: Machine, amortised: AmortisedNetworks) -> None:
         self._machine, self._amortised = machine, amortised
         self._features = ForceFeatures(machine, amortised.states)
+        self._near = ForceFeatures(machine, amortised.states, near=True)
 
-    def inputs(self, window: WindowStatistics) -> Float32Array | None:
-        """Standardised inputs, shape (1, n_inputs), those of equation 29 only with a phase reference.
+    def inputs(self, window: WindowStatistics) -> tuple[Float32Array, float] | None:
+        """What the first reading looks at; None if a state the networks were trained with is not in the window.
 
-        None if a state the networks were trained with is not in the window.
+        Returns
+        -------
+        inputs : ndarray, shape (1, n_inputs)
+            Standardised; those of equation 29 only with a phase reference.
+        coherence : float
+            Mean squared coherence of the forces on the nominal machine, over all pairs and frequencies, 0 to 1.
         """
         if any(name not in window.states for name in self._amortised.states):
             return None
-        return self._standardised(window, self._amortised.basis, self._features, np.empty((1, 0), dtype=np.float32))
+        none = np.empty((1, 0), dtype=np.float32)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # a dead channel shows as novelty
+            inputs, series = self._standardised(window, self._amortised.basis, self._features, none)
+            return inputs, self._features.coherence(series)
 
     def _standardised(
         self, window: WindowStatistics, basis: FeatureBasis, features: ForceFeatures, centre: Float32Array
-    ) -> Float32Array:
+    ) -> tuple[Float32Array, Float32Array]:
+        """Standardised inputs, and the functions of frequency that they condense."""
         spectrum, synchronous = self._measured(window)
         speed = np.array([window.speed_rad_s])
-        with np.errstate(divide="ignore", invalid="ignore"):  # a dead channel shows as novelty
-            parts = [basis.condensed(features.series(features.force(spectrum))), centre]
-            parts.append(features.consistency(spectrum, speed))
-            if synchronous is not None and basis.centre.size > basis.n_common:
-                parts.append(features.unbalance(spectrum, synchronous[None], speed))
-            return basis.standardised(np.concatenate(parts, axis=1))
+        series = features.series(features.force(spectrum))
+        parts = [basis.condensed(series), centre, features.consistency(spectrum, speed)]
+        if synchronous is not None and basis.centre.size > basis.n_common:
+            parts.append(features.unbalance(spectrum, synchronous[None], speed))
+        return basis.standardised(np.concatenate(parts, axis=1)), series
 
     def stated(self, window: WindowStatistics, inputs: Float32Array) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Mean and Cholesky factor of the logarithmic ratios, not calibrated, of every equation that has its inputs.
@@ -158,16 +167,12 @@ class NetworkDiagnostician:
             if not (sharp and np.all(np.abs(mean) <= self._amortised.log_range)):  # nor what is not a number
                 return first
             centre[own[equation]] = mean
-        features = ForceFeatures(around(self._machine, centre), self._amortised.states, near=True)
-        again = self._standardised(window, near.basis, features, centre[None].astype(np.float32))
+        features = self._near.around(around(self._machine, centre))
+        again, _ = self._standardised(window, near.basis, features, centre[None].astype(np.float32))
         remainder = _stated(near.networks, again)
         if not all(np.all(np.abs(mean) <= trained[own[name]]) for name, (mean, _) in remainder.items()):
             return first
         return {name: (centre[own[name]] + mean, factor) for name, (mean, factor) in remainder.items()}
-
-    def coherence(self, window: WindowStatistics) -> float:
-        """Mean squared coherence of the forces on the nominal machine, over all pairs and frequencies, 0 to 1."""
-        return self._features.coherence(self._features.force(self._measured(window)[0]))
 
     def _measured(self, window: WindowStatistics) -> tuple[ComplexArray, ComplexArray | None]:
         """Spectra, shape (1, n_bins, n, n), and rotation-synchronous vectors of the states trained with."""
@@ -180,10 +185,11 @@ class NetworkDiagnostician:
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Judge one window; never raises: what cannot be read carries its reason."""
         amortised = self._amortised
-        inputs = self.inputs(window)
-        if inputs is None:
+        seen = self.inputs(window)
+        if seen is None:
             absent = ", ".join(name for name in amortised.states if name not in window.states)
             return self._refused(f"not measured: {absent}")
+        inputs, coherence = seen
         apart = self._disagreement(inputs)
         if apart:
             return self._refused(f"displacement and rate disagree: {apart}; at most {_MOST_APART:.0%} is evaluated")
@@ -195,7 +201,7 @@ class NetworkDiagnostician:
             )
         readings: list[Parameter] = []
         blocks: list[FloatArray] = []
-        calibration = amortised.calibration_at(self.coherence(window) if amortised.coherent else 0.0)
+        calibration = amortised.calibration_at(coherence)
         stated = self.stated(window, inputs)
         for network in amortised.networks:
             if network.equation not in stated:

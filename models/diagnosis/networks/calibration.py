@@ -140,10 +140,11 @@ def calibrate_networks(
         errors: dict[str, list[tuple[float, float]]] = {}
         seen: list[float] = []
         for window, changes in windows:
-            inputs = reader.inputs(window)
-            if inputs is None:
+            found = reader.inputs(window)
+            if found is None:
                 continue
-            seen.append(reader.coherence(window))
+            inputs, coherence = found
+            seen.append(coherence)
             for equation, (mean, factor) in reader.stated(window, inputs).items():
                 for name, value, deviation in zip(OWN[equation], mean, np.linalg.norm(factor, axis=1), strict=True):
                     error = float(value - np.log1p(changes.get(name, 0.0)))

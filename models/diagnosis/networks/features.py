@@ -12,6 +12,7 @@ Frequencies are then condensed by principal components of *expected* features ov
 directions in which nothing but sampling error varies are left out.
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,7 +48,7 @@ class ForceFeatures:
         plan = plan_for(machine)
         self.states, self.frequencies_hz = plan.states if states is None else states, plan.frequencies_hz
         self.has_angle = plan.angle_column is not None
-        self._machine, self._near = machine, near
+        self._near = near
         self._duration_s = plan.hops * plan.hop / plan.rate_hz
         index = np.array([STATE_INDEX[name] for name in self.states])
         self._dofs = sorted(set(index % 6))
@@ -57,11 +58,21 @@ class ForceFeatures:
             for name in self.states
             if f"{name}_dot" in self.states
         )
-        self._motion = self._motion_weights(index)
+        self._bands = np.linspace(0, self.frequencies_hz.size, _BANDS + 1)[:-1].astype(int)
+        self._take(machine)
+
+    def around(self, machine: Machine) -> "ForceFeatures":
+        """The same features, with the cross-spectra taken through another machine with the same sensors."""
+        found = copy(self)
+        found._take(machine)
+        return found
+
+    def _take(self, machine: Machine) -> None:
+        self._machine = machine
+        self._corners_rad_s = self._corners()
         w = 2 * np.pi * self.frequencies_hz
         self._force = self._to_force(w, np.full(w.size, machine.operation.speed_rad_s))
         self._force_adjoint = np.ascontiguousarray(self._force.conj().swapaxes(1, 2))
-        self._bands = np.linspace(0, w.size, _BANDS + 1)[:-1].astype(int)
 
     @property
     def n_series(self) -> int:
@@ -73,7 +84,7 @@ class ForceFeatures:
         """Number of features that `consistency` gives."""
         return 1 + 2 * _BANDS * len(self._twice)
 
-    def _motion_weights(self, index: npt.NDArray[np.intp]) -> FloatArray:
+    def _corners(self) -> FloatArray:
         """Corner ω where rates take over from displacements, for each measured degree of freedom, rad/s.
 
         Their noise is proportional to their own rms, so that ω is the ratio of the two, here of the nominal machine
@@ -86,7 +97,7 @@ class ForceFeatures:
         )
         variance = np.diag(stochastic_covariance(machine.rotor, machine.operation.speed_rad_s, sources))
         corner = np.sqrt(variance[6:] / variance[:6])
-        present = set(index.tolist())
+        present = {STATE_INDEX[name] for name in self.states}
         return np.array(
             [0.0 if d not in present else np.inf if d + 6 not in present else corner[d] for d in self._dofs]
         )
@@ -106,16 +117,21 @@ class ForceFeatures:
         gyroscopic = P_matrix(rotor, 1.0) - still  # linear in Ω
         W = w[:, None, None]
         dynamic = 1j * W * (still + speed_rad_s[:, None, None] * gyroscopic) - W**2 * M_matrix(rotor) + Q_matrix(rotor)
-        stiffness = np.linalg.inv(np.linalg.inv(dynamic)[:, self._dofs][:, :, self._dofs])
-        motion = np.zeros((w.size, len(self._dofs), len(self.states)), dtype=np.complex128)
-        for row, (dof, corner) in enumerate(zip(self._dofs, self._motion, strict=True)):
+        # No force acts where nothing is measured: those degrees of freedom follow the others (Schur complement).
+        rows = np.array(self._dofs)
+        others = np.setdiff1d(np.arange(6), rows)
+        stiffness = dynamic[:, rows[:, None], rows]
+        if others.size:
+            follow = np.linalg.solve(dynamic[:, others[:, None], others], dynamic[:, others[:, None], rows])
+            stiffness = stiffness - dynamic[:, rows[:, None], others] @ follow
+        force = np.empty((w.size, rows.size, len(self.states)), dtype=np.complex128)
+        for column, name in enumerate(self.states):
+            row = self._dofs.index(STATE_INDEX[name] % 6)
+            corner = self._corners_rad_s[row]
             rate = np.ones_like(w) if corner == 0 else 1 / (1 + (corner / w) ** 2)
-            for column, name in enumerate(self.states):
-                if STATE_INDEX[name] == dof:
-                    motion[:, row, column] = 1 - rate
-                elif STATE_INDEX[name] == dof + 6:
-                    motion[:, row, column] = rate / (1j * w)
-        return np.asarray(stiffness @ motion, dtype=np.complex128)
+            motion = 1 - rate if STATE_INDEX[name] < 6 else rate / (1j * w)
+            force[:, :, column] = stiffness[:, :, row] * motion[:, None]
+        return force
 
     def force(self, spectrum: npt.NDArray[np.complexfloating]) -> ComplexArray:
         """Cross-spectra of the equivalent forces, shape (n_windows, n_bins, n_dofs, n_dofs).
@@ -143,9 +159,15 @@ class ForceFeatures:
         level = out[:m].mean(axis=0, keepdims=True)
         return np.concatenate([level, out[:m] - level, out[m:], 2 * out[m::2] * out[m + 1 :: 2]])
 
-    def coherence(self, force: npt.NDArray[np.complexfloating]) -> float:
-        """Mean squared coherence over all windows, frequencies and pairs of forces; 0 where there is no pair."""
-        parts = self.series(force)[len(self._dofs) :]
+    def coherence(self, series: Float32Array) -> float:
+        """Mean squared coherence over all windows, frequencies and pairs of forces; 0 where there is no pair.
+
+        Parameters
+        ----------
+        series : ndarray, shape (n_series, n_windows, n_bins)
+            From `series`, of the nominal machine.
+        """
+        parts = series[len(self._dofs) :]
         return 2 * float(np.mean(parts**2)) if self._pairs else 0.0
 
     def consistency(self, spectrum: npt.NDArray[np.complexfloating], speed_rad_s: FloatArray) -> Float32Array:
