@@ -21,6 +21,7 @@ from models.commissioning.commissioned import (
 from models.commissioning.healthy import HealthyRecording, known_lines
 from models.commissioning.levels import LEVELS, NO_SUCH_ROTOR, HealthyPiece, Learned, Progress, pieces_of
 from models.diagnosis.baseline.rows import Row, evaluable_rows
+from models.diagnosis.moments import states_of
 from models.diagnosis.networks.equations import EQUATIONS, Equation, SynchronousEquation, missing
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.check import sensor_findings
@@ -256,10 +257,8 @@ def commission(
     knowledge = knowledge_of(machine)
     checks = [check_data(machine, recordings)]
     pieces = [] if checks[0].verdict == "refused" else pieces_of(recordings)
-    learned = Learned(())
-    if pieces and not recordings[0].plan.states:
-        checks.append(_ONLY_LEVELS)
-    elif pieces:
+    learned, states = Learned(()), states_of(machine)
+    if pieces:
         by_recording = {
             one.name: [piece.window for piece in pieces if piece.recording == one.name] for one in recordings
         }
@@ -267,8 +266,12 @@ def commission(
             name: [f for window in windows for f in sensor_findings(window, None, machine.sensors)]
             for name, windows in by_recording.items()
         }
-        checks += [check_sensors_of(findings), check_steady(recordings, by_recording), check_lines(recordings)]
-        if all(check.verdict != "refused" for check in checks):
+        checks.append(check_sensors_of(findings))
+        if not states:
+            checks.append(_only_levels(machine, knowledge.text))
+        else:
+            checks += [check_steady(recordings, by_recording), check_lines(recordings)]
+        if states and all(check.verdict != "refused" for check in checks):
             try:
                 learned = LEVELS[knowledge.level](machine, pieces, progress)
             except EstimationError as error:
@@ -307,12 +310,11 @@ def commission(
     )
 
 
-_ONLY_LEVELS = Check(
-    name="can be learned",
-    verdict="limited",
-    text="no channel is at a bearing or disc, in y or z: vibration levels are learned, and nothing is diagnosed",
-    advice="name location and direction of the sensors as the model does, where they are at such places",
-)
+def _only_levels(machine: MachineFile, text: str) -> Check:
+    advice = "name location and direction of the sensors as the model does, where they are at such places"
+    if not machine.holds_band:
+        advice = "record longer snapshots, where band_hz shall hold 20 frequencies of segment_s"
+    return Check(name="can be learned", verdict="limited", text=text, advice=advice)
 
 
 def _not_learned(level: KnowledgeLevel, text: str) -> Check:
@@ -358,7 +360,7 @@ def _report(
             "level": knowledge.level,
             "level_text": knowledge.text,
             "verdict": verdict,
-            "summary": _summary(verdict, checks, [one.name for one in parameters if one.evaluable]),
+            "summary": _summary(verdict, checks, _told(machine, [one.name for one in parameters if one.evaluable])),
             "version": 0 if commissioned is None else commissioned.version,
             "identity": None if commissioned is None else commissioned.identity,
             "healthy_s": healthy_s,
@@ -395,12 +397,17 @@ def _growths(machine: MachineFile, commissioned: Commissioned | None) -> tuple[G
     )
 
 
-def _summary(verdict: str, checks: Sequence[Check], evaluable: Sequence[str]) -> str:
+def _told(machine: MachineFile, evaluable: Sequence[str]) -> str:
+    if evaluable:
+        return f"changes of {', '.join(evaluable)} can be read"
+    return "only changed or not changed can be said" if states_of(machine) else "only levels are compared"
+
+
+def _summary(verdict: str, checks: Sequence[Check], read: str) -> str:
     told = {each: [check for check in checks if check.verdict == each] for each in ("refused", "limited")}
     if verdict == "refused":
         reasons = told["refused"] or told["limited"]
         return "; ".join(f"{check.text}; instead: {check.advice}" for check in reasons) or "nothing could be learned"
-    read = f"changes of {', '.join(evaluable)} can be read" if evaluable else "only changed or not changed can be said"
     if verdict == "limited":
         return f"{read}; limited by: {'; '.join(check.text for check in told['limited'])}"
     return read

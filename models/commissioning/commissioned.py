@@ -24,6 +24,7 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.moments import states_of
 from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.shape import HealthyShape
@@ -65,6 +66,9 @@ def knowledge_of(machine: MachineFile) -> Knowledge:
     'full'
     """
     rotor = machine.rotor
+    if not states_of(machine):
+        lacks = "no channel is at bearing or disc, in y or z" if machine.holds_band else "snapshots are too short"
+        return Knowledge(KnowledgeLevel.NONE, f"{lacks}: vibration levels are learned, and nothing is diagnosed")
     if isinstance(machine, Machine):
         return Knowledge(KnowledgeLevel.FULL, "the machine file gives all parameters of the rotor")
     if rotor is None:
@@ -295,7 +299,7 @@ class Installed:
     @property
     def known(self) -> Machine | None:
         """The machine with all its parameters, given or identified; None where only a baseline is known."""
-        if not self.machine.holds_band:
+        if not states_of(self.machine):
             return None
         if self.commissioned is not None:
             return self.commissioned.completed(self.machine)

@@ -128,6 +128,12 @@ class Plan:
         return si
 
 
+def states_of(machine: MachineFile) -> tuple[str, ...]:
+    """Measured motions of bearing and disc, in the order of a plan; without one there are levels alone."""
+    measured = machine.descriptor.states
+    return tuple(name for name in (*STATE_INDEX, *ACCELERATIONS) if name in measured and machine.holds_band)
+
+
 def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False) -> Plan:
     """Derive the plan of a machine.
 
@@ -140,7 +146,7 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False)
     """
     window, rate_hz = machine.window, machine.rate_hz
     order = {name: column for column, name in enumerate(machine.descriptor.states)}
-    states = tuple(name for name in (*STATE_INDEX, *ACCELERATIONS) if name in order and machine.holds_band)
+    states = states_of(machine)
     others = tuple(name for name in order if name not in states and name != "theta")
     columns = np.array([order[name] for name in (*states, *others)], dtype=np.intp)
     channels = [machine.sensors[column] for column in columns]

@@ -59,6 +59,8 @@ _STATE_NAMES: dict[tuple[Quantity, str, str], str] = {
 }
 
 _LOCATIONS, _DIRECTIONS = ("bearing", "disc", "shaft"), ("y", "z", "rotation")
+_ELSEWHERE = ("DE", "NDE", "casing")
+"""Names of other places that are never taken for a misspelt one."""
 _RATES: dict[Quantity, str] = {Quantity.DISPLACEMENT: "", Quantity.VELOCITY: "_dot", Quantity.ACCELERATION: "_ddot"}
 LEAST_APART_DEG = 30.0
 """Angle between two sensors from which on they are turned to y and z: nearer, their noise would be all there is."""
@@ -123,12 +125,13 @@ class Channel(BaseModel, extra="forbid", frozen=True):
             return self
         known = self.location in _LOCATIONS
         hint = did_you_mean(self.direction, _DIRECTIONS) if known else did_you_mean(self.location, _LOCATIONS)
+        hint = "" if self.location in _ELSEWHERE else hint
         if self.quantity is Quantity.SHAFT_ANGLE or known or hint:
             raise ValueError(
                 f"channel {self.name}: no {self.quantity} at location {self.location!r}, direction {self.direction!r}; "
                 "the shaft angle is at 'shaft'/'rotation', tilt at 'disc', the rest at 'bearing' or 'disc' in y or z, "
                 "or two at an angle, each with angle_deg; "
-                f"at places with other names (DE, NDE, casing, …) only levels are watched{hint}"
+                f"at places with other names ({', '.join(_ELSEWHERE)}, …) only levels are watched{hint}"
             )
         return self
 

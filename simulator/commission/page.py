@@ -66,7 +66,7 @@ def pictures_of(
             "mark lies left of the dashed one, the wished change is found by one window with 95% probability.",
         ),
     ]
-    if portraits:
+    if portraits and portraits[0].statistics.states:  # of channels elsewhere there are levels alone
         drawn += [
             ("spectra", "Spectra of the recordings", lambda: draw_spectra(portraits), _spectra_caption(portraits)),
             ("levels", "Speed and level over time", lambda: draw_levels(portraits), _levels_caption(portraits)),

@@ -170,8 +170,11 @@ def headline(report: CommissioningReport) -> str:
     read = [parameter.name for parameter in report.parameters if parameter.evaluable]
     if read:
         told = f"changes of {listed(read)} can be told from the healthy state"
-    else:
+    elif report.conditions is None or report.conditions.rms:
         told = "it can only be said that a channel has changed or has not, and no part of the machine is named"
+    else:
+        than = "first windows that the monitor sees" if not report.levels else "healthy recordings"
+        told = f"the vibration levels of its channels are compared with those of the {than}, and no part is diagnosed"
     if report.verdict == "commissioned":
         return f"{place} is commissioned: {told}."
     limits = "; ".join(f"{check.name} ({check.text})" for check in report.checks if check.verdict == "limited")

@@ -31,6 +31,15 @@ NOTHING, PARTIAL = _less(LAB)
 """The rotor kit with channels and sampling alone, and with masses and shaft besides."""
 
 
+def elsewhere(machine: MachineFile) -> MachineFile:
+    """The same with its sensors on the casing, where they measure no motion that is modelled."""
+    moved = [
+        one if one.quantity == "shaft_angle" else one.model_copy(update={"location": "casing"})
+        for one in machine.sensors
+    ]
+    return machine.model_copy(update={"sensors": tuple(moved)})
+
+
 @cache
 def stream(duration_s: float, seed: int, *events: Event) -> tuple[SampleBlock, ...]:
     """Blocks of the shipped healthy scenario with events of one's own."""

@@ -23,7 +23,19 @@ from models.errors import BundleError
 from models.machine import MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETERS
 from simulator.scenario import Event
-from tests.commissioning.rotor_kit import LAB, NOTHING, PARTIAL, commissioned, healthy, recording, stream, windows_of
+from tests.commissioning.rotor_kit import (
+    LAB,
+    NOTHING,
+    PARTIAL,
+    commissioned,
+    elsewhere,
+    healthy,
+    recording,
+    samples_of,
+    stream,
+    windows_of,
+    with_samples,
+)
 
 HEALTHY_S = 90.0
 MACHINES = {"full": LAB, "partial": PARTIAL, "none": NOTHING}
@@ -45,6 +57,21 @@ def test_a_machine_file_says_how_much_is_known() -> None:
     without_inertia = PARTIAL.model_copy(update={"rotor": rotor})
     assert knowledge_of(without_inertia).level is KnowledgeLevel.NONE
     assert "lacks I2_kg_m2" in knowledge_of(without_inertia).text
+
+
+@pytest.mark.parametrize("known", [LAB, PARTIAL, NOTHING])
+def test_where_no_motion_is_measured_levels_are_all_there_is_whatever_is_known(known: MachineFile) -> None:
+    machine = elsewhere(known)
+    assert install(machine, None).watching
+    made = commissioned(machine, healthy(machine, 70.0, 60106)).commissioned
+    assert made is not None
+    assert (made.level, made.levels is None) == (KnowledgeLevel.NONE, False)
+    blocks = stream(70.0, 60106)
+    stuck = samples_of(blocks)
+    stuck[:, 2] = 0.3
+    report = commissioned(machine, recording(machine, with_samples(blocks, stuck))).report
+    assert report.verdict == "refused"
+    assert "y1_dot: repeated the value 0.3 mm/s" in report.summary
 
 
 @pytest.mark.slow

@@ -37,6 +37,7 @@ from tests.commissioning.rotor_kit import (
     NOTHING,
     PARTIAL,
     commissioned,
+    elsewhere,
     healthy,
     recording,
     samples_of,
@@ -135,6 +136,9 @@ def case(name: str) -> Case:
         machine, recordings = PARTIAL, (healthy(PARTIAL, 70.0, 66, RUDE),)
     elif name == "none":
         machine, recordings = NOTHING, (healthy(NOTHING, 70.0, 67), healthy(NOTHING, 40.0, 68, RUDE))
+    elif name == "casing":  # of which all is known, but for what its sensors are to do with it
+        machine = elsewhere(LAB)
+        recordings = (healthy(machine, 70.0, 60105),)
     elif name == "too short":
         machine, recordings = NOTHING, (healthy(NOTHING, 30.0, 69),)
     elif name == "no hop":
@@ -149,8 +153,8 @@ def case(name: str) -> Case:
 
 LEVELS = ("full", "partial", "none")
 REFUSED = ("too short", "no hop", "second excitation", "no speed")
-CASES = (*LEVELS, *REFUSED, "no phase reference")
-DRAWN = ("none", "no speed")
+CASES = (*LEVELS, *REFUSED, "no phase reference", "casing")
+DRAWN = ("none", "no speed", "casing")
 """Cases whose pictures become SVG, which takes seconds; those of the others are painted and no more."""
 
 
@@ -291,6 +295,17 @@ def test_a_refusal_says_why_and_what_to_record_instead(folder: Path, name: str) 
     assert "--machine FILE@FOLDER" not in text
 
 
+def test_a_machine_of_whose_motion_nothing_is_measured_is_said_to_be_compared_by_its_levels(folder: Path) -> None:
+    text, report = written(folder, "casing")
+    assert report.verdict == "limited"
+    told = "the vibration levels of its channels are compared with those of the healthy recordings"
+    assert f"with limits: {told}, and no part is diagnosed. What limits it:" in section(text, "verdict")
+    assert "only levels are compared; limited by: " in report.summary
+    assert "has changed or has not" not in Page(text).text
+    assert report.level_text.startswith("no channel is at bearing or disc")
+    assert {one.channel for one in report.levels} == {one.name for one in LAB.sensors if one.name != "theta"}
+
+
 def test_nothing_of_a_recordings_name_reaches_the_page_as_markup(folder: Path) -> None:
     for name in ("partial", "none", "second excitation"):
         text, _ = written(folder, name)
@@ -324,9 +339,11 @@ def test_pictures(folder: Path) -> None:
         assert list(pictures(written(folder, name)[0])) == everything
     for name in ("too short", "second excitation", "no speed"):
         assert list(pictures(written(folder, name)[0])) == everything[2:]
-    assert pictures(written(folder, "no hop")[0]) == {}
+    assert pictures(written(folder, "no hop")[0]) == pictures(written(folder, "casing")[0]) == {}
     spectra = {
-        name: pictures(written(folder, name)[0])["Spectra of the recordings"] for name in CASES if name != "no hop"
+        name: pictures(written(folder, name)[0])["Spectra of the recordings"]
+        for name in CASES
+        if name not in ("no hop", "casing")
     }
     assert "Shaded: the band that is used, 3 to 150 Hz. Grey: the rotation at 22.0 Hz" in spectra["none"]
     assert "speed is not known" in spectra["no speed"]
