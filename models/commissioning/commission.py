@@ -266,6 +266,8 @@ def commission(
             name: [f for window in windows for f in sensor_findings(window, None, machine.sensors)]
             for name, windows in by_recording.items()
         }
+        if not states:  # levels of a machine that stands are levels, too
+            findings = {name: [f for f in found if f.states != ("theta",)] for name, found in findings.items()}
         checks.append(check_sensors_of(findings))
         if not states:
             checks.append(_only_levels(machine, knowledge.text))

@@ -72,8 +72,11 @@ class LevelReference(BaseModel):
 
     def at(self, speed_rad_s: float | None) -> tuple[OperatingState, bool]:
         """The state nearest in speed, and whether the machine ran at such a speed when it was learned."""
-        if speed_rad_s is None or not math.isfinite(speed_rad_s):
-            return max(self.states, key=lambda state: state.windows), True
+        turning = speed_rad_s is not None and math.isfinite(speed_rad_s)
+        # A machine that stands is compared with itself while it stood, and one that runs with itself while it ran.
+        alike = [state for state in self.states if (state.speed_rad_s is not None) == turning] or self.states
+        if speed_rad_s is None or not turning:
+            return max(alike, key=lambda state: state.windows), True
 
         def distance(state: OperatingState) -> float:
             if state.speed_rad_s is None:
@@ -82,7 +85,7 @@ class LevelReference(BaseModel):
             now = abs(speed_rad_s)
             return max(slowest - now, now - fastest, 0.0) / max(fastest, 1e-9)
 
-        nearest = min(self.states, key=distance)
+        nearest = min(alike, key=distance)
         return nearest, distance(nearest) <= _SAME_SPEED
 
 

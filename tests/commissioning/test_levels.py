@@ -67,6 +67,9 @@ def test_where_no_motion_is_measured_levels_are_all_there_is_whatever_is_known(k
     assert made is not None
     assert (made.level, made.levels is None) == (KnowledgeLevel.NONE, False)
     blocks = stream(70.0, 60106)
+    still = samples_of(blocks)
+    still[:, machine.descriptor.states.index("theta")] = 1.0
+    assert commissioned(machine, recording(machine, with_samples(blocks, still))).commissioned is not None
     stuck = samples_of(blocks)
     stuck[:, 2] = 0.3
     report = commissioned(machine, recording(machine, with_samples(blocks, stuck))).report

@@ -128,6 +128,20 @@ def test_a_window_that_fills_scatters_about_the_loudest_healthy_one_too(overall:
     assert limits(found)["overall"].state == state
 
 
+@pytest.mark.parametrize("speed_rad_s", [SPEED, None, np.nan])
+def test_running_and_standing_are_each_compared_with_themselves(speed_rad_s: float | None) -> None:
+    still = [window(overall=0.1e-3, speed_rad_s=None) for _ in range(3)]
+    ran = [window(overall=2e-3, speed_rad_s=SPEED) for _ in range(2)]
+    level = 2e-3 if speed_rad_s == SPEED else 0.1e-3
+    for healthy in (reference(*still, *ran), reference(*still[:1], *ran)):
+        for factor, state in ((1.0, "normal"), (1.7, "alert"), (0.4, "alert")):
+            found = judged(CASING, window(overall=factor * level, speed_rad_s=speed_rad_s), healthy)
+            assert limits(found)["overall"].state == state
+    only = reference(*ran)  # where one of them was not commissioned, the other is all there is
+    assert limits(judged(CASING, window(overall=2e-3, speed_rad_s=None), only))["overall"].state == "normal"
+    assert limits(judged(CASING, window(overall=0.1e-3), reference(*still)))["overall"].state == "normal"
+
+
 def test_a_line_that_was_noise_has_to_stand_out_of_it() -> None:
     healthy = reference(*(window(error=1e-5, x2=value) for value in (1e-5, 2e-5, 1.5e-5)))
     assert limits(judged(CASING, window(x2=6e-5), healthy))["x2"].state == "normal"
