@@ -33,7 +33,7 @@ import numpy as np
 import zenoh
 import zenoh.ext
 from machine_kind import MachineKind
-from running_monitor import on_loopback, started, url_of
+from running_monitor import on_loopback, serving
 
 from models.diagnosis.moments import plan_for
 from models.machine import MachineFile
@@ -158,13 +158,19 @@ def monitored(
     environment, endpoint = on_loopback(folder)
     entries = [{"file": str(folder / f"{machine.name}.toml"), **bundle} for machine in machines]
     environment["ROTORWATCH_MACHINES"] = json.dumps(entries)
-    process = started(["service.rotorwatch", "run"], folder / "out", folder / "log", environment)
-    try:
-        yield Process(process.pid), endpoint, url_of(process, folder / "out", folder / "log")
-    finally:
-        Process(process.pid).signal(signal.SIGCONT)
-        process.terminate()
-        process.wait(120)
+    with serving(folder, environment) as (process, url):
+        try:
+            yield Process(process.pid), endpoint, url
+        finally:
+            Process(process.pid).signal(signal.SIGCONT)
+
+
+def session_with(endpoint: str) -> zenoh.Session:
+    """A session of a client."""
+    config = zenoh.Config()
+    for path, value in LinkSettings(mode="client", connect=(endpoint,)).zenoh_items().items():
+        config.insert_json5(path, value)
+    return zenoh.open(config)
 
 
 @contextmanager
@@ -172,10 +178,7 @@ def sending(
     endpoint: str, machines: Sequence[MachineFile], streams: list[list[SampleBlock]]
 ) -> Iterator[tuple[Plant, threading.Thread]]:
     """A plant that sends and hears reports, and the thread that does until the streams end or the block is left."""
-    config = zenoh.Config()
-    for path, value in LinkSettings(mode="client", connect=(endpoint,)).zenoh_items().items():
-        config.insert_json5(path, value)
-    with zenoh.open(config) as session:
+    with session_with(endpoint) as session:
         plant, ended = Plant(machines, session, streams), threading.Event()
         subscriber = session.declare_subscriber("rotorwatch/*/*/report", plant.hear)
         sender = threading.Thread(target=plant.send, args=(ended,))

@@ -27,7 +27,7 @@ import numpy as np
 import psycopg
 from capacity import BLOCK_S, KINDS, Plant, sending
 from ray.cluster_utils import Cluster
-from running_monitor import on_loopback, started, url_of
+from running_monitor import on_loopback, serving
 
 from models.machine import MachineFile, load_machine
 from models.signals.link import LinkSettings
@@ -132,25 +132,22 @@ def run(
         for gone in ("ROTORWATCH_LINK", "ROTORWATCH_HISTORY__URL"):
             environment.pop(gone)
         settings = fleet_files(folder, machines, database, link, inner)
-        command = ["service.rotorwatch", "fleet", "--address", cluster.address, "--config", str(settings)]
-        with route(LinkSettings(listen=(link,))):
-            process = started(command, folder / "out", folder / "log", environment)
-            try:
-                url = url_of(process, folder / "out", folder / "log")
-                with sending(link, machines, streams) as (plant, sender):
-                    time.sleep(WARM_S + BETWEEN_S)
-                    for number in range(kills):
-                        killed(plant, cluster, number)
-                        if not sender.is_alive():
-                            raise SystemExit("the streams have ended: the last kill says nothing")
-                    sender.join()
-                    time.sleep(3 * base.window.hop_s)
-                    late = np.array([one for _, one in plant.heard])
-                    print(f"  reports late by {np.median(late):.2f} s (median), {np.quantile(late, 0.99):.2f} (99 %)")
-                    logs = logs_of(url, plant, round(1e3 * length_s))
-            finally:
-                process.terminate()
-                process.wait(120)
+        command = ("fleet", "--address", cluster.address, "--config", str(settings))
+        with (
+            route(LinkSettings(listen=(link,))),
+            serving(folder, environment, *command) as (_, url),
+            sending(link, machines, streams) as (plant, sender),
+        ):
+            time.sleep(WARM_S + BETWEEN_S)
+            for number in range(kills):
+                killed(plant, cluster, number)
+                if not sender.is_alive():
+                    raise SystemExit("the streams have ended: the last kill says nothing")
+            sender.join()
+            time.sleep(3 * base.window.hop_s)
+            late = np.array([one for _, one in plant.heard])
+            print(f"  reports late by {np.median(late):.2f} s (median), {np.quantile(late, 0.99):.2f} (99 %)")
+            logs = logs_of(url, plant, round(1e3 * length_s))
     return logs
 
 

@@ -26,7 +26,7 @@ import httpx
 import numpy as np
 from capacity import Process
 from machine_kind import MachineKind
-from running_monitor import on_loopback, started, url_of
+from running_monitor import on_loopback, serving
 
 from models.commissioning.commissioned import install
 from models.machine import MachineFile
@@ -128,14 +128,9 @@ def monitored(folder: Path, file: Path, machines: Sequence[MachineFile]) -> Iter
     entries = [{"file": str(folder / f"{machine.name}.toml"), "bundle": "lab"} for machine in machines]
     environment |= {"ROTORWATCH_MACHINES": json.dumps(entries), "ROTORWATCH_HISTORY__URL": f"sqlite:///{file}"}
     begin_s = time.monotonic()
-    process = started(["service.rotorwatch", "run"], folder / "out", folder / "log", environment)
-    try:
-        url = url_of(process, folder / "out", folder / "log")
+    with serving(folder, environment) as (process, url):
         httpx.get(f"{url}/readyz", trust_env=False, timeout=60.0)
         yield Process(process.pid), url, time.monotonic() - begin_s, Process(process.pid).cpu_s()
-    finally:
-        process.terminate()
-        process.wait(120)
 
 
 def questions(machine: MachineFile, machines: Sequence[MachineFile]) -> dict[str, str]:

@@ -54,6 +54,20 @@ class Monitor:
 
 
 @contextmanager
+def serving(
+    folder: Path, environment: dict[str, str], *arguments: str
+) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """The service (``run`` without arguments) until the block is left, its output in the folder; and its address."""
+    out, log = folder / "out", folder / "log"
+    process = started(["service.rotorwatch", *(arguments or ("run",))], out, log, environment)
+    try:
+        yield process, url_of(process, out, log)
+    finally:
+        process.terminate()
+        process.wait(120)
+
+
+@contextmanager
 def monitor(folder: Path, files: int, settings: dict[str, str], *publish: str) -> Iterator[Monitor]:
     """A monitor that may open so many files, and a machine that sends to it.
 

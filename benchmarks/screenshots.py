@@ -15,7 +15,7 @@ from pathlib import Path
 from page import chromium
 from PIL import Image
 from playwright.sync_api import Page
-from running_monitor import PLACE, Monitor, monitor, started, url_of
+from running_monitor import PLACE, Monitor, monitor, serving, started
 
 #: Path of each view, what is there when it is complete, and how high a picture of it is.
 VIEWS = {
@@ -78,24 +78,17 @@ def look(one: Monitor, folder: Path) -> None:
 
 def sign_in(temporary: Path, folder: Path) -> None:
     """The view of a monitor that wants a token."""
-    out, log = temporary / "guarded", temporary / "guarded.log"
     settings = {
         "ROTORWATCH_MACHINES": json.dumps([{"file": "lab"}]),
         "ROTORWATCH_LINK": json.dumps({"listen": ["tcp/127.0.0.1:0"]}),
         "ROTORWATCH_HTTP__PORT": "0",
         "ROTORWATCH_HISTORY__URL": f"sqlite:///{temporary}/guarded.sqlite",
     }
-    process = started(["service.rotorwatch", "run"], out, log, os.environ | settings)
-    try:
-        url = url_of(process, out, log)
-        with chromium() as browser:
-            page = browser.new_page(viewport={"width": WIDTH, "height": 900}, color_scheme="light")
-            page.goto(f"{url}/#/")
-            page.get_by_label("Access token").wait_for(timeout=WAIT_MS)
-            picture(page, folder / "page-sign-in.png", 400)
-    finally:
-        process.terminate()
-        process.wait(60)
+    with serving(temporary, os.environ | settings) as (_, url), chromium() as browser:
+        page = browser.new_page(viewport={"width": WIDTH, "height": 900}, color_scheme="light")
+        page.goto(f"{url}/#/")
+        page.get_by_label("Access token").wait_for(timeout=WAIT_MS)
+        picture(page, folder / "page-sign-in.png", 400)
 
 
 def main() -> None:

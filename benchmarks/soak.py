@@ -13,14 +13,12 @@ import argparse
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from http import HTTPStatus
 from itertools import islice, zip_longest
 from pathlib import Path
 from typing import Any
@@ -28,6 +26,8 @@ from typing import Any
 import httpx
 import numpy as np
 import zenoh
+from capacity import Process, session_with
+from running_monitor import on_loopback, started, url_of
 
 import models
 from models.alarm_names import STREAM_LOST
@@ -139,7 +139,7 @@ class Plant:
     """The monitor, whoever follows it, and what is seen of them."""
 
     folder: Path
-    file: Path
+    environment: dict[str, str]
     endpoint: str
     rng: np.random.Generator
     kills_wanted: float
@@ -151,40 +151,11 @@ class Plant:
     follower_kills: int = 0
     memory_mb: list[tuple[float, float]] = field(default_factory=list)
 
-    def settings(self) -> Path:
-        """Settings of the monitor."""
-        path = self.folder / "monitor.toml"
-        path.write_text(
-            f'[link]\nlisten = ["{self.endpoint}"]\n[http]\nport = 0\n[access]\nopen_on_loopback = true\n'
-            f'[history]\nurl = "sqlite:///{self.folder / "history.sqlite"}"\n'
-            f'[queue]\nblocks = 40\nwhen_full = "wait"\n[[machines]]\nfile = "{self.file}"\n',
-            encoding="utf-8",
-        )
-        return path
-
     def start(self) -> None:
-        """Start the monitor and wait until it listens."""
-        log = self.folder / "monitor.log"
-        with log.open("ab") as sink:
-            position = log.stat().st_size
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "service.rotorwatch", "run", "--config", str(self.settings())],
-                stdout=sink,
-                stderr=sink,
-                env=os.environ | {"PYTHONUNBUFFERED": "1"},
-            )
-        while (line := self._line(log, position, "HTTP API ")) is None:
-            if self.process.poll() is not None:
-                raise SystemExit(f"the monitor ended:\n{log.read_text(encoding='utf-8')[position:]}")
-            time.sleep(0.05)
-        self.url = line
-
-    @staticmethod
-    def _line(log: Path, position: int, begin: str) -> str | None:
-        for line in log.read_text(encoding="utf-8")[position:].splitlines():
-            if line.startswith(begin):
-                return line.removeprefix(begin)
-        return None
+        """Start the monitor and wait until it listens; what it says goes into files of this start."""
+        out, log = (self.folder / f"{name}-{self.kills}" for name in ("out", "log"))
+        self.process = started(["service.rotorwatch", "run"], out, log, self.environment)
+        self.url = url_of(self.process, out, log)
 
     def kill(self) -> None:
         """Kill -9, and up again; wait until the publisher's cache arrives."""
@@ -215,8 +186,7 @@ class Plant:
     def weigh(self, data_h: float) -> None:
         """Note the monitor's memory."""
         assert self.process is not None  # noqa: S101  # for the type checker
-        pages = int(Path(f"/proc/{self.process.pid}/statm").read_text(encoding="utf-8").split()[1])
-        self.memory_mb.append((data_h, pages * os.sysconf("SC_PAGE_SIZE") / 1e6))
+        self.memory_mb.append((data_h, Process(self.process.pid).memory_mb()))
 
 
 def disturbed(plant: Plant, machine: Machine, seed: int, hours: float) -> Iterator[tuple[SampleBlock, tuple[()]]]:
@@ -261,20 +231,10 @@ def counting(plant: Plant, session: zenoh.Session, machine: Machine) -> "zenoh.S
     return session.declare_subscriber(machine.keys.report, take)
 
 
-def free_endpoint() -> str:
-    """A free address on loopback."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
 def live(plant: Plant, machine: Machine, seed: int, hours: float) -> None:
     """Play the day."""
     plant.start()
-    config = zenoh.Config()
-    for path, value in LinkSettings(mode="client", connect=(plant.endpoint,)).zenoh_items().items():
-        config.insert_json5(path, value)
-    with zenoh.open(config) as session:
+    with session_with(plant.endpoint) as session:
         subscriber = counting(plant, session, machine)
         settings = PublishSettings(
             link=LinkSettings(connect=(plant.endpoint,)), pace=None, wait_for_subscriber_s=60.0, linger_s=0, drain_s=60
@@ -333,7 +293,12 @@ def soak(folder: Path, seed: int, hours: float, kills_wanted: float) -> int:
     arguments = ["--offline", str(file), "--hours", str(hours), "--seed", str(seed)]
     with (folder / "offline.jsonl").open("wb") as sink:
         undisturbed = subprocess.Popen([sys.executable, __file__, *arguments], stdout=sink)
-    plant = Plant(folder, file, free_endpoint(), np.random.default_rng([seed, 3]), kills_wanted)
+    environment, endpoint = on_loopback(folder)
+    environment |= {
+        "ROTORWATCH_MACHINES": json.dumps([{"file": str(file)}]),
+        "ROTORWATCH_QUEUE": json.dumps({"blocks": 40, "when_full": "wait"}),
+    }
+    plant = Plant(folder, environment, endpoint, np.random.default_rng([seed, 3]), kills_wanted)
     try:
         live(plant, machine, seed, hours)
         undisturbed.wait()
@@ -388,13 +353,10 @@ def _tell_memory(plant: Plant, hours: float) -> None:
 
 
 def _health(url: str) -> dict[str, Any]:
-    """Health over HTTP, asked again where too many have asked."""
-    while True:
-        answer = httpx.get(f"{url}/api/v1/machines/{_PLACE}/health", trust_env=False)
-        if answer.status_code != HTTPStatus.TOO_MANY_REQUESTS:
-            health: dict[str, Any] = answer.raise_for_status().json()
-            return health
-        time.sleep(0.5)
+    """Health over HTTP."""
+    answer = httpx.get(f"{url}/api/v1/machines/{_PLACE}/health", trust_env=False)
+    health: dict[str, Any] = answer.raise_for_status().json()
+    return health
 
 
 def _windows(history: MachineStore) -> list[int]:
