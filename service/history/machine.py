@@ -10,10 +10,18 @@ from sqlalchemy import Connection, delete, func, select
 from sqlalchemy.sql.base import ReadOnlyColumnCollection
 from sqlalchemy.sql.elements import ColumnElement
 
-from rotorwatch.records.history import Reading, ReadingBucket
+from rotorwatch.records.history import Reading
 from service.history.claim import Claim, pack, unpack
 from service.history.database import Database
-from service.history.records import Checkpoint, CheckpointHead, Step, StoredEvent, StoredReport, StoreError
+from service.history.records import (
+    Checkpoint,
+    CheckpointHead,
+    Step,
+    StoredBucket,
+    StoredEvent,
+    StoredReport,
+    StoreError,
+)
 from service.history.shared import EVENT, ReportLog
 from service.history.tables import alarm_events, checkpoint_parts, checkpoints, evidence, reports, series, windows
 from service.history.trend import trend
@@ -256,7 +264,7 @@ class MachineStore:
         since_ns: int | None = None,
         until_ns: int | None = None,
         points: int = 300,
-    ) -> tuple[ReadingBucket, ...]:
+    ) -> tuple[StoredBucket, ...]:
         """Readings reduced to at most so many buckets of equal length for each name, by name and time.
 
         Parameters
@@ -276,7 +284,7 @@ class MachineStore:
             of = connection, self._claim.machine_id, self._bucket_ns
             return trend(*of, quantity, names, since_ns, until_ns, _checked(points))
 
-    def latest(self, quantity: str, name: str, *, span_ns: int, points: int) -> tuple[ReadingBucket, ...]:
+    def latest(self, quantity: str, name: str, *, span_ns: int, points: int) -> tuple[StoredBucket, ...]:
         """Readings of one name up to the newest window, reduced like those of `downsampled`.
 
         Parameters

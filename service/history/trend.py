@@ -1,22 +1,23 @@
 """Readings over a long time, reduced to as many numbers as a plot can show."""
 
 from collections.abc import Sequence
+from itertools import repeat
 
 import numpy as np
 import numpy.typing as npt
 from sqlalchemy import Connection, func, select
 from sqlalchemy.sql.elements import ColumnElement
 
-from rotorwatch.records.history import ReadingBucket
+from service.history.records import StoredBucket
 from service.history.tables import buckets, machines, series, windows
-from service.history.windows import BUCKET, READING, Records, add_up, finite, singles, unpacked
+from service.history.windows import BUCKET, READING, Parts, add_up, finite, singles, stored_parts, unpacked
 
 _SINGLE = 20_000
 """Windows whose single readings are reduced when a trend is asked for; over more of them the stored buckets are."""
 _SINGLE_FOR_COARSE = 2_000
 """The same where stored buckets are at most twice as long as what is asked for; they cost a tenth."""
 _END = 2**63 - 1
-_Timed = tuple[npt.NDArray[np.int64], Records]
+_Timed = tuple[npt.NDArray[np.int64], Parts]
 """Buckets, and when each begins."""
 
 
@@ -29,7 +30,7 @@ def trend(  # noqa: PLR0913  # each narrows it
     since_ns: int | None,
     until_ns: int | None,
     points: int,
-) -> tuple[ReadingBucket, ...]:
+) -> tuple[StoredBucket, ...]:
     """Reduce readings, and what older ones have been reduced to, to at most `points` buckets; see `MachineStore`.
 
     Every reading is in a stored bucket, or will be in the one that is being filled. Where all windows that are asked
@@ -78,24 +79,27 @@ def trend(  # noqa: PLR0913  # each narrows it
             last = until // unit * unit
             parts.append(_single(connection, machine_id, list(titles), window.end_ns, last, until))
         parts += [_between(each, first, last) for each in stored]
-    times, records = (np.concatenate(each) for each in zip(*parts, strict=True))
-    places, made = add_up(records, (times - start) // length)
-    reduced = (
-        ReadingBucket(
-            name=titles[series_id],
-            start_ns=start + place * length,
-            length_ns=length,
-            count=count,
-            minimum=minimum,
-            mean=total / count,
-            maximum=maximum,
-            mean_standard_error=errors_total / errors if errors else None,
-        )
-        for place, (series_id, count, minimum, maximum, total, errors, errors_total) in zip(
-            places.tolist(), made.tolist(), strict=True
+    times = np.concatenate([each for each, _ in parts])
+    places, made = add_up(Parts.together([each for _, each in parts]), (times - start) // length)
+    # By name, and of each name in the order of time, which they are in.
+    rank = {series_id: place for place, series_id in enumerate(sorted(titles, key=titles.__getitem__))}
+    order = np.argsort([rank[series_id] for series_id in made["series_id"].tolist()], kind="stable")
+    places, made = places[order], made[order]
+    with np.errstate(invalid="ignore", over="ignore"):
+        means, errors = made["total"] / made["count"], made["errors_total"] / np.maximum(made["errors"], 1)
+    return tuple(
+        map(
+            StoredBucket,
+            map(titles.__getitem__, made["series_id"].tolist()),
+            (start + places * length).tolist(),
+            repeat(length),
+            made["count"].tolist(),
+            made["minimum"].tolist(),
+            means.tolist(),
+            made["maximum"].tolist(),
+            (error if count else None for count, error in zip(made["errors"].tolist(), errors.tolist(), strict=True)),
         )
     )
-    return tuple(sorted(reduced, key=lambda each: (each.name, each.start_ns)))
 
 
 def _stored(
@@ -106,13 +110,14 @@ def _stored(
     query = select(stored.start_ns, stored.length_ns, stored.readings).order_by(stored.start_ns)
     query = query.where(stored.machine_id == machine_id, stored.start_ns >= since, stored.start_ns < until)
     rows = connection.execute(query).all()
-    of, records = unpacked([row.readings for row in rows], BUCKET)
-    chosen = np.isin(records["series_id"], series_ids)
+    of, records = unpacked([row[2] for row in rows], BUCKET)
+    chosen = np.flatnonzero(np.isin(records["series_id"], series_ids))
     times, lengths = (np.array([row[n] for row in rows], np.int64)[of[chosen]] for n in (0, 1))
     bucketed = connection.scalar(select(machines.c.bucketed).where(machines.c.machine_id == machine_id)) or 0
     ends, filling = _single(connection, machine_id, series_ids, windows.c.number, bucketed + 1, _END)
-    filled = _between((ends // bucket_ns * bucket_ns, filling), since, until)
-    made = [(times, records[chosen]), (filled[0][finite(filled[1])], filled[1][finite(filled[1])])]
+    with_mean = finite(filling)
+    starts, filling = ends[with_mean] // bucket_ns * bucket_ns, filling.of(with_mean)
+    made = [(times, stored_parts(records, chosen)), _between((starts, filling), since, until)]
     unit = max(int(lengths.max(initial=1)), bucket_ns if len(made[1][0]) else 1)
     return unit, [each for each in made if len(each[0])]
 
@@ -124,12 +129,12 @@ def _single(
     window = windows.c
     query = select(window.end_ns, window.readings).order_by(column)
     rows = connection.execute(query.where(window.machine_id == machine_id, column >= first, column < end)).all()
-    of, readings = unpacked([row.readings for row in rows], READING)
-    chosen = np.isin(readings["series_id"], series_ids)
-    return np.array([row.end_ns for row in rows], np.int64)[of[chosen]], singles(readings[chosen])
+    of, readings = unpacked([row[1] for row in rows], READING)
+    chosen = np.flatnonzero(np.isin(readings["series_id"], series_ids))
+    return np.array([row[0] for row in rows], np.int64)[of[chosen]], singles(readings, chosen)
 
 
 def _between(timed: _Timed, first: int, end: int) -> _Timed:
-    times, records = timed
+    times, parts = timed
     inside = (times >= first) & (times < end)
-    return times[inside], records[inside]
+    return times[inside], parts.of(inside)

@@ -5,6 +5,7 @@ what compressing leaves of them.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -25,6 +26,8 @@ BUCKET = np.dtype(
         ("errors", "<i4"), ("errors_total", "<f8"),
     ]
 )  # fmt: skip
+_FIELDS: tuple[str, ...] = BUCKET.names or ()
+_ALL = slice(None)
 _FEW = 4  # places to count in, for each number
 _log = structlog.get_logger("rotorwatch", part="history")
 
@@ -52,19 +55,44 @@ def unpacked(values: Sequence[bytes], kind: np.dtype[np.void]) -> tuple[npt.NDAr
     return np.repeat(np.arange(len(opened)), sizes), records
 
 
-def singles(readings: Records) -> Records:
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """The fields of buckets, each by itself: of a million readings these are added up much faster than records."""
+
+    series_id: npt.NDArray[np.int32]
+    count: npt.NDArray[np.int32]
+    minimum: npt.NDArray[np.float64]
+    maximum: npt.NDArray[np.float64]
+    total: npt.NDArray[np.float64]
+    errors: npt.NDArray[np.int32]
+    errors_total: npt.NDArray[np.float64]
+
+    def of(self, chosen: npt.NDArray[np.bool_]) -> "Parts":
+        """Some of them."""
+        return self if chosen.all() else Parts(*(getattr(self, name)[chosen] for name in _FIELDS))
+
+    @classmethod
+    def together(cls, parts: Sequence["Parts"]) -> "Parts":
+        """All of them, in this order."""
+        return cls(*(np.concatenate([getattr(each, name) for each in parts]) for name in _FIELDS))
+
+
+def singles(readings: Records, chosen: npt.NDArray[np.intp] | slice = _ALL) -> Parts:
     """Each reading as a bucket of its own."""
-    made, known = np.empty(len(readings), BUCKET), ~np.isnan(readings["standard_error"])
-    made["series_id"], made["count"], made["errors"] = readings["series_id"], 1, known
-    made["minimum"] = made["maximum"] = made["total"] = readings["value"]
-    made["errors_total"] = np.where(known, readings["standard_error"], 0.0)
-    return made
+    series_id, values, errors = (readings[name][chosen] for name in ("series_id", "value", "standard_error"))
+    known = ~np.isnan(errors)
+    once = np.ones(len(values), np.int32)
+    return Parts(series_id, once, values, values, values, known.astype(np.int32), np.where(known, errors, 0.0))
 
 
-def finite(parts: Records) -> npt.NDArray[np.bool_]:
+def stored_parts(stored: Records, chosen: npt.NDArray[np.intp] | slice = _ALL) -> Parts:
+    """Buckets that were stored."""
+    return Parts(*(stored[name][chosen] for name in _FIELDS))
+
+
+def finite(parts: Parts) -> npt.NDArray[np.bool_]:
     """Which have a mean."""
-    found: npt.NDArray[np.bool_] = np.isfinite(parts["total"]) & np.isfinite(parts["errors_total"])
-    return found
+    return np.isfinite(parts.total) & np.isfinite(parts.errors_total)
 
 
 def _distinct(numbers: npt.NDArray[np.integer[Any]]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
@@ -76,21 +104,19 @@ def _distinct(numbers: npt.NDArray[np.integer[Any]]) -> tuple[npt.NDArray[np.int
     return np.flatnonzero(there), (np.cumsum(there) - 1)[numbers]
 
 
-def add_up(parts: Records, places: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], Records]:
+def add_up(parts: Parts, places: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], Records]:
     """Buckets, those at the same place and of the same series in one, by place and series; and their places."""
-    series_ids, column = _distinct(parts["series_id"])
+    series_ids, column = _distinct(parts.series_id)
     width = max(1, len(series_ids))
     keys, group = _distinct(places * width + column)
     made = np.empty(len(keys), BUCKET)
     made["series_id"] = series_ids[keys % width]
     for name in ("count", "total", "errors", "errors_total"):
-        made[name] = np.bincount(group, parts[name], len(keys))
-    # Numbers of two bytes are sorted without comparing them.
-    order = np.argsort(group.astype(np.uint16) if len(keys) <= 2**16 else group, kind="stable")
-    sizes = np.bincount(group, minlength=len(keys))
-    first = np.cumsum(sizes) - sizes
-    made["minimum"] = np.minimum.reduceat(parts["minimum"][order], first)
-    made["maximum"] = np.maximum.reduceat(parts["maximum"][order], first)
+        made[name] = np.bincount(group, getattr(parts, name), len(keys))
+    minimum, maximum = np.full(len(keys), np.inf), np.full(len(keys), -np.inf)
+    np.minimum.at(minimum, group, parts.minimum)
+    np.maximum.at(maximum, group, parts.maximum)
+    made["minimum"], made["maximum"] = minimum, maximum
     return keys // width, made
 
 
@@ -106,14 +132,14 @@ def fill_buckets(
     for start_ns in sorted(set(starts)):
         inside = [row for row, start in zip(rows, starts, strict=True) if start == start_ns]
         parts = singles(unpacked([row.readings for row in inside], READING)[1])
-        parts, recorded_ns = parts[finite(parts)], [row.recorded_ns for row in inside]
+        parts, recorded_ns = parts.of(finite(parts)), [row.recorded_ns for row in inside]
         key = {"machine_id": machine_id, "start_ns": start_ns, "length_ns": bucket_ns}
         there = select(stored.recorded_ns, stored.readings).where(*(stored[name] == key[name] for name in key))
         for row in connection.execute(there):
-            parts = np.concatenate([unpacked([row.readings], BUCKET)[1], parts])
+            parts = Parts.together([stored_parts(unpacked([row.readings], BUCKET)[1]), parts])
             recorded_ns.append(row.recorded_ns)
-        if len(parts):
-            _, made = add_up(parts, np.zeros(len(parts), np.int64))
+        if len(parts.total):
+            _, made = add_up(parts, np.zeros(len(parts.total), np.int64))
             changes = {"recorded_ns": max(recorded_ns), "readings": packed(made)}
             new = database.insert(buckets).values(key | changes)
             connection.execute(new.on_conflict_do_update(index_elements=list(key), set_=changes))

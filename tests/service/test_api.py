@@ -145,7 +145,9 @@ def test_readings_are_reduced_to_a_plot(http: httpx.Client) -> None:
     (whole,) = answered(http.get(f"{PLACE}/readings?name=k_by&points=1"), ReadingList).buckets
     assert (whole.name, whole.count, whole.minimum, whole.maximum) == ("k_by", 4, min(every), max(every))
     assert whole.mean == pytest.approx(sum(every) / 4)
-    two = answered(http.get(f"{PLACE}/readings?name=k_by&name=e&points=3"), ReadingList)
+    told = http.get(f"{PLACE}/readings?name=k_by&name=e&points=3")
+    two = answered(told, ReadingList)
+    assert told.text == two.model_dump_json()
     assert two.readings == ()
     assert {one.name for one in two.buckets} == {"k_by", "e"}
     assert sum(one.count for one in two.buckets) == 8

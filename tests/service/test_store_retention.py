@@ -11,9 +11,8 @@ import numpy.typing as npt
 import pytest
 from pydantic import ValidationError
 
-from rotorwatch.records.history import ReadingBucket
 from service.history.machine import MachineStore
-from service.history.records import Dropped, Retention, Step, StoredReading, StoredReport
+from service.history.records import Dropped, Retention, Step, StoredBucket, StoredReading, StoredReport
 from service.history.store import Store
 from tests.service.postgres import KINDS, database_url
 from tests.service.test_store import AUDIT, T0, alarm_event
@@ -79,7 +78,7 @@ def write(lab: MachineStore, clock: Clock, hops: int, per_step: int = 40) -> Wri
     return Written(ends, values, errors)
 
 
-def by_numpy(written: Written, name: str, places: npt.NDArray[np.int64], grid: ReadingBucket) -> list[ReadingBucket]:
+def by_numpy(written: Written, name: str, places: npt.NDArray[np.int64], grid: StoredBucket) -> list[StoredBucket]:
     """Buckets on the grid of another one, from the readings themselves; `places` are the times that decide."""
     expected = []
     numbers = (places - grid.start_ns) // grid.length_ns
@@ -88,7 +87,7 @@ def by_numpy(written: Written, name: str, places: npt.NDArray[np.int64], grid: R
         value, error = written.values[name][inside], written.errors[name][inside]
         error = error[~np.isnan(error)]
         expected.append(
-            ReadingBucket(
+            StoredBucket(
                 name=name, start_ns=int(grid.start_ns + number * grid.length_ns), length_ns=grid.length_ns,
                 count=int(inside.sum()), minimum=float(value.min()), mean=float(value.mean()),
                 maximum=float(value.max()),
@@ -98,7 +97,7 @@ def by_numpy(written: Written, name: str, places: npt.NDArray[np.int64], grid: R
     return expected
 
 
-def assert_same(found: list[ReadingBucket], expected: list[ReadingBucket]) -> None:
+def assert_same(found: list[StoredBucket], expected: list[StoredBucket]) -> None:
     assert len(found) == len(expected)
     for one, other in zip(found, expected, strict=True):
         exact = ("name", "start_ns", "length_ns", "count", "minimum", "maximum")
