@@ -59,6 +59,8 @@ class MachineMonitor:
     skips : callable
         Takes the end of a hop and says whether its window is not to be evaluated: live, because the computer cannot
         keep up; in a replay, because the live monitor did not.
+    remembered : bool
+        Whether `state` will be asked for; what is only for that takes time with every hop.
 
     Attributes
     ----------
@@ -66,24 +68,25 @@ class MachineMonitor:
         Whether the latest message was itself used at once, and not one that waited for it.
     """
 
-    def __init__(self, installed: Installed, skips: Callable[[int], bool] = lambda _: False) -> None:
+    def __init__(
+        self, installed: Installed, skips: Callable[[int], bool] = lambda _: False, *, remembered: bool = True
+    ) -> None:
         self.machine = machine = installed.machine
         self._name = f"{machine.site}/{machine.name}"
         self.identity = identity_of(installed)
         self._skips = skips
-        self._evaluator = evaluator_for(installed)
+        self._evaluator = judge = evaluator_for(installed)
         self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
         self._watching = installed.watching
-        self._plan = plan = plan_for(machine, lagged=self._evaluator.needs_lags, levels=True)
+        self._plan = plan = plan_for(machine, lagged=judge.needs_lags, levels=True)
         self._levels = LevelWatch(plan, machine, installed)
         self._senders = Senders()
         self._arrivals = Arrivals(machine.ingest.reorder_blocks)
         self._due: deque[Arrived] = deque()
         self._done: list[MonitorReport] = []
         self._gate = Gate(machine)
-        self._window = SlidingWindow(self._plan, remembered=True)
-        settings = SequentialSettings.for_machine(machine, short=self._evaluator.takes_short)
-        self._test = SequentialTest(settings, by=self._evaluator.by)
+        self._window = SlidingWindow(self._plan, remembered=remembered)
+        self._test = SequentialTest(SequentialSettings.for_machine(machine, short=judge.takes_short), by=judge.by)
         self._alarms = AlarmBook(machine.alarms)
         self._data_path = DataPathAlarms(self._alarms, machine)
         self._quality = Quality()
@@ -127,8 +130,7 @@ class MachineMonitor:
             block, schema_hash = decode_block(payload, attachment, encoding)
         except WireError as error:
             return (MonitorReport(self._count(Admission(Reason.MALFORMED, f"{self._name}: {error}"))),)
-        misshapen = self._gate.form(block, schema_hash)
-        if misshapen is not None:  # before anything is made of its run and number
+        if (misshapen := self._gate.form(block, schema_hash)) is not None:  # before its run and number are used
             return (MonitorReport(self._count(misshapen)),)
         if self._window.lacks:
             if self._gate.knows(block):
@@ -191,8 +193,7 @@ class MachineMonitor:
         disputed = self._senders.take(block)
         if disputed and not self._arrivals.withdraw(block.run, block.sequence):
             self._window.gap()  # the other version may be in the unfinished hop
-        conflict = self._senders.conflict
-        if conflict:
+        if conflict := self._senders.conflict:
             self._data_path.conflict(conflict, block.end_ns if self._end_ns is None else self._end_ns, at_once=True)
         return disputed
 
@@ -227,8 +228,7 @@ class MachineMonitor:
         self._used = block
         windows: list[Report] = []
         try:
-            for end_ns in self._hops(block, verdict, dropped):
-                windows.append(self._evaluate(end_ns))
+            windows.extend(map(self._evaluate, self._hops(block, verdict, dropped)))  # each before the next hop
         except Exception as error:  # whatever it is, the machine must not look healthy on account of it
             self._window.gap()
             self._failed(error, block.end_ns)

@@ -78,7 +78,7 @@ class OfflineReplay:
         span = source.span(keys)
         self._from_ns = span.start_ns if from_ns is None else from_ns
         self._to_ns = span.end_ns + 1 if to_ns is None else to_ns
-        self._monitor = MachineMonitor(installed, skipped_windows(source, keys).__contains__)
+        self._monitor = MachineMonitor(installed, skipped_windows(source, keys).__contains__, remembered=False)
         self.identity = self._monitor.identity
         self._digest = hashlib.sha256()
         self._windows = self._alarms = self._messages = 0
