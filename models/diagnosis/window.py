@@ -68,6 +68,9 @@ class WindowStatistics:
     speed_range: tuple[float, float]  # slowest and fastest hop, rad/s (nan if unknown)
     hop_speed_rad_s: FloatArray  # (n_hops,), mean speed of each hop (nan if unknown)
     removed_by_hop: bool  # whether the rotation was taken out hop by hop, each with its own amplitude
+    # (n_bins, n): squared coherence of each bin with the angle or, where the rotation was taken out hop by hop, with
+    # itself a segment later: none of noise, all of a line. None without a phase reference
+    phase_kept: FloatArray | None
     duration_s: float  # length of the data in the window
     # What the samples of each hop look like: of each of `sensors`, those of `states` first.
     waveforms: tuple[Waveform, ...]
@@ -112,7 +115,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
     total = products[0].copy()
     for hop in products[1:]:  # one by one, in order: the sum must not depend on how numpy would pair them
         total += hop
-    synchronous = hop_synchronous = relative_synchronous = None
+    synchronous = hop_synchronous = relative_synchronous = phase_kept = None
     if rotation.by_hop:
         phase_reference = rotation.source == "phase reference"
         level = regression(total[0] if phase_reference else total[0][: n + 1, : n + 1], n)
@@ -123,6 +126,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         cleaned = segments[:, :, :n] - segments[:, :, n:] @ own.segments.transpose(0, 2, 1)
         if phase_reference:
             synchronous = _synchronous(level)
+            phase_kept = _coherence(cleaned[:-2], cleaned[2:])  # those between overlap both
         elif plan.states:
             relative_synchronous = relative_vectors(np.stack([_synchronous(one) for one in own.hops]))
     else:
@@ -133,6 +137,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         cleaned = through(remove, segments)
         if plan.angle_column is not None:
             synchronous = _synchronous(beta)
+            phase_kept = _coherence(cleaned, segments[:, :, n + 1 : n + 2])
     if plan.angle_column is not None:
         hop_synchronous = _synchronous(regression(products[:, 0], n))
     by_bin = np.ascontiguousarray(cleaned.transpose(1, 0, 2))
@@ -157,6 +162,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         speed_range=speed_range,
         hop_speed_rad_s=rotation.hop_speed_rad_s,
         removed_by_hop=rotation.by_hop,
+        phase_kept=phase_kept,
         duration_s=len(hops) * plan.hop / plan.rate_hz,
         waveforms=tuple(hop.waveform for hop in hops),
         sensors=plan.sensors,
@@ -215,6 +221,13 @@ def levels_of(plan: Plan, hops: tuple[HopMoments, ...], *, errors: bool = True) 
         phase_reference=rotation.source == "phase reference",
         errors=errors,
     )
+
+
+def _coherence(one: ComplexArray | FloatArray, other: ComplexArray | FloatArray) -> FloatArray:
+    """Squared coherence over the segments, shape (n_bins, n)."""
+    powers = (np.abs(one) ** 2).sum(axis=0) * (np.abs(other) ** 2).sum(axis=0)
+    shared = np.abs((one * other.conj()).sum(axis=0)) ** 2
+    return np.asarray(shared / np.maximum(powers, np.finfo(float).tiny), dtype=np.float64)
 
 
 def _speeds(rotation: Rotation, hops: tuple[HopMoments, ...], plan: Plan) -> tuple[float, tuple[float, float]]:

@@ -248,3 +248,25 @@ def test_a_shaft_that_changes_its_speed_has_a_sound_angle() -> None:
     speed_rpm = machine_of("lab").operation.speed_rpm
     event = Event(at_s=25.0, ramp_s=10.0, speed_rpm=1.03 * speed_rpm)
     assert found_in(recorded("lab", 927, events=(event,))) == ()
+
+
+@pytest.mark.parametrize(("wanders", "resonance"), [(0.0, 1.0), (0.0, 1.01), (0.01, 1.0), (0.01, 1.2)])
+@pytest.mark.parametrize("damping", [0.002, 0.01])
+def test_a_lightly_damped_shaft_near_its_resonance_has_a_sound_angle(
+    wanders: float, resonance: float, damping: float
+) -> None:
+    rng, plan = np.random.default_rng([60120, round(1e4 * damping), round(100 * resonance)]), plan_of("lab")
+    plan = replace(plan, states=("y1",), columns=plan.columns[:1], scales=plan.scales[:1])
+    machine = machine_of("lab")
+    t_s = np.arange(round((WINDOW_S + MORE_S) * machine.rate_hz)) / machine.rate_hz
+    speed_hz = machine.operation.speed_rpm / 60
+    knots_s = np.arange(0.0, t_s[-1] + 8.0, 4.0)
+    turning_hz = speed_hz * (1 + wanders * np.interp(t_s, knots_s, rng.standard_normal(knots_s.size)))
+    theta = 2 * np.pi * np.cumsum(turning_hz) / machine.rate_hz
+    f, own_hz = np.fft.rfftfreq(t_s.size, 1 / machine.rate_hz), resonance * speed_hz
+    force = np.fft.rfft(rng.standard_normal(t_s.size))
+    shaken = np.fft.irfft(force / (own_hz**2 - f**2 + 2j * damping * own_hz * f), t_s.size)
+    motion = 1e-4 * (np.cos(theta) + shaken / shaken.std() / np.sqrt(2))
+    (window,) = windows_in(plan, np.stack([motion, np.mod(theta, 2 * np.pi)], axis=1))
+    assert window.removed_by_hop == (wanders > 0)
+    assert sensor_findings(window) == ()
