@@ -10,7 +10,7 @@ import numpy as np
 
 from models.levels.bands import Growth, growth
 from models.levels.gains import place_of, wrong_gain
-from models.levels.kurtosis import departure
+from models.levels.kurtosis import GAUSSIAN, departure, fallen_by_lines, without_lines
 from models.levels.limits import (
     BEYOND_RANGE,
     ERRORS,
@@ -25,7 +25,7 @@ from models.levels.limits import (
     unit_size,
 )
 from models.levels.measures import LevelPlan, WindowLevels
-from models.levels.reference import LevelReference
+from models.levels.reference import LevelReference, OperatingState
 from models.levels.settings import LevelSettings
 from models.levels.zones import ZONES, zone_of
 from models.signals.channels import Channel, Quantity
@@ -137,7 +137,7 @@ class LevelJudge:
             return next(iter(grown), "")
         n_errors = _ERRORS_OF_DOUBT if named else ERRORS
         found = [
-            (departure(kurtosis[:, column], state.kurtosis[one.name], BEYOND_RANGE, n_errors), one)
+            (self._departure(levels, column, state, n_errors), one)
             for column, one in enumerate(self._channels)
             if one.name in state.kurtosis
         ]
@@ -150,6 +150,25 @@ class LevelJudge:
             f"a vibration at {channel.name} ({channel.location} {channel.direction}) that is {how}: kurtosis of its "
             f"random part {healthy + most:.2f}, {healthy:.2f} on the healthy machine"
         )
+
+    def _departure(self, levels: WindowLevels, column: int, state: OperatingState, n_errors: float) -> float:
+        """By how much a channel's kurtosis is off, beyond what lines make of it that have grown or gone.
+
+        What has risen to less than a Gaussian's 3 may have lost a line.
+        """
+        name, kurtosis = self._channels[column].name, levels.random_kurtosis
+        if kurtosis is None or levels.moments is None or levels.bands is None:
+            return 0.0
+        hops, healthy = kurtosis[:, column], state.kurtosis[name]
+        found = departure(hops, healthy, BEYOND_RANGE, n_errors)
+        if found < 0:
+            in_bands, speed_rad_s = levels.moments[3], levels.speed_rad_s or 0.0
+            lines = fallen_by_lines(levels.bands, in_bands, column, speed_rad_s, state.bands.get(name))
+            return found if departure(hops + lines, healthy, BEYOND_RANGE, n_errors) < 0 else 0.0
+        if found and healthy.mean < GAUSSIAN:
+            random = without_lines(healthy)
+            return found if departure(hops, random, BEYOND_RANGE, n_errors) > 0 else 0.0
+        return found
 
     def _channel(
         self,

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
+from models.levels.bands import BandLevels, BandReference
 from models.signals.block import FloatArray
 
 
@@ -53,6 +54,46 @@ def learn_kurtosis(windows: Sequence[FloatArray]) -> KurtosisReference | None:
         hops=values.size,
         range=float(np.max(np.abs(np.array(means) - mean))),
     )
+
+
+GAUSSIAN = 3.0
+_LINES = 3
+"""Orders whose lines are taken out."""
+_STEADIER = 0.5
+"""Part of the scatter of noise from hop to hop below which what a band holds is a line."""
+
+
+def fallen_by_lines(
+    bands: BandLevels, in_bands: FloatArray, column: int, speed_rad_s: float, healthy: BandReference | None
+) -> float:
+    """What lines at other frequencies, such as a gear mesh, have taken from a channel's kurtosis since it was healthy.
+
+    A line has the same power in every hop, noise has not: relative to its mean, of f degrees of freedom, √(2/f).
+
+    Parameters
+    ----------
+    in_bands : ndarray, shape (n_hops, n_bands, n)
+        Mean squares of each hop.
+    """
+    own = in_bands[:, :, column]
+    power, total = own.mean(axis=0), max(float(own.mean(axis=0).sum()), np.finfo(float).tiny)
+    steady = own.std(axis=0) < _STEADIER * power * np.sqrt(2 * len(own) / bands.freedom)
+    multiples = abs(speed_rad_s) / (2 * np.pi) * np.arange(1, _LINES + 1)[:, None]
+    # The taper spreads a line over the edges of its band.
+    rotation = ((multiples > 0.97 * bands.edges_hz[:-1]) & (multiples < 1.03 * bands.edges_hz[1:])).any(axis=0)
+    before = np.zeros_like(power)
+    if healthy is not None and len(healthy.mean) == power.size:
+        before = np.square(healthy.mean)
+        before /= max(float(before.sum()), np.finfo(float).tiny)
+    more = np.maximum((power / total) ** 2 - before**2, 0.0)
+    return float(1.5 * more[steady & ~rotation].sum())
+
+
+def without_lines(healthy: KurtosisReference) -> KurtosisReference:
+    """The same if it is below that of noise because of a line, and this has gone: noise alone scatters more."""
+    share = min(1.0, np.sqrt(max(0.0, (GAUSSIAN - healthy.mean) / 1.5)))  # of the power
+    scatter = healthy.scatter / max(1 - share, 0.1) ** 2
+    return healthy.model_copy(update={"mean": GAUSSIAN, "scatter": float(scatter)})
 
 
 def departure(hops: FloatArray, reference: KurtosisReference, beyond_range: float, n_errors: float) -> float:

@@ -364,7 +364,7 @@ class WindowLevels:
         Mean speed; None where it is not known.
     bands : BandLevels or None
     moments : tuple of ndarray, or None
-        Of each hop, what `random_kurtosis` is made of.
+        Of each hop, what `random_kurtosis` is made of, and the mean squares in the bands.
     """
 
     values: Mapping[str, FloatArray]
@@ -373,12 +373,12 @@ class WindowLevels:
     speed_rad_s: float | None = None
     hops: int = 1
     bands: BandLevels | None = None
-    moments: tuple[FloatArray, FloatArray, _ComplexArray] | None = None
+    moments: tuple[FloatArray, FloatArray, _ComplexArray, FloatArray] | None = None
 
     @property
     def random_kurtosis(self) -> FloatArray | None:
         """See `models.levels.kurtosis`; shape (n_hops, n)."""
-        return None if self.moments is None else random_kurtosis(*self.moments)
+        return None if self.moments is None else random_kurtosis(*self.moments[:3])
 
 
 def window_levels(
@@ -447,7 +447,7 @@ def window_levels(
         np.sqrt(in_bands).std(axis=0) / np.sqrt(max(1, count - 1)) if errors else None,
         freedom,
     )
-    moments = sums[:, 1], sums[:, 4], every_order[:, 1:]
+    moments = sums[:, 1], sums[:, 4], every_order[:, 1:], in_bands
     return WindowLevels(values, scatter, vectors, speed_rad_s, count, bands, moments)
 
 

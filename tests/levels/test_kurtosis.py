@@ -1,10 +1,15 @@
 """The kurtosis of a random part against closed forms, and what departs from a healthy machine's."""
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 import pytest
 
+from models.levels.judgement import LevelJudge
 from models.levels.kurtosis import KurtosisReference, departure, learn_kurtosis
 from models.levels.measures import LevelPlan, WindowLevels, hop_levels, level_plan, window_levels
+from models.levels.reference import learn_levels
+from models.levels.settings import LevelSettings
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from models.signals.waveform import waveform_of
@@ -80,6 +85,39 @@ def test_a_departure_is_seen_in_the_newest_half_before_the_window_is_full_of_it(
     at = T.size // 2
     samples[at:] = np.clip(samples[at:], -2.5, 2.5)
     assert departure(kurtosis(samples), healthy, 1.25, 6.0) < 0
+
+
+def suspects(meshes: Sequence[float], healthy_mesh: float, spoilt: Callable[[FloatArray], FloatArray]) -> list[str]:
+    """What is said of windows with a gear mesh of these amplitudes beside noise, spoilt, on a machine commissioned."""
+
+    def samples(seed: int, mesh: float) -> FloatArray:
+        lines = 2 * np.cos(THETA) + mesh * np.cos(11 * THETA + seed)
+        return np.asarray(noise(seed) + lines, dtype=np.float64)
+
+    healthy = learn_levels("commissioned", [Y.name], [window(samples(60150 + n, healthy_mesh)) for n in range(5)])
+    found, judge = [], LevelJudge(PLAN, [Y], LevelSettings())
+    for number, mesh in enumerate(meshes):
+        levels = window(spoilt(samples(60160 + number, mesh)))
+        found.append(judge.foreign(levels, judge.judge(levels, healthy), healthy, named=False))
+    return found
+
+
+def clipped(samples: FloatArray) -> FloatArray:
+    return np.asarray(np.clip(samples, -1.3 * samples.std(), 1.3 * samples.std()), dtype=np.float64)
+
+
+def knocking(samples: FloatArray) -> FloatArray:
+    knocks = np.zeros(T.size)
+    knocks[:: round(RATE_HZ / 10)] = 12.0
+    return samples + knocks
+
+
+@pytest.mark.parametrize("healthy_mesh", [0.0, 1.5])
+def test_a_gear_mesh_that_grows_or_goes_is_no_rub_but_a_rub_is_one(healthy_mesh: float) -> None:
+    meshes = (0.0, 0.7, 1.5, 3.0)
+    assert suspects(meshes, healthy_mesh, lambda samples: samples) == [""] * 4
+    assert all("clipped, as by a rub" in one for one in suspects(meshes, healthy_mesh, clipped))
+    assert all("with impacts" in one for one in suspects(meshes[:2], healthy_mesh, knocking))
 
 
 def test_less_will_do_to_doubt_what_else_was_found() -> None:

@@ -243,12 +243,13 @@ def _jitter(window: WindowStatistics, columns: Sequence[int], vectors: ComplexAr
     step_hz, hop_s = window.frequencies_hz[1] - window.frequencies_hz[0], window.duration_s / len(own)
     # A jitter of more than half a radian miscounts turns at random: then the line is somewhere near the hops' speeds.
     power = np.einsum("fii->fi", window.spectrum[first : last + 1]).real[:, list(columns)]
-    kept = kept[first : last + 1, list(columns)]
-    middle = int((kept * power / np.maximum(power.mean(axis=0), np.finfo(float).tiny)).sum(axis=1).argmax())
     # A resonance stands out as a line does, but its noise keeps no phase.
-    if np.median(kept[middle]) < (_LINES_PHASE if window.removed_by_hop else _SHAFTS_PHASE):
+    least = _LINES_PHASE if window.removed_by_hop else _SHAFTS_PHASE
+    lines = np.median(kept[first : last + 1, list(columns)], axis=1) >= least
+    if not lines.any():
         return None
-    middle += first
+    strength = (power / np.maximum(power.mean(axis=0), np.finfo(float).tiny)).sum(axis=1)
+    middle = first + int(np.where(lines, strength, -1.0).argmax())
     left, beside = _surroundings(window, columns, middle)
     if not window.removed_by_hop:
         # Amplitudes that really changed leave a line, too; their scatter by the vibration around it does not.
