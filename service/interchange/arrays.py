@@ -4,6 +4,8 @@ What the three have in common: an array is a set of columns, samples run along i
 memory (or from the file, where it is mapped).
 """
 
+import os
+import struct
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -99,6 +101,10 @@ class MatlabSource(_Arrays):
             self._file.close()
 
 
+_UNKNOWN_SIZE = 0xFFFFFFFF
+"""Of samples that a program wrote without knowing how many there would be."""
+
+
 class WavSource(_Arrays):
     """A WAV file; its channels are named ``1``, ``2`` and so on. Mapped, not read, where its number format allows.
 
@@ -110,6 +116,7 @@ class WavSource(_Arrays):
     def __init__(self, path: Path) -> None:
         from scipy.io import wavfile  # noqa: PLC0415  # slow to import; only for these files
 
+        self._check_whole(path)
         with readable(path, self.kind), warnings.catch_warnings():
             warnings.simplefilter("ignore", wavfile.WavFileWarning)  # chunks of other programs that it skips
             try:
@@ -119,6 +126,27 @@ class WavSource(_Arrays):
         table = samples[:, None] if samples.ndim == 1 else samples
         self._rate_hz = float(rate)
         super().__init__(path, {str(number + 1): table[:, number] for number in range(table.shape[1])})
+
+    def _check_whole(self, path: Path) -> None:
+        """Refuse a file that ends before its samples do: what is not there would be missed by nobody."""
+        with readable(path, self.kind), path.open("rb") as file:
+            order, frame, long_size = (">" if file.read(12)[:4] == b"RIFX" else "<"), 1, 0
+            while len(head := file.read(8)) == 8:
+                name, size = struct.unpack(f"{order}4sI", head)
+                if name == b"data":
+                    size, there = long_size or size, path.stat().st_size - file.tell()
+                    if size == _UNKNOWN_SIZE or size <= there:
+                        return
+                    raise SourceError(
+                        f"{path}: is cut: {there // frame} samples of each channel are there, "
+                        f"expected the {size // frame} that its header says"
+                    )
+                content = file.read(min(size, 16))
+                if name == b"fmt " and len(content) == 16:
+                    (frame,) = struct.unpack_from(f"{order}H", content, 12)
+                elif name == b"ds64":
+                    (long_size,) = struct.unpack_from("<Q", content, 8)
+                file.seek(size + size % 2 - len(content), os.SEEK_CUR)
 
     def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002
         """Return the rate in the header; WAV knows no start time."""

@@ -12,7 +12,7 @@ from pydantic import BaseModel, BeforeValidator, Field, model_validator
 from models.errors import MachineFileError
 from models.machine import MachineFile
 from models.mistakes import checked, did_you_mean, read_toml
-from models.signals.channels import Channel, Quantity, time_unit_ns, unit_factor
+from models.signals.channels import Channel, Quantity, Sensor, time_unit_ns, unit_factor
 
 Format = Literal["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"]
 _DATETIME = "datetime"
@@ -175,9 +175,23 @@ class Mapping(BaseModel, extra="forbid", frozen=True):
                     )
         for name, channel in known.items():
             self._check_channel(name, channel)
+        for table, columns in (("channels", self.channels), ("acceleration.channels", self.accelerations)):
+            self._check_double(table, columns, known)
         angle = next((name for name, channel in known.items() if channel.quantity is Quantity.SHAFT_ANGLE), None)
         if self.keyphasor is not None and angle is None:
             raise ValueError("keyphasor: the machine has no shaft_angle channel for it")
+
+    def _check_double(self, table: str, columns: dict[str, Column], known: dict[str, Sensor]) -> None:
+        """Refuse one column for two sensors: only an accelerometer may be two, once a velocity, once a displacement."""
+        taken: dict[tuple[str, int | None, Quantity | None], str] = {}
+        for name, one in columns.items():
+            key = (one.column, one.index, known[name].quantity if columns is self.accelerations else None)
+            first = taken.setdefault(key, name)
+            if first != name:
+                where = f"column {one.column!r}" + ("" if one.index is None else f", index {one.index},")
+                raise ValueError(
+                    f"{table}.{name}: {where} is that of channel {first} already; expected that of another sensor"
+                )
 
     def _check_channel(self, name: str, channel: Channel) -> None:
         is_angle = channel.quantity is Quantity.SHAFT_ANGLE

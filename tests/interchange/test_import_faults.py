@@ -67,6 +67,7 @@ def test_a_missing_column_is_named_with_those_that_there_are(tmp_path: Path) -> 
         ("12:00:00Z", "12:00:00", "has no time zone"),
         ('{ column = "x", unit = "um" }', '{ column = "x", unit = "um", scale = 0 }', "scale is 0"),
         ("[channels]", '[keyphasor]\npulse_times = "k"\n[channels]', "channels.theta: expected [channels.theta], or a"),
+        ('"v"', '"x"', "channels.y1_dot: column 'x' is that of channel y1 already; expected that of another sensor"),
         ("[channels]", "[keyphasor]\n[channels]", "keyphasor: expected either pulse_times or column"),
     ],
 )
@@ -76,6 +77,19 @@ def test_a_wrong_mapping_is_named_by_field(tmp_path: Path, old: str, new: str, s
     text = fault(tmp_path, good_rows(), mapping.replace(old, new, 1))
     assert "mapping.toml: " in text
     assert said in text
+
+
+@pytest.mark.parametrize("number", [np.float32, np.int16])
+def test_a_wav_file_that_was_cut_is_refused_with_what_is_there(tmp_path: Path, number: type) -> None:
+    samples: np.ndarray = np.random.default_rng(60161).uniform(-100, 100, (1000, 3)).astype(number)
+    wavfile.write(tmp_path / "run.wav", 2000, samples)
+    mapping = f'[time]\nstart = "{START}"\n' + CHANNELS.replace('"x"', "1").replace('"v"', "2").replace('"a"', "3")
+    done, _ = imported(tmp_path, tmp_path / "run.wav", mapping)
+    assert done.written.samples == 1000
+    whole = (tmp_path / "run.wav").read_bytes()
+    (tmp_path / "run.wav").write_bytes(whole[: -400 * samples[0].nbytes])
+    with pytest.raises(MachineFileError, match="is cut: 600 samples of each channel are there, expected the 1000"):
+        imported(tmp_path, tmp_path / "run.wav", mapping)
 
 
 def test_a_channel_that_is_not_mapped_is_named(tmp_path: Path) -> None:
