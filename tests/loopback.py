@@ -1,7 +1,11 @@
-"""Free addresses on loopback for tests that run beside each other."""
+"""Free addresses on loopback for tests that run beside each other, and Zenoh sessions there."""
 
 import os
 import socket
+
+import zenoh
+
+from models.signals.link import LinkSettings
 
 _WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % 8
 _used_ports: set[int] = set()
@@ -22,3 +26,11 @@ def endpoint() -> str:
             except OSError:
                 continue
         return f"tcp/127.0.0.1:{port}"
+
+
+def session_of(link: LinkSettings, **more: str) -> zenoh.Session:
+    """A session with these settings and more of Zenoh's own."""
+    config = zenoh.Config()
+    for path, value in (link.zenoh_items() | more).items():
+        config.insert_json5(path, value)
+    return zenoh.open(config)

@@ -24,6 +24,7 @@ from models.signals.link import LinkSettings
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import Health, HealthState
 from rotorwatch.records.monitor import Readiness
+from tests.loopback import session_of
 from tests.service.hooked import Hook
 from tests.service.live import LAB, Program, endpoint, program
 
@@ -311,14 +312,10 @@ def _event(event: AlarmCloudEvent) -> Event:
 
 @contextmanager
 def _witness(address: str, heard: list[Event]) -> Iterator[None]:
-    config = zenoh.Config()
-    for path, value in LinkSettings(mode="client", connect=(address,)).zenoh_items().items():
-        config.insert_json5(path, value)
-
     def take(sample: zenoh.Sample) -> None:
         heard.append(_event(AlarmCloudEvent.model_validate_json(sample.payload.to_bytes())))
 
-    with zenoh.open(config) as session:
+    with session_of(LinkSettings(mode="client", connect=(address,))) as session:
         subscriber = session.declare_subscriber(LAB.keys.alarm_event, take)
         yield
         subscriber.undeclare()  # type: ignore[no-untyped-call]

@@ -17,6 +17,12 @@ START = "2026-01-31T12:00:00Z"
 START_NS = 1769860800_000_000_000
 RATE_HZ = 2000.0
 SPEED_HZ = 22.0
+CHANNELS = """
+[channels]
+y1 = { column = "x", unit = "um" }
+y1_dot = { column = "v", unit = "mm/s" }
+theta = { column = "a", unit = "rad" }
+"""
 
 
 @dataclass(frozen=True)

@@ -9,21 +9,13 @@ import pytest
 
 from service.interchange.source import SourceError
 from service.interchange.summary import summary_lines
-from tests.interchange.material import RATE_HZ, START_NS, imported, machine, signals, stretches
+from tests.interchange.material import CHANNELS, RATE_HZ, START_NS, imported, machine, signals, stretches
 
 ON_S, EVERY_S, FILES = 2.0, 20.0, 12
 COUNT = round(ON_S * RATE_HZ)
 KIT = machine(schedule={"on_s": ON_S, "every_s": EVERY_S}, window={}, ingest={})
 BEGIN = datetime(2026, 1, 31, 12, tzinfo=UTC)
-NAMED = """
-[time]
-rate_hz = 2000.0
-
-[channels]
-y1 = { column = "x", unit = "um" }
-y1_dot = { column = "v", unit = "mm/s" }
-theta = { column = "a", unit = "rad" }
-"""
+NAMED = f"\n[time]\nrate_hz = 2000.0\n{CHANNELS}"
 START = 'start = "2026-01-31T12:00:00Z"\nrate_hz'
 NUMBERED = NAMED.replace("rate_hz", START)
 DATED = NAMED.replace("rate_hz = 2000.0", 'column = "t"\nunit = "ns"\nstart = "unix"')

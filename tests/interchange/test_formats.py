@@ -17,16 +17,10 @@ from scipy.io import savemat, wavfile
 from models.signals.recording import read_recording
 from service.interchange.source import Reference, SourceError
 from service.interchange.tables import ParquetSource
-from tests.interchange.material import RATE_HZ, START, START_NS, imported, machine, signals, stretches
+from tests.interchange.material import CHANNELS, RATE_HZ, START, START_NS, imported, machine, signals, stretches
 
 COUNT = 70_001  # more than one chunk of rows
 
-CHANNELS = """
-[channels]
-y1 = { column = "x", unit = "um" }
-y1_dot = { column = "v", unit = "mm/s" }
-theta = { column = "a", unit = "rad" }
-"""
 TIME_COLUMN = f'[time]\ncolumn = "t"\nstart = "{START}"\n'
 RATE = f'[time]\nrate_hz = 2000.0\nstart = "{START}"\n'
 

@@ -15,16 +15,10 @@ from models.signals.block import integrated, lowest_valid_hz, settling_s
 from models.signals.channels import unit_factor
 from service.interchange.mapping import Acceleration, Column, CsvFormat, Keyphasor, Mapping, TimeBase
 from service.interchange.summary import summary_lines
-from tests.interchange.material import START, START_NS, imported, signals, stretches
+from tests.interchange.material import CHANNELS, START, START_NS, imported, signals, stretches
 from tests.service.preloaded import ran
 
 TIME = f'[time]\ncolumn = "t"\nstart = "{START}"\n'
-CHANNELS = """
-[channels]
-y1 = { column = "x", unit = "um" }
-y1_dot = { column = "v", unit = "mm/s" }
-theta = { column = "a", unit = "rad" }
-"""
 
 
 def table(path: Path, rows: list[str], header: str = "t,x,v,a") -> Path:

@@ -15,15 +15,19 @@ from models.signals.block import FloatArray
 from models.signals.channels import unit_factor
 from models.signals.keyphasor import EdgeDetector, pulse_train, shaft_angle
 from service.interchange.source import SourceError
-from tests.interchange.material import RATE_HZ, SPEED_HZ, START, START_NS, imported, machine, signals, stretches
+from tests.interchange.material import (
+    CHANNELS,
+    RATE_HZ,
+    SPEED_HZ,
+    START,
+    START_NS,
+    imported,
+    machine,
+    signals,
+    stretches,
+)
 
 STEP_NS = 500_000
-CHANNELS = """
-[channels]
-y1 = { column = "x", unit = "um" }
-y1_dot = { column = "v", unit = "mm/s" }
-theta = { column = "a", unit = "rad" }
-"""
 NANOSECONDS = '[time]\ncolumn = "t"\nunit = "ns"\nstart = "unix"\n'
 
 runs = st.lists(

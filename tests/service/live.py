@@ -39,6 +39,8 @@ IN_MEMORY = HistorySettings(url="sqlite:///:memory:")
 OPEN = AccessSettings(open_on_loopback=True, limits=LimitSettings(requests_per_minute=1_000_000))
 PATIENT = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]")
 """For `machine_file`: no silence is one."""
+IN_ORDER = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
+"""The same, and a gap is one at once."""
 SHORT = (("length_s = 60.0", "length_s = 20.0"), ("off_delay_s = 60.0", "off_delay_s = 20.0"))
 """For `machine_file`: windows are full, and alarms cleared, after a third of the time."""
 _ALONE = {
@@ -70,10 +72,7 @@ def until_subscribed(session: zenoh.Session, key: str) -> None:
 @contextmanager
 def open_session(connect: str, mode: Literal["peer", "client"] = "peer") -> Iterator[zenoh.Session]:
     """A session beside a service that subscribes to the lab machine; what it puts is heard from the beginning."""
-    config = zenoh.Config()
-    for path, value in LinkSettings(mode=mode, connect=(connect,)).zenoh_items().items():
-        config.insert_json5(path, value)
-    with zenoh.open(config) as session:
+    with loopback.session_of(LinkSettings(mode=mode, connect=(connect,))) as session:
         until_subscribed(session, LAB.keys.stream)
         yield session
 
@@ -191,6 +190,11 @@ class Feed:
         self.put(block)
         self.sequence += 1
         self.start_ns = block.end_ns
+
+    def skip(self, seconds: int = 3) -> None:
+        """Leave out so much: a gap before the next block."""
+        self.sequence += 10 * seconds
+        self.start_ns += seconds * 10**9
 
 
 @dataclass(slots=True)

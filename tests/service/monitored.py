@@ -18,6 +18,8 @@ from service.settings.access import AccessSettings, LimitSettings
 from service.stream.worker import MachineWorker
 from simulator.scenario import parse_fault
 from tests.service.live import (
+    IN_ORDER,
+    PATIENT,
     Feed,
     endpoint,
     machine_file,
@@ -42,11 +44,7 @@ M = TypeVar("M", bound=BaseModel)
 def faulty(folder: Path, access: AccessSettings = OPEN) -> Iterator[tuple[Runtime, MachineWorker]]:
     """The lab machine without a third of its horizontal bearing stiffness, 78 s of data, alarms after 10 s."""
     address = endpoint()
-    file = machine_file(
-        folder,
-        ("on_delay_s = 5.0", "on_delay_s = 10.0"),
-        ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]"),
-    )
+    file = machine_file(folder, ("on_delay_s = 5.0", "on_delay_s = 10.0"), PATIENT)
     (folder / "recordings").mkdir(exist_ok=True)
     plan = settings(address, file, bundle="lab", when_full="wait")
     recording = plan.recording.model_copy(update={"directory": folder / "recordings"})
@@ -61,9 +59,7 @@ def faulty(folder: Path, access: AccessSettings = OPEN) -> Iterator[tuple[Runtim
 def fed(folder: Path, access: AccessSettings = OPEN, *lines: tuple[str, str]) -> Iterator[tuple[Runtime, Feed]]:
     """The lab machine, which gets the blocks that a test puts; gaps of a second are an alarm at once."""
     address = endpoint()
-    file = machine_file(
-        folder, ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]"), *lines
-    )
+    file = machine_file(folder, IN_ORDER, *lines)
     plan = settings(address, file, when_full="wait")
     with running(plan.model_copy(update={"access": access})) as runtime, open_session(address) as session:
         yield runtime, Feed(session)

@@ -10,7 +10,8 @@ import zenoh
 
 from models.signals.keys import Grant, MachineKeys
 from models.signals.link import LinkSettings
-from tests.service.live import endpoint, until
+from tests.loopback import endpoint, session_of
+from tests.service.live import until
 
 PUMP = MachineKeys("demo", "pump")
 GRANTS = (
@@ -21,14 +22,6 @@ GRANTS = (
     Grant(who=("one",), views=("demo/lab",)),
 )
 USERS = ("lab", "pump", "monitor", "all", "one")
-
-
-def opened(link: LinkSettings, **more: str) -> zenoh.Session:
-    """A session with these settings and more of Zenoh's own."""
-    config = zenoh.Config()
-    for path, value in (link.zenoh_items() | more).items():
-        config.insert_json5(path, value)
-    return zenoh.open(config)
 
 
 def at_once(hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
@@ -63,7 +56,7 @@ class Plant:
 
     @contextmanager
     def client(self, user: str, **more: str) -> Iterator[zenoh.Session]:
-        with opened(self.link(user), **more) as session:
+        with session_of(self.link(user), **more) as session:
             yield session
 
     def until_heard(self, key: str, text: str) -> None:
@@ -78,7 +71,7 @@ def plant(folder: Path, mode: Literal["router", "peer"] = "router") -> Iterator[
     passwords = kept(folder / "passwords", "".join(f"{user}:word of {user}\n" for user in USERS))
     address = endpoint()
     link = LinkSettings(mode=mode, listen=(address,), passwords_file=passwords, grants=GRANTS)
-    with opened(link) as session:
+    with session_of(link) as session:
         found = Plant(session, address, folder)
 
         for keys in ("rotorwatch/**", "rotorwatch/**/@adv/**"):

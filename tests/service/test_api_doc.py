@@ -163,8 +163,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]
     """Address and token of a service with an alarm of a gap."""
     with fed(tmp_path_factory.mktemp("machine"), GUARDED) as (runtime, feed):
         feed.put_good()
-        feed.start_ns += 3_000_000_000
-        feed.sequence += 30
+        feed.skip()
         feed.put_good()
         with client(runtime, token(runtime)) as http:
             until(lambda: '"unacknowledged"' in http.get(f"{PLACE}/alarms").text, "alarm")

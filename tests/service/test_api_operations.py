@@ -27,8 +27,7 @@ def gap(folder: Path) -> Iterator[tuple[Runtime, Feed, httpx.Client]]:
     latching = ("[alarms]", '[alarms]\nlatching = ["data-gap"]\nlongest_shelf_s = 3600.0')
     with fed(folder, GUARDED, latching, ("off_delay_s = 60.0", "off_delay_s = 0.0")) as (runtime, feed):
         feed.put_good()
-        feed.start_ns += 3_000_000_000
-        feed.sequence += 30
+        feed.skip()
         feed.put_good()
         with client(runtime, token(runtime)) as http:
             until(lambda: state(http) == "unacknowledged", "alarm")

@@ -21,7 +21,18 @@ from simulator.publisher import PublishSettings, publish
 from simulator.scenario import load_scenario, parse_fault
 from simulator.stream import TruthRecord, blocks
 from tests.service.asyncapi import asyncapi
-from tests.service.live import LAB, ROOT, START_NS, endpoint, machine_file, open_session, settings, until, worker_of
+from tests.service.live import (
+    LAB,
+    PATIENT,
+    ROOT,
+    START_NS,
+    endpoint,
+    machine_file,
+    open_session,
+    settings,
+    until,
+    worker_of,
+)
 
 PAGE = ROOT / "docs" / "asyncapi.json"
 DOCUMENT = asyncapi(TruthRecord)
@@ -101,11 +112,7 @@ def test_examples_are_valid() -> None:
 def heard(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     """Everything on the keys of a simulated machine with a fault, and answers to questions."""
     address, found, lock = endpoint(), dict[str, list[str]](), threading.Lock()
-    file = machine_file(
-        tmp_path_factory.mktemp("machine"),
-        ("on_delay_s = 5.0", "on_delay_s = 0.0"),
-        ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]"),
-    )
+    file = machine_file(tmp_path_factory.mktemp("machine"), ("on_delay_s = 5.0", "on_delay_s = 0.0"), PATIENT)
     scenario, machine = load_scenario("healthy")
     scenario = scenario.overridden(duration_s=70.0, seed=3, faults=(parse_fault("k_by=-0.33@5"),))
     names = {getattr(KEYS, name): name for name in DOCUMENT["channels"] if name != "alarm_log"}

@@ -38,7 +38,7 @@ from service.runtime.runtime import Runtime, running
 from service.settings.access import AccessSettings, HttpTlsSettings
 from service.settings.service import HistorySettings, HttpSettings, ServiceSettings
 from service.stream.worker import MachineWorker
-from tests.service.live import ROOT, Feed, endpoint, machine_file, open_session, settings, until
+from tests.service.live import IN_ORDER, ROOT, Feed, endpoint, machine_file, open_session, settings, until
 from tests.service.monitored import GUARDED, OPEN, client, faulty, fed, token
 
 PLACE = "demo/lab"
@@ -198,17 +198,15 @@ def gapped(plan: ServiceSettings, *, feed_it: bool = True) -> Iterator[Runtime]:
             with open_session(plan.link.listen[0]) as session:
                 feed = Feed(session)
                 feed.put_good()
-                feed.start_ns += 3_000_000_000
-                feed.sequence += 30
+                feed.skip()
                 feed.put_good()
                 until(lambda: runtime.machines()[0].alarms().sequence >= 0, "alarm")
         yield runtime
 
 
 def plan(folder: Path, **changes: object) -> ServiceSettings:
-    quiet = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
     latching = ("[alarms]", '[alarms]\nlatching = ["data-gap"]')
-    made = settings(endpoint(), machine_file(folder, quiet, latching), when_full="wait")
+    made = settings(endpoint(), machine_file(folder, IN_ORDER, latching), when_full="wait")
     return made.model_copy(update=changes)
 
 

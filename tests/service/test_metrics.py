@@ -18,7 +18,7 @@ from service.monitor.reports import Tally
 from service.runtime.runtime import Runtime, running
 from service.settings.service import HistorySettings
 from tests.service.hooked import hook, settings_for
-from tests.service.live import ROOT, Feed, endpoint, machine_file, open_session, settings, until
+from tests.service.live import IN_ORDER, ROOT, Feed, endpoint, machine_file, open_session, settings, until
 from tests.service.monitored import GUARDED, PLACE, client, token
 
 LAB = {"site": "demo", "machine": "lab"}
@@ -74,9 +74,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def served(folder: Path) -> Iterator[tuple[Runtime, str, Read]]:
     """12 good blocks, one with a nan, one of a number that was there, 3 s missing, 2 good blocks; recorded."""
     address = endpoint()
-    file = machine_file(
-        folder, ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
-    )
+    file = machine_file(folder, IN_ORDER)
     (folder / "recordings").mkdir()
     plan = settings(address, file, when_full="wait")
     recording = plan.recording.model_copy(update={"directory": str(folder / "recordings")})
@@ -99,8 +97,7 @@ def served(folder: Path) -> Iterator[tuple[Runtime, str, Read]]:
             samples = feed.samples()
             samples[3, 1] = np.nan
             feed.put(feed.block(samples=samples))
-            feed.start_ns += 3_000_000_000
-            feed.sequence += 30
+            feed.skip()
             feed.put_good()
             feed.put_good()
             until(lambda: worker.health().quality.accepted_blocks == 14, "the last block")
@@ -248,16 +245,13 @@ def test_webhooks_over_http(served: tuple[Runtime, str, Read]) -> None:
 
 def test_after_a_restart(tmp_path: Path) -> None:
     address = endpoint()
-    file = machine_file(
-        tmp_path, ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
-    )
+    file = machine_file(tmp_path, IN_ORDER)
     plan = settings(address, file, when_full="wait")
     plan = plan.model_copy(update={"history": HistorySettings(url=f"sqlite:///{tmp_path / 'history.sqlite'}")})
     with running(plan) as runtime, open_session(address) as session:
         feed = Feed(session)
         feed.put_good()
-        feed.start_ns += 3_000_000_000
-        feed.sequence += 30
+        feed.skip()
         feed.put_good()
         until(lambda: runtime.machines()[0].history.last_sequence() == 0, "the alarm on the gap")
         until(lambda: parsed(runtime.metrics.text().decode()).of_lab("alarm_events_total", kind="raised") == 1, "count")

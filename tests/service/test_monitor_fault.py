@@ -23,7 +23,9 @@ from service.runtime.runtime import running
 from service.stream.checkpoints import checkpoint_step, restored
 from service.stream.inbox import Inbox, RawBlock
 from tests.service.live import (
+    IN_ORDER,
     LAB,
+    PATIENT,
     START_NS,
     Feed,
     endpoint,
@@ -104,8 +106,7 @@ def test_a_service_with_a_defect_is_not_ready_and_says_of_which_machine(
 ) -> None:
     monkeypatch.setattr(KnownMachineEvaluator, "evaluate", defective)
     address = endpoint()
-    quiet = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]")
-    with service(address, machine_file(tmp_path, quiet), when_full="wait") as (runtime, worker):
+    with service(address, machine_file(tmp_path, PATIENT), when_full="wait") as (runtime, worker):
         send(address, scenario_blocks(70.0), worker.machine)
         until(lambda: worker.tally.windows >= 13, "all windows")
         with client(runtime) as http:
@@ -195,8 +196,7 @@ def test_overload_clears_when_the_monitor_keeps_up() -> None:
 
 def test_a_full_queue_says_so_to_operators(tmp_path: Path) -> None:
     address = endpoint()
-    quiet = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
-    plan = plan_for(address, machine_file(tmp_path, quiet), bound=30)
+    plan = plan_for(address, machine_file(tmp_path, IN_ORDER), bound=30)
     with running(plan) as runtime, open_session(address) as session:
         worker = worker_of(runtime)
         feed = Feed(session, worker.machine)

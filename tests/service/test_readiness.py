@@ -16,7 +16,7 @@ from service.runtime.runtime import Runtime, running
 from service.settings.service import HistorySettings, ServiceSettings
 from service.stream.liveness import Pulse
 from tests.service.hooked import hook, settings_for
-from tests.service.live import Feed, endpoint, machine_file, open_session, service, settings, until
+from tests.service.live import IN_ORDER, Feed, endpoint, machine_file, open_session, service, settings, until
 from tests.service.monitored import client
 from tests.service.test_metrics import parsed
 
@@ -32,9 +32,7 @@ def test_a_history_that_cannot_be_written_is_a_reason_until_it_can(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address, file = endpoint(), tmp_path / "history.sqlite"
-    machine = machine_file(
-        tmp_path, ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
-    )
+    machine = machine_file(tmp_path, IN_ORDER)
     plan = settings(address, machine, when_full="wait")
     # As the runtime makes it, but not as patient with its database.
     monkeypatch.setattr("service.runtime.runtime.Store", partial(Store, timeout_s=2.0, retry_s=0.05))
@@ -49,8 +47,7 @@ def test_a_history_that_cannot_be_written_is_a_reason_until_it_can(
             until(lambda: runtime.machines()[0].health().quality.accepted_blocks == 1, "the first block")
             blocker = sqlite3.connect(file, isolation_level=None)  # another program that does not let go of the file
             blocker.execute("BEGIN IMMEDIATE")
-            feed.start_ns += 3_000_000_000
-            feed.sequence += 30
+            feed.skip()
             feed.put_good()  # an alarm on the gap, which must be written
             until(lambda: not runtime.readiness().ready, "trouble")
             status, found = asked(runtime)
@@ -103,17 +100,14 @@ def void(_: object) -> None:
 def test_webhooks_and_recorders_are_stated_and_no_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.delivery.webhooks.dispatcher._QUIET_S", 1e6)  # they are woken, or they sleep on
     address = endpoint()
-    machine = machine_file(
-        tmp_path, ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
-    )
+    machine = machine_file(tmp_path, IN_ORDER)
     with hook(lambda _: (503, {})) as receiver:
         plan = settings(address, machine, when_full="wait")
         plan = plan.model_copy(update={"webhooks": (settings_for(receiver, tmp_path),)})
         with running(plan) as runtime, open_session(address) as session:
             feed = Feed(session)
             feed.put_good()
-            feed.start_ns += 3_000_000_000
-            feed.sequence += 30
+            feed.skip()
             feed.put_good()
             until(lambda: runtime.readiness().failing_webhooks != (), "the webhook that fails")
             status, found = asked(runtime)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import zenoh
 
+from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording, summarize_recording
 from models.signals.salvage import inspect_recording, salvage_recording
 from models.signals.wire import encode_block
@@ -25,6 +26,7 @@ from service.recordings.leftovers import is_locked
 from service.recordings.recorder import MachineRecorder
 from service.runtime.runtime import running
 from service.settings.service import RecordingSettings, ServiceSettings
+from tests.loopback import session_of
 from tests.service.live import LAB, ROOT, Feed, Program, endpoint, open_session, program, settings, until, worker_of
 
 KEYS = LAB.keys
@@ -111,12 +113,9 @@ def test_everything_under_the_keys_is_recorded_as_it_was(tmp_path: Path) -> None
 
 def test_a_descriptor_announced_before_the_recorder_came_is_asked_for(tmp_path: Path) -> None:
     listen = endpoint()
-    config = zenoh.Config()
-    config.insert_json5("listen/endpoints", json.dumps([listen]))
-    config.insert_json5("scouting/multicast/enabled", "false")
     announced = b'{"announced": "by query"}'
     with (
-        zenoh.open(config) as session,
+        session_of(LinkSettings(listen=(listen,))) as session,
         program(
             tmp_path,
             "service.rotorwatch",

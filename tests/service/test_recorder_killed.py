@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 import zenoh
 
+from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
 from models.signals.salvage import inspect_recording, salvage_recording
 from service.recordings.leftovers import DAMAGED
+from tests.loopback import session_of
 from tests.service.live import LAB, Program, endpoint, program, until
 from tests.service.preloaded import ran
 
@@ -81,13 +83,10 @@ def on_disk(folder: Path, scratch: Path) -> list[tuple[bytes, bytes]]:
 def test_nothing_that_was_safe_is_lost_when_the_recorder_is_killed_again_and_again(tmp_path: Path) -> None:
     listen = endpoint()
     moments = np.random.default_rng(20)
-    config = zenoh.Config()
-    config.insert_json5("listen/endpoints", json.dumps([listen]))
-    config.insert_json5("scouting/multicast/enabled", "false")
     folders = [tmp_path / f"disk{n}" / "demo" / "lab" for n in range(BESIDE)]
     before: dict[Path, list[tuple[bytes, bytes]]] = {folder: [] for folder in folders}
     losses: list[int] = []
-    with zenoh.open(config) as session:
+    with session_of(LinkSettings(listen=(listen,))) as session:
         for number in range(ROUNDS):
             send = Sender(session)
             with ExitStack() as stack:

@@ -15,6 +15,7 @@ from service.recordings.replay.source import RecordingSource
 from service.stream.inbox import RawBlock
 from service.stream.replay_link import LiveMachineError, NetworkPlan, replay_to_network
 from service.stream.transport import Link, MachineCallbacks, MachineLink, route
+from tests.loopback import session_of
 from tests.service.live import LAB, endpoint, scenario_blocks, service, until
 from tests.service.replaying import recording, write
 
@@ -22,10 +23,7 @@ Heard = list[tuple[str, bytes, bytes, str]]
 
 
 def session(listen: str, namespace: str = "") -> zenoh.Session:
-    config = zenoh.Config()
-    for path, value in LinkSettings(listen=(listen,), namespace=namespace).zenoh_items().items():
-        config.insert_json5(path, value)
-    return zenoh.open(config)
+    return session_of(LinkSettings(listen=(listen,), namespace=namespace))
 
 
 def plan(source: RecordingSource, address: str, prefix: str, **changes: object) -> NetworkPlan:

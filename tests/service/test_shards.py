@@ -28,6 +28,7 @@ from service.settings.service import HistorySettings, MachineEntry, ServiceSetti
 from service.stream.shard_link import RelaySettings
 from simulator.scenario import parse_fault
 from tests.service.live import (
+    PATIENT,
     SHORT,
     Feed,
     endpoint,
@@ -43,7 +44,6 @@ from tests.service.monitored import OPEN, answered, client, problem
 
 SECONDS = 45.0
 NAMES = ("lab", "pump")
-QUIET = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]")
 PATHS = (
     "", "/configuration", "/detectable", "/detectable?change=-0.2", "/alarms?all=true", "/alarms/events", "/spectra",
     "/orbits?revolutions=4", "/correlations", "/waveforms", "/full-spectra", "/waterfalls",
@@ -57,7 +57,7 @@ def plan_for(folder: Path, count: int | None, address: str | None = None) -> Ser
     entries = []
     for name in NAMES:
         (folder / name).mkdir(exist_ok=True)
-        changes = (*SHORT, QUIET, ('name = "lab"', f'name = "{name}"'), ("on_delay_s = 5.0", "on_delay_s = 10.0"))
+        changes = (*SHORT, PATIENT, ('name = "lab"', f'name = "{name}"'), ("on_delay_s = 5.0", "on_delay_s = 10.0"))
         entries.append(MachineEntry(file=machine_file(folder / name, *changes)))
     plan = settings(address, when_full="wait")
     changed = {

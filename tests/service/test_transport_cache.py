@@ -10,6 +10,7 @@ import zenoh.ext
 
 from models.signals.link import LinkSettings
 from service.stream.inbox import RawBlock
+from tests.loopback import session_of
 from tests.service.live import LAB, endpoint, until
 from tests.service.test_transport import machine_link
 
@@ -20,10 +21,7 @@ SIZE = 30_000
 @pytest.mark.parametrize("wait", [True, False], ids=["batch run", "live machine"])
 def test_kept_and_live_blocks_arrive_each_once(wait: bool) -> None:
     address = endpoint()
-    config = zenoh.Config()
-    for path, value in LinkSettings(connect=(address,)).zenoh_items().items():
-        config.insert_json5(path, value)
-    config.insert_json5("transport/link/tx/queue/congestion_control/block/wait_before_close", json.dumps(60_000_000))
+    patience = {"transport/link/tx/queue/congestion_control/block/wait_before_close": json.dumps(60_000_000)}
     seen: list[int] = []
     begun = threading.Event()
 
@@ -32,7 +30,7 @@ def test_kept_and_live_blocks_arrive_each_once(wait: bool) -> None:
         seen.append(int.from_bytes(block.payload[:4], "little"))
         time.sleep(0.001)  # slow enough for live blocks to arrive in between
 
-    with zenoh.open(config) as session:
+    with session_of(LinkSettings(connect=(address,)), **patience) as session:
         publisher = zenoh.ext.declare_advanced_publisher(
             session,
             LAB.keys.stream,

@@ -22,6 +22,7 @@ from service.settings.service import load_settings
 from service.settings.webhooks import WebhookSettings
 from tests.service.hooked import Got, Hook, hook, settings_for
 from tests.service.live import (
+    IN_ORDER,
     ROOT,
     START_NS,
     Feed,
@@ -275,8 +276,7 @@ def raise_gap(address: str) -> None:
     with open_session(address) as session:
         feed = Feed(session, start_ns=START_NS)
         feed.put_good()
-        feed.start_ns += 3_000_000_000
-        feed.sequence += 30
+        feed.skip()
         feed.put_good()
 
 
@@ -289,7 +289,7 @@ def receiver() -> Iterator[Hook]:
 def test_killed_monitors_lose_nothing(tmp_path: Path, receiver: Hook) -> None:
     secret = new_secret()
     settings_for(receiver, tmp_path, secret)
-    machine_file(tmp_path, ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]"))
+    machine_file(tmp_path, IN_ORDER)
     (tmp_path / "plant.toml").write_text(
         '[[machines]]\nfile = "machine.toml"\n\n[log]\nlevel = "debug"\n\n[[webhooks]]\nname = "pager"\n'
         f'url = "{receiver.url}/{SECRET_PATH}"\nsecret_file = "hook.secret"\nlongest_pause_s = 1.0\n',

@@ -22,6 +22,7 @@ from service.monitor.reports import identity_of
 from service.stream.checkpoints import stored_event, stored_report
 from simulator.scenario import load_scenario, parse_fault
 from simulator.stream import blocks
+from tests.loopback import session_of
 from tests.service.live import (
     PATIENT,
     SHORT,
@@ -106,12 +107,9 @@ def offline() -> tuple[list[str], list[str]]:
 @contextmanager
 def plant(folder: Path, *, recording: bool, kept: int) -> Iterator[Plant]:
     address = endpoint()
-    config = zenoh.Config()
-    for path, value in LinkSettings(connect=(address,)).zenoh_items().items():
-        config.insert_json5(path, value)
     # On a busy computer a queue may be full for longer than a link is held for.
-    config.insert_json5("transport/link/tx/queue/congestion_control/block/wait_before_close", json.dumps(60_000_000))
-    with zenoh.open(config) as session:
+    patience = {"transport/link/tx/queue/congestion_control/block/wait_before_close": json.dumps(60_000_000)}
+    with session_of(LinkSettings(connect=(address,)), **patience) as session:
         yield Plant(folder, session, address, recording, kept)
 
 

@@ -18,8 +18,9 @@ from service.runtime.runtime import running
 from service.settings.service import HttpSettings, MachineEntry, ServiceSettings
 from service.stream.transport import Link, TopicMessage, follow
 from simulator.publisher import PublishError, PublishSettings, publish
+from tests.loopback import session_of
 from tests.service.live import LAB, ROOT, endpoint, program, scenario_blocks, until
-from tests.service.plant import GRANTS, PUMP, Plant, at_once, kept, opened, plant
+from tests.service.plant import GRANTS, PUMP, Plant, at_once, kept, plant
 
 
 @pytest.fixture
@@ -83,7 +84,7 @@ def test_only_a_certificate_of_the_authority_opens(tmp_path: Path) -> None:
     ours, foreign = Authority(tmp_path, trustme.CA()), Authority(tmp_path, trustme.CA())
     address = endpoint().replace("tcp/", "tls/")
     served = ours.tls("router", "127.0.0.1")
-    with opened(LinkSettings(mode="router", listen=(address,), tls=served, grants=GRANTS)):
+    with session_of(LinkSettings(mode="router", listen=(address,), tls=served, grants=GRANTS)):
         good = ours.tls("lab")
         knock(LinkSettings(mode="client", connect=(address,), tls=good))
         for tls, reason in (
@@ -101,7 +102,7 @@ def test_a_router_under_another_name_is_not_trusted(tmp_path: Path) -> None:
     ours = Authority(tmp_path, trustme.CA())
     address = endpoint().replace("tcp/", "tls/")
     router = LinkSettings(mode="router", listen=(address,), tls=ours.tls("router", "another.plant"))
-    with opened(router), pytest.raises(PublishError, match="another name than the endpoint's"):
+    with session_of(router), pytest.raises(PublishError, match="another name than the endpoint's"):
         knock(LinkSettings(mode="client", connect=(address,), tls=ours.tls("lab")))
 
 
@@ -109,13 +110,13 @@ def test_a_certificates_common_name_is_the_name_in_the_grants(tmp_path: Path) ->
     ours = Authority(tmp_path, trustme.CA())
     address = endpoint().replace("tcp/", "tls/")
     link = LinkSettings(mode="router", listen=(address,), tls=ours.tls("router", "127.0.0.1"), grants=GRANTS)
-    with opened(link) as session:
+    with session_of(link) as session:
         heard: list[str] = []
         session.declare_subscriber("rotorwatch/**", at_once(lambda sample: heard.append(str(sample.key_expr))))
-        with opened(LinkSettings(mode="client", connect=(address,), tls=ours.tls("stranger"))) as stranger:
+        with session_of(LinkSettings(mode="client", connect=(address,), tls=ours.tls("stranger"))) as stranger:
             for number, name in enumerate(("lab", "pump"), start=1):
                 stranger.put(LAB.keys.stream, "stranger", congestion_control=zenoh.CongestionControl.BLOCK)
-                with opened(LinkSettings(mode="client", connect=(address,), tls=ours.tls(name))) as client:
+                with session_of(LinkSettings(mode="client", connect=(address,), tls=ours.tls(name))) as client:
                     for keys in (PUMP, LAB.keys, PUMP):
                         client.put(keys.stream, name, congestion_control=zenoh.CongestionControl.BLOCK)
                     until(lambda number=number: len(heard) >= number + number // 2, f"stream of {name}")  # type: ignore[misc]

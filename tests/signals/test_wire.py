@@ -35,7 +35,7 @@ from models.signals.channels import ACCELERATIONS, UNIT_TO_SI, Channel, ChannelD
 from models.signals.keys import PREFIX, MachineKeys
 from models.signals.link import LinkSettings
 from models.signals.wire import ARROW_ENCODING, BLOCK_ENCODING, HEADER_BYTES, decode_block, encode_arrow, encode_block
-from tests.loopback import endpoint
+from tests.loopback import endpoint, session_of
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
 Encoder = Callable[[SampleBlock, str], tuple[bytes, bytes, str]]
@@ -257,9 +257,6 @@ def test_the_page_python_example_is_received(tmp_path: Path) -> None:
     script = tmp_path / "example.py"
     script.write_text(_page_blocks("python")[0], encoding="utf-8")
     address = endpoint()
-    config = zenoh.Config()
-    config.insert_json5("listen/endpoints", json.dumps([address]))
-    config.insert_json5("scouting/multicast/enabled", "false")
     received: list[tuple[str, bytes, bytes, str]] = []
     complete = threading.Event()
 
@@ -269,7 +266,7 @@ def test_the_page_python_example_is_received(tmp_path: Path) -> None:
         if sum(key.endswith("/stream") for key, *_ in received) == 4:
             complete.set()
 
-    with zenoh.open(config) as session:
+    with session_of(LinkSettings(listen=(address,))) as session:
         session.declare_subscriber("rotorwatch/demo/rig7/*", keep)
         begin = time.time_ns()
         with subprocess.Popen([sys.executable, str(script), address, "4"]) as process:

@@ -21,7 +21,7 @@ from models.signals.wire import ARROW_ENCODING, decode_block
 from simulator.publisher import PublishError, PublishSettings, publish
 from simulator.scenario import ChannelSettings, Event, Scenario, Sensors, load_scenario, parse_fault
 from simulator.stream import DEFAULT_START_NS, RunSummary, TruthRecord, blocks
-from tests.loopback import endpoint
+from tests.loopback import endpoint, session_of
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +38,7 @@ def _endpoint() -> str:
 @pytest.fixture
 def monitor(endpoint: str) -> Iterator[zenoh.Session]:
     """A session that listens where the publisher connects."""
-    config = zenoh.Config()
-    for path, value in LinkSettings(listen=(endpoint,)).zenoh_items().items():
-        config.insert_json5(path, value)
-    with zenoh.open(config) as session:
+    with session_of(LinkSettings(listen=(endpoint,))) as session:
         yield session
 
 

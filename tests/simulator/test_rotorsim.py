@@ -13,12 +13,13 @@ import pytest
 import zenoh
 from typer.testing import CliRunner, Result
 
+from models.signals.link import LinkSettings
 from models.signals.recording import read_recording, summarize_recording
 from models.signals.wire import decode_block
 from simulator.rotorsim import app
 from simulator.scenario import load_scenario
 from simulator.stream import DEFAULT_START_NS, TruthRecord, blocks
-from tests.loopback import endpoint
+from tests.loopback import endpoint, session_of
 
 ROOT = Path(__file__).parents[2]
 
@@ -138,9 +139,6 @@ def test_a_run_time_failure_exits_1() -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_publishing_cleanly(number: signal.Signals) -> None:
     address = endpoint()
-    config = zenoh.Config()
-    config.insert_json5("listen/endpoints", json.dumps([address]))
-    config.insert_json5("scouting/multicast/enabled", "false")
     three = threading.Event()
     gone = threading.Event()
 
@@ -153,7 +151,7 @@ def test_a_signal_ends_publishing_cleanly(number: signal.Signals) -> None:
         if sample.kind == zenoh.SampleKind.DELETE:
             gone.set()
 
-    with zenoh.open(config) as session:
+    with session_of(LinkSettings(listen=(address,))) as session:
         session.declare_subscriber("rotorwatch/demo/lab/stream", keep)
         session.liveliness().declare_subscriber("rotorwatch/demo/lab/alive/publisher", watch)
         command = [sys.executable, "-m", "simulator.rotorsim", "publish", "--connect", address, "--block-s", "0.05"]
@@ -174,10 +172,7 @@ def test_publishing_shows_how_far_it_is_and_whether_anybody_listens(listened: bo
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         where = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    config = zenoh.Config()
-    for name, value in (("listen/endpoints", f'["{where}"]'), ("scouting/multicast/enabled", "false")):
-        config.insert_json5(name, value)
-    with zenoh.open(config) as session:
+    with session_of(LinkSettings(listen=(where,))) as session:
         if listened:
             session.declare_subscriber("rotorwatch/demo/lab/stream", lambda _: None)
         result = _run("publish", "healthy", "--duration", 4, "--connect", where, "--linger", 0)
