@@ -353,7 +353,6 @@ def _tell_memory(plant: Plant, hours: float) -> None:
 
 
 def _health(url: str) -> dict[str, Any]:
-    """Health over HTTP."""
     answer = httpx.get(f"{url}/api/v1/machines/{_PLACE}/health", trust_env=False)
     health: dict[str, Any] = answer.raise_for_status().json()
     return health

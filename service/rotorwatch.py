@@ -127,7 +127,6 @@ def _prepare() -> None:
 
 
 def _serve(settings: "ServiceSettings", config: Path | None, ray_address: str | None = None) -> None:
-    """Monitor until Ctrl-C."""
     from service.runtime.runtime import running  # noqa: PLC0415  # must see the variables that were set
     from service.terminal.logs import configure_logging  # noqa: PLC0415  # keeps --help quick
     from service.terminal.stopping import stop_request  # noqa: PLC0415

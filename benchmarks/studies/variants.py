@@ -142,7 +142,6 @@ class _FixedSpeedEquation(SynchronousEquation):
     """Equation 29 without powers of Ω among its inputs."""
 
     def rows(self, view: StatisticsView, machine: Machine) -> EquationRows:
-        """Rows of one view."""
         rows = SynchronousEquation.rows(self, view, machine)
         speed2 = (view.speed_rad_s / machine.operation.speed_rad_s) ** 2
         inputs = rows.inputs[..., (0, 3, 4)] / np.array([1.0, speed2, speed2])

@@ -140,7 +140,6 @@ class _Picture:
         return Past.find(self.history, self.key, (self.from_, self.to))
 
     def draw(self, paint: "Paint") -> None:
-        """Draw and write it."""
         from service.analysis.figures.style import Look, draw  # noqa: PLC0415
 
         draw(self.out, Look(self.title, self._inches(), self.dpi), paint)

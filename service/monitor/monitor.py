@@ -482,7 +482,6 @@ class MachineMonitor:
         )
 
     def _window_now(self, start_ns: int, end_ns: int, state: HealthState) -> WindowHeading:
-        """First fields of a report."""
         return {
             **self.identity,
             "start_ns": start_ns,

@@ -262,7 +262,6 @@ class _Actor:
         self._begin()
 
     def begin_again(self) -> None:
-        """As `ShardProcess.begin_again`."""
         if self._moves_to:
             self._end_actor()
             strategies = self._ray.util.scheduling_strategies
@@ -279,7 +278,6 @@ class _Actor:
         self._actor = self._ray.remote(ShardActor).options(**self._options).remote(*self._arguments)
 
     def said(self, wait_s: float) -> str | None:
-        """As `ShardProcess.said`."""
         answer = self._actor.said.remote(self._next, wait_s)
         try:
             found: tuple[str, str] | None = self._ray.get(answer, timeout=wait_s + _ANSWER_S)
@@ -296,7 +294,6 @@ class _Actor:
         return said
 
     def ended(self, wait_s: float) -> str:
-        """As `ShardProcess.ended`."""
         if self._life is None:
             return ""
         if not self._ray.wait([self._life], timeout=wait_s)[0]:
@@ -315,11 +312,9 @@ class _Actor:
         self.ask_to_stop()
 
     def ask_to_stop(self) -> None:
-        """As `ShardProcess.ask_to_stop`."""
         self._actor.ask_to_stop.remote()
 
     def end(self, patience_s: float) -> None:
-        """As `ShardProcess.end`."""
         self.ended(patience_s)
         self._end_actor()
 

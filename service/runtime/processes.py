@@ -108,11 +108,9 @@ class _Spawned:
 
     @property
     def pid(self) -> int:
-        """Its number in the system."""
         return self._process.pid or 0
 
     def begin_again(self) -> None:
-        """As `ShardProcess.begin_again`."""
         self.end(0.0)
         self._begin()
 
@@ -133,24 +131,20 @@ class _Spawned:
         self._connection, self._process = ours, process
 
     def said(self, wait_s: float) -> str | None:
-        """As `ShardProcess.said`."""
         try:
             return self._connection.recv_bytes().decode() if self._connection.poll(wait_s) else None
         except OSError as error:
             raise EOFError from error
 
     def ended(self, wait_s: float) -> str:
-        """As `ShardProcess.ended`."""
         self._process.join(wait_s)
         return "" if self._process.exitcode is None else f"ended (exit {self._process.exitcode})"
 
     def ask_to_stop(self) -> None:
-        """As `ShardProcess.ask_to_stop`."""
         with suppress(OSError):
             self._connection.send_bytes(b"")
 
     def end(self, patience_s: float) -> None:
-        """As `ShardProcess.end`."""
         self._process.join(patience_s)
         if self._process.is_alive():
             self._process.kill()

@@ -94,11 +94,9 @@ class _Shard:
         machines.start(undo)
 
     def health(self, health: Health) -> None:
-        """Hear that a machine's health has changed."""
         self._tell(f"{health.site}/{health.machine}", changed=True)
 
     def wake(self) -> None:
-        """Hear that alarm events were committed."""
         for place, worker in self._workers.items():
             if worker.history.last_sequence() != self._told.get(place):
                 self._tell(place, changed=True)

@@ -92,5 +92,4 @@ class _OnceAMinute(logging.Filter):
         self._limiter = Limiter(quiet_s=60.0)
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether a line is written."""
         return record.levelno >= logging.ERROR or self._limiter.admit(str(record.msg)) is not None

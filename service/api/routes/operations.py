@@ -98,7 +98,6 @@ def _add_reading_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
 
 
 def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: OperationKind) -> None:
-    """Add the route of one operation."""
     configures = kind in ("remove-from-service", "return-to-service")
     model: Any = _ORDERS.get(kind, OperationOrder)
     shown = {"example": {"summary": "as seen in the control room", "value": example(model)}}

@@ -116,7 +116,6 @@ class _RecordingFile(FileResponse):
     """A file, or a range of it; a range that cannot be had is a problem like any other."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send it."""
         refused: int | None = None
 
         async def watched(message: Message) -> None:
