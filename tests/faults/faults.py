@@ -27,43 +27,34 @@ def _silent(seen: Seen) -> bool:
 
 
 def publisher_killed(plant: Plant) -> None:
-    first = plant.publish()
-    plant.flowing()
-    plant.rest(0.5, 2.0)
+    first = plant.at_work()
     first.kill()
     plant.broken()
     plant.stated(_silent, "stream lost")
     plant.publish(run=2)
-    plant.mended()
-    plant.recovered()
+    plant.over()
     plant.away_s = 60.0  # nobody measured meanwhile
 
 
 def publisher_stands(plant: Plant) -> None:
-    publisher = plant.publish()
-    plant.flowing()
-    plant.rest(0.5, 2.0)
+    publisher = plant.at_work()
     pause(publisher)
     plant.broken()
     plant.stated(_silent, "stream lost")
     os.kill(publisher.process.pid, signal.SIGCONT)
-    plant.mended()
-    plant.recovered()
+    plant.over()
 
 
 def restarted_at(offset_s: float) -> Callable[[Plant], None]:
     def run(plant: Plant) -> None:
         start = "2026-01-01T12:00:00Z"
-        first = plant.publish("--start", start)
-        plant.flowing()
-        plant.rest(0.5, 2.0)
+        first = plant.at_work("--start", start)
         first.stop()
         hour = 12 + round(offset_s / 3600)
         plant.publish("--start", f"2026-01-01T{hour:02}:00:00Z", run=2)
         plant.broken()
         plant.stated(lambda seen: "publisher restarted" in seen.health.quality.last_gap, "restart of the publisher")
-        plant.mended()
-        plant.recovered(lambda seen: seen.well and not seen.raised(CLOCK))
+        plant.over(lambda seen: seen.well and not seen.raised(CLOCK))
         plant.away_s = abs(offset_s) + 60.0
 
     return run
@@ -93,8 +84,7 @@ def clock_set(offset_s: float) -> Callable[[Plant], None]:
                 offset_ns[0] = round(offset_s * 1e9)
                 plant.broken()
                 plant.stated(lambda seen: any(one.name == CLOCK for one in seen.health.alarms), "clock that was set")
-                plant.mended()
-                plant.recovered(lambda seen: seen.well and seen.raised(CLOCK))
+                plant.over(lambda seen: seen.well and seen.raised(CLOCK))
                 seen = plant.look()
                 assert seen is not None
                 plant.missing_s += sum(seen.health.quality.refused_blocks.values()) * _FED_S
@@ -115,8 +105,7 @@ def two_publishers(plant: Plant) -> None:
     plant.stated(lambda seen: seen.raised(CONFLICT), "two publishers")
     plant.rest(2.0, 4.0)
     second.stop()
-    plant.mended()
-    plant.recovered(lambda seen: seen.flowing and not seen.raised(CONFLICT))
+    plant.over(lambda seen: seen.flowing and not seen.raised(CONFLICT))
     plant.away_s = 1e6
 
 
@@ -126,16 +115,13 @@ def through_router(plant: Plant) -> None:
 
 
 def link_cut(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.rest(0.5, 2.0)
+    plant.at_work()
     assert plant.router is not None
     plant.router.kill()
     plant.broken()
     plant.stated(_silent, "stream lost")
     plant.start_router()
-    plant.mended()
-    plant.recovered()
+    plant.over()
 
 
 def start_again(plant: Plant) -> None:
@@ -156,9 +142,7 @@ def monitor_killed(plant: Plant) -> None:
 
 
 def monitor_stopped(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.rest(0.5, 2.0)
+    plant.at_work()
     plant.broken()
     assert plant.end(signal.SIGTERM) == 0
     start_again(plant)
@@ -170,8 +154,7 @@ def monitor_stands(plant: Plant) -> None:
     pause(plant.running)
     plant.rest(6.0, 8.0)
     os.kill(plant.running.process.pid, signal.SIGCONT)
-    plant.mended()
-    plant.recovered()
+    plant.over()
     plant.rest(1.0, 1.5)
 
 
@@ -186,8 +169,7 @@ def second_monitor(plant: Plant) -> None:
         assert second.process.wait(180) == 1
         assert "another monitor writes the history of demo/lab" in second.errors()
     plant.stated_now()
-    plant.mended()
-    plant.recovered()
+    plant.over()
 
 
 def _unwritable(seen: Seen) -> bool:
@@ -195,15 +177,12 @@ def _unwritable(seen: Seen) -> bool:
 
 
 def history_locked(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.rest(0.5, 2.0)
+    plant.at_work()
     with locked(plant.history):
         plant.broken()
         plant.stated(_unwritable, "history that cannot be written")
         plant.rest(1.0, 3.0)
-    plant.mended()
-    plant.recovered()
+    plant.over()
 
 
 def locked_to_the_end(plant: Plant) -> None:
@@ -226,9 +205,7 @@ def small_disk(plant: Plant) -> None:
 
 
 def disk_full(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.rest(0.5, 2.0)
+    plant.at_work()
     filler = plant.history.with_name("filler")
     with filler.open("wb", buffering=0) as file, suppress(OSError):
         while True:
@@ -237,14 +214,11 @@ def disk_full(plant: Plant) -> None:
     plant.stated(_unwritable, "full disk")
     plant.rest(2.0, 4.0)
     filler.unlink()
-    plant.mended()
-    plant.recovered()
+    plant.over()
 
 
 def torn_write(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.wait_for_orders()
+    plant.under_orders()
     pid = plant.running.process.pid
     log = Path(f"{plant.history}-wal")
     limit = log.stat().st_size + int(plant.rng.integers(100, 3 * _PAGE))
@@ -259,22 +233,17 @@ def torn_write(plant: Plant) -> None:
 
 
 def deleted(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.wait_for_orders()
+    plant.under_orders()
     plant.history.unlink()
     plant.broken()
     plant.stated(lambda seen: any(one.name == FAULT for one in seen.health.alarms), "deleted history")
-    plant.mended()
-    plant.recovered(lambda seen: _goes_on(seen) and seen.ready)
+    plant.over(lambda seen: _goes_on(seen) and seen.ready)
     plant.wait_for_orders()
     assert plant.history.exists()
 
 
 def replaced(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.wait_for_orders()
+    plant.under_orders()
     other = plant.folder / "other"
     store = Store(f"sqlite:///{other}", Retention())
     store.open()
@@ -283,8 +252,7 @@ def replaced(plant: Plant) -> None:
     plant.broken()
     plant.stated(lambda seen: "another file was put in its place" in seen.why_not, "replaced history")
     plant.orders_may_be_lost = True
-    plant.mended()
-    plant.recovered(_goes_on)
+    plant.over(_goes_on)
     plant.wait_for_orders()
 
 
@@ -301,24 +269,19 @@ def _overwrite(file: Path, begin: int) -> None:
 
 
 def damaged_in_use(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.wait_for_orders()
+    plant.under_orders()
     _overwrite(plant.history, 0)
     _overwrite(Path(f"{plant.history}-wal"), 0)
     plant.broken()
     plant.stated(lambda seen: "damaged" in seen.why_not, "damaged history")
     plant.orders_may_be_lost = True
-    plant.mended()
-    plant.recovered(_goes_on)
+    plant.over(_goes_on)
     plant.wait_for_orders()
     assert len(list(plant.history.parent.glob("h.sqlite.damaged-*"))) >= 1
 
 
 def damaged_at_start(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.wait_for_orders()
+    plant.under_orders()
     assert plant.end(signal.SIGTERM) == 0
     with sqlite3.connect(plant.history) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # what is overwritten holds everything
@@ -328,8 +291,7 @@ def damaged_at_start(plant: Plant) -> None:
     plant.start()
     plant.stated(lambda seen: "damaged" in seen.why_not, "damaged history")
     plant.orders_may_be_lost = True
-    plant.mended()
-    plant.recovered(_goes_on)
+    plant.over(_goes_on)
     plant.away_s = 60.0
     assert len(list(plant.history.parent.glob("h.sqlite.damaged-*"))) >= 1
 
@@ -347,8 +309,7 @@ def refused_step(plant: Plant) -> None:
     plant.stated(lambda seen: "the history does not take what happens" in seen.why_not, "refused step")
     plant.rest(1.0, 3.0)
     reports("1000")
-    plant.mended()
-    plant.recovered()
+    plant.over()
 
 
 def receiver(plant: Plant) -> None:
@@ -368,16 +329,13 @@ def receiver_away(plant: Plant) -> None:
         return 204, {}
 
     receiver.answer = take
-    plant.publish()
-    plant.flowing()
-    plant.wait_for_orders()
+    plant.under_orders()
     receiver.answer = lambda _: (503, {})
     plant.broken()
     plant.stated(lambda seen: any("503" in one for one in seen.readiness.failing_webhooks), "failing webhook")
     plant.wait_for_orders(4)
     receiver.answer = take
-    plant.mended()
-    plant.recovered(lambda seen: seen.well and not seen.readiness.failing_webhooks)
+    plant.over(lambda seen: seen.well and not seen.readiness.failing_webhooks)
     told = [one[0] for one in plant.log()]
     until(lambda: len(taken) >= len(told), "every event")
     assert taken[: len(told)] == told
@@ -395,5 +353,4 @@ def flood(plant: Plant) -> None:
                 feed.put_raw(plant.rng.bytes(200), b"", "application/octet-stream")
             if not plant.stated_s and (seen := plant.look()) and sum(seen.health.quality.refused_blocks.values()):
                 plant.stated_now()
-        plant.mended()
-    plant.recovered(lambda seen: seen.well and sum(seen.health.quality.refused_blocks.values()) > 1000)
+        plant.over(lambda seen: seen.well and sum(seen.health.quality.refused_blocks.values()) > 1000)

@@ -196,6 +196,19 @@ class Plant:
         """Wait until data have come in for a while, and operators have been answered."""
         self.wait(lambda s: s.flowing and s.health.quality.accepted_blocks >= blocks, "data")
 
+    def at_work(self, *options: str) -> Program:
+        """Publish, and go on for a moment once data have come in."""
+        publisher = self.publish(*options)
+        self.flowing()
+        self.rest(0.5, 2.0)
+        return publisher
+
+    def under_orders(self) -> None:
+        """Publish, and wait until operators have been answered once data have come in."""
+        self.publish()
+        self.flowing()
+        self.wait_for_orders()
+
     def rest(self, from_s: float, to_s: float) -> None:
         """Let some time pass, another one with each seed."""
         time.sleep(self.rng.uniform(from_s, to_s))
@@ -227,6 +240,11 @@ class Plant:
         """Wait until everything is as it should be."""
         self.wait(condition, "recovery")
         self.recovered_s.append(time.monotonic() - self._begin_s)
+
+    def over(self, condition: Callable[[Seen], bool] = lambda seen: seen.well) -> None:
+        """It was mended just now; wait until everything is as it should be."""
+        self.mended()
+        self.recovered(condition)
 
     # What came of it
 
