@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from benchmarks.finite_elements.observed import windows_of
+from benchmarks.finite_elements.rotor import BeamRotor, changed_rotor
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician, gain_suspicion
 from models.diagnosis.baseline.learned import Baseline, disagreements, learn_baseline, learned_rows, undetermined
 from models.diagnosis.baseline.rows import ROWS
@@ -16,22 +18,21 @@ from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.readings import Diagnosis, parameter_reading
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
-from tests.diagnosis.fe_rotor import INDEPENDENT, Excitation, Rotor, plan, simulate, windows, with_bearing
+from tests.diagnosis.fe_rotor import INDEPENDENT, ROTOR, Excitation, plan, simulate
 
-SLOW = Rotor()
-FAST = replace(SLOW, speed_rad_s=2 * np.pi * 33.0)
+FAST = replace(ROTOR, speed_rad_s=2 * np.pi * 33.0)
 OTHER = Excitation(cutoff_hz=50.0, sources=INDEPENDENT)
 
 
 @cache
-def recorded(rotor: Rotor, excitation: Excitation, seed: int, count: int) -> tuple[WindowStatistics, ...]:
-    return tuple(windows(simulate(rotor, excitation, 60.0 * count + 3, seed), plan()))
+def recorded(rotor: BeamRotor, excitation: Excitation, seed: int, count: int) -> tuple[WindowStatistics, ...]:
+    return tuple(windows_of(simulate(rotor, excitation, 60.0 * count + 3, seed), plan()))
 
 
 @cache
 def baseline() -> Baseline:
     return learn_baseline(
-        [*recorded(SLOW, Excitation(), 81, 2), *recorded(FAST, OTHER, 82, 2)], conditions=["slow"] * 2 + ["fast"] * 2
+        [*recorded(ROTOR, Excitation(), 81, 2), *recorded(FAST, OTHER, 82, 2)], conditions=["slow"] * 2 + ["fast"] * 2
     )
 
 
@@ -39,14 +40,14 @@ def baseline() -> Baseline:
 def test_every_commissioned_speed_has_its_own_unbalance() -> None:
     assert [round(one.speed_rad_s / 2 / np.pi) for one in baseline().rotations] == [24, 33]
     monitor = BaselineDiagnostician(baseline())
-    for seed, rotor in ((83, SLOW), (84, FAST)):
-        heavier = replace(rotor, unbalance_kg_m=1.6 * rotor.unbalance_kg_m)
+    for seed, rotor in ((83, ROTOR), (84, FAST)):
+        heavier = changed_rotor(rotor, {"e": 0.6})
         e = monitor.diagnose(*recorded(heavier, Excitation(), seed, 1)).evaluable[-1]
         assert e.name == "e"
         assert e.relative_change is not None
         assert e.standard_error is not None
         assert abs(e.relative_change - 0.6) < 3 * e.standard_error
-    between = replace(SLOW, speed_rad_s=2 * np.pi * 28.0)
+    between = replace(ROTOR, speed_rad_s=2 * np.pi * 28.0)
     found = {one.name: one.reason for one in monitor.diagnose(*recorded(between, OTHER, 85, 1)).parameters}
     assert found["e"] == "speed 1680 rpm, the baseline was learned at 1440, 1980 rpm"
     assert found["k_by"] == ""
@@ -60,8 +61,8 @@ def test_conditions_that_agree_leave_no_doubt() -> None:
 
 
 def test_a_condition_with_another_bearing_is_found_and_widens_later_intervals() -> None:
-    softer = recorded(with_bearing(SLOW, k_y=-0.15), OTHER, 86, 2)
-    mixed = learn_baseline([*recorded(SLOW, Excitation(), 81, 2), *softer], conditions=["a", "a", "b", "b"])
+    softer = recorded(changed_rotor(ROTOR, {"k_by": -0.15}), OTHER, 86, 2)
+    mixed = learn_baseline([*recorded(ROTOR, Excitation(), 81, 2), *softer], conditions=["a", "a", "b", "b"])
     assert any("bearing stiffness, horizontal" in sentence for sentence in disagreements(mixed))
     horizontal, vertical = mixed.relations
     assert horizontal is not None
@@ -87,14 +88,14 @@ def test_an_unphysical_relation_is_not_determined() -> None:
 
 def test_conditions_are_one_for_each_window() -> None:
     with pytest.raises(EstimationError, match="2 conditions are given for 1 healthy windows"):
-        learn_baseline(recorded(SLOW, Excitation(), 81, 2)[:1], conditions=["a", "b"])
+        learn_baseline(recorded(ROTOR, Excitation(), 81, 2)[:1], conditions=["a", "b"])
 
 
 def test_a_restored_baseline_reads_the_same_to_the_last_bit() -> None:
     text = BaselineRecord.of(baseline()).model_dump_json()
     again = BaselineRecord.model_validate_json(text).baseline()
     assert BaselineRecord.of(again).model_dump_json() == text
-    (window,) = recorded(with_bearing(SLOW, c_y=-0.3), OTHER, 87, 1)
+    (window,) = recorded(changed_rotor(ROTOR, {"c_by": -0.3}), OTHER, 87, 1)
     one, other = (BaselineDiagnostician(each).diagnose(window) for each in (baseline(), again))
     assert one.parameters == other.parameters
     assert one.misfit_z == other.misfit_z

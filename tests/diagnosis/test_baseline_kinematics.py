@@ -6,6 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks.finite_elements.motion import PROBES
+from benchmarks.finite_elements.observed import windows_of
+from benchmarks.finite_elements.rotor import BeamRotor, changed_rotor
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.lag_moments import gain, kernels, passband_hz, shape_for
 from models.diagnosis.baseline.learned import learn_baseline
@@ -23,7 +26,7 @@ from models.diagnosis.readings import Diagnosis
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
-from tests.diagnosis.fe_rotor import COLUMNS, INDEPENDENT, Excitation, Rotor, plan, simulate, windows, with_bearing
+from tests.diagnosis.fe_rotor import INDEPENDENT, ROTOR, Excitation, plan, simulate
 
 DISPLACEMENTS = ("y1", "y2", "z1", "z2")
 VELOCITIES = tuple(f"{name}_dot" for name in DISPLACEMENTS)
@@ -45,18 +48,18 @@ def of_states(window: WindowStatistics, states: tuple[str, ...]) -> WindowStatis
 
 
 @cache
-def sampled(rotor: Rotor, excitation: Excitation, seed: int, count: int) -> FloatArray:
+def sampled(rotor: BeamRotor, excitation: Excitation, seed: int, count: int) -> FloatArray:
     return simulate(rotor, excitation, 60.0 * count + 3, seed)
 
 
 @cache
-def recorded(rotor: Rotor, excitation: Excitation, seed: int, count: int) -> tuple[WindowStatistics, ...]:
-    return tuple(windows(sampled(rotor, excitation, seed, count), plan(states=COLUMNS)))
+def recorded(rotor: BeamRotor, excitation: Excitation, seed: int, count: int) -> tuple[WindowStatistics, ...]:
+    return tuple(windows_of(sampled(rotor, excitation, seed, count), plan(states=PROBES)))
 
 
 def healthy() -> tuple[WindowStatistics, ...]:
     other = Excitation(50.0, ((0.3, 0.8, -0.5, 0.2),))
-    return recorded(Rotor(), Excitation(), 71, 2) + recorded(Rotor(), other, 72, 1)
+    return recorded(ROTOR, Excitation(), 71, 2) + recorded(ROTOR, other, 72, 1)
 
 
 @cache
@@ -135,19 +138,19 @@ def test_kernels_differentiate_within_their_passband(deepest: int) -> None:
 )
 def test_one_quantity_per_place_names_what_changed(states: tuple[str, ...]) -> None:
     monitor = monitor_of(*states)
-    (same,) = recorded(Rotor(), OTHER, 73, 1)
+    (same,) = recorded(ROTOR, OTHER, 73, 1)
     assert names(monitor.diagnose(of_states(same, states))) == ()
-    (softer,) = recorded(with_bearing(Rotor(), k_y=-0.1), OTHER, 74, 1)
+    (softer,) = recorded(changed_rotor(ROTOR, {"k_by": -0.1}), OTHER, 74, 1)
     diagnosis = monitor.diagnose(of_states(softer, states))
     assert names(diagnosis) == ("k_by",)
     assert diagnosis.evaluable[0].relative_change == pytest.approx(-0.09, abs=0.03)
-    (looser,) = recorded(with_bearing(Rotor(), c_z=-0.4), OTHER, 75, 1)
+    (looser,) = recorded(changed_rotor(ROTOR, {"c_bz": -0.4}), OTHER, 75, 1)
     assert names(monitor.diagnose(of_states(looser, states))) == ("c_bz",)
 
 
 def test_the_common_part_is_part_of_the_covariance() -> None:
     monitor = monitor_of(*DISPLACEMENTS)
-    (same,) = recorded(Rotor(), OTHER, 73, 1)
+    (same,) = recorded(ROTOR, OTHER, 73, 1)
     diagnosis = monitor.diagnose(of_states(same, DISPLACEMENTS))
     assert diagnosis.common is not None
     assert diagnosis.covariance is not None
@@ -159,7 +162,7 @@ def test_the_common_part_is_part_of_the_covariance() -> None:
 def test_a_plane_without_a_probe_says_so_and_the_other_is_read() -> None:
     states = ("y1", "y2", "z1")
     monitor = monitor_of(*states)
-    (same,) = recorded(Rotor(), OTHER, 73, 1)
+    (same,) = recorded(ROTOR, OTHER, 73, 1)
     reasons = {reading.name: reading.reason for reading in monitor.diagnose(of_states(same, states)).parameters}
     assert reasons["k_bz"] == "not measured: disc, vertical (displacement, velocity or acceleration)"
     assert reasons["k_by"] == reasons["c_by"] == ""
@@ -167,11 +170,11 @@ def test_a_plane_without_a_probe_says_so_and_the_other_is_read() -> None:
 
 @pytest.mark.slow
 def test_without_a_phase_reference_the_unbalance_is_read_from_the_line_itself() -> None:
-    sizes = plan(speed_rad_s=Rotor().speed_rad_s)
-    base = windows(sampled(Rotor(), Excitation(), 71, 2), sizes)
+    sizes = plan(speed_rad_s=ROTOR.speed_rad_s)
+    base = windows_of(sampled(ROTOR, Excitation(), 71, 2), sizes)
     monitor = BaselineDiagnostician(learn_baseline(base))
-    heavier = replace(Rotor(), unbalance_kg_m=1.5 * Rotor().unbalance_kg_m)
-    (window,) = windows(simulate(heavier, Excitation(), 63, 76), sizes)
+    heavier = changed_rotor(ROTOR, {"e": 0.5})
+    (window,) = windows_of(simulate(heavier, Excitation(), 63, 76), sizes)
     assert window.speed_source == "estimated"
     e = {reading.name: reading for reading in monitor.diagnose(window).parameters}["e"]
     assert e.relative_change is not None
@@ -184,7 +187,7 @@ def test_a_row_that_is_added_is_learned_and_read() -> None:
     rows = (*ROWS, second)
     base = [of_states(window, DISPLACEMENTS) for window in healthy()]
     monitor = BaselineDiagnostician(learn_baseline(base, rows=rows), rows)
-    (softer,) = recorded(with_bearing(Rotor(), k_y=-0.1), OTHER, 74, 1)
+    (softer,) = recorded(changed_rotor(ROTOR, {"k_by": -0.1}), OTHER, 74, 1)
     found = {reading.name: reading for reading in monitor.diagnose(of_states(softer, DISPLACEMENTS)).parameters}
     assert set(found) == {*parameters_of(), "EI"}
     assert found["EI"].relative_change == pytest.approx(-0.09, abs=0.03)
