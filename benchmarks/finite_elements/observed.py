@@ -1,10 +1,7 @@
-"""A finite-element rotor as its sensors see it: samples, windows of the monitor, a recording, a machine file."""
+"""A finite-element rotor as its sensors see it: samples, windows of the monitor, a stream, a machine file."""
 
-import hashlib
-import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from scipy.signal import lfilter
@@ -17,9 +14,6 @@ from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.channels import Channel, ChannelDescriptor
-from models.signals.keys import MachineKeys
-from models.signals.recording import RecordedMessage, RecordingWriter
-from simulator.stream import JSON_ENCODING, block_message
 
 RATE_HZ = 2000.0
 SITE = "beams"
@@ -137,10 +131,17 @@ def _channel(probe: str) -> Channel:
 def machine_of(
     rotor: BeamRotor, sizes: WindowSizes, probes: tuple[str, ...] = MOTION, *, phase_reference: bool = True
 ) -> MachineFile:
-    """Load what `machine_file` writes."""
-    return MachineFile.model_validate(
-        tomllib.loads(machine_file(rotor, sizes, probes, phase_reference=phase_reference))
-    )
+    """Machine file with channels and sampling alone: nothing about the rotor."""
+    described = descriptor(rotor, probes, phase_reference=phase_reference)
+    fields = {
+        "site": described.site,
+        "name": described.machine,
+        "description": f"{rotor.description}; its parameters are not given",
+        "rate_hz": described.rate_hz,
+        "window": {**asdict(sizes), "max_span_s": 1.5 * sizes.length_s},
+        "sensors": described.channels,
+    }
+    return MachineFile.model_validate(fields)
 
 
 def plan(
@@ -161,70 +162,7 @@ def windows_of(samples: FloatArray, sizes: Plan) -> list[WindowStatistics]:
     return found
 
 
-def machine_file(
-    rotor: BeamRotor, sizes: WindowSizes, probes: tuple[str, ...] = MOTION, *, phase_reference: bool = True
-) -> str:
-    """Machine file (TOML) with channels and sampling alone: nothing about the rotor."""
-    described = descriptor(rotor, probes, phase_reference=phase_reference)
-    lines = [
-        f'site = "{described.site}"',
-        f'name = "{described.machine}"',
-        f'description = "{rotor.description}; its parameters are not given"',
-        f"rate_hz = {described.rate_hz}",
-        "",
-        "[window]",
-        f"length_s = {sizes.length_s}",
-        f"hop_s = {sizes.hop_s}",
-        f"max_span_s = {1.5 * sizes.length_s}",
-        f"segment_s = {sizes.segment_s}",
-        f"band_hz = [{sizes.band_hz[0]}, {sizes.band_hz[1]}]",
-    ]
-    for channel in described.channels:
-        fields = ("name", "quantity", "location", "direction", "unit")
-        lines += ["", "[[sensors]]", *(f'{name} = "{getattr(channel, name)}"' for name in fields)]
-    return "\n".join(lines) + "\n"
-
-
-def record_run(
-    path: Path,
-    rotor: BeamRotor,
-    condition: RunCondition,
-    duration_s: float,
-    seed: int | list[int],
-    probes: tuple[str, ...] = MOTION,
-    *,
-    phase_reference: bool = True,
-    block_s: float = 0.1,
-    start_ns: int = _START_NS,
-    overwrite: bool = False,
-) -> int:
-    """Record a run as a live machine would have sent it; returns the number of blocks.
-
-    Raises
-    ------
-    models.errors.RecordingError
-        If the file cannot be written.
-    models.errors.EstimationError
-        If the rotor is unstable.
-    """
-    described = descriptor(rotor, probes, phase_reference=phase_reference)
-    keys = MachineKeys(described.site, described.machine)
-    samples = sampled(rotor, condition, duration_s, seed, probes, phase_reference=phase_reference)
-    run = int.from_bytes(hashlib.sha256(repr((seed, start_ns)).encode()).digest()[:2], "big")
-    count = 0
-    with RecordingWriter(path, overwrite=overwrite) as writer:
-        payload = described.model_dump_json().encode()
-        writer.write(RecordedMessage(keys.descriptor, payload, b"", JSON_ENCODING, start_ns, start_ns))
-        for block in blocks(samples, described, block_s, start_ns, run):
-            data, attachment, encoding = block_message(block, described.schema_hash, "raw")
-            writer.write(RecordedMessage(keys.stream, data, attachment, encoding, block.end_ns, block.end_ns))
-            count += 1
-    return count
-
-
-def blocks(
-    samples: FloatArray, described: ChannelDescriptor, block_s: float = 0.5, start_ns: int = _START_NS, run: int = 1
-) -> Iterator[SampleBlock]:
+def blocks(samples: FloatArray, described: ChannelDescriptor, block_s: float = 0.5) -> Iterator[SampleBlock]:
     """The stream that a live machine would have sent of what `sampled` gives."""
     factors = np.array([channel.to_si for channel in described.channels])
     scaled = np.asarray(samples / factors, dtype=np.float32)
@@ -232,5 +170,5 @@ def blocks(
         scaled[:, -1] = np.where(scaled[:, -1] >= 2 * np.pi, 0.0, scaled[:, -1])
     length = round(block_s * described.rate_hz)
     for sequence, first in enumerate(range(0, len(scaled), length)):
-        start = start_ns + round(first * 1e9 / described.rate_hz)
-        yield SampleBlock(start, sequence, run, described.rate_hz, scaled[first : first + length])
+        start = _START_NS + round(first * 1e9 / described.rate_hz)
+        yield SampleBlock(start, sequence, 1, described.rate_hz, scaled[first : first + length])

@@ -1,10 +1,8 @@
 """Finite-element rotors against closed forms, the Ljapunov equation and the frequency response."""
 
 import math
-import tomllib
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,11 +25,10 @@ from benchmarks.finite_elements.observed import (
     RATE_HZ,
     RunCondition,
     WindowSizes,
+    blocks,
     descriptor,
-    machine_file,
     machine_of,
     plan,
-    record_run,
     sampled,
     windows_of,
 )
@@ -42,9 +39,6 @@ from models.diagnosis.window import SlidingWindow
 from models.errors import EstimationError
 from models.physics.excitation import Source, source_spectrum
 from models.signals.block import FloatArray
-from models.signals.channels import ChannelDescriptor
-from models.signals.recording import read_recording
-from models.signals.wire import decode_block
 
 BEAM = BeamRotor(
     name="beam",
@@ -335,38 +329,26 @@ def test_windows_hold_what_the_plan_says_and_see_the_unbalance() -> None:
     assert level / np.sqrt(np.sum(np.abs(expected[[1, 3]]) ** 2) / 2) == pytest.approx(1.5, rel=0.25)
 
 
-def test_a_recording_is_what_a_live_machine_sends(tmp_path: Path) -> None:
+def test_the_stream_is_what_a_live_machine_sends() -> None:
     rotor = rotor_named("overhung")
-    condition = RunCondition(forces(rotor), rotor.speed_rad_s)
     probes = ("y1", "z1", "y2_ddot")
-    path = tmp_path / "run.mcap"
-    assert record_run(path, rotor, condition, 1.05, 3, probes) == 11
-    messages = list(read_recording(path))
-    described = ChannelDescriptor.model_validate_json(messages[0].payload)
-    assert described == descriptor(rotor, probes)
-    blocks = [decode_block(one.payload, one.attachment, one.encoding) for one in messages[1:]]
-    assert {schema for _, schema in blocks} == {described.schema_hash}
-    assert [block.sequence for block, _ in blocks] == list(range(11))
-    assert all(after[0].start_ns == before[0].end_ns for before, after in pairwise(blocks))
-    stored = np.concatenate([block.samples for block, _ in blocks]).astype(float)
-    expected = sampled(rotor, condition, 1.05, 3, probes)
+    expected = sampled(rotor, RunCondition(forces(rotor), rotor.speed_rad_s), 1.05, 3, probes)
+    sent = list(blocks(expected, descriptor(rotor, probes), 0.1))
+    assert [block.sequence for block in sent] == list(range(11))
+    assert all(after.start_ns == before.end_ns for before, after in pairwise(sent))
+    stored = np.concatenate([block.samples for block in sent]).astype(float)
     assert stored * [1e-6, 1e-6, 1.0, 1.0] == pytest.approx(expected, rel=1e-6, abs=1e-12)
-    assert [one.log_time_ns for one in messages[1:]] == [block.end_ns for block, _ in blocks]
 
 
-def test_a_recording_read_back_gives_the_windows_that_the_rotor_gives(tmp_path: Path) -> None:
+def test_the_stream_gives_the_windows_that_the_rotor_gives() -> None:
     rotor, sizes = rotor_named("overhung"), WindowSizes(length_s=20.0)
-    condition = RunCondition(forces(rotor), rotor.speed_rad_s)
-    path = tmp_path / "run.mcap"
-    record_run(path, rotor, condition, 23.0, 3)
+    samples = sampled(rotor, RunCondition(forces(rotor), rotor.speed_rad_s), 23.0, 3)
     machine = machine_of(rotor, sizes)
     monitored, sliding, found = plan_for(machine), SlidingWindow(plan_for(machine)), []
-    for message in read_recording(path, keys={machine.keys.stream}):
-        block, schema = decode_block(message.payload, message.attachment, message.encoding)
-        assert schema == machine.descriptor.schema_hash
+    for block in blocks(samples, machine.descriptor):
         for _ in sliding.feed(monitored.to_si(block.samples), block.start_ns):
             found.append(sliding.statistics())
-    (direct,) = windows_of(sampled(rotor, condition, 23.0, 3), plan(rotor, sizes))
+    (direct,) = windows_of(samples, plan(rotor, sizes))
     assert found[-1] is not None
     assert len(found) == 4
     scale = np.sqrt(np.outer(np.diag(direct.correlation[0]), np.diag(direct.correlation[0])))
@@ -375,9 +357,9 @@ def test_a_recording_read_back_gives_the_windows_that_the_rotor_gives(tmp_path: 
 
 def test_the_machine_file_tells_channels_and_sampling_and_nothing_of_the_rotor() -> None:
     rotor = rotor_named("both-sides")
-    content = tomllib.loads(machine_file(rotor, WindowSizes(), (*MOTION, "y1_ddot")))
-    assert set(content) == {"site", "name", "description", "rate_hz", "window", "sensors"}
-    assert [sensor["name"] for sensor in content["sensors"]] == [*MOTION, "y1_ddot", "theta"]
-    assert set(PROBES) >= {sensor["name"] for sensor in content["sensors"]} - {"theta"}
-    bare = tomllib.loads(machine_file(rotor, WindowSizes(), ("y1", "z1"), phase_reference=False))
-    assert [sensor["location"] for sensor in bare["sensors"]] == ["bearing", "bearing"]
+    file = machine_of(rotor, WindowSizes(), (*MOTION, "y1_ddot"))
+    assert file.model_fields_set == {"site", "name", "description", "rate_hz", "window", "sensors"}
+    assert [sensor.name for sensor in file.sensors] == [*MOTION, "y1_ddot", "theta"]
+    assert set(PROBES) >= {sensor.name for sensor in file.sensors} - {"theta"}
+    bare = machine_of(rotor, WindowSizes(), ("y1", "z1"), phase_reference=False)
+    assert [sensor.location for sensor in bare.sensors] == ["bearing", "bearing"]
