@@ -1,6 +1,6 @@
 """Coloured forces at any coordinates of a rotor, and what they do in the long run.
 
-The colour is that of `models.physics.excitation`: white noise through a Butterworth low-pass, with or without a hump.
+The colour is that of `models.physics.excitation`: white noise through a Butterworth low-pass.
 """
 
 from dataclasses import dataclass
@@ -17,40 +17,17 @@ from models.signals.block import FloatArray
 class Force:
     """One independent source; it may act at several places, shared with signs and weights.
 
-    Attributes
-    ----------
-    cutoff_hz : float
-    rms_N : float
-    share : tuple of (int, float)
-        Coordinates (`benchmarks.finite_elements.assembly.place`) and the part of the force there.
-    order : int
-        Of the Butterworth low-pass, 1 to 4.
-    hump_share, hump_hz, hump_damping : float
-        As `models.physics.excitation.Source`.
+    A share is of a coordinate (`benchmarks.finite_elements.assembly.place`): the part of the force there.
     """
 
     cutoff_hz: float
     rms_N: float
     share: tuple[tuple[int, float], ...]
-    order: int = 2
-    hump_share: float = 0.0
-    hump_hz: float = 80.0
-    hump_damping: float = 0.4
 
     @property
     def colour(self) -> ColouringFilter:
         """White noise to a force of unit variance."""
-        return colouring_filter(
-            Source(
-                cutoff_hz=self.cutoff_hz,
-                direction=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0),  # where it acts is ours to say
-                force_rms_N=1.0,
-                order=self.order,
-                hump_share=self.hump_share,
-                hump_hz=self.hump_hz,
-                hump_damping=self.hump_damping,
-            )
-        )
+        return colouring_filter(Source(cutoff_hz=self.cutoff_hz, direction=(0.0,) * 6, force_rms_N=1.0))
 
 
 def forced(forces: tuple[Force, ...]) -> tuple[int, ...]:
