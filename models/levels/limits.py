@@ -23,6 +23,7 @@ from rotorwatch.records.levels import LevelBound
 BEYOND_RANGE = 1.25
 ERRORS = 6.0
 _TURNED = 0.6
+_LEAST_DANGER = 0.25  # of the overall level, for a line that was nothing but noise: it has no level to be a multiple of
 PEAK_TO_PEAK = (Quantity.DISPLACEMENT, Quantity.TILT)
 
 
@@ -83,6 +84,9 @@ def relative_limits(
             danger = None  # what levels are at another speed says too little
             if seen:
                 danger = max(given.danger_ratio * one.mean, alert * given.danger_ratio / given.alert_ratio)
+                overall = state.levels[channel.name].get("overall")
+                if name in {"x1", "x2"} and one.mean < ERRORS * one.error and overall is not None:
+                    danger = max(danger, _LEAST_DANGER * overall.mean)
             fall = None
             if name in {"overall", "velocity"} and given.fall_ratio:
                 quietest = one.low * min(1 / BEYOND_RANGE, 1 - _filling(one, shorter))

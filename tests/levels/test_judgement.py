@@ -148,6 +148,14 @@ def test_a_line_that_was_noise_has_to_stand_out_of_it() -> None:
     assert limits(judged(CASING, window(x2=9e-5), healthy))["x2"].state == "alert"
 
 
+@pytest.mark.parametrize(
+    ("x2", "state"), [(0.05e-3, "normal"), (0.11e-3, "alert"), (0.24e-3, "alert"), (0.26e-3, "danger")]
+)
+def test_a_line_out_of_noise_is_a_danger_only_where_it_is_much_of_the_vibration(x2: float, state: str) -> None:
+    healthy = reference(*(window(error=1e-5, overall=1e-3, x2=3e-5) for _ in range(3)))
+    assert limits(judged(CASING, window(overall=1e-3, x2=x2), healthy))["x2"].state == state
+
+
 def test_a_1x_vector_that_turns_leaves_its_acceptance_region_at_the_same_size() -> None:
     healthy = reference(*(window(x1=10e-6 * np.exp(1j * turn)) for turn in (-0.05, 0.0, 0.05)), channel=SHAFT)
     near, turned = (limits(judged(SHAFT, window(x1=10e-6 * np.exp(1j * turn)), healthy))["x1"] for turn in (0.3, 1.0))
