@@ -126,7 +126,9 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         cleaned = segments[:, :, :n] - segments[:, :, n:] @ own.segments.transpose(0, 2, 1)
         if phase_reference:
             synchronous = _synchronous(level)
-            phase_kept = _coherence(cleaned[:-2], cleaned[2:])  # those between overlap both
+            one, other = cleaned[:-2], cleaned[2:]  # those between overlap both
+            powers = (np.abs(one) ** 2).sum(axis=0) * (np.abs(other) ** 2).sum(axis=0)
+            phase_kept = _coherence((one * other.conj()).sum(axis=0), powers)
         elif plan.states:
             relative_synchronous = relative_vectors(np.stack([_synchronous(one) for one in own.hops]))
     else:
@@ -137,11 +139,14 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         cleaned = through(remove, segments)
         if plan.angle_column is not None:
             synchronous = _synchronous(beta)
-            phase_kept = _coherence(cleaned, segments[:, :, n + 1 : n + 2])
     if plan.angle_column is not None:
         hop_synchronous = _synchronous(regression(products[:, 0], n))
     by_bin = np.ascontiguousarray(cleaned.transpose(1, 0, 2))
     spectrum = np.asarray(by_bin.transpose(0, 2, 1) @ by_bin.conj(), dtype=np.complex128)
+    if synchronous is not None and phase_kept is None:
+        angle = segments[:, :, n + 1].T[:, :, None]
+        powers = np.einsum("fii->fi", spectrum).real * (np.abs(angle) ** 2).sum(axis=1)
+        phase_kept = _coherence((by_bin.transpose(0, 2, 1) @ angle.conj())[:, :, 0], powers)
     speed_rad_s, speed_range = _speeds(rotation, hops, plan)
     found = WindowStatistics(
         states=plan.mounted,
@@ -223,11 +228,9 @@ def levels_of(plan: Plan, hops: tuple[HopMoments, ...], *, errors: bool = True) 
     )
 
 
-def _coherence(one: ComplexArray | FloatArray, other: ComplexArray | FloatArray) -> FloatArray:
-    """Squared coherence over the segments, shape (n_bins, n)."""
-    powers = (np.abs(one) ** 2).sum(axis=0) * (np.abs(other) ** 2).sum(axis=0)
-    shared = np.abs((one * other.conj()).sum(axis=0)) ** 2
-    return np.asarray(shared / np.maximum(powers, np.finfo(float).tiny), dtype=np.float64)
+def _coherence(shared: ComplexArray | FloatArray, powers: FloatArray) -> FloatArray:
+    """Squared coherence, shape (n_bins, n), from sums over the segments of cross-products, and of powers."""
+    return np.asarray(np.abs(shared) ** 2 / np.maximum(powers, np.finfo(float).tiny), dtype=np.float64)
 
 
 def _speeds(rotation: Rotation, hops: tuple[HopMoments, ...], plan: Plan) -> tuple[float, tuple[float, float]]:
