@@ -1,6 +1,5 @@
 """What is wrong with a mapping, a file or a command is named; acceleration is integrated right above its frequency."""
 
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from models.signals.channels import unit_factor
 from service.interchange.mapping import Acceleration, Column, CsvFormat, Keyphasor, Mapping, TimeBase
 from service.interchange.summary import summary_lines
 from tests.interchange.material import CHANNELS, START, START_NS, imported, signals, stretches
-from tests.service.preloaded import ran
+from tests.service.preloaded import rotorwatch as run
 
 TIME = f'[time]\ncolumn = "t"\nstart = "{START}"\n'
 
@@ -191,10 +190,6 @@ def test_an_index_outside_the_table_is_named(tmp_path: Path) -> None:
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "docs" / "examples" / "fe_rotor"
-
-
-def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return ran("service.rotorwatch", *arguments, environment={"PATH": "/usr/bin:/bin", "COLUMNS": "200"})
 
 
 def sample(path: Path) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:

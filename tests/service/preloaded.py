@@ -91,6 +91,12 @@ def ran(
         )
 
 
+def rotorwatch(*arguments: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run the command to its end, in an environment of little else."""
+    clean = {"PATH": "/usr/bin:/bin", "COLUMNS": "200", **environment}
+    return ran("service.rotorwatch", *arguments, environment=clean)
+
+
 def _run(arguments: tuple[str, ...], cwd: Path, out: Path, err: Path, environment: dict[str, str]) -> None:
     gc.freeze()  # looking through what is shared would copy it
     for number, path in ((0, os.devnull), (1, out), (2, err)):

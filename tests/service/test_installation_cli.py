@@ -20,17 +20,13 @@ from simulator.publisher import PublishSettings, publish
 from tests.loopback import endpoint
 from tests.service.live import ROOT, until
 from tests.service.monitored import client, token
-from tests.service.preloaded import ran
+from tests.service.preloaded import rotorwatch as run
 
 RATE_HZ, START_NS = 2560.0, 1_767_225_600_000_000_000
 FAN = (
     "init", "--site", "plant", "--name", "fan", "--rate-hz", "2560", "--zones", "ISO 20816-3 group 2 rigid",
     "--sensor", "DE-H acceleration g DE horizontal", "--sensor", "NDE-V velocity mm/s NDE vertical",
 )  # fmt: skip
-
-
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return ran("service.rotorwatch", *arguments, environment={"PATH": "/usr/bin:/bin", "COLUMNS": "200"})
 
 
 def blocks(seconds: float, rate_hz: float = RATE_HZ, every_s: float = 0.5) -> Iterator[tuple[SampleBlock, tuple[()]]]:

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-import subprocess
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -10,7 +10,7 @@ import pytest
 from models.signals.recording import read_recording
 from simulator.scenario import parse_fault
 from tests.service.live import LAB, endpoint, machine_file, program, scenario_blocks, until
-from tests.service.preloaded import ran
+from tests.service.preloaded import rotorwatch
 from tests.service.replaying import recording, write
 
 
@@ -20,9 +20,7 @@ def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return recording(folder / "faulty.mcap", scenario_blocks(80.0, parse_fault("c_bz=0.5@0")))
 
 
-def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    clean = {"PATH": "/usr/bin:/bin", "COLUMNS": "200"}
-    return ran("service.rotorwatch", "replay", *arguments, environment=clean)
+run = partial(rotorwatch, "replay")
 
 
 def test_lines_go_to_a_file_or_to_the_terminal_and_are_the_same(faulty: Path, tmp_path: Path) -> None:

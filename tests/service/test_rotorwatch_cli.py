@@ -29,13 +29,7 @@ from tests.service.live import (
     service,
     until,
 )
-from tests.service.preloaded import ran
-
-
-def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run the command to its end."""
-    clean = {"PATH": "/usr/bin:/bin", "COLUMNS": "200", **environment}
-    return ran("service.rotorwatch", *arguments, environment=clean)
+from tests.service.preloaded import rotorwatch as run
 
 
 def test_help_is_quick_because_nothing_heavy_is_imported() -> None:

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from models.errors import MachineFileError
 from service.settings.service import DEFAULT_LISTEN, ServiceSettings, load_settings
 from tests.service.live import ROOT, machine_file
-from tests.service.test_rotorwatch_cli import run
+from tests.service.preloaded import rotorwatch as run
 
 GOOD = """
 [link]
