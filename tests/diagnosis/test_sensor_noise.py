@@ -16,7 +16,7 @@ from models.signals.block import FloatArray
 from rotorwatch.records.windows import SensorFault
 from simulator.scenario import Event, Scenario, Sensors
 from simulator.stream import blocks
-from tests.diagnosis.test_sensor_checks import MORE_S, WINDOW_S, machine_of, sources_along
+from tests.diagnosis.test_sensor_checks import MORE_S, WINDOW_S, column, machine_of, only, sources_along
 from tests.diagnosis.test_sensor_checks import windows_of as windows_in
 
 DISPLACEMENTS = ("y1", "z1", "y2", "z2")
@@ -71,15 +71,6 @@ def found_in(
     (window,) = windows_of("lab", samples, displacements=displacements)
     reference = reference_of("lab", displacements=displacements) if reference is None else reference
     return sensor_findings(window, reference, machine_of("lab").sensors)
-
-
-def only(findings: tuple[SensorFault, ...]) -> SensorFault:
-    assert len(findings) == 1, [finding.text for finding in findings]
-    return findings[0]
-
-
-def column(state: str) -> int:
-    return plan_of("lab").states.index(state)
 
 
 def with_noise(samples: FloatArray, state: str, part: float, seed: int = 0) -> FloatArray:

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from service.history.records import Retention
 from service.history.store import Store
@@ -100,9 +101,9 @@ def database_url(kind: str, folder: Path, *, empty: bool = False) -> str:
 
 
 @contextmanager
-def opened(url: str) -> Iterator[Store]:
+def opened(url: str, **changes: Any) -> Iterator[Store]:
     """A history with the usual retention."""
-    store = Store(url, Retention())
+    store = Store(url, Retention(), **changes)
     store.open()
     try:
         yield store

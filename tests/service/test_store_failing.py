@@ -11,6 +11,7 @@ import threading
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import psycopg
@@ -24,6 +25,7 @@ from service.history.store import Store
 from service.history.tables import MIGRATING
 from tests.service.live import until
 from tests.service.postgres import KINDS, USER, PostgresServer, database_url, postgres_server
+from tests.service.postgres import opened as history_opened
 from tests.service.test_store import T0, alarm_event, head, hop_step
 
 QUICK_S = 1.0
@@ -58,14 +60,7 @@ def void(connection: sqlite3.Connection, statement: str) -> None:
     connection.execute(statement)
 
 
-@contextmanager
-def opened(url: str, **changes: float) -> Iterator[Store]:
-    store = Store(url, Retention(), timeout_s=QUICK_S, retry_s=0.05, **changes)  # type: ignore[arg-type]  # numbers
-    store.open()
-    try:
-        yield store
-    finally:
-        store.close()
+opened = partial(history_opened, timeout_s=QUICK_S, retry_s=0.05)
 
 
 def written(machine: MachineStore, step: Step) -> None:
