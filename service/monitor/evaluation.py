@@ -17,6 +17,7 @@ from models.commissioning.commissioned import Commissioned, IdentifiedRecord, In
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.likelihood.fit import LengthFits
+from models.diagnosis.moments import states_of
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
@@ -304,6 +305,7 @@ class BaselineEvaluator(WindowEvaluator):
     def __init__(self, machine: MachineFile, commissioned: Commissioned) -> None:
         self._place = f"{machine.site}/{machine.name}"
         self._conditions = commissioned.conditions
+        self._diagnosed = states_of(machine) != ()
         self._shape = commissioned.shape
         self._length_s = machine.window_data_s
         self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate
@@ -319,7 +321,8 @@ class BaselineEvaluator(WindowEvaluator):
         _ = short
         outside = self._conditions.outside(window)
         if outside:
-            raise EstimationError(f"{self._place}: not evaluable here: {outside}")
+            here = "not evaluable here" if self._diagnosed else "levels are judged by the nearest commissioned speed"
+            raise EstimationError(f"{self._place}: {here}: {outside}")
         speed = float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else None
         if self._baselines:
             deciding = determined(self._baseline_for(window).diagnose(window), window, self._length_s)

@@ -77,8 +77,8 @@ class MachineMonitor:
         self._skips = skips
         self._evaluator = judge = evaluator_for(installed)
         self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
-        self._watching = installed.watching
         self._plan = plan = plan_for(machine, lagged=judge.needs_lags, levels=True)
+        self._watching = installed.watching or not plan.states
         self._levels = LevelWatch(plan, machine, installed)
         self._senders = Senders()
         self._arrivals = Arrivals(machine.ingest.reorder_blocks)

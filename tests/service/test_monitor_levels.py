@@ -24,6 +24,8 @@ from service.monitor.alarms.book import AlarmBook
 from service.monitor.levels import LevelWatch
 from service.monitor.monitor import MachineMonitor
 from service.rotorwatch import app
+from simulator.scenario import Event
+from tests.commissioning.rotor_kit import NOTHING, commissioned, elsewhere, healthy, stream
 from tests.service.live import LAB, scenario_blocks
 
 RATE_HZ, BLOCK_S, START_NS = 5120.0, 0.5, 1_767_225_600_000_000_000
@@ -170,6 +172,20 @@ def test_commissioned_levels_are_the_reference_and_say_what_is_unchanged(tmp_pat
     _, events = run(monitor, blocks(7, 40, growth=(0.0, 2.2), first=120))
     assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
     assert monitor.health().state is HealthState.ALERT
+
+
+def test_levels_are_judged_at_a_speed_that_was_not_commissioned() -> None:
+    machine = elsewhere(NOTHING)
+    made = commissioned(machine, healthy(machine, 70.0, 60163)).commissioned
+    assert made is not None
+    faster = Event(at_s=0.0, speed_rpm=1.06 * LAB.operation.speed_rpm)
+    for size, state in ((1.0, HealthState.WATCHING), (4.0, HealthState.ALERT)):
+        monitor = MachineMonitor(Installed(machine, None, made))
+        for block in stream(66.0, 60164, faster, Event(at_s=0.0, excitation_level=size)):
+            monitor.step(block, machine.descriptor.schema_hash)
+        now = monitor.health()
+        assert now.state is state
+        assert "levels are judged by the nearest commissioned speed: speed is 1399 rpm" in now.reason
 
 
 def test_a_machine_that_is_watched_says_what_would_have_been_seen() -> None:
