@@ -258,7 +258,8 @@ def growth_sentence(report: CommissioningReport) -> str:
     (least, first), (most, last) = (edge(found, key=lambda each: each[0]) for edge in (min, max))
     return (
         f"A level raises an alert, relative to the healthy machine, once it has grown by {100 * least:.0f}% "
-        f"({first.channel} {first.measure}) to {100 * most:.0f}% ({last.channel} {last.measure})."
+        f"({first.channel} {first.measure}) to {100 * most:.0f}% ({last.channel} {last.measure}). A load that is not "
+        "in the recordings, stronger or from another direction, makes some channels louder as well and raises alerts."
     )
 
 

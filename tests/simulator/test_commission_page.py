@@ -493,7 +493,8 @@ def test_what_growth_of_a_level_raises_an_alert_stands_on_the_page_and_in_the_te
         assert f"{one.channel} {one.measure} " in told
         assert f"{100 * one.growth:.0f}%" in told
     out = StringIO()
-    print_report(report, Console(file=out, width=200))
+    print_report(report, Console(file=out, width=400))
+    assert "not in the recordings, stronger or from another direction, makes some channels louder" in out.getvalue()
     assert "A level raises an alert, relative to the healthy machine, once it has grown by 60%" in out.getvalue()
     refused, _ = written(folder, "no hop")
     assert 'id="levels"' not in refused
