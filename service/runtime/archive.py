@@ -10,7 +10,6 @@ from rotorwatch.records.replays import OfflineSummary
 from service.recordings.replay.machine import choose_machine
 from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.source import RecordingSource
-from service.runtime.fleet import imported_ray, join_cluster
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +43,9 @@ def on_cluster(address: str, tasks: Sequence[MachineTask]) -> Iterator[tuple[Off
     RotorwatchError
         If there is no cluster; or naming the machine that cannot be evaluated, and why.
     """
+    # Here and not above: every worker imports this module, and what these bring takes as long as all that it needs.
+    from service.runtime.fleet import imported_ray, join_cluster  # noqa: PLC0415
+
     ray = imported_ray()
     with ExitStack() as undo:
         join_cluster(address, undo)
