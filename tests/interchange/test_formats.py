@@ -268,6 +268,15 @@ def test_pickled_objects_are_not_loaded(tmp_path: Path) -> None:
         imported(tmp_path, tmp_path / "run.npz", RATE + CHANNELS)
 
 
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # pyuff's own
+def test_a_data_set_that_is_cut_off_is_missing_not_without_a_unit(tmp_path: Path) -> None:
+    t, x, v, a = signals(1000)
+    write_uff(tmp_path / "run.uff", {"t": t, "x": x, "v": v, "a": a})
+    (tmp_path / "run.uff").write_bytes((tmp_path / "run.uff").read_bytes()[:-100])
+    with pytest.raises(SourceError, match=r"run.uff: no data set 'a'; there are set 1, set 2, x, v"):
+        imported(tmp_path, tmp_path / "run.uff", f'[time]\nstart = "{START}"\n' + without_units(CHANNELS))
+
+
 @pytest.mark.parametrize("suffix", ["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"])
 def test_a_file_that_is_none_of_its_kind_is_named(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"broken.{suffix}"
