@@ -252,7 +252,7 @@ class MachineMonitor:
             # Until now the time of day was all there was; shelving goes on by the time of the data.
             self._alarms.clock_stepped(block.start_ns, block.start_ns - self._reached_ns)
         self._alarms.passed(block.start_ns)
-        self._data_path.accepted(verdict, block.start_ns, dropped)
+        self._fault = self._data_path.accepted(verdict, block.start_ns, dropped) or self._fault
         self._end_ns = block.end_ns
         return self._window.feed(self._plan.to_si(block.samples), block.start_ns)
 

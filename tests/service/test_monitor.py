@@ -169,6 +169,26 @@ def test_a_publisher_started_anew_while_the_monitor_was_away() -> None:
         assert [event.alarm.name for event in events if event.kind == "raised"] == told
 
 
+@pytest.mark.parametrize("torn", ["times that are not counted in samples", "lost blocks"])
+def test_where_no_hop_is_whole_nothing_stays_healthy(torn: str) -> None:
+    target, after = watching(), healthy(170.0)[650:]
+    spoilt = after[:400]
+    if torn == "lost blocks":
+        spoilt = [block for number, block in enumerate(spoilt) if number % 20]
+    else:
+        spoilt = [replace(block, start_ns=block.start_ns + 10**6 * (number % 3)) for number, block in enumerate(spoilt)]
+    windows, events = feed(target, spoilt)
+    assert not [window for window in windows if window.end_ns > spoilt[60].start_ns]
+    assert [(event.kind, event.alarm.name) for event in events] == [("raised", "data-gap")]
+    assert "no 5 s without a gap for 2" in events[0].alarm.note
+    assert target.health().state is HealthState.NOT_EVALUABLE
+    assert "nothing is evaluated: blocks are lost, or their times" in target.health().reason
+    windows, events = feed(target, after[400:])
+    assert windows
+    assert target.health().state is HealthState.HEALTHY
+    assert target.health().reason == ""
+
+
 def test_undecodable_bytes_are_a_refusal_like_any_other() -> None:
     target = monitor()
     (report,) = target.step_payload(b"abc", b"too short", "application/x-rotorwatch-block")

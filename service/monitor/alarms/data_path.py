@@ -9,6 +9,9 @@ from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 from service.monitor.alarms.book import AlarmBook
 
+_MOST_HOPS = 4
+"""After a gap the next hop is whole within three."""
+
 
 class DataPathAlarms:
     """Judges what happens to the data on their way from the sensors through the monitor."""
@@ -19,9 +22,10 @@ class DataPathAlarms:
         self._silence_s = machine.ingest.no_data_after_s
         self._silence_ns = round(self._silence_s * 1e9)
         self._hop_ns = round(machine.window.hop_s * 1e9)
+        self._whole_ns: int | None = None  # end of the latest hop, or where the first could have begun
         self._unseen_windows, self._unseen_blocks, self._unseen_s = 0, 0, 0.0
 
-    def accepted(self, verdict: Admission, start_ns: int, dropped: int) -> None:
+    def accepted(self, verdict: Admission, start_ns: int, dropped: int) -> str:
         """A block was accepted.
 
         Parameters
@@ -30,6 +34,11 @@ class DataPathAlarms:
             Its beginning.
         dropped : int
             Blocks before it that the monitor itself threw away.
+
+        Returns
+        -------
+        str
+            Why nothing has been evaluated for long, although data come; empty if it has.
         """
         book, before_ns = self._book, start_ns - round(verdict.gap_s * 1e9)
         missing, overloaded = Evidence(start_ns=before_ns, end_ns=start_ns), dropped > 0 and verdict.gap_s > 0
@@ -43,7 +52,23 @@ class DataPathAlarms:
             book.update_state(GAP, True, start_ns, verdict.text, evidence=missing, at_once=True)
         if verdict.clock_step_s and not verdict.new_run:
             book.update_state(CLOCK, True, start_ns, verdict.text, at_once=True)
+        torn = self._torn(verdict, start_ns)
+        if torn:
+            book.update_state(GAP, True, start_ns, torn, at_once=True)
         book.suppress(None, start_ns)
+        return torn
+
+    def _torn(self, verdict: Admission, start_ns: int) -> str:
+        """Whether gaps, each too short for an alarm, follow each other so closely that no hop is whole."""
+        if self._whole_ns is None or verdict.clock_step_s or verdict.gap_s >= self._gap_s:
+            self._whole_ns = start_ns
+        without_ns = start_ns - self._whole_ns
+        if verdict.continuous or without_ns < _MOST_HOPS * self._hop_ns:
+            return ""
+        return (
+            f"no {self._hop_ns / 1e9:g} s without a gap for {without_ns / 1e9:.3g} s, so nothing is evaluated: blocks "
+            f"are lost, or their times are not counted in samples; the latest: {verdict.text}"
+        )
 
     def passed(self, time_ns: int, end_ns: int | None) -> None:
         """Time has passed since the end of the newest data."""
@@ -62,6 +87,7 @@ class DataPathAlarms:
         skipped : bool
             Whether its window is not evaluated, because the monitor cannot keep up.
         """
+        self._whole_ns = end_ns
         for name in (GAP, CLOCK) if skipped else (GAP, CLOCK, FAULT, OVERLOADED):
             self._book.update_state(name, False, end_ns)
         if skipped:
