@@ -65,7 +65,8 @@ def fleet_files(folder: Path, machines: Sequence[MachineFile], database: str, li
 @contextmanager
 def cluster_of() -> Iterator[Any]:
     """A Ray cluster of these computers, beside one without cores."""
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    head = {"num_cpus": 0, "include_dashboard": False, "_system_config": {"worker_niceness": 0}}
+    cluster = Cluster(initialize_head=True, head_node_args=head)
     try:
         for _ in range(COMPUTERS):
             cluster.add_node(num_cpus=CORES)

@@ -109,8 +109,8 @@ def fleet(
     [bold]Example[/bold]
 
     On the first computer, and with its address on each of the others:
-    [cyan]ray start --head --disable-usage-stats[/cyan]
-    [cyan]ray start --address 10.0.0.5:6379 --disable-usage-stats[/cyan]
+    [cyan]RAY_worker_niceness=0 ray start --head --disable-usage-stats[/cyan]
+    [cyan]RAY_worker_niceness=0 ray start --address 10.0.0.5:6379 --disable-usage-stats[/cyan]
     Then on the first one:
     [cyan]rotorwatch fleet --address auto --config fleet.toml[/cyan]
     """

@@ -197,7 +197,9 @@ def join_cluster(address: str, undo: ExitStack) -> None:
             socket.create_connection((host.strip("[]"), int(port)), _ANSWER_S).close()
         ray.init(address=address, namespace="rotorwatch", logging_level="warning", runtime_env={"env_vars": _VARIABLES})
     except (OSError, RuntimeError, ValueError) as error:
-        raise RotorwatchError(f"no Ray cluster at {address}: {error}; start one with: ray start --head") from error
+        raise RotorwatchError(
+            f"no Ray cluster at {address}: {error}; start one with: RAY_worker_niceness=0 ray start --head"
+        ) from error
     undo.callback(ray.shutdown)
 
 
@@ -215,6 +217,9 @@ class ShardActor:
         """Monitor its machines, if it does not."""
         if self._thread is not None and self._thread.is_alive():
             return
+        if (niceness := os.nice(0)) > 0:
+            why = "Ray was started without RAY_worker_niceness=0"
+            _log.warning("other programs of this computer come before a shard", niceness=niceness, why=why)
         self._said.clear()
         self._connection, theirs = Pipe()
         self._thread = threading.Thread(target=run_shard, args=(*self._arguments, theirs), daemon=True)

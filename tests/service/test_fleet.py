@@ -40,7 +40,8 @@ def fleet_plan(folder: Path, database: str, count: int = 2) -> ServiceSettings:
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
     """A Ray cluster of two computers with a core each, beside one without any; all are this computer."""
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    head = {"num_cpus": 0, "include_dashboard": False, "_system_config": {"worker_niceness": 0}}
+    made = Cluster(initialize_head=True, head_node_args=head)
     try:
         for _ in range(2):
             made.add_node(num_cpus=1)
@@ -160,7 +161,7 @@ def test_a_cluster_that_is_not_there(tmp_path: Path) -> None:
     found = CliRunner().invoke(app, command)
     assert found.exit_code == 1
     assert "no Ray cluster at 127.0.0.1:" in found.output
-    assert "ray start --head" in found.output
+    assert "RAY_worker_niceness=0 ray start --head" in found.output
 
 
 def test_where_a_shard_goes() -> None:

@@ -36,7 +36,12 @@ AGAIN_S = 60.0
 FAULT = "k_by=-0.33@30"
 START_NS = 1_767_225_600 * 10**9
 CHECKS = '{"health_check_period_ms":1000,"health_check_timeout_ms":2000,"health_check_failure_threshold":5}'
-_VARIABLES = {"RAY_USAGE_STATS_ENABLED": "0", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+_VARIABLES = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_worker_niceness": "0",
+    "OPENBLAS_NUM_THREADS": "1",
+    "PYTHONPATH": str(ROOT),
+}
 
 
 @dataclass(slots=True)
