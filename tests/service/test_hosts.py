@@ -97,8 +97,9 @@ def test_what_a_cut_cable_and_a_lost_host_cost_is_stated_and_the_alarm_log_arriv
 
         net.cut("monitor")
         time.sleep(CUT_S)
+        # A monitor that other programs slow down still has blocks from before the cut to take.
+        until(lambda: health().stream.silent, "silence")
         away, cut_ns = health(), evaluated_until()
-        assert away.stream.silent
         assert away.state is HealthState.ALERT, "missing data must not hide the alarm"
         net.mend("monitor")
         until(lambda: evaluated_until() > cut_ns + 1e9 * PACE * CUT_S, "window after the cut")
