@@ -12,6 +12,7 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+os.environ.setdefault("RAY_worker_niceness", "0")
 
 import argparse
 import json
@@ -65,8 +66,7 @@ def fleet_files(folder: Path, machines: Sequence[MachineFile], database: str, li
 @contextmanager
 def cluster_of() -> Iterator[Any]:
     """A Ray cluster of these computers, beside one without cores."""
-    head = {"num_cpus": 0, "include_dashboard": False, "_system_config": {"worker_niceness": 0}}
-    cluster = Cluster(initialize_head=True, head_node_args=head)
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
     try:
         for _ in range(COMPUTERS):
             cluster.add_node(num_cpus=CORES)

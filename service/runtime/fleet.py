@@ -219,7 +219,7 @@ class ShardActor:
             return
         if (niceness := os.nice(0)) > 0:
             why = "Ray was started without RAY_worker_niceness=0"
-            _log.warning("other programs of this computer come before a shard", niceness=niceness, why=why)
+            _log.warning("other programs on this computer take precedence over this shard", niceness=niceness, why=why)
         self._said.clear()
         self._connection, theirs = Pipe()
         self._thread = threading.Thread(target=run_shard, args=(*self._arguments, theirs), daemon=True)

@@ -27,6 +27,7 @@ from tests.service.live import PATIENT, ROOT, SHORT, machine_file, program, unti
 from tests.service.postgres import USER, postgres_server
 
 _WHY_NOT = why_not()
+# Hosts are network namespaces, which take an administrator to make.
 pytestmark = [pytest.mark.long, pytest.mark.skipif(bool(_WHY_NOT), reason=f"NO HOSTS: {_WHY_NOT}")]
 
 KITS = ("one", "two")

@@ -15,6 +15,7 @@ from tests.service.hosts import MIDDLE, hosts, why_not
 from tests.service.live import ROOT, SHORT, Program, machine_file, program, until
 
 _WHY_NOT = why_not()
+# Hosts are network namespaces, which take an administrator to make.
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(_WHY_NOT), reason=f"NO HOSTS: {_WHY_NOT}")]
 
 PACE = 10.0
