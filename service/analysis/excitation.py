@@ -12,7 +12,7 @@ import numpy as np
 
 from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN, BinGroups, Motions, group_bins, integrated
 from models.diagnosis.likelihood.scoring import FisherScoring
-from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, SpectralModel, starting_point
+from models.diagnosis.likelihood.spectral_model import SpectralModel, starting_point, usual_force
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
@@ -120,7 +120,7 @@ def excitation_of(machine: Machine, window: WindowStatistics) -> Excitation:
     low_hz, high_hz = machine.window.band_hz
     groups = group_bins(frequencies_hz, machine, np.asarray(excluded, dtype=np.bool_), (high_hz - low_hz) / _GROUPS)
     usual_cutoff_hz = math.sqrt(math.prod(machine.condition.cutoff_hz))
-    force_scale = _force_scale(machine, motions, groups, speed, usual_cutoff_hz)
+    force_scale = usual_force(machine, motions, groups, speed, usual_cutoff_hz)
     model = SpectralModel(machine, motions, groups, force_scale)
     observed = motions.spectra(groups.average(window.spectrum), model.centre)
     search = FisherScoring(model, observed, window.n_segments, speed, usual_cutoff_hz, _SMOOTH)
@@ -162,17 +162,6 @@ def _noise_of(
         theory = np.sum(gain * w ** (2 * _order(state)) * power[:, :, at], axis=1)
         found[state] = sensor_noise(measured[:, at], theory, averages, groups.centre_hz, machine.window.band_hz[1])
     return found
-
-
-def _force_scale(machine: Machine, motions: Motions, groups: BinGroups, speed: float, cutoff_hz: float) -> float:
-    """Unit of forces in which equal independent sources of level one make the mean power that was measured."""
-    model = SpectralModel(machine, motions, groups, shapes=0)
-    theta = np.zeros(model.size)
-    theta[model.cutoff_at], theta[model.order_at] = np.log(cutoff_hz), np.log(2)
-    theta[model.noise_at] = -np.inf
-    theta[model.level_at] = np.eye(6)[ROWS, COLUMNS]
-    explained = groups.bins @ np.einsum("fii->f", model.at(theta, speed).S).real / (model.n * groups.bins.sum())
-    return float(explained**-0.5)
 
 
 def _dof(state: str) -> int:

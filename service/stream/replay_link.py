@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 
 import zenoh
 import zenoh.ext
@@ -23,7 +24,7 @@ from rotorwatch.records.replays import ReplayProgress
 from service.recordings.replay.control import Control
 from service.recordings.replay.player import PlayPlan, play
 from service.recordings.replay.source import RecordingSource
-from service.stream.transport import Declared, Link
+from service.stream.transport import Declared, Link, answering
 
 _JSON = "application/json"
 _CACHE_STREAM = 300
@@ -141,7 +142,8 @@ class ReplayLink:
             self._publisher(keys.descriptor)
             if descriptor is not None:
                 key = target.key(keys.descriptor)
-                self._keep(session.declare_queryable(key, self._link.guarded(_answering(key, descriptor))))
+                reply = answering(key, partial(bytes, descriptor))
+                self._keep(session.declare_queryable(key, self._link.guarded(reply)))
             if target.prefix:
                 # On the original keys there is no token: it would say that a live machine is there, and hide one.
                 self._keep(session.liveliness().declare_token(target.key(keys.publisher_alive)))
@@ -300,11 +302,3 @@ def replay_to_network(
 
 def _sent_by(machines: Sequence[MachineKeys]) -> frozenset[str]:
     return frozenset(key for keys in machines for key in (keys.stream, keys.descriptor, keys.truth))
-
-
-def _answering(key: str, answer: bytes) -> Callable[[zenoh.Query], None]:
-    def reply(query: zenoh.Query) -> None:
-        with query:
-            query.reply(key, answer, encoding=_JSON)
-
-    return reply

@@ -180,7 +180,7 @@ class MachineLink:
         for publisher in (self._report, self._event, self._state, self._health):
             keep(publisher)
         for key, answer in ((keys.alarm_state, self._callbacks.alarm_state), (keys.health, self._callbacks.health)):
-            keep(session.declare_queryable(key, guarded(_answering(key, answer))))
+            keep(session.declare_queryable(key, guarded(answering(key, answer))))
         log = _answering_from_log(keys.alarm_event, self._callbacks.alarm_events)
         # A thread of its own, because it waits for the database: the others, and Zenoh, go on.
         keep(session.declare_queryable(keys.alarm_event, zenoh.handlers.Callback(guarded(log), indirect=True)))
@@ -420,7 +420,9 @@ def _stream_subscriber(
     )
 
 
-def _answering(key: str, answer: Callable[[], str]) -> Callable[[zenoh.Query], None]:
+def answering(key: str, answer: Callable[[], str | bytes]) -> Callable[[zenoh.Query], None]:
+    """A queryable's callback that replies with JSON."""
+
     def reply(query: zenoh.Query) -> None:
         with query:
             query.reply(key, answer(), encoding=_JSON)

@@ -19,12 +19,11 @@ from models.diagnosis.likelihood.goodness import MOST_MISFIT, goodness_of_fit, u
 from models.diagnosis.likelihood.motions import BinGroups, Motions, group_bins, integrated
 from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Weights, Whitened
 from models.diagnosis.likelihood.spectral_model import (
-    COLUMNS,
-    ROWS,
     STRUCTURAL,
     ModelPoint,
     SpectralModel,
     starting_point,
+    usual_force,
 )
 from models.diagnosis.likelihood.unbalance import Unbalance, estimate_unbalance, estimate_unbalance_by_hop
 from models.diagnosis.moments import ComplexArray
@@ -318,7 +317,7 @@ class LikelihoodFit:
         """Search from the last window's maximum, or cold: first on coarse groups with one low-pass for all forces."""
         groups = self._grouped(window.frequencies_hz, excluded, 1.0)
         motions = Motions(window.states, scale)
-        force_scale = self._force_scale(motions, groups, speed)
+        force_scale = usual_force(self._machine, motions, groups, speed, self._usual_cutoff_hz)
         model = SpectralModel(self._machine, motions, groups, force_scale)
         search = self._search(model, window, speed, self._strength)
         if self._last is not None and self._last.size == model.size:
@@ -357,20 +356,6 @@ class LikelihoodFit:
             widest_hz = coarser * (high - low) / _GROUPS
             self._groups[key] = group_bins(frequencies_hz, self._machine, excluded, widest_hz)
         return self._groups[key]
-
-    def _force_scale(self, motions: Motions, groups: BinGroups, speed: float) -> float:
-        """Unit of forces in which equal independent sources of level one make the mean power of the nominal rotor.
-
-        A parameter point therefore stays a good start when the machine merely becomes louder.
-        """
-        model = SpectralModel(self._machine, motions, groups, shapes=0)
-        theta = np.zeros(model.size)
-        theta[model.cutoff_at] = np.log(self._usual_cutoff_hz)
-        theta[model.order_at] = np.log(2)
-        theta[model.noise_at] = -np.inf
-        theta[model.level_at] = np.eye(6)[ROWS, COLUMNS]
-        explained = groups.bins @ np.einsum("fii->f", model.at(theta, speed).S).real / (model.n * groups.bins.sum())
-        return float(explained**-0.5)
 
     def _stated(self, why: str) -> str:
         """Why a window is unexplained, as a sentence; empty if it is explained."""

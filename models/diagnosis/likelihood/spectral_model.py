@@ -344,6 +344,20 @@ _VISIBLE = 0.02
 _LEAST_LEVEL = 1e-3
 
 
+def usual_force(machine: Machine, motions: Motions, groups: BinGroups, speed_rad_s: float, cutoff_hz: float) -> float:
+    """Unit of force, N/√Hz, in which equal independent sources of level one make the mean power that was measured.
+
+    A parameter point therefore stays a good start when the machine merely becomes louder.
+    """
+    model = SpectralModel(machine, motions, groups, shapes=0)
+    theta = np.zeros(model.size)
+    theta[model.cutoff_at], theta[model.order_at] = np.log(cutoff_hz), np.log(2)
+    theta[model.noise_at] = -np.inf
+    theta[model.level_at] = np.eye(6)[ROWS, COLUMNS]
+    explained = groups.bins @ np.einsum("fii->f", model.at(theta, speed_rad_s).S).real / (model.n * groups.bins.sum())
+    return float(explained**-0.5)
+
+
 def starting_point(model: SpectralModel, observed: ComplexArray, centre: FloatArray, speed_rad_s: float) -> FloatArray:
     """Guess the excitation with the nominal rotor.
 
