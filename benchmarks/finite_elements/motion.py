@@ -204,6 +204,7 @@ def _stiffening(run: _Run, force: FloatArray, pull: ComplexArray, angle: FloatAr
     step = np.hstack([F, g_now, g_old])
     size = 2 * n
     state = np.zeros(size + 2 * len(at))
+    moving, now, old = np.split(state, [size, size + len(at)])  # views of it
     inputs = np.hstack([force, np.cos(angle)[:, None], np.sin(angle)[:, None]])
     first_all, second_all = np.hstack([first[:, :n_force], first_1x]), np.hstack([second[:, :n_force], second_1x])
     rows = list(probed(run.rotor))
@@ -214,11 +215,13 @@ def _stiffening(run: _Run, force: FloatArray, pull: ComplexArray, angle: FloatAr
         end = min(begin + _PIECE, len(force))
         driven = inputs[begin - 1 : end - 1] @ first_all.T + inputs[begin:end] @ second_all.T
         path = np.empty_like(driven)
-        for number, drive in enumerate(driven):
-            state[size + len(at) :] = state[size : size + len(at)]
-            state[size : size + len(at)] = cubic * state[at] ** 3
-            state[:size] = step @ state + drive
-            path[number] = state[:size]
+        for drive, reached in zip(driven, path, strict=True):
+            old[:] = now
+            moved = moving[at]
+            np.multiply(cubic * moved, moved * moved, out=now)
+            np.dot(step, state, out=reached)
+            reached += drive
+            moving[:] = reached
         values[begin:end, :4] = path[:, rows]
         values[begin:end, 4:8] = path[:, [n + row for row in rows]]
         values[begin:end, 8:] = np.hstack([path, path[:, at] ** 3]) @ to_rates.T + inputs[begin:end] @ to_rates_direct.T

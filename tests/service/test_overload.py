@@ -47,8 +47,8 @@ from tests.service.monitored import client
 from tests.service.replaying import lines_of
 
 S = 10**9
-LOUD_FROM_S, LOUD_TO_S = 120, 150
-LENGTH_S = 320.0  # long enough for the alarm to clear after what waits has been taken
+LOUD_FROM_S, LOUD_TO_S = 60, 90
+LENGTH_S = 260.0  # long enough for the alarm to clear after what waits has been taken
 LIMIT = '\n[[levels.limits]]\nchannel = "y1"\nmeasure = "overall"\nalert = 220.0\ndanger = 1000.0\n'
 
 
@@ -188,7 +188,7 @@ def test_what_is_loud_is_heard_in_skipped_windows_as_soon_as_in_others(kit: Inst
         monitor = MachineMonitor(kit, skips)
         told = [
             (f"{event.kind.value} {event.alarm.name}", (event.time_ns - START_NS) / S)
-            for block in loud_in_between(210.0)
+            for block in loud_in_between(LOUD_TO_S + 60.0)
             for event in monitor.step(block).events
         ]
         return [one for one in told if LEVEL in one[0]]
@@ -200,7 +200,7 @@ def test_what_is_loud_is_heard_in_skipped_windows_as_soon_as_in_others(kit: Inst
 
 
 def test_a_change_is_named_although_every_other_window_is_skipped(kit: Installed) -> None:
-    stream = scenario_blocks(200.0, parse_fault("k_by=-0.33@100"))
+    stream = scenario_blocks(120.0, parse_fault("k_by=-0.33@50"))
     hop_ns = round(kit.machine.window.hop_s * 1e9)
     monitor = MachineMonitor(kit, lambda end_ns: (end_ns - START_NS) // hop_ns % 2 == 0)
     events = [one for _, told in fed(monitor, stream) for one in told]
@@ -209,13 +209,13 @@ def test_a_change_is_named_although_every_other_window_is_skipped(kit: Installed
 
 
 def test_a_monitor_goes_on_from_between_skipped_windows_as_if_nothing_had_happened(kit: Installed) -> None:
-    stream = scenario_blocks(200.0, parse_fault("k_by=-0.33@100"))
+    stream = scenario_blocks(120.0, parse_fault("k_by=-0.33@50"))
     hop_ns = round(kit.machine.window.hop_s * 1e9)
 
     def every_third(end_ns: int) -> bool:
         return (end_ns - START_NS) // hop_ns % 3 == 0
 
-    first, at = MachineMonitor(kit, every_third), 1237
+    first, at = MachineMonitor(kit, every_third), 737
     before = list(fed(first, stream[:at]))
     state, second = first.state(whole=True), MachineMonitor(kit, every_third)
     second.restore(state.state, [data for _, data in state.new_parts])
