@@ -220,7 +220,7 @@ def _stiffening(run: _Run, force: FloatArray, pull: ComplexArray, angle: FloatAr
             moved = moving[at]
             np.multiply(cubic * moved, moved * moved, out=now)
             np.dot(step, state, out=reached)
-            reached += drive
+            np.add(reached, drive, out=reached)
             moving[:] = reached
         values[begin:end, :4] = path[:, rows]
         values[begin:end, 4:8] = path[:, [n + row for row in rows]]
