@@ -20,6 +20,7 @@ from service.commands.running import (
     prepare_numerics,
     raise_file_limit,
 )
+from service.terminal.memory import keep_loaded
 
 if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
     from service.settings.service import ServiceSettings
@@ -133,6 +134,7 @@ def _serve(settings: "ServiceSettings", config: Path | None, ray_address: str | 
 
     configure_logging(settings.log)
     with stop_request() as stop, running(settings, ray_address) as service:
+        keep_loaded()
         for worker in service.machines():
             networks = worker.identity["bundle"] or "none: the equations are not evaluated"
             typer.echo(f"machine {worker.machine.site}/{worker.machine.name}, bundle {networks}")

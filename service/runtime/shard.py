@@ -22,7 +22,7 @@ from service.stream.shard_link import ShardLink
 from service.stream.transport import Link
 from service.stream.worker import MachineWorker
 from service.terminal.logs import configure_logging, logger
-from service.terminal.memory import prepare_memory
+from service.terminal.memory import keep_loaded, prepare_memory
 
 _STATUS_S = 1.0
 _PATIENCE_S = 15.0
@@ -51,6 +51,7 @@ def run_shard(settings: ServiceSettings, inner: LinkSettings, connection: Connec
         with ExitStack() as starting:
             shard = _Shard(settings, inner, starting)
             undo = starting.pop_all()
+            keep_loaded()
     except Exception as error:  # whatever it is, somebody waits to hear it
         if not isinstance(error, RotorwatchError):
             _log.exception("a shard cannot begin")
