@@ -13,6 +13,7 @@ from models.commissioning.checks import Check, check_data, check_lines, check_se
 from models.commissioning.commissioned import (
     Commissioned,
     HealthyEntry,
+    HealthyMisfit,
     KnowledgeLevel,
     OperatingRange,
     described,
@@ -36,6 +37,7 @@ from models.machine import Machine, MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETER_TEXT, PARAMETERS
 
 _POWER = 0.95
+_NO_CHANCE = 3.0  # standard errors
 
 
 class EquationRow(BaseModel, extra="forbid", frozen=True):
@@ -296,6 +298,13 @@ def commission(
             recordings=tuple(entries),
             conditions=OperatingRange.of(windows),
             identified=learned.identified,
+            misfit=None
+            if learned.machine is None
+            else HealthyMisfit.of(
+                [diagnosis for _, _, diagnosis in learned.diagnoses],
+                [window.duration_s for window in windows],
+                machine.window_data_s,
+            ),
             baselines=learned.baselines,
             shape=learned.shape,
             sensors=learn_sensor_reference(windows),
@@ -373,8 +382,20 @@ def _report(
             "parameters": parameters,
             "conditions": None if commissioned is None else commissioned.conditions,
             "levels": _growths(machine, commissioned),
-            "notes": learned.notes,
+            "notes": (*learned.notes, *_misfit_notes(commissioned)),
         }
+    )
+
+
+def _misfit_notes(commissioned: Commissioned | None) -> tuple[str, ...]:
+    """That the theory is a little off from the start, where that is no chance."""
+    misfit = None if commissioned is None else commissioned.misfit
+    if misfit is None or misfit.mean < _NO_CHANCE * misfit.standard_error:
+        return ()
+    return (
+        f"the healthy windows lie {misfit.mean:.1f} ± {misfit.standard_error:.1f} standard deviations from the theory: "
+        "masses and shaft in the machine file are not quite the machine's; later windows are outside the model where "
+        "they lie further off than that",
     )
 
 

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from models.checkpoint import checked, prefixed, unprefixed
-from models.commissioning.commissioned import Commissioned, IdentifiedRecord, Installed
+from models.commissioning.commissioned import Commissioned, Installed
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.likelihood.fit import LengthFits
@@ -162,8 +162,7 @@ def evaluator_for(installed: Installed) -> WindowEvaluator:
     """The evaluator that what is known of the machine allows."""
     known, commissioned = installed.known, installed.commissioned
     if known is not None:
-        identified = None if commissioned is None else commissioned.identified
-        return KnownMachineEvaluator(known, installed.bundle, identified)
+        return KnownMachineEvaluator(known, installed.bundle, commissioned)
     if commissioned is None:
         return NoEvaluator()
     return BaselineEvaluator(installed.machine, commissioned)
@@ -190,18 +189,21 @@ class KnownMachineEvaluator(WindowEvaluator):
         With all its parameters.
     bundle : Bundle or None
         Without it the equations are reported as not evaluable.
-    identified : IdentifiedRecord, optional
-        Uncertainty of parameters that were identified; part of every reading.
+    commissioned : Commissioned, optional
+        Uncertainty of parameters that were identified, part of every reading; and the healthy windows' misfit, which
+        later ones are compared with.
     """
 
     by = "likelihood"
     takes_short = True
 
-    def __init__(self, machine: Machine, bundle: Bundle | None, identified: IdentifiedRecord | None = None) -> None:
+    def __init__(self, machine: Machine, bundle: Bundle | None, commissioned: Commissioned | None = None) -> None:
         self._machine = machine
         self._place = f"{machine.site}/{machine.name}"
         self._likelihood = LengthFits(machine)
+        identified = None if commissioned is None else commissioned.identified
         self._shared = None if identified is None else identified.matrix()
+        self._healthy_misfit = None if commissioned is None else commissioned.misfit
         self._has_networks = bundle is not None
         self._explained_ns: int | None = None
         others: list[Diagnostician] = []
@@ -288,6 +290,9 @@ class KnownMachineEvaluator(WindowEvaluator):
         except np.linalg.LinAlgError as error:
             raise EstimationError(f"{self._place}: {error} in this window") from error
         stated = determined(diagnosis, window, self._machine.window_data_s)
+        if self._healthy_misfit is not None and stated.misfit_z is not None:
+            part = window.duration_s / self._machine.window_data_s
+            stated = replace(stated, misfit_z=self._healthy_misfit.beyond(stated.misfit_z, part))
         return stated if self._shared is None else with_shared_error(stated, self._shared)
 
 

@@ -13,15 +13,19 @@ from models.commissioning.commission import Commissioning
 from models.commissioning.commissioned import (
     FILE,
     Commissioned,
+    HealthyMisfit,
+    Installed,
     KnowledgeLevel,
     OperatingRange,
     install,
     knowledge_of,
     load_commissioned,
 )
+from models.diagnosis.readings import Diagnosis
 from models.errors import BundleError
 from models.machine import MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETERS
+from service.monitor.evaluation import evaluator_for
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import (
     LAB,
@@ -95,6 +99,47 @@ def test_partial_knowledge_identifies_the_rotor_within_its_errors() -> None:
     summaries = {one.name: one for one in made.report.parameters}
     assert summaries["k_by"].commissioning_error == pytest.approx(errors[0], rel=0.1)
     assert summaries["k_by"].identified == made.machine.rotor.k_by_N_per_m
+
+
+def test_a_later_window_is_judged_by_how_far_the_healthy_ones_were_off() -> None:
+    rng = np.random.default_rng(4_501)
+    judged, standard = [], []
+    for off in (0.0, 3.0):
+        for _ in range(4000):
+            # A deviation of one size, in windows of half the monitor's length and then in one as long.
+            found = [Diagnosis("likelihood", (), misfit_z=z) for z in rng.normal(off * 0.5**0.5, 1.0, 8).tolist()]
+            misfit = HealthyMisfit.of(found, [30.0] * 8, 60.0)
+            assert misfit is not None
+            judged.append(misfit.beyond(rng.normal(off, 1.0), 1.0))
+            standard.append(misfit.standard_error)
+    assert standard == pytest.approx([0.5] * 8000)
+    exact, bounded = np.array(judged[4000:]), np.array(judged[:4000])
+    assert abs(exact.mean()) < 4 / 4000**0.5
+    assert abs(exact.std() - 1) < 4 / 8000**0.5
+    # Where the theory holds, a mean below nothing is chance: then a window is judged as it is.
+    assert bounded.mean() < 0.05
+    assert (bounded > 2.0).mean() < 0.023 + 4 * (0.023 / 4000) ** 0.5
+    assert HealthyMisfit.of([Diagnosis("likelihood", ())], [60.0], 60.0) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("level", ["partial", pytest.param("full", marks=pytest.mark.long)])
+def test_a_misfit_that_was_there_when_the_machine_was_healthy_is_none_of_a_later_window(level: str) -> None:
+    made, machine = made_at(level).commissioned, MACHINES[level]
+    assert made is not None
+    assert made.misfit is not None
+    assert abs(made.misfit.mean) < 5 * made.misfit.standard_error
+    (window,) = windows_of(healthy(machine, 66.0, 43))
+
+    def misfit_z(known: HealthyMisfit | None) -> float:
+        installed = Installed(machine, None, made.model_copy(update={"misfit": known}))
+        found = evaluator_for(installed).evaluate(window, {}).deciding.misfit_z
+        assert found is not None
+        return found
+
+    raw = misfit_z(None)
+    assert misfit_z(HealthyMisfit(mean=4.0, standard_error=0.0)) == pytest.approx(raw - 4.0)
+    assert misfit_z(HealthyMisfit(mean=-1.0, standard_error=0.75)) == pytest.approx(raw / 1.25)
 
 
 @pytest.mark.slow
