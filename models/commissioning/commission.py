@@ -13,7 +13,6 @@ from models.commissioning.checks import Check, check_data, check_lines, check_se
 from models.commissioning.commissioned import (
     Commissioned,
     HealthyEntry,
-    HealthyMisfit,
     KnowledgeLevel,
     OperatingRange,
     described,
@@ -22,6 +21,7 @@ from models.commissioning.commissioned import (
 from models.commissioning.healthy import HealthyRecording, known_lines
 from models.commissioning.levels import LEVELS, NO_SUCH_ROTOR, HealthyPiece, Learned, Progress, pieces_of
 from models.diagnosis.baseline.rows import Row, evaluable_rows
+from models.diagnosis.misfit import HealthyMisfit
 from models.diagnosis.moments import states_of
 from models.diagnosis.networks.equations import EQUATIONS, Equation, SynchronousEquation, missing
 from models.diagnosis.readings import Diagnosis
@@ -298,13 +298,7 @@ def commission(
             recordings=tuple(entries),
             conditions=OperatingRange.of(windows),
             identified=learned.identified,
-            misfit=None
-            if learned.machine is None
-            else HealthyMisfit.of(
-                [diagnosis for _, _, diagnosis in learned.diagnoses],
-                [window.duration_s for window in windows],
-                machine.window_data_s,
-            ),
+            misfit=_healthy_misfit(machine, learned, pieces),
             baselines=learned.baselines,
             shape=learned.shape,
             sensors=learn_sensor_reference(windows),
@@ -387,15 +381,25 @@ def _report(
     )
 
 
+def _healthy_misfit(machine: MachineFile, learned: Learned, pieces: Sequence[HealthyPiece]) -> HealthyMisfit | None:
+    """How far the healthy windows lie from the theory, where there is one."""
+    found = [
+        (diagnosis.goodness, piece.window.duration_s / machine.window_data_s)
+        for (_, _, diagnosis), piece in zip(learned.diagnoses, pieces, strict=False)
+        if diagnosis.goodness is not None
+    ]
+    return HealthyMisfit.of([goodness for goodness, _ in found], [part for _, part in found])
+
+
 def _misfit_notes(commissioned: Commissioned | None) -> tuple[str, ...]:
     """That the theory is a little off from the start, where that is no chance."""
     misfit = None if commissioned is None else commissioned.misfit
-    if misfit is None or misfit.mean < _NO_CHANCE * misfit.standard_error:
+    if misfit is None or misfit.mean < _NO_CHANCE * misfit.error:
         return ()
     return (
-        f"the healthy windows lie {misfit.mean:.1f} ± {misfit.standard_error:.1f} standard deviations from the theory: "
-        "masses and shaft in the machine file are not quite the machine's; later windows are outside the model where "
-        "they lie further off than that",
+        f"the healthy windows lie {misfit.mean:.1f} ± {misfit.error:.1f} standard deviations from the theory: masses "
+        "and shaft in the machine file are not quite the machine's; later windows are outside the model where they "
+        "deviate otherwise, or more",
     )
 
 

@@ -14,7 +14,6 @@ A commissioning is frozen: another one is another version, which names what it r
 
 import hashlib
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -25,9 +24,9 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.misfit import HealthyMisfit
 from models.diagnosis.moments import states_of
 from models.diagnosis.networks.bundle import Bundle, load_bundle
-from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.shape import HealthyShape
 from models.diagnosis.window import WindowStatistics
@@ -195,46 +194,6 @@ class IdentifiedRecord(BaseModel, extra="forbid", frozen=True):
     def matrix(self) -> FloatArray:
         """`covariance` as an array, shape (6, 6)."""
         return np.array(self.covariance, dtype=np.float64)
-
-
-class HealthyMisfit(BaseModel, extra="forbid", frozen=True):
-    """How far healthy windows lie from the theory: masses and shaft of a machine file are never quite the machine's."""
-
-    mean: _Finite = Field(description="of a window of the monitor's length, standard deviations")
-    standard_error: float = Field(ge=0, allow_inf_nan=False, description="of the mean")
-
-    @classmethod
-    def of(
-        cls, diagnoses: Sequence[Diagnosis], durations_s: Sequence[float], window_s: float
-    ) -> "HealthyMisfit | None":
-        """Misfit of healthy windows; None where none was tested.
-
-        A deviation of one size stands out by the root of the data's length, chance does not.
-
-        Parameters
-        ----------
-        durations_s : sequence of float
-            Data in each window.
-        window_s : float
-            Data in a window of the monitor.
-        """
-        longer = np.sqrt(window_s / np.array(durations_s))
-        found = [(one.misfit_z * by, by) for one, by in zip(diagnoses, longer, strict=True) if one.misfit_z is not None]
-        if not found:
-            return None
-        values, factors = np.array(found).T
-        return cls(mean=float(values.mean()), standard_error=float(np.sqrt(np.sum(factors**2)) / len(found)))
-
-    def beyond(self, misfit_z: float, part: float) -> float:
-        """What is left of a later window's misfit, standard normal as long as the machine is as it was.
-
-        Parameters
-        ----------
-        part : float
-            Its data, in parts of a full window's.
-        """
-        root = math.sqrt(part)
-        return (misfit_z - root * max(0.0, self.mean)) / math.hypot(1.0, root * self.standard_error)
 
 
 class ConditionBaseline(BaseModel, extra="forbid", frozen=True):

@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from models.diagnosis.misfit import Goodness
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.physics.rotor import PARAMETER_TEXT, QUANTITY, impossible
@@ -218,6 +219,7 @@ class Diagnosis:
     # Over-identification: how far the window is from anything the model can explain, standard normal where the model
     # holds; None where the diagnostician has no such test.
     misfit_z: float | None = None
+    goodness: Goodness | None = None  # what that is made of, where it is made of tests of single things
     # What explains the misfit best, if one thing does: a sensor's gain, a mass, a shaft unequal in y and z; empty if
     # nothing stands out or there is no such test.
     suspect: str = ""

@@ -290,9 +290,9 @@ class KnownMachineEvaluator(WindowEvaluator):
         except np.linalg.LinAlgError as error:
             raise EstimationError(f"{self._place}: {error} in this window") from error
         stated = determined(diagnosis, window, self._machine.window_data_s)
-        if self._healthy_misfit is not None and stated.misfit_z is not None:
-            part = window.duration_s / self._machine.window_data_s
-            stated = replace(stated, misfit_z=self._healthy_misfit.beyond(stated.misfit_z, part))
+        if self._healthy_misfit is not None and stated.goodness is not None:
+            left = self._healthy_misfit.beyond(stated.goodness, window.duration_s / self._machine.window_data_s)
+            stated = replace(stated, misfit_z=left.misfit_z, suspect=left.suspect)
         return stated if self._shared is None else with_shared_error(stated, self._shared)
 
 

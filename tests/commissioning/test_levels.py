@@ -13,7 +13,6 @@ from models.commissioning.commission import Commissioning
 from models.commissioning.commissioned import (
     FILE,
     Commissioned,
-    HealthyMisfit,
     Installed,
     KnowledgeLevel,
     OperatingRange,
@@ -21,6 +20,7 @@ from models.commissioning.commissioned import (
     knowledge_of,
     load_commissioned,
 )
+from models.diagnosis.misfit import AlternativeTest, Goodness, HealthyMisfit
 from models.diagnosis.readings import Diagnosis
 from models.errors import BundleError
 from models.machine import MachineFile
@@ -101,25 +101,32 @@ def test_partial_knowledge_identifies_the_rotor_within_its_errors() -> None:
     assert summaries["k_by"].identified == made.machine.rotor.k_by_N_per_m
 
 
-def test_a_later_window_is_judged_by_how_far_the_healthy_ones_were_off() -> None:
-    rng = np.random.default_rng(4_501)
-    judged, standard = [], []
-    for off in (0.0, 3.0):
-        for _ in range(4000):
-            # A deviation of one size, in windows of half the monitor's length and then in one as long.
-            found = [Diagnosis("likelihood", (), misfit_z=z) for z in rng.normal(off * 0.5**0.5, 1.0, 8).tolist()]
-            misfit = HealthyMisfit.of(found, [30.0] * 8, 60.0)
-            assert misfit is not None
-            judged.append(misfit.beyond(rng.normal(off, 1.0), 1.0))
-            standard.append(misfit.standard_error)
-    assert standard == pytest.approx([0.5] * 8000)
-    exact, bounded = np.array(judged[4000:]), np.array(judged[:4000])
-    assert abs(exact.mean()) < 4 / 4000**0.5
-    assert abs(exact.std() - 1) < 4 / 8000**0.5
-    # Where the theory holds, a mean below nothing is chance: then a window is judged as it is.
-    assert bounded.mean() < 0.05
-    assert (bounded > 2.0).mean() < 0.023 + 4 * (0.023 / 4000) ** 0.5
-    assert HealthyMisfit.of([Diagnosis("likelihood", ())], [60.0], 60.0) is None
+def test_a_later_window_is_judged_by_how_the_healthy_ones_were_off() -> None:
+    rng, names = np.random.default_rng(4_501), ("mass of the disc", "gain of y1", "gain of z1")
+    off = np.array([4.0, -2.5, 0.0])
+
+    def window(part: float, *, more: float = 0.0) -> Goodness:
+        mass, gain, other = rng.normal(off * part**0.5, 1.0).tolist()
+        tests = [AlternativeTest(name, z, z / 100) for name, z in zip(names, (mass, gain, other + more), strict=True)]
+        return Goodness(rng.normal(2.0 * part, 1.0), tuple(tests), 4)
+
+    before, judged, changed = [], [], []
+    for _ in range(1500):
+        # Windows of half the monitor's length, and then one as long.
+        healthy = HealthyMisfit.of([window(0.5) for _ in range(8)], [0.5] * 8)
+        assert healthy is not None
+        assert (healthy.error, healthy.excess_error) == pytest.approx((0.5, 0.5**0.5))
+        before.append(window(1.0).misfit_z)
+        judged.append(healthy.beyond(window(1.0), 1.0).misfit_z)
+        changed.append(healthy.beyond(window(1.0, more=7.0), 1.0))
+    assert np.mean(before) > 2.5
+    assert (np.array(judged) > 2.0).mean() < 0.023 + 4 * (0.023 / 1500) ** 0.5
+    assert np.mean(judged) > -0.5
+    # What deviates otherwise shows, though it is no larger than what was there.
+    assert np.mean([one.misfit_z > 4.0 for one in changed]) > 0.8
+    suspects = {one.suspect.partition(" (")[0] for one in changed}
+    assert suspects <= {"gain of z1", ""}
+    assert HealthyMisfit.of([], []) is None
 
 
 @pytest.mark.slow
@@ -128,18 +135,25 @@ def test_a_misfit_that_was_there_when_the_machine_was_healthy_is_none_of_a_later
     made, machine = made_at(level).commissioned, MACHINES[level]
     assert made is not None
     assert made.misfit is not None
-    assert abs(made.misfit.mean) < 5 * made.misfit.standard_error
+    assert made.misfit.error == pytest.approx((60 / 35 / 2) ** 0.5, rel=0.05)  # of 70 s
+    assert abs(made.misfit.mean) < 5 * made.misfit.error
     (window,) = windows_of(healthy(machine, 66.0, 43))
 
-    def misfit_z(known: HealthyMisfit | None) -> float:
+    def judged(known: HealthyMisfit | None) -> Diagnosis:
         installed = Installed(machine, None, made.model_copy(update={"misfit": known}))
-        found = evaluator_for(installed).evaluate(window, {}).deciding.misfit_z
-        assert found is not None
-        return found
+        return evaluator_for(installed).evaluate(window, {}).deciding
 
-    raw = misfit_z(None)
-    assert misfit_z(HealthyMisfit(mean=4.0, standard_error=0.0)) == pytest.approx(raw - 4.0)
-    assert misfit_z(HealthyMisfit(mean=-1.0, standard_error=0.75)) == pytest.approx(raw / 1.25)
+    raw = judged(None)
+    assert raw.goodness is not None
+    assert raw.misfit_z is not None
+    scores = {one.tried: one.z for one in raw.goodness.alternatives}
+    assert len(scores) == len(raw.goodness.alternatives)
+    exact = HealthyMisfit(mean=0.0, scores=scores, error=0.0, excess=raw.goodness.excess_z, excess_error=0.0)
+    assert (judged(exact).misfit_z or 0.0) < raw.misfit_z
+    shifted = exact.model_copy(update={"scores": scores | {"mass of the disc": scores["mass of the disc"] - 12.0}})
+    assert (judged(shifted).misfit_z or 0.0) > 10.0
+    assert "mass of the disc" in judged(shifted).suspect
+    assert judged(shifted).parameters == raw.parameters
 
 
 @pytest.mark.slow

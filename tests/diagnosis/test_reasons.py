@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.likelihood.goodness import AlternativeTest, Goodness
+from models.diagnosis.misfit import AlternativeTest, Goodness
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import load_bundle
 from models.diagnosis.readings import Diagnosis, beyond, parameter_reading, possible_reading

@@ -188,7 +188,12 @@ class LikelihoodFit:
         self._latest = window, model, found.whitened.point, structural, speed
         read = self._read(*self._latest)
         return replace(
-            read, misfit_z=goodness.misfit_z, suspect=goodness.suspect, unexplained=unexplained, steps=found.steps
+            read,
+            misfit_z=goodness.misfit_z,
+            goodness=goodness,
+            suspect=goodness.suspect,
+            unexplained=unexplained,
+            steps=found.steps,
         )
 
     def balanced(self, machine: Machine, diagnosis: Diagnosis) -> Diagnosis:

@@ -7,82 +7,25 @@ no such direction explains shows in the total excess of estimated over theoretic
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import log_ndtr, ndtri
 
 from models.diagnosis.likelihood.motions import Mismatch
 from models.diagnosis.likelihood.scoring import Maximum, Weights, Whitened, inverse_factor
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed, twice_packed
+from models.diagnosis.misfit import UNEQUAL, AlternativeTest, Goodness
 from models.diagnosis.moments import ComplexArray, through
 from models.diagnosis.readings import beyond
 from models.machine import Machine
-from models.physics.rotor import PARAMETER_TEXT, Q_shaft, impossible
+from models.physics.rotor import PARAMETER_TEXT, Q_shaft
 from models.signals.block import FloatArray
 
 # Of the elements of the dynamic matrix: what couples motions in y, and what couples motions in z.
 _SIGNS = np.kron([[1.0, 0.0], [0.0, -1.0]], np.ones((3, 3)))
-_UNEQUAL = "shaft stiffer in y than in z"
 # In which degree of freedom of y; that of z is three further on.
 _MASSES = {"mass at the bearing": 0, "mass of the disc": 1, "inertia of the disc": 2}
-_LEAST_SUSPECT_Z = 5.0
-_LEAST_SUSPECT = 5e-4  # a smaller one would read as ±0.0 %, and no machine is built as true as that
-_LINEAR = 0.5  # largest one-step estimate that is worth telling: farther out it only says that the thing is not small
 # An alternative of which less than this is left beside the model's own parameters cannot be told from them.
 _LEAST_INFORMATION = 1e-4
-
-
-@dataclass(frozen=True, slots=True)
-class AlternativeTest:
-    """One thing outside the model, tried on a window."""
-
-    name: str
-    z: float  # its score in standard errors
-    change: float  # one-step estimate of its relative size
-
-    @property
-    def quantity(self) -> str:
-        """What kind of quantity it is."""
-        return self.name.split()[0]
-
-
-@dataclass(frozen=True, slots=True)
-class Goodness:
-    """How well the theory explains a window."""
-
-    excess_z: float  # total squared excess of the whitened spectra over its expectation, in standard deviations
-    alternatives: tuple[AlternativeTest, ...]  # everything tried
-    tests: int  # how many of them, and the total, say something of their own
-
-    @property
-    def misfit_z(self) -> float:
-        """All tests in one number, standard normal (one-sided) where the model holds: the worst, Šidák-corrected."""
-        worst = max(-log_ndtr(-self.excess_z), *(-_two_sided(one.z) for one in self.alternatives))
-        tests = self.tests
-        log_p = np.log(-np.expm1(tests * np.log1p(-np.exp(-worst)))) if worst < 30 else np.log(tests) - worst
-        return -float(ndtri(np.exp(max(log_p, -700.0))))
-
-    @property
-    def suspect(self) -> str:
-        """The alternative with the largest score, if that is beyond 5 standard errors and possible; else empty.
-
-        A one-step estimate that physics does not allow says that this is not what happened: no suspect is named then,
-        for a score that is only second best explains less still.
-        """
-        if not self.alternatives:
-            return ""
-        best = max(self.alternatives, key=lambda one: abs(one.z))
-        small = abs(best.change) < _LEAST_SUSPECT
-        if abs(best.z) <= _LEAST_SUSPECT_Z or small or impossible(best.change, best.quantity):
-            return ""
-        if best.name == _UNEQUAL and impossible(-best.change, best.quantity):
-            return ""  # what y gains z loses
-        return f"{best.name} ({best.change:+.1%})" if abs(best.change) <= _LINEAR else best.name
-
-
-def _two_sided(z: float) -> float:
-    return float(np.log(2) + log_ndtr(-abs(z)))
 
 
 def goodness_of_fit(
@@ -122,8 +65,8 @@ def _named(mismatch: Mismatch, alternatives: dict[str, AlternativeTest]) -> Alte
     x, v = (f"gain of {state}" for state in mismatch.states)
     z_x, z_v = (abs(alternatives[name].z) if name in alternatives else 0.0 for name in (x, v))
     if z_x > z_v:
-        return AlternativeTest(x, mismatch.z, 1 / (1 + mismatch.change) - 1)
-    return AlternativeTest(v, mismatch.z, mismatch.change)
+        return AlternativeTest(x, mismatch.z, 1 / (1 + mismatch.change) - 1, mismatch.states)
+    return AlternativeTest(v, mismatch.z, mismatch.change, mismatch.states)
 
 
 def _excess_z(model: SpectralModel, weights: Weights, found: Maximum) -> float:
@@ -153,7 +96,7 @@ def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tup
         names.append(name)
         slopes.append(sides.slope(mass * w2, slice(first, None, 3)))
     shaft = Q_shaft(rotor) * np.exp(found.theta[STRUCTURAL.index("EI")])
-    names.append(_UNEQUAL)
+    names.append(UNEQUAL)
     slopes.append(sides.slope(-np.ones_like(w2), change=shaft * _SIGNS))
     return names, np.stack(slopes)
 

@@ -1,0 +1,140 @@
+"""How far a window lies from all that the model can explain: things outside the model, each tried on it, and the rest.
+
+Masses and shaft of a machine file are never quite the machine's, so the healthy machine may lie off its theory, too. It
+does so in the same way in every window: each thing that was tried is compared with its mean in the healthy windows.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, Field
+from scipy.special import log_ndtr, ndtri
+
+from models.physics.rotor import impossible
+
+UNEQUAL = "shaft stiffer in y than in z"
+_LEAST_SUSPECT_Z = 5.0
+_LEAST_SUSPECT = 5e-4  # a smaller one would read as ±0.0 %, and no machine is built as true as that
+_LINEAR = 0.5  # largest one-step estimate that is worth telling: farther out it only says that the thing is not small
+
+
+@dataclass(frozen=True, slots=True)
+class AlternativeTest:
+    """One thing outside the model, tried on a window."""
+
+    name: str
+    z: float  # its score in standard errors
+    change: float  # one-step estimate of its relative size
+    pair: tuple[str, ...] = ()  # two sensors whose disagreement it is, put down to the one that `name` says
+
+    @property
+    def quantity(self) -> str:
+        """What kind of quantity it is."""
+        return self.name.split()[0]
+
+    @property
+    def tried(self) -> str:
+        """What it is known by from window to window."""
+        return " and ".join(self.pair) or self.name
+
+
+@dataclass(frozen=True, slots=True)
+class Goodness:
+    """How well the theory explains a window."""
+
+    excess_z: float  # total squared excess of the whitened spectra over its expectation, in standard deviations
+    alternatives: tuple[AlternativeTest, ...]  # everything tried
+    tests: int  # how many of them, and the total, say something of their own
+
+    @property
+    def misfit_z(self) -> float:
+        """All tests in one number, standard normal (one-sided) where the model holds: the worst, Šidák-corrected."""
+        worst = max(-log_ndtr(-self.excess_z), *(-_two_sided(one.z) for one in self.alternatives))
+        tests = self.tests
+        log_p = np.log(-np.expm1(tests * np.log1p(-np.exp(-worst)))) if worst < 30 else np.log(tests) - worst
+        return -float(ndtri(np.exp(max(log_p, -700.0))))
+
+    @property
+    def suspect(self) -> str:
+        """The alternative with the largest score, if that is beyond 5 standard errors and possible; else empty.
+
+        A one-step estimate that physics does not allow says that this is not what happened: no suspect is named then,
+        for a score that is only second best explains less still.
+        """
+        if not self.alternatives:
+            return ""
+        best = max(self.alternatives, key=lambda one: abs(one.z))
+        small = abs(best.change) < _LEAST_SUSPECT
+        if abs(best.z) <= _LEAST_SUSPECT_Z or small or impossible(best.change, best.quantity):
+            return ""
+        if best.name == UNEQUAL and impossible(-best.change, best.quantity):
+            return ""  # what y gains z loses
+        return f"{best.name} ({best.change:+.1%})" if abs(best.change) <= _LINEAR else best.name
+
+
+def _two_sided(z: float) -> float:
+    return float(np.log(2) + log_ndtr(-abs(z)))
+
+
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Error = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class HealthyMisfit(BaseModel, extra="forbid", frozen=True):
+    """How far healthy windows lie from the theory, for windows of the monitor's length."""
+
+    mean: _Finite = Field(description="mean of the windows' misfit, standard deviations")
+    scores: dict[str, _Finite] = Field(description="mean score of each thing that was tried, standard errors")
+    error: _Error = Field(description="standard error of the mean scores")
+    excess: _Finite = Field(description="mean total excess, standard deviations")
+    excess_error: _Error = Field(description="its standard error")
+
+    @classmethod
+    def of(cls, windows: Sequence[Goodness], parts: Sequence[float]) -> "HealthyMisfit | None":
+        """Average over healthy windows; None without any.
+
+        A deviation of one size stands out by the root of the data's length in a score, and by the length in the total
+        excess.
+
+        Parameters
+        ----------
+        parts : sequence of float
+            Data of each, in parts of a window of the monitor.
+        """
+        if not windows:
+            return None
+        count, length = len(windows), 1 / np.array(parts)
+        root = np.sqrt(length)
+        scores: dict[str, list[float]] = {}
+        for one, by in zip(windows, root.tolist(), strict=True):
+            for each in one.alternatives:
+                scores.setdefault(each.tried, []).append(by * each.z)
+        return cls(
+            mean=float(np.mean([by * one.misfit_z for one, by in zip(windows, root, strict=True)])),
+            scores={name: float(np.mean(found)) for name, found in scores.items() if len(found) == count},
+            error=float(np.sqrt(length.sum())) / count,
+            excess=float(np.mean([by * one.excess_z for one, by in zip(windows, length, strict=True)])),
+            excess_error=float(np.sqrt(np.sum(length**2))) / count,
+        )
+
+    def beyond(self, window: Goodness, part: float) -> Goodness:
+        """What is left of a later window: as of a machine that the theory explains, as long as this one is as it was.
+
+        Parameters
+        ----------
+        part : float
+            Its data, in parts of a window of the monitor.
+        """
+        root = math.sqrt(part)
+        alternatives = []
+        for one in window.alternatives:
+            left = one.z - root * self.scores.get(one.tried, 0.0)
+            change = one.change * left / one.z if one.z else 0.0
+            alternatives.append(replace(one, z=left / math.hypot(1.0, root * self.error), change=change))
+        excess = window.excess_z - part * max(0.0, self.excess)
+        return replace(
+            window, excess_z=excess / math.hypot(1.0, part * self.excess_error), alternatives=tuple(alternatives)
+        )
