@@ -91,7 +91,9 @@ def check_sensors_of(findings: Mapping[str, Sequence[SensorFault]]) -> Check:
     )
 
 
-def check_steady(recordings: Sequence[HealthyRecording], windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
+def check_steady(
+    machine: MachineFile, recordings: Sequence[HealthyRecording], windows: Mapping[str, Sequence[WindowStatistics]]
+) -> Check:
     """Whether speed and level held still within each recording."""
     told = partial(Check, name="stationary")
     moved = []
@@ -112,9 +114,9 @@ def check_steady(recordings: Sequence[HealthyRecording], windows: Mapping[str, S
             ratio = np.sqrt(powers[half:].mean(axis=0) / np.maximum(powers[:half].mean(axis=0), np.finfo(float).tiny))
             worst = int(np.argmax(np.abs(np.log(np.maximum(ratio, np.finfo(float).tiny)))))
             if not 1 / _STEADY_LEVEL <= ratio[worst] <= _STEADY_LEVEL:
-                state = windows[recording.name][0].as_mounted.states[worst]
+                channel = with_channel_names(windows[recording.name][0].as_mounted.states[worst], machine.sensors)
                 moved.append(
-                    f"{recording.name}: the random vibration of {state} in the second half is "
+                    f"{recording.name}: the random vibration of {channel} in the second half is "
                     f"{round(ratio[worst], 6):.2g} times that of the first"
                 )
     if not moved:
@@ -126,7 +128,7 @@ def check_steady(recordings: Sequence[HealthyRecording], windows: Mapping[str, S
     )
 
 
-def check_lines(recordings: Sequence[HealthyRecording]) -> Check:
+def check_lines(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> Check:
     """Whether something else than noise and the rotation drives the machine."""
     told = partial(Check, name="second excitation")
     found = [(one.name, line) for one in recordings for line in foreign_lines(one)]
@@ -135,7 +137,7 @@ def check_lines(recordings: Sequence[HealthyRecording]) -> Check:
         return told(verdict="passed", text="no line but those of the rotation stands out")
     text = "; ".join(
         f"{recording}: a steady line at {line.frequency_hz:.2f} Hz makes {line.share:.0%} of the random vibration of "
-        f"{line.state}"
+        f"{with_channel_names(line.state, machine.sensors)}"
         for recording, line in loud
     )
     advice = (

@@ -274,7 +274,7 @@ def commission(
         if not states:
             checks.append(_only_levels(machine, knowledge.text))
         else:
-            checks += [check_steady(recordings, by_recording), check_lines(recordings)]
+            checks += [check_steady(machine, recordings, by_recording), check_lines(machine, recordings)]
         if states and all(check.verdict != "refused" for check in checks):
             try:
                 learned = LEVELS[knowledge.level](machine, pieces, progress)

@@ -121,18 +121,21 @@ def test_another_machine_that_hums() -> None:
         moved_m = 20e-6 if channel.location == "bearing" else 60e-6
         hum = 2 * np.pi * 48.6 * np.cos(turned) if channel.quantity == "velocity" else np.sin(turned)
         samples[:, column] += moved_m * hum / channel.to_si
-    made = made_of(with_samples(blocks, samples))
-    verdict, text, advice = verdict_of(made, "second excitation")
+    humming = with_samples(blocks, samples)
+    verdict, text, advice = verdict_of(made_of(humming), "second excitation")
     assert verdict in {"limited", "refused"}
     assert "a steady line at 48.60 Hz" in text
     assert "neighbouring machine" in advice
+    sensors = tuple(one.model_copy(update={"name": f"XE-{one.name}"}) for one in NOTHING.sensors)
+    named = check_lines(NOTHING.model_copy(update={"sensors": sensors}), [recording(NOTHING, humming)]).text
+    assert "of the random vibration of XE-" in named
 
 
 @pytest.mark.slow
 def test_a_healthy_recording_has_no_foreign_line() -> None:
     """Which the check says of the recording before anything is learned from it."""
     for seed in (52, 58):
-        assert check_lines([recording(NOTHING, stream(HEALTHY_S, seed))]).verdict == "passed"
+        assert check_lines(NOTHING, [recording(NOTHING, stream(HEALTHY_S, seed))]).verdict == "passed"
 
 
 def test_a_file_that_describes_another_machine() -> None:
