@@ -383,9 +383,11 @@ def _report(
 
 def _healthy_misfit(machine: MachineFile, learned: Learned, pieces: Sequence[HealthyPiece]) -> HealthyMisfit | None:
     """How far the healthy windows lie from the theory, where there is one."""
+    if learned.machine is None:
+        return None
     found = [
         (diagnosis.goodness, piece.window.duration_s / machine.window_data_s)
-        for (_, _, diagnosis), piece in zip(learned.diagnoses, pieces, strict=False)
+        for (_, _, diagnosis), piece in zip(learned.diagnoses, pieces, strict=True)
         if diagnosis.goodness is not None
     ]
     return HealthyMisfit.of([goodness for goodness, _ in found], [part for _, part in found])

@@ -217,7 +217,12 @@ class Commissioned(BaseModel, extra="forbid", frozen=True):
     recordings: tuple[HealthyEntry, ...] = Field(min_length=1)
     conditions: OperatingRange
     identified: IdentifiedRecord | None = Field(default=None, description="level partial")
-    misfit: HealthyMisfit | None = Field(default=None, description="levels full and partial: of the healthy windows")
+    # Left out where there is none: bundles that were made without it keep their identity.
+    misfit: HealthyMisfit | None = Field(
+        default=None,
+        exclude_if=lambda found: found is None,
+        description="levels full and partial: of the healthy windows",
+    )
     baselines: tuple[ConditionBaseline, ...] = Field(
         default=(), description="level none: one for all conditions, or one for each speed where they differ"
     )

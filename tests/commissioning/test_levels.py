@@ -135,6 +135,7 @@ def test_a_misfit_that_was_there_when_the_machine_was_healthy_is_none_of_a_later
     made, machine = made_at(level).commissioned, MACHINES[level]
     assert made is not None
     assert made.misfit is not None
+    assert "misfit" not in json.loads(made.model_copy(update={"misfit": None}).model_dump_json())
     assert made.misfit.error == pytest.approx((60 / 35 / 2) ** 0.5, rel=0.05)  # of 70 s
     assert abs(made.misfit.mean) < 5 * made.misfit.error
     (window,) = windows_of(healthy(machine, 66.0, 43))
