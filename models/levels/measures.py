@@ -58,7 +58,7 @@ _SAMPLES_A_TURN = 8.0
 """At least: products of two orders go up to six times running speed."""
 _HANN_BINS = 1.5
 """Bins of a tapered spectrum that say as much as one of an untapered one."""
-_STANDS = 2 * np.pi * 0.5
+STANDS_RAD_S = 2 * np.pi * 0.5
 """Slower than this, rad/s, a shaft is not taken to turn."""
 
 _ComplexArray = npt.NDArray[np.complex128]
@@ -409,7 +409,7 @@ def window_levels(
     every_order = np.concatenate([hop.orders for hop in hops]).reshape(count, len(ORDERS), n)
     s_max = np.full((count, n), np.nan)
     s_max[:, [y for y, _ in plan.pairs]] = np.concatenate([hop.radius for hop in hops]).reshape(count, -1)
-    turning = np.abs(speeds_rad_s) > _STANDS  # not where it is not known
+    turning = np.abs(speeds_rad_s) > STANDS_RAD_S  # not where it is not known
     orders = every_order if turning.all() else every_order[turning]
     speed_rad_s, vectors, amplitudes = None, None, np.full((len(ORDERS), n), np.nan)
     if len(orders):

@@ -82,9 +82,16 @@ class Evaluation:
         changed = [shape.text for shape in self.shapes if shape.verdict == "changed"]
         return "; ".join(filter(None, (self.deciding.suspect, *changed)))
 
-    @property
-    def why_nothing(self) -> str:
-        """Why no parameter could be read, every reason once."""
+    def reason(self, *, told: bool) -> str:
+        """Why no parameter could be read, every reason once.
+
+        Parameters
+        ----------
+        told : bool
+            Whether the verdict says it: what has changed explains a window astride the change.
+        """
+        if self.deciding.unexplained or self.deciding.evaluable:
+            return "" if told else self.deciding.unexplained
         return "; ".join(dict.fromkeys(one.reason for one in self.deciding.parameters if one.reason))
 
     def named(self, channels: Sequence[Channel], foreign: str) -> "Evaluation":

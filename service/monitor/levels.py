@@ -17,6 +17,9 @@ from rotorwatch.records.alarms import Evidence
 from rotorwatch.records.levels import ChannelLevels
 from service.monitor.alarms.book import AlarmBook
 
+_STILL_RAD = 0.1
+"""Less than this in a hop is no turning: an encoder may waver. The slowest kilns turn further."""
+
 
 class LevelWatch:
     """Judges the levels of every window.
@@ -50,6 +53,7 @@ class LevelWatch:
         self._states = [state_name(channel) for channel in channels]
         self._machine = machine
         self._hop_ns = round(machine.window.hop_s * 1e9)
+        self._by_angle = plan.angle_column is not None
 
     @property
     def reference(self) -> LevelReference | None:
@@ -67,7 +71,8 @@ class LevelWatch:
             return
         self.latest = self.judged(found)
         self._found = found
-        if self._takes_first and window.filled == 1:
+        stood = any(abs(hop.turned_rad) < _STILL_RAD for hop in window.hops)  # not where there is no angle: nan
+        if self._takes_first and window.filled == 1 and not stood:
             self.first.take(window.hops[0].start_ns, window.hops[-1].end_ns, found)
 
     def foreign(self, window: SlidingWindow, statistics: WindowStatistics, *, named: bool) -> str:
@@ -86,7 +91,15 @@ class LevelWatch:
                 return with_channel_names(text, self._machine.sensors)
         return self._judge.foreign(self._found, self.latest, self.reference, named=named)
 
-    def tell(self, alarms: AlarmBook, end_ns: int, *, faulty: Collection[str] = (), explained: bool = False) -> None:
+    def tell(
+        self,
+        alarms: AlarmBook,
+        end_ns: int,
+        *,
+        faulty: Collection[str] = (),
+        explained: bool = False,
+        standing: bool = False,
+    ) -> None:
         """Let operators hear of what is beyond its limits at the end of a hop.
 
         Parameters
@@ -94,15 +107,20 @@ class LevelWatch:
         faulty : collection of str
             States whose sensors are at fault: what they show may be no vibration, so only what is dangerously loud
             counts.
+        standing : bool
+            Whether the machine stood in the window. If it has a shaft angle that says so the same counts then, unless
+            it was commissioned standing too.
         explained : bool
             Whether parameters have been found to have changed, without reserve: their alarms say what has become
             louder, and why, so an alert is not raised beside them. What is raised already stays, and a danger is
             always told.
         """
         evidence = Evidence(start_ns=end_ns - self._hop_ns, end_ns=end_ns)
+        known = () if self.reference is None else self.reference.states
+        unlike = standing and self._by_angle and all(one.speed_rad_s is not None for one in known)
         for state, levels in zip(self._states, self.latest, strict=False):
             now, name = channel_state(levels), f"{LEVEL}{levels.channel}"
-            held = state in faulty or (explained and not alarms.present(name))
+            held = unlike or state in faulty or (explained and not alarms.present(name))
             beyond = now.beyond and (now.absolute or now.danger or not held)
             # In the deadband, or while a sensor is at fault, an alarm stays as it is.
             alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=now.small)

@@ -23,6 +23,7 @@ from models.commissioning.commissioned import Installed
 from models.diagnosis.moments import plan_for
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import implicated
+from models.diagnosis.sensors.standstill import Standstill
 from models.diagnosis.verdict.calibration import detectable_changes
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.sequential_state import SequentialState
@@ -45,10 +46,7 @@ from service.monitor.parts import divided, joined
 from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, WindowHeading, counted, identity_of
 
 _RPM = 30 / np.pi
-_NEWEST_SAMPLES = 20_000
 _SKIPPED = "not evaluated: this computer cannot keep up; levels and sensors were judged"
-_ONLY_LEVELS = {HealthState.UNCHANGED, HealthState.WATCHING}
-"""States in which little is claimed, and what would have been seen has to be said."""
 
 
 class MachineMonitor:
@@ -77,6 +75,7 @@ class MachineMonitor:
         self._skips = skips
         self._evaluator = judge = evaluator_for(installed)
         self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
+        self._standstill = Standstill(self._sensors)
         self._plan = plan = plan_for(machine, lagged=judge.needs_lags, levels=True)
         self._watching = installed.watching or not plan.states
         self._levels = LevelWatch(plan, machine, installed)
@@ -101,7 +100,7 @@ class MachineMonitor:
         self._fault = ""
         self._defect: Exception | None = None
         self._statistics: WindowStatistics | None = None
-        self._newest = NewestBlocks(_NEWEST_SAMPLES)
+        self._newest = NewestBlocks(20_000)
         self._used: SampleBlock | None = None
         self.used = False
         self.could_use = self._gate.could_use
@@ -323,6 +322,7 @@ class MachineMonitor:
             **prefixed("test", self._test.state.checkpoint()),
             **prefixed("evaluator", self._evaluator.checkpoint()),
             **prefixed("levels", self._levels.first.checkpoint()),
+            **prefixed("standstill", self._standstill.checkpoint()),
             "calm": np.array([self._calm.value]),
             "end_ns": np.array([] if self._end_ns is None else [self._end_ns], dtype=np.int64),
         }
@@ -348,6 +348,7 @@ class MachineMonitor:
         self._window.restore(unprefixed("window", arrays))
         self._evaluator.restore(unprefixed("evaluator", arrays))
         self._levels.first.restore(unprefixed("levels", arrays))
+        self._standstill.restore(unprefixed("standstill", arrays))
         self._test.state = test
         self._end_ns, self._calm = end_ns, HealthState(*calm)
         self._arrivals.resume(self._gate.courses)
@@ -427,20 +428,21 @@ class MachineMonitor:
             return Report(**self._window_now(end_ns, end_ns, self._state(HealthState.WARMING)))
         speed_rad_s = statistics.speed_rad_s
         self._alarms.suppress(float(speed_rad_s * _RPM) if np.isfinite(speed_rad_s) else None, end_ns)
-        findings = sensor_findings(statistics, self._sensors, self.machine.sensors)
-        self._data_path.sensors(findings, statistics)
+        stood = self._standstill.found(statistics)
+        findings = sensor_findings(statistics, self._sensors, self.machine.sensors, standing=bool(stood))
+        self._data_path.sensors(findings, statistics, standing=bool(stood))
         start_ns, faulty = statistics.start_ns, implicated(findings)
 
         def unread(state: HealthState, reason: str) -> Report:
             """Of the levels and the sensors alone."""
-            self._levels.tell(self._alarms, end_ns, faulty=faulty)
+            self._levels.tell(self._alarms, end_ns, faulty=faulty, standing=bool(stood))
             return Report(**self._window_now(start_ns, end_ns, self._state(state)), sensors=findings, reason=reason)
 
         # A fault of a channel elsewhere says nothing of the equations, but it is all there is where they are none.
         if findings and (not self._plan.states or faulty - set(self._plan.others)):
             return unread(HealthState.DATA_HEALTH, "; ".join(each.text for each in findings))
-        if skipped:
-            return unread(HealthState.NOT_EVALUABLE, _SKIPPED)
+        if stood or skipped:
+            return unread(HealthState.NOT_EVALUABLE, stood or _SKIPPED)
         present = {hops: one for hops in self._test.wanted() if (one := self._window.statistics(hops)) is not None}
         try:
             evaluation = self._evaluator.evaluate(statistics, present)
@@ -456,9 +458,7 @@ class MachineMonitor:
         explained = bool(verdict.changed) and not verdict.outside_model
         self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=explained)
         unexplained = evaluation.deciding.unexplained
-        reason = "" if verdict.current else unexplained  # what a window astride a change explains is in the verdict
-        if not unexplained and not evaluation.deciding.evaluable:
-            reason = evaluation.why_nothing
+        reason = evaluation.reason(told=bool(verdict.current))
         if evaluation.shapes:
             changed, evidence = evaluation.unlike_healthy, Evidence(start_ns=start_ns, end_ns=end_ns)
             self._alarms.update_state(SHAPE, changed != "", end_ns, changed, evidence=evidence)
@@ -482,6 +482,7 @@ class MachineMonitor:
         )
 
     def _window_now(self, start_ns: int, end_ns: int, state: HealthState) -> WindowHeading:
+        little = state in {HealthState.UNCHANGED, HealthState.WATCHING}  # is claimed: what would be seen has to be said
         return {
             **self.identity,
             "start_ns": start_ns,
@@ -489,7 +490,7 @@ class MachineMonitor:
             "state": state,
             "filled": self._window.filled,
             "levels": self._levels.latest,
-            "level_growth": growth_seen(self._levels.latest) if state in _ONLY_LEVELS else None,
+            "level_growth": growth_seen(self._levels.latest) if little else None,
         }
 
     def _state(self, otherwise: HealthState) -> HealthState:

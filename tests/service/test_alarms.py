@@ -153,7 +153,8 @@ def test_every_kind_of_fault_of_a_sensor_raises_its_alarm(kind: FaultKind) -> No
     machine = load_machine("lab").model_copy(update={"alarms": AlarmSettings(on_delay_s=0)})
     book = AlarmBook(machine.alarms)
     fault = SensorFault(states=("y1",), kind=kind, text="y1 is at fault", value=1.0)
-    DataPathAlarms(book, machine).sensors((fault,), cast("WindowStatistics", SimpleNamespace(start_ns=0, end_ns=10**9)))
+    statistics = cast("WindowStatistics", SimpleNamespace(start_ns=0, end_ns=10**9))
+    DataPathAlarms(book, machine).sensors((fault,), statistics, standing=False)
     (event,) = book.take()
     assert event.text == f"ALERT: data health, {kind.text}: y1 is at fault"
     assert book.severity is None

@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable
 
+import numpy as np
+
 from models.diagnosis.motion import motion_pairs
 from models.diagnosis.sensors.disagreement import BROKEN, gain_and_delay, suspect_pairs, swapped
 from models.diagnosis.sensors.kinematics import PairReading, banded, read_pair
@@ -9,6 +11,7 @@ from models.diagnosis.sensors.level import clipped, gain_jump, offset, stuck
 from models.diagnosis.sensors.noise import noisy
 from models.diagnosis.sensors.phase import phase_faults
 from models.diagnosis.sensors.reference import Naming, SensorReference, implicated
+from models.diagnosis.sensors.standstill import runs_down
 from models.diagnosis.window import WindowStatistics
 from models.signals.channels import Channel
 from rotorwatch.records.sensor_faults import FaultKind
@@ -16,7 +19,11 @@ from rotorwatch.records.windows import SensorFault
 
 
 def sensor_findings(
-    window: WindowStatistics, reference: SensorReference | None = None, channels: Iterable[Channel] = ()
+    window: WindowStatistics,
+    reference: SensorReference | None = None,
+    channels: Iterable[Channel] = (),
+    *,
+    standing: bool = False,
 ) -> tuple[SensorFault, ...]:
     """Check the sensors of a window.
 
@@ -25,6 +32,8 @@ def sensor_findings(
     reference : SensorReference, optional
         What the sensors were like on the healthy machine; without it only what is impossible for any healthy sensor is
         found.
+    standing : bool
+        Whether the machine stood in the window: channels are not compared then, and no angle has to turn.
 
     Returns
     -------
@@ -33,7 +42,10 @@ def sensor_findings(
         jumps, slips or jitters, channels are not compared: what turns with the shaft stays among what they share.
     """
     window, naming = window.as_mounted, Naming(channels)
-    findings = [*stuck(window, naming), *clipped(window, naming)]
+    stood = np.full(len(window.waveforms), True) if standing else runs_down(window)
+    findings = [*stuck(window, naming, stood), *clipped(window, naming)]
+    if stood.any():
+        return tuple(findings)
     findings += [found for found in offset(window, naming, reference) if not set(found.states) & implicated(findings)]
     bad = implicated(findings)
 

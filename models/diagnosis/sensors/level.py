@@ -9,6 +9,7 @@ or with the other channels moving too, cannot be told from the machine and is le
 import re
 
 import numpy as np
+import numpy.typing as npt
 
 from models.diagnosis.motion import motion_pairs
 from models.diagnosis.sensors.reference import Naming, SensorReference
@@ -29,19 +30,30 @@ MOVED_PART = 3.0
 _TOGETHER = 0.3  # where another displacement moves by at least this part of a displacement's step, the shaft has moved
 
 
-def stuck(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
-    """Channels that hold a value, show nothing but their quantisation, or an angle that does not turn."""
+def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]) -> list[SensorFault]:
+    """Channels that hold a value, show nothing but their quantisation, or an angle that does not turn.
+
+    Parameters
+    ----------
+    stood : ndarray of bool, shape (n_hops,)
+        Where the machine stood or was about to: no angle turns then.
+    """
     hops, findings = window.hop_waveform, []
     rate_hz = hops.n_samples * len(window.waveforms) / window.duration_s
     limit = max(3, min(round(STILL_S * rate_hz), hops.n_samples))
     for column, state in enumerate(window.sensors):
         runs, rms, step = hops.longest_run[:, column], hops.rms[:, column], hops.step[:, column]
         name, coarse = naming.name(state), rms < step
+        if state == "theta":
+            runs = np.where(stood, 0, runs)
         whole = int(np.sum(runs[runs >= hops.n_samples]))
         longest_s = max(whole, int(runs.max())) / rate_hz
         if state == "theta":
             if runs.max() >= limit:
-                text = f"{name}: the shaft angle stood still for {longest_s:.3g} s; it must turn or be left out"
+                text = (
+                    f"{name}: the shaft angle stood still for {longest_s:.3g} s: the phase reference is lost, or the "
+                    "machine has not run since the monitor began"
+                )
                 findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=longest_s))
         elif np.any(coarse):
             quiet_s = float(coarse.sum()) * hops.n_samples / rate_hz

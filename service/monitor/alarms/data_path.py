@@ -95,8 +95,14 @@ class DataPathAlarms:
             note = self._unseen(windows=1)
             self._book.update_state(OVERLOADED, True, end_ns, note, evidence=evidence, at_once=True)
 
-    def sensors(self, findings: tuple[SensorFault, ...], statistics: WindowStatistics) -> None:
-        """One alarm for each kind of fault, with a sentence for each channel it is found in."""
+    def sensors(self, findings: tuple[SensorFault, ...], statistics: WindowStatistics, *, standing: bool) -> None:
+        """One alarm for each kind of fault, with a sentence for each channel it is found in.
+
+        Parameters
+        ----------
+        standing : bool
+            Whether the machine stood: nothing is seen then of most faults, and those that were there stay.
+        """
         said: dict[str, list[str]] = {}
         for found in findings:
             # Whatever is wrong with the shaft's angle costs the phase reference.
@@ -105,7 +111,8 @@ class DataPathAlarms:
         evidence = Evidence(start_ns=statistics.start_ns, end_ns=statistics.end_ns)
         for name in (PHASE_REFERENCE, *map(data_alarm, FaultKind)):
             note = "; ".join(said.get(name, ()))
-            self._book.update_state(name, name in said, statistics.end_ns, note, evidence=evidence)
+            small = name not in said and not standing
+            self._book.update_state(name, name in said, statistics.end_ns, note, evidence=evidence, small=small)
 
     def fault(self, what: str, time_ns: int) -> None:
         """The monitor itself is at fault; that is over once a hop has been evaluated for the off-delay."""

@@ -1,0 +1,107 @@
+"""A machine that stops and starts raises nothing on its sensors; a phase reference that is lost while it runs does."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from models.alarm_names import PHASE_REFERENCE
+from models.commissioning.commissioned import Installed
+from models.diagnosis.networks.bundle import load_bundle
+from models.machine import MachineFile
+from models.signals.block import SampleBlock
+from models.signals.channels import Quantity
+from rotorwatch.records.alarms import EventKind
+from rotorwatch.records.health import HealthState, Report
+from service.monitor.monitor import MachineMonitor
+from tests.service.live import LAB, scenario_blocks
+
+STOPS_S, STANDS_S, STARTS_S, RUNS_S, END_S = 80.0, 90.0, 170.0, 180.0, 260.0
+NOISE = 0.01
+NEW = MachineFile.model_validate(
+    LAB.model_dump(exclude={"rotor", "condition"}, exclude_none=True)
+    | {"levels": {"reference_windows": 2}, "window": LAB.window.model_dump() | {"length_s": 20.0}}
+)
+WITHOUT_ANGLE = NEW.model_copy(update={"sensors": NEW.sensors[:-1]})
+
+
+def stopping(machine: MachineFile, what: str) -> Iterator[SampleBlock]:
+    """A machine that runs, slows down, stands and runs again; or whose ``angle``, or ``signals``, stand for that time.
+
+    The running machine's own samples, at times that pass as fast as it turns; forces go with the square of speed.
+    """
+    stream = scenario_blocks(END_S)
+    samples = np.concatenate([block.samples for block in stream]).astype(float)
+    t = np.arange(len(samples)) / LAB.rate_hz
+    speed = np.interp(t, [STOPS_S, STANDS_S, STARTS_S, RUNS_S], [1.0, 0.0, 0.0, 1.0])
+    turned = np.cumsum(speed) / LAB.rate_hz
+    rng = np.random.default_rng(93001)
+    for column, channel in enumerate(LAB.sensors):
+        own = samples[:, column].copy()
+        if channel.quantity is Quantity.SHAFT_ANGLE:
+            samples[:, column] = np.interp(t if what == "signals" else turned, t, np.unwrap(own)) % (2 * np.pi)
+            continue
+        if what == "machine":
+            size = speed ** (3 if channel.quantity is Quantity.VELOCITY else 2)
+            samples[:, column] = size * np.interp(turned, t, own) + NOISE * own.std() * rng.standard_normal(len(t))
+        elif what == "signals":
+            samples[(t > STOPS_S) & (t < RUNS_S), column] = 0.0
+    first = 0
+    for block in stream:
+        last = first + len(block.samples)
+        yield replace(block, samples=samples[first:last, : len(machine.sensors)].astype(np.float32))
+        first = last
+
+
+def watched(monitor: MachineMonitor, stream: list[SampleBlock]) -> tuple[list[Report], list[tuple[EventKind, str]]]:
+    """Reports, and what happened to alarms."""
+    done = [monitor.step(block) for block in stream]
+    return (
+        [report for one in done for report in one.windows],
+        [(event.kind, event.alarm.name) for one in done for event in one.events],
+    )
+
+
+def monitor_of(machine: MachineFile) -> MachineMonitor:
+    return MachineMonitor(Installed(machine, load_bundle("lab", LAB) if machine is LAB else None))
+
+
+def test_a_machine_that_stops_and_starts_raises_nothing_and_is_healthy_again_after_a_restart_too() -> None:
+    stream = list(stopping(LAB, "machine"))
+    monitor = monitor_of(LAB)
+    reports, events = watched(monitor, stream)
+    assert events == []
+    states = {round((one.end_ns - stream[0].start_ns) / 1e9): one.state for one in reports}
+    assert states[78] is states[258] is HealthState.HEALTHY
+    standing = [one for one in reports if "the machine stands" in one.reason]
+    assert {one.state for one in standing} == {HealthState.NOT_EVALUABLE}
+    assert standing[-1].end_ns - standing[0].end_ns >= (STARTS_S - STANDS_S) * 1e9
+    assert not any(one.sensors for one in standing)
+    half = len(stream) // 2  # while it stands
+    before, after = monitor_of(LAB), monitor_of(LAB)
+    seen, _ = watched(before, stream[:half])
+    state = before.state(whole=True)
+    after.restore(state.state, tuple(data for _, data in state.new_parts))
+    assert seen + watched(after, stream[half:])[0] == reports
+
+
+@pytest.mark.parametrize(("what", "alarm"), [("angle", PHASE_REFERENCE), ("signals", "data-stuck")])
+def test_what_is_lost_while_the_machine_runs_is_told(what: str, alarm: str) -> None:
+    _, events = watched(monitor_of(LAB), list(stopping(LAB, what)))
+    assert events == [(EventKind.RAISED, alarm)]
+
+
+def test_without_a_shaft_angle_no_sensor_is_blamed_but_levels_have_fallen() -> None:
+    reports, events = watched(monitor_of(WITHOUT_ANGLE), list(stopping(WITHOUT_ANGLE, "machine")))
+    assert any("all its sensors have lost their supply" in one.reason for one in reports)
+    assert {name for _, name in events} == {f"level:{one.name}" for one in WITHOUT_ANGLE.sensors}
+
+
+def test_levels_of_a_machine_that_stands_are_no_reference_for_it_when_it_runs() -> None:
+    monitor = monitor_of(NEW)
+    stream = list(stopping(NEW, "machine"))[round(10 * STANDS_S) :]
+    for seconds, learned in ((STARTS_S - STANDS_S, False), (END_S - STARTS_S, True)):
+        watched(monitor, stream[: round(10 * seconds)])
+        del stream[: round(10 * seconds)]
+        assert (monitor._levels.reference is not None) == learned
