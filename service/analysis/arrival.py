@@ -9,7 +9,7 @@ import numpy as np
 from models.commissioning.commissioned import Installed
 from models.diagnosis.moments import plan_for
 from models.errors import WireError
-from models.ingest import Gate
+from models.ingest import Admission, Gate
 from models.levels.measures import hop_levels, window_levels
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
@@ -19,6 +19,9 @@ from models.signals.wire import decode_block
 from service.analysis.revolutions import Excerpt
 from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.levels import LevelWatch
+
+_MOST_BREAKS = 3
+"""Told one by one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +51,7 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
         others = sorted({one.key for one in messages})
         heard = f"; heard were {', '.join(others)}" if others else ""
         return Arrival((f"{place}: no sample blocks",), (f"nothing arrived under {keys.stream}{heard}", *troubles))
-    gate, refused, accepted = Gate(machine), Counter[str](), list[SampleBlock]()
+    gate, refused, accepted, breaks = Gate(machine), Counter[str](), list[SampleBlock](), list[Admission]()
     rates: set[float] = set()
     for message in stream:
         try:
@@ -62,10 +65,17 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
             refused[verdict.text] += 1
             continue
         if not verdict.continuous:
-            troubles.append(verdict.text)
+            breaks.append(verdict)
         if not verdict.continuous or verdict.new_snapshot:
             accepted.clear()
         accepted.append(block)
+    if len(breaks) > _MOST_BREAKS:
+        missing_s = sum(one.gap_s for one in breaks)
+        troubles.append(
+            f"{len(breaks)} times a block does not follow the one before; {missing_s:.3g} s of data are missing, such "
+            "as here:"
+        )
+    troubles += [one.text for one in breaks[:_MOST_BREAKS]]
     for text, count in refused.most_common(5):
         troubles.append(f"{count} blocks would be refused: {text}")
     lines = [f"{place}: {len(stream)} sample blocks, {len(stream) - sum(refused.values())} of them usable"]

@@ -25,7 +25,10 @@ class MdfSource(Source):
         places: dict[str, tuple[int, int]] = {}
         with readable(path, self.kind, self.package):
             from asammdf import MDF  # noqa: PLC0415  # an extra
+            from asammdf.blocks.mdf_v4 import MDF4  # noqa: PLC0415
 
+            # What it has half read of a damaged file it cannot close, and says so with a traceback beside ours.
+            MDF4.__del__ = lambda _: None  # type: ignore[method-assign]
             logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # its errors come as exceptions as well
             if not path.is_file():
                 raise SourceError(f"{path}: no such file")

@@ -177,7 +177,7 @@ def readable(path: Path, kind: str, package: str = "") -> Iterator[None]:
     except OSError as error:
         raise SourceError(f"{path}: cannot be read as a {kind} file ({error.strerror or error})") from error
     except Exception as error:
-        raise SourceError(f"{path}: not a {kind} file, or damaged: {str(error) or type(error).__name__}") from error
+        raise SourceError(f"{path}: damaged, or no {kind} file: {str(error) or type(error).__name__}") from error
 
 
 def as_numbers(path: Path, reference: Reference, column: Array, first_row: int) -> npt.NDArray[np.float64]:

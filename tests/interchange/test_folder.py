@@ -107,7 +107,7 @@ def test_files_that_follow_each_other_are_one_stretch(tmp_path: Path) -> None:
             EVERY_S,
             "column k: 0 pulses, expected at least two",
         ),
-        (f'format = "tdms"\n{NAMED}', EVERY_S, "not a TDMS file, or damaged"),
+        (f'format = "tdms"\n{NAMED}', EVERY_S, "damaged, or no TDMS file"),
     ],
 )
 def test_what_is_wrong_with_a_folder_is_told(tmp_path: Path, mapping: str, every_s: float, says: str) -> None:

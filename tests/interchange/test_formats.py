@@ -1,6 +1,7 @@
 """Files written by each format's own library come in with their samples and times."""
 
 import csv
+import gc
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -284,6 +285,17 @@ def test_a_file_that_is_none_of_its_kind_is_named(tmp_path: Path, suffix: str) -
     with pytest.raises(SourceError, match=r"broken\."):
         imported(tmp_path, path, RATE + CHANNELS)
     assert not list(tmp_path.glob("*.mcap*"))
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # asammdf's own
+def test_a_measurement_that_is_cut_off_is_named_without_the_complaint_of_a_library(tmp_path: Path) -> None:
+    t, x, v, a = signals(1000)
+    path = tmp_path / "run.mf4"
+    write_mf4(path, {"t": t, "x": x, "v": v, "a": a})
+    path.write_bytes(path.read_bytes()[:-2000])
+    with pytest.raises(SourceError, match=r"run\.mf4: damaged, or no MF4 file: .*"):
+        imported(tmp_path, path, CHANNELS)
+    gc.collect()  # what is not closed complains then
 
 
 def test_an_unknown_format_says_which_ones_there_are(tmp_path: Path) -> None:

@@ -13,7 +13,10 @@ import pytest
 from models.machine import load_machine_file
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
+from models.signals.recording import RecordedMessage
+from models.signals.wire import encode_block
 from service.access.scopes import Scope
+from service.analysis.arrival import examined
 from service.runtime.runtime import running
 from service.settings.service import load_settings
 from simulator.publisher import PublishSettings, publish
@@ -125,6 +128,18 @@ def test_the_doctor_says_what_is_wrong(tmp_path: Path) -> None:
     silent = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", endpoint(), "--seconds", "1")
     assert silent.returncode == 1
     assert "nothing arrived under rotorwatch/plant/fan/stream" in silent.stdout
+
+
+def test_the_doctor_sums_up_gaps_that_are_many(tmp_path: Path) -> None:
+    run(*FAN, "--folder", str(tmp_path))
+    machine = load_machine_file(tmp_path / "fan.toml")
+    messages = [
+        RecordedMessage(machine.keys.stream, *encode_block(block, ""), block.start_ns, block.start_ns)
+        for block, _ in blocks(12.0, every_s=0.6)
+    ]
+    troubles = examined(machine, messages).troubles
+    assert "19 times a block does not follow the one before; 1.9 s of data are missing, such as here:" in troubles
+    assert sum("0.1 s" in one for one in troubles) == 3
 
 
 def test_a_strangers_two_sensors_have_a_trend_in_three_commands(tmp_path: Path) -> None:
