@@ -332,6 +332,7 @@ class ChannelState:
     beyond: bool
     danger: bool
     absolute: bool  # beyond a limit of the machine file or of a standard, not only of a reference
+    fallen: bool  # a level is below its limit
     small: bool  # every level is back by a tenth of its limit: the deadband of ISA-18.2
     text: str
 
@@ -342,9 +343,13 @@ def channel_state(levels: ChannelLevels) -> ChannelState:
     small = all(one.state == "normal" and not _near(getattr(levels, one.measure), one) for one in limits)
     texts = sorted((one.state != "danger", not one.absolute, one.text) for one in limits if one.text)
     absolute = any(one.state != "normal" and one.absolute for one in limits)
-    return ChannelState(
-        levels.beyond != "", levels.beyond == "danger", absolute, small, "; ".join(text for *_, text in texts)
+    fallen = any(
+        one.fall is not None and value is not None and value < one.fall
+        for one in limits
+        for value in (getattr(levels, one.measure),)
     )
+    text = "; ".join(text for *_, text in texts)
+    return ChannelState(levels.beyond != "", levels.beyond == "danger", absolute, fallen, small, text)
 
 
 def _near(value: float | None, limits: LevelLimits) -> bool:

@@ -13,7 +13,7 @@ from models.errors import CheckpointError
 from models.levels.bands import BandLevels, BandReference, learn_bands
 from models.levels.gains import GainReference
 from models.levels.kurtosis import KurtosisReference, learn_kurtosis
-from models.levels.measures import COMPARED, WindowLevels
+from models.levels.measures import COMPARED, QUIET, WindowLevels
 
 _STORED = ConfigDict(extra="forbid", frozen=True, strict=True)
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -165,29 +165,51 @@ def _reference(name: str, column: int, levels: Sequence[WindowLevels]) -> Refere
 class FirstWindows:
     """Takes the first windows that are seen as a reference, where nothing was commissioned.
 
+    Where the machine was not seen to turn in them, and every channel vibrates four times as much once it is, it stood,
+    and the first windows in which it turns are a reference besides.
+
     Parameters
     ----------
     count : int
         Windows that do not overlap.
+    turns : bool
+        Whether it can be seen to turn: with a shaft angle, or a speed about which to look.
     """
 
-    def __init__(self, channels: Sequence[str], count: int) -> None:
+    def __init__(self, channels: Sequence[str], count: int, *, turns: bool = False) -> None:
         self._channels = tuple(channels)
         self._count = count
+        self._turns = turns
         self._seen: list[WindowLevels] = []
         self._end_ns = 0
         self.reference: LevelReference | None = None
 
+    @property
+    def learning(self) -> bool:
+        """Whether windows are still taken."""
+        return self.reference is None or (
+            self._turns and all(state.speed_rad_s is None for state in self.reference.states)
+        )
+
     def take(self, start_ns: int, end_ns: int, levels: WindowLevels) -> None:
         """Take note of a full window."""
-        if self.reference is not None or start_ns < self._end_ns:
+        before = self.reference
+        if not self.learning or start_ns < self._end_ns or (before is not None and not self._started(before, levels)):
             return
         self._end_ns = end_ns
         # Only diagnosis needs a healthy kurtosis, and a machine that is diagnosed is commissioned.
         self._seen.append(replace(levels, moments=None))
         if len(self._seen) == self._count:
-            self.reference = learn_levels("the first windows", self._channels, self._seen)
-            self._seen = []
+            learned, self._seen = learn_levels("the first windows", self._channels, self._seen), []
+            states = (*(() if before is None else before.states), *learned.states)
+            self.reference = learned.model_copy(update={"states": states})
+
+    def _started(self, reference: LevelReference, levels: WindowLevels) -> bool:
+        """Whether the machine turns, and stood in the reference."""
+        stood, _ = reference.at(None)
+        quiet = [stood.levels[name].get("overall") for name in self._channels]
+        means = np.array([np.nan if one is None else one.mean for one in quiet])
+        return levels.speed_rad_s is not None and bool(np.all(QUIET * levels.values["overall"] > means))
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything as named arrays."""

@@ -47,13 +47,14 @@ class LevelWatch:
         of = machine.levels.reference or ("first windows" if installed.watching else "commissioned")
         self._takes_first = of == "first windows"
         self._commissioned = None if installed.commissioned is None else installed.commissioned.levels
-        self.first = FirstWindows([channel.name for channel in channels], machine.levels.reference_windows)
+        self._by_angle = plan.angle_column is not None
+        turns = self._by_angle or plan.speed_rad_s is not None
+        self.first = FirstWindows([one.name for one in channels], machine.levels.reference_windows, turns=turns)
         self.latest: tuple[ChannelLevels, ...] = ()
         self._found: WindowLevels | None = None
         self._states = [state_name(channel) for channel in channels]
         self._machine = machine
         self._hop_ns = round(machine.window.hop_s * 1e9)
-        self._by_angle = plan.angle_column is not None
 
     @property
     def reference(self) -> LevelReference | None:
@@ -66,7 +67,7 @@ class LevelWatch:
 
     def take(self, window: SlidingWindow) -> None:
         """Take the levels of the window as it is after a hop."""
-        found = window.levels(errors=self._takes_first and self.reference is None)
+        found = window.levels(errors=self._takes_first and self.first.learning)
         if found is None:
             return
         self.latest = self.judged(found)
@@ -108,8 +109,8 @@ class LevelWatch:
             States whose sensors are at fault: what they show may be no vibration, so only what is dangerously loud
             counts.
         standing : bool
-            Whether the machine stood in the window. If it has a shaft angle that says so the same counts then, unless
-            it was commissioned standing too.
+            Whether the machine stood in the window. The same counts then, unless the reference holds a machine that
+            stands; without a shaft angle that says so what has fallen counts too, for its sensors may have no supply.
         explained : bool
             Whether parameters have been found to have changed, without reserve: their alarms say what has become
             louder, and why, so an alert is not raised beside them. What is raised already stays, and a danger is
@@ -117,10 +118,11 @@ class LevelWatch:
         """
         evidence = Evidence(start_ns=end_ns - self._hop_ns, end_ns=end_ns)
         known = () if self.reference is None else self.reference.states
-        unlike = standing and self._by_angle and all(one.speed_rad_s is not None for one in known)
+        unlike = standing and all(one.speed_rad_s is not None for one in known)
         for state, levels in zip(self._states, self.latest, strict=False):
             now, name = channel_state(levels), f"{LEVEL}{levels.channel}"
-            held = unlike or state in faulty or (explained and not alarms.present(name))
+            held = state in faulty or (explained and not alarms.present(name))
+            held |= unlike and (self._by_angle or not now.fallen)
             beyond = now.beyond and (now.absolute or now.danger or not held)
             # In the deadband, or while a sensor is at fault, an alarm stays as it is.
             alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=now.small)

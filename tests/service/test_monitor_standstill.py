@@ -98,10 +98,21 @@ def test_without_a_shaft_angle_no_sensor_is_blamed_but_levels_have_fallen() -> N
     assert {name for _, name in events} == {f"level:{one.name}" for one in WITHOUT_ANGLE.sensors}
 
 
-def test_levels_of_a_machine_that_stands_are_no_reference_for_it_when_it_runs() -> None:
-    monitor = monitor_of(NEW)
-    stream = list(stopping(NEW, "machine"))[round(10 * STANDS_S) :]
-    for seconds, learned in ((STARTS_S - STANDS_S, False), (END_S - STARTS_S, True)):
-        watched(monitor, stream[: round(10 * seconds)])
-        del stream[: round(10 * seconds)]
-        assert (monitor._levels.reference is not None) == learned
+@pytest.mark.parametrize("machine", [NEW, WITHOUT_ANGLE])
+def test_levels_of_a_machine_that_stands_are_no_reference_for_it_when_it_runs(machine: MachineFile) -> None:
+    monitor = monitor_of(machine)
+    stream = list(stopping(machine, "machine"))[round(10 * STANDS_S) :]
+    starts, found = round(10 * (STARTS_S - STANDS_S)), []
+    for part in (stream[:starts], stream[starts:]):
+        _, events = watched(monitor, part)
+        reference = monitor._levels.reference
+        states = () if reference is None else reference.states
+        found.append(([one.speed_rad_s is None for one in states], [name for _, name in events if "level" in name]))
+    if machine is NEW:
+        assert found[0] == ([], [])
+        assert not any(found[1][0])
+        assert found[1][1] == []
+    else:  # it is told once that the machine has become louder
+        assert found[0] == ([True], [])
+        assert found[1][0] == [True, False]
+        assert set(found[1][1]) == {f"level:{one.name}" for one in machine.sensors}

@@ -12,11 +12,9 @@ import numpy.typing as npt
 from models.checkpoint import checked
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.window import WindowStatistics
-from models.levels.measures import STANDS_RAD_S
+from models.levels.measures import QUIET, STANDS_RAD_S
 from models.signals.block import FloatArray
 
-QUIET = 0.25
-"""Part of the running vibration: ISO 10816-1 has more than that looked into where a machine stands (background)."""
 _SLOW = 0.5
 """Part of the window's highest speed."""
 _STEADY = 0.15
