@@ -60,9 +60,6 @@ _HANN_BINS = 1.5
 """Bins of a tapered spectrum that say as much as one of an untapered one."""
 STANDS_RAD_S = 2 * np.pi * 0.5
 """Slower than this, rad/s, a shaft is not taken to turn."""
-QUIET = 0.25
-"""Part of the running vibration below which a machine may stand: ISO 10816-1 has more than that looked into where one
-does (background)."""
 
 _ComplexArray = npt.NDArray[np.complex128]
 _SingleArray = npt.NDArray[np.float32]

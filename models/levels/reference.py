@@ -13,13 +13,16 @@ from models.errors import CheckpointError
 from models.levels.bands import BandLevels, BandReference, learn_bands
 from models.levels.gains import GainReference
 from models.levels.kurtosis import KurtosisReference, learn_kurtosis
-from models.levels.measures import COMPARED, QUIET, WindowLevels
+from models.levels.measures import COMPARED, WindowLevels
 
 _STORED = ConfigDict(extra="forbid", frozen=True, strict=True)
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Level = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _SAME_SPEED = 0.03
 """Windows whose speeds differ by less, relative, are of one operating state."""
+QUIET = 0.25
+"""Part of the running vibration below which a machine may stand: ISO 10816-1 has more than that looked into where one
+does (background)."""
 
 
 class ReferenceLevel(BaseModel):
