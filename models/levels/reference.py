@@ -177,12 +177,20 @@ class FirstWindows:
         Windows that do not overlap.
     turns : bool
         Whether it can be seen to turn: with a shaft angle, or a speed about which to look.
+    since : str
+        Since when they count, as operators will read it; empty if from the beginning.
+    of : str
+        Tells apart whatever levels depend on: a reference of another machine, or of other settings, is not restored.
     """
 
-    def __init__(self, channels: Sequence[str], count: int, *, turns: bool = False) -> None:
+    def __init__(
+        self, channels: Sequence[str], count: int, *, turns: bool = False, since: str = "", of: str = ""
+    ) -> None:
         self._channels = tuple(channels)
         self._count = count
         self._turns = turns
+        self._source = f"the first windows since {since}" if since else "the first windows"
+        self._of = of
         self._seen: list[WindowLevels] = []
         self._end_ns = 0
         self.reference: LevelReference | None = None
@@ -203,7 +211,7 @@ class FirstWindows:
         # Only diagnosis needs a healthy kurtosis, and a machine that is diagnosed is commissioned.
         self._seen.append(replace(levels, moments=None))
         if len(self._seen) == self._count:
-            learned, self._seen = learn_levels("the first windows", self._channels, self._seen), []
+            learned, self._seen = learn_levels(self._source, self._channels, self._seen), []
             states = (*(() if before is None else before.states), *learned.states)
             self.reference = learned.model_copy(update={"states": states})
 
@@ -221,6 +229,7 @@ class FirstWindows:
         shape = (len(seen), len(COMPARED), len(self._channels))
         vectors = [np.zeros((0, 0)) if one.vectors is None else one.vectors for one in seen]
         return {
+            "of": np.array([self._of]),
             "reference": np.array(["" if self.reference is None else self.reference.model_dump_json()]),
             "end_ns": np.array(self._end_ns, dtype=np.int64),
             "speeds": np.array(speeds, dtype=np.float64),
@@ -244,7 +253,9 @@ class FirstWindows:
         CheckpointError
             If the arrays are damaged, or of other channels; nothing is changed then.
         """
-        (text,) = texts(arrays, "reference")
+        (of,), (text,) = texts(arrays, "of"), texts(arrays, "reference")
+        if of != self._of:
+            raise CheckpointError("the levels are of other sensors or settings")
         try:
             reference = LevelReference.model_validate_json(text) if text else None
         except ValueError as error:

@@ -54,6 +54,13 @@ class LevelSettings(BaseModel):
         "were seen; if left out, the first windows where nothing else is known of the machine",
     )
     reference_windows: int = Field(default=5, ge=2, le=1000, description="how many first windows make a reference")
+    reference_since: str = Field(
+        default="",
+        max_length=200,
+        exclude_if=lambda text: not text,  # machine files from before keep their hash
+        description="since when first windows count, and why, such as '2026-11-25, new bearing': with another text "
+        "they are taken anew",
+    )
 
     @model_validator(mode="after")
     def _sensible(self) -> Self:

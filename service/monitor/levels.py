@@ -1,7 +1,9 @@
 """The vibration levels of one machine: taken of every window, and judged against limits and reference."""
 
+import hashlib
 import math
 from collections.abc import Collection
+from typing import Any
 
 from models.alarm_names import LEVEL
 from models.commissioning.commissioned import Installed
@@ -17,6 +19,12 @@ from rotorwatch.records.alarms import Evidence
 from rotorwatch.records.levels import ChannelLevels
 from service.monitor.alarms.book import AlarmBook
 
+_DEPENDS_ON: Any = {
+    **dict.fromkeys(("sensors", "rate_hz", "operation", "schedule"), True),
+    "window": {"hop_s"},
+    "levels": {"band_hz", "reference", "reference_windows", "reference_since"},
+}
+"""Of a machine file: what levels of first windows depend on. They outlast any other change, and another program."""
 _STILL_RAD = 0.1
 """Less than this in a hop is no turning: an encoder may waver. The slowest kilns turn further."""
 
@@ -49,7 +57,14 @@ class LevelWatch:
         self._commissioned = None if installed.commissioned is None else installed.commissioned.levels
         self._by_angle = plan.angle_column is not None
         turns = self._by_angle or plan.speed_rad_s is not None
-        self.first = FirstWindows([one.name for one in channels], machine.levels.reference_windows, turns=turns)
+        given = machine.levels
+        self.first = FirstWindows(
+            [one.name for one in channels],
+            given.reference_windows,
+            turns=turns,
+            since=given.reference_since,
+            of=hashlib.sha256(machine.model_dump_json(include=_DEPENDS_ON).encode()).hexdigest()[:16],
+        )
         self.latest: tuple[ChannelLevels, ...] = ()
         self._found: WindowLevels | None = None
         self._states = [state_name(channel) for channel in channels]

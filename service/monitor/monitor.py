@@ -64,6 +64,8 @@ class MachineMonitor:
     ----------
     used : bool
         Whether the latest message was itself used at once, and not one that waited for it.
+    end_ns : int or None
+        End of the newest data; None before the first.
     """
 
     def __init__(
@@ -91,7 +93,7 @@ class MachineMonitor:
         self._quality = Quality()
         self._latest: Report | None = None
         self._calm = HealthState.WARMING
-        self._end_ns: int | None = None
+        self.end_ns: int | None = None
         self._reached_ns: int | None = None
         self._kept_is_valid = True
         self._not_recalled = self._dropped = 0
@@ -193,7 +195,7 @@ class MachineMonitor:
         if disputed and not self._arrivals.withdraw(block.run, block.sequence):
             self._window.gap()  # the other version may be in the unfinished hop
         if conflict := self._senders.conflict:
-            self._data_path.conflict(conflict, block.end_ns if self._end_ns is None else self._end_ns, at_once=True)
+            self._data_path.conflict(conflict, block.end_ns if self.end_ns is None else self.end_ns, at_once=True)
         return disputed
 
     def _step_due(self) -> tuple[MonitorReport, ...]:
@@ -209,8 +211,6 @@ class MachineMonitor:
 
         Parameters
         ----------
-        block : SampleBlock
-            The next block of the stream.
         schema_hash : str
             Hash of the channel descriptor the sender named, empty if none.
 
@@ -247,12 +247,12 @@ class MachineMonitor:
             self._kept_is_valid = False  # hops may end at the same times as before
             self._test.clear()
             self._alarms.clock_stepped(block.start_ns, round(verdict.clock_step_s * 1e9))
-        elif self._end_ns is None and self._reached_ns is not None:
+        elif self.end_ns is None and self._reached_ns is not None:
             # Until now the time of day was all there was; shelving goes on by the time of the data.
             self._alarms.clock_stepped(block.start_ns, block.start_ns - self._reached_ns)
         self._alarms.passed(block.start_ns)
         self._fault = self._data_path.accepted(verdict, block.start_ns, dropped) or self._fault
-        self._end_ns = block.end_ns
+        self.end_ns = block.end_ns
         return self._window.feed(self._plan.to_si(block.samples), block.start_ns)
 
     def fault(self, what: str, time_ns: int) -> tuple[AlarmEvent, ...]:
@@ -276,13 +276,8 @@ class MachineMonitor:
         """
         self._reached_ns = time_ns
         self._alarms.passed(time_ns)
-        self._data_path.passed(time_ns, self._end_ns)
+        self._data_path.passed(time_ns, self.end_ns)
         return self._alarms.take()
-
-    @property
-    def end_ns(self) -> int | None:
-        """End of the newest data; None before the first."""
-        return self._end_ns
 
     @property
     def blocks_to_hop(self) -> int:
@@ -324,14 +319,16 @@ class MachineMonitor:
             **prefixed("levels", self._levels.first.checkpoint()),
             **prefixed("standstill", self._standstill.checkpoint()),
             "calm": np.array([self._calm.value]),
-            "end_ns": np.array([] if self._end_ns is None else [self._end_ns], dtype=np.int64),
+            "end_ns": np.array([] if self.end_ns is None else [self.end_ns], dtype=np.int64),
         }
         state, new, names = divided(arrays, self._test.state.hops(), kept if self._kept_is_valid else ())
         self._kept_is_valid = True
-        return MonitorState(self._alarms.checkpoint(), state, new, names, self._end_ns)
+        return MonitorState(self._alarms.checkpoint(), state, new, names, self.end_ns)
 
-    def restore(self, state: bytes, parts: Collection[bytes] = ()) -> None:
+    def restore(self, state: bytes, parts: Collection[bytes] = (), *, levels_alone: bool = False) -> None:
         """Go on where another monitor of the same machine, files and version stood; alarms are restored by themselves.
+
+        With `levels_alone` these may differ: of all that was remembered only the first windows are taken.
 
         Raises
         ------
@@ -339,6 +336,9 @@ class MachineMonitor:
             If the bytes are damaged or of another form; this monitor is of no use then.
         """
         arrays, hops = joined(state, parts)
+        self._levels.first.restore(unprefixed("levels", arrays))
+        if levels_alone:
+            return
         test = SequentialState.restored(unprefixed("test", arrays), hops)
         calm = texts(arrays, "calm")
         if calm not in {(state.value,) for state in HealthState}:
@@ -347,10 +347,9 @@ class MachineMonitor:
         self._gate.restore(unprefixed("gate", arrays))
         self._window.restore(unprefixed("window", arrays))
         self._evaluator.restore(unprefixed("evaluator", arrays))
-        self._levels.first.restore(unprefixed("levels", arrays))
         self._standstill.restore(unprefixed("standstill", arrays))
         self._test.state = test
-        self._end_ns, self._calm = end_ns, HealthState(*calm)
+        self.end_ns, self._calm = end_ns, HealthState(*calm)
         self._arrivals.resume(self._gate.courses)
 
     def restore_alarms(self, alarms: str, next_sequence: int | None = None, end_ns: int | None = None) -> None:
@@ -363,7 +362,7 @@ class MachineMonitor:
             are of the same clock.
         """
         self._alarms.restore(alarms, next_sequence)
-        self._end_ns = end_ns if self._end_ns is None else self._end_ns
+        self.end_ns = end_ns if self.end_ns is None else self.end_ns
 
     def health(self) -> MachineHealth:
         """Where the machine stands now."""
@@ -376,16 +375,16 @@ class MachineMonitor:
             self._quality,
             self._alarms.next_sequence - 1,
             self._fault or ("" if self._latest is None else self._latest.reason),
-            self._end_ns,
+            self.end_ns,
         )
 
     def _judged(self, block: SampleBlock, schema_hash: str, dropped: int) -> Admission:
         """What the gate says; of the data that another monitor had before this one it knows nothing."""
         anew = not self._gate.courses
         verdict = self._gate.judge(block, schema_hash)
-        if anew and verdict.accepted and self._end_ns is not None:
+        if anew and verdict.accepted and self.end_ns is not None:
             name, ingest = self._name, self.machine.ingest
-            late_s = (block.start_ns - self._end_ns) / 1e9
+            late_s = (block.start_ns - self.end_ns) / 1e9
             if abs(late_s) > ingest.max_jump_s:
                 text = f"{name}: the stream's clock is {late_s:.6g} s from where it was before the restart"
                 verdict = Admission(text=text, clock_step_s=late_s, new_run=block.sequence == 0)

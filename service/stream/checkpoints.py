@@ -25,7 +25,7 @@ from service.monitor.alarms.book import NO_ALARMS
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import Identity, MonitorState
 
-FORMAT = 2
+FORMAT = 3
 """Goes up when what a monitor remembers changes its form."""
 _LOOK_BACK_NS, _LATE_NS = 300 * 10**9, 3600 * 10**9
 
@@ -180,7 +180,8 @@ def restored(
 ) -> tuple[MachineMonitor, str]:
     """A monitor that goes on from what was remembered, as far as that fits.
 
-    Alarms are restored whatever else differs; windows and tests only if the files and the program are the same.
+    Alarms are restored whatever else differs, and so are first windows while sensors and settings of levels are the
+    same; windows and tests only if the files and the program are.
 
     Parameters
     ----------
@@ -206,6 +207,10 @@ def restored(
         monitor.restore_alarms(NO_ALARMS, next_sequence)
         return monitor, f"all alarms begin anew: {error}"
     if differs:
+        try:  # a machine that has become louder since its first windows must not be taken for a healthy one
+            monitor.restore(head.state, tuple(data for _, data in checkpoint.parts), levels_alone=True)
+        except CheckpointError as error:
+            differs = [*differs, f"where first windows are the reference of levels they are taken anew ({error})"]
         return monitor, f"alarms are as they were at {at}; the window fills anew: {'; '.join(differs)}"
     return monitor, f"went on where it stood at {at}"
 

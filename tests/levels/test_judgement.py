@@ -236,12 +236,13 @@ def test_a_machine_that_stood_in_the_first_windows_is_learned_again_once_it_runs
     times: float, learned: list[bool]
 ) -> None:
     """But not one that has become louder, and turns visibly: it may have turned all the time."""
-    first = FirstWindows(["DE-H"], 2, turns=True)
+    first = FirstWindows(["DE-H"], 2, turns=True, since="May, new bearing")
     for number in range(8):
         size, speed_rad_s = (1e-3, None) if number < 4 else (1e-3 * times, 150.0)
         first.take(number * 60, number * 60 + 60, window(overall=size, speed_rad_s=speed_rad_s))
     assert first.reference is not None
     assert [one.speed_rad_s is None for one in first.reference.states] == learned
+    assert first.reference.source == "the first windows since May, new bearing"
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,10 +21,13 @@ from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, HealthState, Report
 from rotorwatch.records.levels import ChannelLevels, LevelGrowth
 from service.commands import watching
+from service.history.records import Checkpoint
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.levels import LevelWatch
 from service.monitor.monitor import MachineMonitor
+from service.monitor.reports import identity_of
 from service.rotorwatch import app
+from service.stream.checkpoints import checkpoint_step, restored
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import NOTHING, commissioned, elsewhere, healthy, stream
 from tests.service.live import LAB, scenario_blocks
@@ -154,6 +158,29 @@ def test_a_monitor_that_is_restarted_goes_on_to_the_last_bit() -> None:
             second._window.recall(block.samples, block.start_ns, newest=number == 89)
         after = run(second, iter(stream[90:]))
         assert (before[0] + after[0], before[1] + after[1]) == expected, whole
+
+
+@pytest.mark.parametrize(
+    ("changes", "kept"),
+    [
+        ({"description": "a fan"}, True),
+        ({"alarms": AlarmSettings(on_delay_s=20.0)}, True),
+        ({"levels": FAN.levels.model_copy(update={"reference_since": "2026-11-25, new bearing"})}, False),
+        ({"sensors": (FAN.sensors[0].model_copy(update={"unit": "g"}), FAN.sensors[1])}, False),
+    ],
+)
+def test_first_windows_outlast_whatever_they_do_not_depend_on(changes: dict[str, Any], kept: bool) -> None:
+    """Or a machine that has become louder would be healthy after an update of the program."""
+    before = install(FAN, None)
+    monitor = MachineMonitor(before)
+    run(monitor, blocks(8, 65))
+    step = checkpoint_step(identity_of(before), monitor.state(), 1)
+    now = install(FAN.model_copy(update=changes), None)
+    told = Checkpoint(replace(step.head, code_version="0.0.9"), step.new_parts)
+    after, text = restored(lambda: MachineMonitor(now), identity_of(now), told, 0)
+    assert ("they are taken anew (the levels are of other sensors or settings)" in text) == (not kept)
+    _, events = run(after, blocks(8, 60, growth=(0.0, 3.0), first=130))
+    assert [name for kind, name, _ in events if kind is EventKind.RAISED] == (["level:DE-H"] if kept else [])
 
 
 def test_commissioned_levels_are_the_reference_and_say_what_is_unchanged(tmp_path: Path) -> None:
