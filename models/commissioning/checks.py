@@ -56,6 +56,9 @@ def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> 
     if refused:
         last = next(one.last_refusal for one in reversed(recordings) if one.last_refusal)
         lost += f", {sum(refused.values())} blocks refused (the latest: {last})"
+    stopped_s = sum(one.stopped_s for one in recordings)
+    if stopped_s:
+        lost += f"; {stopped_s:.4g} s left out in which the machine stood, ran up or ran down"
     files = "one recording" if len(recordings) == 1 else f"{len(recordings)} recordings"
     found = f"{used_s:.4g} s of usable data in {files}; {lost}"
     wanted_s = _FEW_WINDOWS * machine.window_data_s

@@ -6,15 +6,21 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from models.diagnosis.lines import KnownLine, Line, steady_lines
 from models.diagnosis.moments import HopMoments, Plan, plan_for
 from models.diagnosis.window import SlidingWindow, window_statistics
 from models.errors import RecordingError, WireError
 from models.ingest import Gate
+from models.levels.measures import STANDS_RAD_S
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from models.signals.recording import read_recording, summarize_recording
 from models.signals.wire import decode_block
+
+_RUN_UP = 0.03
+"""Part of the usual speed that is missing while a machine still runs up, or runs down already."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +34,7 @@ class HealthyRecording:
     missing_s: float = 0.0  # data that they cost
     refused: tuple[tuple[str, int], ...] = ()  # blocks that could not be used, by reason
     last_refusal: str = ""  # the latest such reason in a sentence
+    stopped_s: float = 0.0  # data left out in which the machine stood, ran up or ran down
 
     @property
     def hops(self) -> tuple[HopMoments, ...]:
@@ -76,8 +83,40 @@ def healthy_from_blocks(
             hop = window.latest_hop
             if hop is not None:
                 stretches[-1].append(hop)
-    filled = tuple(tuple(stretch) for stretch in stretches if stretch)
-    return HealthyRecording(name, plan, filled, gaps, missing_s, tuple(sorted(refused.items())), last_refusal)
+    running = [part for stretch in stretches for part in _without_stops(plan, stretch)]
+    stopped = sum(map(len, stretches)) - sum(map(len, running))
+    return HealthyRecording(
+        name,
+        plan,
+        tuple(tuple(part) for part in running if part),
+        gaps,
+        missing_s,
+        tuple(sorted(refused.items())),
+        last_refusal,
+        stopped * plan.fresh / plan.rate_hz,
+    )
+
+
+def _without_stops(plan: Plan, stretch: list[HopMoments]) -> list[list[HopMoments]]:
+    """The stretches between its stops, each up to where the machine has its usual speed.
+
+    A machine that stands all the time is recorded so on purpose; of one of which levels alone are watched those at
+    standstill are levels, too.
+    """
+    speeds = np.abs([hop.turned_rad for hop in stretch]) * plan.rate_hz / plan.hop
+    turns = speeds > STANDS_RAD_S
+    if plan.angle_column is None or not plan.states or turns.all() or not turns.any():
+        return [stretch]
+    usual = speeds >= (1 - _RUN_UP) * np.median(speeds[turns])
+    edges = np.flatnonzero(np.diff(turns, prepend=False, append=False)).reshape(-1, 2)  # of the stretches between stops
+    parts = []
+    for first, last in edges.tolist():
+        at_speed = first + np.flatnonzero(usual[first:last])
+        if at_speed.size:
+            # Of the hop after a run-up, and of the one before a run-down, a part may have been below the usual speed.
+            begin = at_speed[0] + (first > 0)
+            parts.append(stretch[begin : at_speed[-1] + (last == len(stretch))])
+    return parts
 
 
 def read_healthy(path: Path, machine: MachineFile, until_s: float | None = None) -> HealthyRecording:

@@ -8,6 +8,7 @@ import pytest
 
 from models.alarm_names import PHASE_REFERENCE
 from models.commissioning.commissioned import Installed
+from models.commissioning.healthy import healthy_from_blocks
 from models.diagnosis.networks.bundle import load_bundle
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
@@ -116,3 +117,18 @@ def test_levels_of_a_machine_that_stands_are_no_reference_for_it_when_it_runs(ma
         assert found[0] == ([True], [])
         assert found[1][0] == [True, False]
         assert set(found[1][1]) == {f"level:{one.name}" for one in machine.sensors}
+
+
+def test_a_stop_is_left_out_of_a_healthy_recording_with_its_run_down_and_run_up() -> None:
+    stream = [(block, "") for block in stopping(LAB, "machine")]
+    recorded = healthy_from_blocks("healthy.mcap", LAB, stream)
+    hop_s = LAB.window.hop_s
+    usual = LAB.operation.speed_rad_s * hop_s
+    assert len(recorded.stretches) == 2
+    assert all(abs(hop.turned_rad) == pytest.approx(usual, rel=0.01) for hop in recorded.hops)
+    assert (
+        STARTS_S - STOPS_S < recorded.stopped_s < RUNS_S - STOPS_S + 4 * hop_s
+    )  # an edge hop on either side, and the grid of hops
+    assert recorded.duration_s + recorded.stopped_s == pytest.approx(END_S, abs=hop_s)
+    standing = [one for one in stream if STANDS_S < (one[0].start_ns - stream[0][0].start_ns) / 1e9 < STARTS_S - 1]
+    assert healthy_from_blocks("standing.mcap", LAB, standing).stopped_s == 0
