@@ -251,6 +251,27 @@ def test_what_is_outside_the_model_is_said_of_clean_data() -> None:
                 assert test.update(looks).outside_model == outside
 
 
+@pytest.mark.parametrize(("before", "lasting"), [(13, True), (4, False)])
+def test_what_has_long_been_outside_the_model_is_taken_back_by_a_whole_window_alone(before: int, lasting: bool) -> None:
+    """Not by stretches too short to show it; but what is outside while a window is astride a change may be that."""
+    test, hops = SequentialTest(SETTINGS), gaussian(SEED + 47)
+    said: list[bool] = []
+    for count, values, misfit in ((15, true(), 0.0), (before, true(), 8.0), (11, true(k_by=0.4), 8.0)):
+        for _ in range(count):
+            looks = {
+                h: replace(one, misfit_z=misfit if h == SETTINGS.window_hops else 0.0)
+                for h, one in hops.looks(values).items()
+            }
+            if looks:
+                said.append(test.update(looks).outside_model)
+    assert all(said[-11 - before : -11])
+    assert said[-9:] == [lasting] * 9  # from the second hop on the change shows
+    for _ in range(3):
+        looks = {h: replace(one, misfit_z=0.0) for h, one in hops.looks(true(k_by=0.4)).items()}
+        outside = test.update(looks).outside_model
+    assert not outside
+
+
 def test_a_gap_is_no_part_of_a_sum() -> None:
     test, hops = SequentialTest(SETTINGS), gaussian(SEED + 8)
     play(test, hops, (24, true()))

@@ -166,6 +166,8 @@ class SequentialTest:
         if deciding:
             outside, confidence = model_test(clean[deciding[-1]], self._thresholds[deciding[-1]])
         unexplained = clean[deciding[-1]].unexplained if deciding else ""
+        by = deciding[-1] if deciding else None
+        outside = self._outside(outside or bool(unexplained), by, own[window_hops].end_ns)
         loud = {hops: self._isolate(hops, look) for hops, look in every.items() if self._is_loud(hops, look)}
         verdicts = {hops: verdict for hops, verdict in loud.items() if verdict.changed}
         decided, isolation = self._decide(every, clean, verdicts)
@@ -175,8 +177,7 @@ class SequentialTest:
         else:
             self._note(isolation.changed, every, clean, verdicts)
         current = self._current(clean[deciding[-1]], isolation.changed) if deciding and not unexplained else ()
-        outside = bool(unexplained) or outside or foreign
-        isolation = replace(isolation, outside=outside, outside_confidence=confidence)
+        isolation = replace(isolation, outside=outside or foreign, outside_confidence=confidence)
         self.unexplained = unexplained
         findings = () if unexplained else self.state.findings
         detected = bool(verdicts) and not unexplained
@@ -222,6 +223,31 @@ class SequentialTest:
             windows *= 2
             found[windows] = total
         return found
+
+    def _outside(self, said: bool, by: int | None, end_ns: int) -> bool:
+        """Whether the machine counts as outside the model.
+
+        What has been said for longer than any window is astride a change, a whole clean window alone takes back: on a
+        machine that no parameters explain stretches contradict each other, and a short one explains little of what it
+        is asked.
+
+        Parameters
+        ----------
+        said : bool
+            By the longest clean stretch of a window at most.
+        by : int or None
+            Its hops; None without one.
+        """
+        state, window_hops = self.state, self.settings.window_hops
+        if said:
+            state.outside_ns = end_ns if state.outside_ns is None else state.outside_ns
+            return True
+        lasting_s = 0.0 if state.outside_ns is None else (end_ns - state.outside_ns) / 1e9
+        if lasting_s >= window_hops * self.settings.hop_s and by != window_hops:
+            return True
+        if by is not None:
+            state.outside_ns = None
+        return False
 
     def _is_clean(self, look: Stretch) -> bool:
         change_ns = self.state.change_ns

@@ -27,6 +27,7 @@ class SequentialState:
     before: tuple[float, ...] = (0.0,) * len(PARAMETERS)
     findings: tuple[Finding, ...] = ()  # what has been found and still holds
     dated_ns: int | None = None  # end of the stretch that showed the latest change: it had come by then
+    outside_ns: int | None = None  # end of the first of the stretches that have been outside the model since
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything but the sums, which are in `hops`, as named arrays."""
@@ -36,6 +37,7 @@ class SequentialState:
         return {
             "change_ns": np.array([] if self.change_ns is None else [self.change_ns], dtype=np.int64),
             "dated_ns": np.array([] if self.dated_ns is None else [self.dated_ns], dtype=np.int64),
+            "outside_ns": np.array([] if self.outside_ns is None else [self.outside_ns], dtype=np.int64),
             "before": np.array(self.before, dtype=np.float64),
             "between_ns": np.array(between, dtype=np.int64).reshape(-1, 2),
             "findings": np.array(rows, dtype=np.int64).reshape(-1, 3),
@@ -69,9 +71,12 @@ class SequentialState:
         lengths = checked(arrays, "finding_stretch_s", np.float64, (len(findings),))
         if np.any((findings[:, 0] < 0) | (findings[:, 0] >= len(PARAMETERS))):
             raise CheckpointError(f"findings are of parameters {findings[:, 0].tolist()}, there are {len(PARAMETERS)}")
-        # What an earlier version stored is without these two.
-        added = {"dated_ns": np.zeros(0, np.int64), "between_ns": np.tile(_NO_LIMITS, (len(findings), 1)), **arrays}
+        # What an earlier version stored is without these.
+        never = np.zeros(0, np.int64)
+        between = np.tile(_NO_LIMITS, (len(findings), 1))
+        added = {"dated_ns": never, "outside_ns": never, "between_ns": between, **arrays}
         state.dated_ns = next(iter(checked(added, "dated_ns", np.int64, (None,)).tolist()), None)
+        state.outside_ns = next(iter(checked(added, "outside_ns", np.int64, (None,)).tolist()), None)
         between = checked(added, "between_ns", np.int64, (len(findings), 2))
         state.findings = tuple(
             finding(PARAMETERS[number], since, found, length, (low, high) if low <= high else None)
