@@ -25,6 +25,8 @@ _STEADY = 0.15
 def runs_down(window: WindowStatistics) -> npt.NDArray[np.bool_]:
     """Which hops have nothing of a running machine but, perhaps, its slow end or beginning, beside others that do.
 
+    None where no speed is known: hops may be quiet beside one that a blow or a disturbance has made loud.
+
     Parameters
     ----------
     window : WindowStatistics
@@ -37,8 +39,8 @@ def runs_down(window: WindowStatistics) -> npt.NDArray[np.bool_]:
     hops, speeds = window.hop_waveform, np.abs(window.hop_speed_rad_s)
     vibrations = [column for column, state in enumerate(window.sensors) if state != "theta"]
     rms = hops.rms[:, vibrations]
-    turns = speeds >= _SLOW * np.max(speeds, initial=0.0, where=np.isfinite(speeds))  # not where it is not known
-    return np.asarray((rms < QUIET * rms.max(axis=0)).all(axis=1) & ~turns)
+    fastest = np.max(speeds, initial=0.0, where=np.isfinite(speeds))
+    return np.asarray((rms < QUIET * rms.max(axis=0)).all(axis=1) & ~(speeds >= _SLOW * fastest) & (fastest > 0))
 
 
 class Standstill:
