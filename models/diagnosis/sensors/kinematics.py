@@ -178,8 +178,8 @@ def _fitted(
     y = h
     for _ in range(4):
         y = h * start.polarity * np.exp(-log_gain + 1j * w * delay_s) - 1
-        log_gain += float(np.log1p(np.clip(weight @ y.real / weight.sum(), -0.5, 1.0)))
-        delay_s -= float(np.clip(weight @ (w * y.imag) / moment, -1e-3, 1e-3))
+        log_gain += float(np.log1p(min(max(weight @ y.real / weight.sum(), -0.5), 1.0)))
+        delay_s -= float(min(max(weight @ (w * y.imag) / moment, -1e-3), 1e-3))
     freedom = max(1, y.size - 1)
     scatter_gain = max(1.0, float(weight @ y.real**2) * 2 / freedom)
     scatter_delay = max(1.0, float(weight @ y.imag**2) * 2 / freedom)
