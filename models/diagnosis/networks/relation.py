@@ -41,10 +41,12 @@ class Network:
 
     def __call__(self, inputs: FloatArray) -> FloatArray:
         """Output for each row of inputs, shape (…, n_rows)."""
-        hidden = inputs / self.input_scale @ self.W1
-        hidden += self.b1
-        np.tanh(hidden, out=hidden)
-        return np.asarray(hidden @ self.W2 + self.b2[0], dtype=np.float64)
+        hidden = inputs @ (2 * self.W1 / self.input_scale[:, np.newaxis])
+        hidden += 2 * self.b1
+        with np.errstate(over="ignore"):  # tanh x = 1 - 2 / (e²ˣ + 1), in half the time of numpy's
+            np.exp(hidden, out=hidden)
+        hidden += 1
+        return np.asarray(self.W2.sum() + self.b2[0] - 1 / hidden @ (2 * self.W2), dtype=np.float64)
 
 
 class Healthy(BaseModel, extra="forbid", frozen=True):
