@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from models.diagnosis.networks.equations import EQUATIONS, Equation, StatisticsView, SynchronousEquation, missing
+from models.diagnosis.networks.relation import Network
 from models.machine import Machine, load_machine
 from models.physics.excitation import Source, expanded_A, expanded_B
 from models.physics.response import correlation, stationary_covariance, synchronous_response
@@ -83,3 +84,14 @@ def test_targets_and_inputs_are_taken_at_the_same_lag() -> None:
             np.testing.assert_array_equal(
                 straight.inputs.reshape(*shape, -1)[::-1], reversed_.inputs.reshape(*shape, -1)
             )
+
+
+def test_a_network_is_its_perceptron_however_large_its_inputs() -> None:
+    rng = np.random.default_rng(20260701)
+    scale, W1, b1 = rng.uniform(1, 2, 4), rng.normal(size=(4, 15)), rng.normal(size=15)
+    W2, b2 = rng.normal(size=15), rng.normal(size=1)
+    size = np.array([1e-3, 1.0, 1e4])[:, None]
+    inputs = rng.normal(size=(3, 50, 4)) * size[..., None]
+    expected = np.tanh(inputs / scale @ W1 + b1) @ W2 + b2[0]
+    left = np.abs(Network(scale, W1, b1, W2, b2)(inputs) - expected)
+    assert np.all(left < 1e-14 * np.maximum(1, size))  # a sum is rounded relative to its terms
