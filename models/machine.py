@@ -20,16 +20,14 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from models.alarm_names import ALARMS, LEVEL, is_alarm
 from models.errors import MachineFileError
 from models.levels.settings import LevelSettings
+from models.levels.unmeasured import unmeasured
 from models.mistakes import changed, checked, did_you_mean, read_toml
 from models.physics.rotor import PARAMETERS, KnownRotor, RotorParameters
 from models.signals.channels import Channel, ChannelDescriptor, Quantity, Sensor
 from models.signals.keys import MachineKeys
+from models.whole_samples import usual_window, whole
 
 _SHIPPED = Path(__file__).parent / "machines"
-
-
-def _whole(value: float) -> bool:
-    return abs(value - round(value)) < 1e-9 * max(1.0, abs(value))
 
 
 class Operation(BaseModel, extra="forbid", frozen=True):
@@ -141,7 +139,7 @@ class WindowSettings(BaseModel, extra="forbid", frozen=True):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if not _whole(self.length_s / self.hop_s) or self.length_s < 4 * self.hop_s:
+        if not whole(self.length_s / self.hop_s) or self.length_s < 4 * self.hop_s:
             raise ValueError(f"length_s {self.length_s} must be a multiple of hop_s {self.hop_s}, at least four hops")
         if self.lag_to_s >= self.hop_s:
             raise ValueError(f"lag_to_s {self.lag_to_s} must be below hop_s {self.hop_s}")
@@ -305,7 +303,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
     rotor: KnownRotor | None = None
     operation: Operation | None = None
     condition: ConditionRange | None = None
-    rate_hz: float = Field(gt=0, le=1e6, description="samples per second and channel")
+    rate_hz: float = Field(gt=0, le=1e6, strict=True, description="samples per second and channel")
     dtype: Literal["float32", "float64"] = "float32"
     sensors: tuple[Sensor, ...] = Field(min_length=1)
     window: WindowSettings = WindowSettings()
@@ -318,7 +316,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
     @model_validator(mode="before")
     @classmethod
     def _defaults_that_depend_on_others(cls, fields: object) -> object:
-        """What is not given: a lag spacing of whole samples near a millisecond, and what follows from a schedule."""
+        """What is not given: what goes with the rate, and what follows from a schedule."""
         if not isinstance(fields, dict) or not isinstance(fields.get("window", {}), dict):
             return fields
         window, rate_hz = fields.get("window", {}), fields.get("rate_hz")
@@ -329,10 +327,12 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
                 schedule = Schedule.model_validate(fields["schedule"])
                 window = schedule.window(rate_hz) | window
                 fields = fields | {"window": window, "ingest": schedule.ingest() | fields.get("ingest", {})}
-        usual = WindowSettings.model_fields["lag_step_s"].default
-        if "lag_step_s" in window or _whole(usual * rate_hz):
-            return fields
-        return fields | {"window": window | {"lag_step_s": max(1, round(usual * rate_hz)) / rate_hz}}
+        usual = WindowSettings()
+        lengths = usual.model_dump(include={"lag_step_s", "segment_s", "hop_s", "length_s", "max_span_s"})
+        fitting = usual_window(rate_hz, lengths, usual.band_hz)
+        if window.keys() & {"segment_s", "hop_s", "length_s"}:  # multiples of each other
+            fitting = {name: one for name, one in fitting.items() if name in {"lag_step_s", "band_hz"}}
+        return fields | {"window": fitting | window} if fitting else fields
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -342,7 +342,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
             raise ValueError(str(error)) from error
         for field in ("length_s", "hop_s", "segment_s", "lag_step_s"):
             samples = getattr(self.window, field) * self.rate_hz
-            if not _whole(samples):
+            if not whole(samples):
                 raise ValueError(
                     f"window.{field} is {samples:.6g} samples at {self.rate_hz} Hz, expected a whole number"
                 )
@@ -363,15 +363,16 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
                 "reference there is no vector at running speed that it could be taken from"
             )
         if self.window.band_hz[1] >= self.rate_hz / 2:
-            raise ValueError(
-                f"window.band_hz ends at {self.window.band_hz[1]} Hz, above half of rate_hz {self.rate_hz}"
-            )
+            end_hz = self.window.band_hz[1]
+            raise ValueError(f"window.band_hz ends at {end_hz} Hz, above half of rate_hz {self.rate_hz}")
         _ = self.descriptor  # refuses double channels
         names = [channel.name for channel in self.sensors if channel.quantity != "shaft_angle"]
-        for limit in self.levels.limits:
-            if limit.channel not in names:
-                hint = did_you_mean(limit.channel, names)
-                raise ValueError(f"levels.limits: no channel {limit.channel!r}; there are {', '.join(names)}{hint}")
+        speed_rpm = self.operation.speed_rpm if self.operation else None
+        if missing := unmeasured(self.levels, self.sensors, self.rate_hz, speed_rpm):
+            raise ValueError(missing)
+        for name in (*self.alarms.latching, *(name for rule in self.alarms.suppress for name in rule.alarms)):
+            if name.startswith(LEVEL) and name.removeprefix(LEVEL) not in names:
+                raise ValueError(f"alarms: {name}: no channel of that name; there are {', '.join(names)}")
         return self
 
     def _check_hops(self) -> None:
@@ -382,7 +383,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
                 raise ValueError(
                     f"window.hop_s is {window.hop_s:g}, expected at most {_LONGEST_HOP_S:g}, or snapshots ([schedule])"
                 )
-            if not _whole(2 * window.hop_s / window.segment_s):
+            if not whole(2 * window.hop_s / window.segment_s):
                 raise ValueError(
                     f"window.hop_s {window.hop_s} must be a multiple of half of segment_s {window.segment_s}"
                 )

@@ -60,7 +60,7 @@ def read_toml(path: Path) -> dict[str, object]:
     except OSError as error:
         raise MachineFileError(f"{path}: cannot be read ({error.strerror})") from error
     try:
-        text = data.decode()
+        text = data.decode("utf-8-sig")  # Windows editors begin a file with a mark of the encoding
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         raise MachineFileError(f"{path}: line {line}: expected UTF-8, save the file in that encoding") from error

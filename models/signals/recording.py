@@ -297,6 +297,9 @@ def writing(path: Path) -> Iterator[None]:
         raise RecordingError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
+_RECOVER = "; rotorwatch recover writes what can be read of it into another"
+
+
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
     """Turn trouble in reading a file, damage included, into a `RecordingError` that names it."""
@@ -305,6 +308,6 @@ def reading(path: Path) -> Iterator[None]:
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror or error})") from error
     except EndOfFile as error:
-        raise RecordingError(f"{path}: the recording is incomplete; recover it from what is there") from error
+        raise RecordingError(f"{path}: the recording is incomplete{_RECOVER}") from error
     except DAMAGE as error:
-        raise RecordingError(f"{path}: not a complete recording: {error}") from error
+        raise RecordingError(f"{path}: not a complete recording{_RECOVER} ({error})") from error

@@ -112,6 +112,12 @@ def test_a_stuck_sensor_is_named_with_its_value_and_for_how_long(state: str) -> 
     assert f"{samples[50_000, column(state)] / channel.to_si:.3g} {channel.unit}" in finding.text
 
 
+def test_a_sensor_that_has_just_stuck_is_named_without_a_value_that_it_never_had() -> None:
+    samples = recorded("lab", 1).copy()
+    samples[122_000:, column("y1")] = samples[122_000, column("y1")]  # the mean of its hop is another value
+    assert "y1: repeated one value for 1.5 s" in only(found_in(samples)).text
+
+
 def test_a_channel_that_shows_only_its_quantisation_is_dead() -> None:
     samples = recorded("lab", 1).copy()
     step = 10 * samples[:, column("z1")].std()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from models.errors import MachineFileError
-from models.machine import Machine, load_machine
+from models.machine import Machine, load_machine, load_machine_file
 from models.physics.response import synchronous_response
 from models.physics.rotor import PARAMETERS, changed, system_A
 
@@ -98,3 +98,29 @@ def test_machine_is_frozen() -> None:
     machine: Machine = load_machine("lab")
     with pytest.raises(ValueError, match="frozen"):
         machine.rate_hz = 1.0  # type: ignore[misc]  # as a program without a type checker may try
+
+
+SENSORS_ALONE = """site = "plant"
+name = "fan"
+rate_hz = 2000.0
+
+[[sensors]]
+name = "DE"
+quantity = "acceleration"
+location = "DE"
+direction = "horizontal"
+unit = "g"
+"""
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 200.0, 256.0, 1666.67, 6400.5, 51200 / 7, 51200 / 3, 102400.0])
+def test_a_machine_file_with_nothing_but_sensors_goes_with_any_rate(tmp_path: Path, rate_hz: float) -> None:
+    machine = load_machine_file(write(tmp_path, SENSORS_ALONE.replace("2000.0", repr(rate_hz))))
+    window = machine.window
+    assert (window.segment_s, window.hop_s, window.length_s) == pytest.approx((2, 5, 60), rel=0.01)
+    assert window.band_hz[0] == 3.0
+    assert window.band_hz[1] < rate_hz / 2
+
+
+def test_the_mark_that_windows_editors_begin_a_file_with_is_no_mistake(tmp_path: Path) -> None:
+    assert load_machine_file(write(tmp_path, "\ufeff" + SENSORS_ALONE)).name == "fan"

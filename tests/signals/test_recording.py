@@ -137,7 +137,7 @@ def test_another_kind_of_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "photo.mcap"
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(1000))
     for read in (lambda path: list(read_recording(path)), summarize_recording):
-        with pytest.raises(RecordingError, match=r"photo\.mcap: not a complete recording"):
+        with pytest.raises(RecordingError, match=r"photo\.mcap: not a complete recording; rotorwatch recover"):
             read(path)
     with pytest.raises(RecordingError, match=r"photo\.mcap: nothing to recover"):
         salvage_recording(path, tmp_path / "new.mcap")

@@ -63,9 +63,11 @@ def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]
             )
             findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=quiet_s))
         elif runs.max() >= limit:
-            level = float(hops.mean[int(runs.argmax()), column])
+            still = int(runs.argmax())  # the mean of a hop is the value that was repeated, if all of the hop was
+            known = runs[still] >= hops.n_samples
+            what = f"the value {naming.value(state, float(hops.mean[still, column]))}" if known else "one value"
             text = (
-                f"{name}: repeated the value {naming.value(state, level)} for {longest_s:.3g} s, "
+                f"{name}: repeated {what} for {longest_s:.3g} s, "
                 f"expected to move within {STILL_S:g} s: the sensor or its line is stuck"
             )
             findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=longest_s))
