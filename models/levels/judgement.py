@@ -145,7 +145,7 @@ class LevelJudge:
         if channel is None or not most:
             return ""
         healthy = state.kurtosis[channel.name].mean
-        how = "clipped, as by a rub" if most < 0 else "with impacts, as of a rub or a loose part"
+        how = "clipped, as by a rub" if most < 0 else "with impacts, as of a rub, a loose part or a damaged bearing"
         return (
             f"a vibration at {channel.name} ({channel.location} {channel.direction}) that is {how}: kurtosis of its "
             f"random part {healthy + most:.2f}, {healthy:.2f} on the healthy machine"
@@ -162,8 +162,8 @@ class LevelJudge:
         hops, healthy = kurtosis[:, column], state.kurtosis[name]
         found = departure(hops, healthy, BEYOND_RANGE, n_errors)
         if found < 0:
-            in_bands, speed_rad_s = levels.moments[3], levels.speed_rad_s or 0.0
-            lines = fallen_by_lines(levels.bands, in_bands, column, speed_rad_s, state.bands.get(name))
+            orders, in_bands = levels.moments[2][:, :, column], levels.moments[3][:, :, column]
+            lines = fallen_by_lines(levels.bands, in_bands, orders, levels.speed_rad_s or 0.0, state.bands.get(name))
             return found if departure(hops + lines, healthy, BEYOND_RANGE, n_errors) < 0 else 0.0
         if found and healthy.mean < GAUSSIAN:
             random = without_lines(healthy)
@@ -195,7 +195,7 @@ class LevelJudge:
             limits = self._limits[key] = self._limits_of(column, alike, standard, zone, edge)
         if grown is not None and relative is not None:
             limits = limits | {"growth": self._growth(relative.source, grown.limit)}
-            words = {**_WORDS, "growth": f"{grown.band_hz[0]:.3g} to {grown.band_hz[1]:.3g} Hz"}
+            words = {**_WORDS, "growth": "{} to {} Hz".format(*map(_plain, grown.band_hz))}
         record["zone"] = zone
         record["limits"] = tuple(
             [
@@ -287,6 +287,17 @@ class LevelJudge:
                 "text": f"{said} {value:.3g} {unit}, {what}",
             }
         )
+
+
+def _plain(value: float) -> str:
+    """Three digits, and no power of ten.
+
+    Examples
+    --------
+    >>> _plain(94.567), _plain(5202.4)
+    ('94.6', '5202')
+    """
+    return f"{value:.0f}" if value >= 1000 else f"{value:.3g}"
 
 
 def _blank(plan: LevelPlan, channel: Channel) -> ChannelLevels:

@@ -57,36 +57,57 @@ def learn_kurtosis(windows: Sequence[FloatArray]) -> KurtosisReference | None:
 
 
 GAUSSIAN = 3.0
-_LINES = 3
-"""Orders whose lines are taken out."""
-_STEADIER = 0.5
-"""Part of the scatter of noise from hop to hop below which what a band holds is a line."""
+_STEADIER = 0.3
+"""Part of the scatter of noise from hop to hop below which what a band holds is a line: noise in one of a hundred."""
+_STEPS = 2
+"""Differences that may be larger: a line that begins has a hop that holds both, and one before and one after."""
 
 
 def fallen_by_lines(
-    bands: BandLevels, in_bands: FloatArray, column: int, speed_rad_s: float, healthy: BandReference | None
-) -> float:
-    """What lines at other frequencies, such as a gear mesh, have taken from a channel's kurtosis since it was healthy.
+    bands: BandLevels,
+    in_bands: FloatArray,
+    orders: npt.NDArray[np.complex128],
+    speed_rad_s: float,
+    healthy: BandReference | None,
+) -> FloatArray:
+    """What lines, such as a gear mesh, have taken from a channel's kurtosis since it was healthy; of each hop.
 
-    A line has the same power in every hop, noise has not: relative to its mean, of f degrees of freedom, √(2/f).
+    Of lines that are no orders but near one, such as mains hum beside 2x, it is what these leave in their bands.
 
     Parameters
     ----------
-    in_bands : ndarray, shape (n_hops, n_bands, n)
-        Mean squares of each hop.
+    in_bands : ndarray, shape (n_hops, n_bands)
+        Mean squares.
+    orders : ndarray of complex, shape (n_hops, n_orders)
+        Amplitudes of the first multiples of running speed, which have been taken out.
     """
-    own = in_bands[:, :, column]
-    power, total = own.mean(axis=0), max(float(own.mean(axis=0).sum()), np.finfo(float).tiny)
-    steady = own.std(axis=0) < _STEADIER * power * np.sqrt(2 * len(own) / bands.freedom)
-    multiples = abs(speed_rad_s) / (2 * np.pi) * np.arange(1, _LINES + 1)[:, None]
+    total = np.maximum(in_bands.sum(axis=1), np.finfo(float).tiny)
+    freedom = bands.freedom / len(in_bands)
+    multiples = abs(speed_rad_s) / (2 * np.pi) * np.arange(1, orders.shape[1] + 1)[:, None]
     # The taper spreads a line over the edges of its band.
-    rotation = ((multiples > 0.97 * bands.edges_hz[:-1]) & (multiples < 1.03 * bands.edges_hz[1:])).any(axis=0)
-    before = np.zeros_like(power)
-    if healthy is not None and len(healthy.mean) == power.size:
+    near = (multiples > 0.97 * bands.edges_hz[:-1]) & (multiples < 1.03 * bands.edges_hz[1:])
+    before = np.zeros(in_bands.shape[1])
+    if healthy is not None and len(healthy.mean) == before.size:
         before = np.square(healthy.mean)
         before /= max(float(before.sum()), np.finfo(float).tiny)
-    more = np.maximum((power / total) ** 2 - before**2, 0.0)
-    return float(1.5 * more[steady & ~rotation].sum())
+    lines = ~near.any(axis=0) & _steady(in_bands, freedom)
+    fallen = np.maximum((in_bands[:, lines] / total[:, None]) ** 2 - before[lines] ** 2, 0.0).sum(axis=1)
+    beside = np.maximum(in_bands @ near.T - np.abs(orders) ** 2 / 2, 0.0)
+    fallen += ((beside / total[:, None]) ** 2)[:, _steady(beside, near @ freedom)].sum(axis=1)
+    return np.asarray(1.5 * fallen, dtype=np.float64)
+
+
+def _steady(power: FloatArray, freedom: FloatArray) -> npt.NDArray[np.bool_]:
+    """In which columns the power is that of a line: it is the same in every hop, but for where it begins or ends.
+
+    That of noise, of so many degrees of freedom in a hop, differs from hop to hop by √(2/freedom) of itself.
+    """
+    differences = np.diff(power, axis=0) ** 2
+    by_noise = 2 / np.maximum(freedom, 1.0) * (power[1:] ** 2 + power[:-1] ** 2)
+    steps = _STEPS if len(power) > 2 * _STEPS else 0
+    order = differences.argsort(axis=0)[: len(differences) - steps]
+    found, noise = (np.take_along_axis(one, order, axis=0).sum(axis=0) for one in (differences, by_noise))
+    return np.asarray(found < _STEADIER**2 * noise)
 
 
 def without_lines(healthy: KurtosisReference) -> KurtosisReference:
@@ -99,6 +120,9 @@ def without_lines(healthy: KurtosisReference) -> KurtosisReference:
 def departure(hops: FloatArray, reference: KurtosisReference, beyond_range: float, n_errors: float) -> float:
     """Difference from the healthy mean, of the newest half of a window or of all of it; 0 within its limit.
 
+    It has to hold without the hop that departs most: one in which the level steps, or the machine stops, holds two
+    vibrations and has a large kurtosis of its own, and one knock is no state of a machine.
+
     Parameters
     ----------
     beyond_range : float
@@ -106,9 +130,17 @@ def departure(hops: FloatArray, reference: KurtosisReference, beyond_range: floa
     n_errors : float
         Nor nearer than so many standard errors.
     """
+
+    def beyond(kept: FloatArray) -> float:
+        difference = float(kept.mean()) - reference.mean
+        by_chance = n_errors * reference.scatter * np.sqrt(1 / len(kept) + 1 / reference.hops)
+        limit = max(by_chance, beyond_range * reference.range * np.sqrt(len(hops) / len(kept)))
+        return difference if abs(difference) > limit else 0.0
+
     for count in (max(1, len(hops) // 2), len(hops)):
-        difference = float(hops[-count:].mean()) - reference.mean
-        by_chance = n_errors * reference.scatter * np.sqrt(1 / count + 1 / reference.hops)
-        if abs(difference) > max(by_chance, beyond_range * reference.range * np.sqrt(len(hops) / count)):
-            return difference
+        newest = hops[-count:]
+        if found := beyond(newest):
+            rest = np.delete(newest, np.abs(newest - reference.mean).argmax())
+            if len(rest) == 0 or (found := beyond(rest)):
+                return found
     return 0.0

@@ -120,6 +120,37 @@ def test_a_gear_mesh_that_grows_or_goes_is_no_rub_but_a_rub_is_one(healthy_mesh:
     assert all("with impacts" in one for one in suspects(meshes[:2], healthy_mesh, knocking))
 
 
+LATE = np.arange(T.size) >= round(0.63 * T.size)  # in the midst of a hop
+
+
+def stepping(samples: FloatArray) -> FloatArray:
+    return np.asarray(np.where(LATE, 2.0, 1.0) * samples, dtype=np.float64)
+
+
+def knocking_once(samples: FloatArray) -> FloatArray:
+    return np.asarray(samples + 40.0 * (np.arange(T.size) == T.size - 3000), dtype=np.float64)
+
+
+def humming(samples: FloatArray) -> FloatArray:
+    return np.asarray(samples + 1.5 * np.cos(2 * np.pi * 46.6 * T), dtype=np.float64)  # beside 2x at 46 Hz
+
+
+def meshing_late(samples: FloatArray) -> FloatArray:
+    return np.asarray(samples + np.where(LATE, 2.0 * np.cos(11 * THETA), 0.0), dtype=np.float64)
+
+
+@pytest.mark.parametrize("spoilt", [stepping, knocking_once, humming, meshing_late])
+def test_a_step_one_knock_a_hum_beside_an_order_and_a_line_that_begins_are_neither(
+    spoilt: Callable[[FloatArray], FloatArray],
+) -> None:
+    assert suspects((0.0, 0.0, 0.0), 0.0, spoilt) == [""] * 3
+
+
+def test_a_rub_is_told_beside_a_line_that_begins() -> None:
+    (found,) = suspects((0.0,), 0.0, lambda samples: clipped(meshing_late(samples)))
+    assert "clipped, as by a rub" in found
+
+
 def test_less_will_do_to_doubt_what_else_was_found() -> None:
     healthy = KurtosisReference(mean=3.0, scatter=0.1, hops=1000, range=0.0)
     by_five_errors = np.full(HOPS, 3.0 - 5 * 0.1 / np.sqrt(HOPS))
