@@ -200,6 +200,28 @@ def test_a_name_needs_to_be_as_good_as_certain() -> None:
     assert judged([SURE | {"c_by": 0.6}] * 3) == ["raised c_bz"]  # one name is there: the other is waited for
 
 
+def test_a_name_is_held_with_reserve_once_nothing_explains_the_machine() -> None:
+    book = AlarmBook(SETTINGS)
+    read = Parameter(name="c_bz", text="c_bz", by="", relative_change=0.2, standard_error=0.03)
+    sure = {"text": "", "detected": True, "confidence": 1.0, "low_confidence": False, "outside_model": False}
+    named = Verdict(
+        **sure,
+        changed=(Finding(name="c_bz", text="c_bz", since_ns=0, found_ns=0, stretch_s=60),),
+        candidates=(Candidate(name="c_bz", text="c_bz", probability=0.97),),
+        outside_confidence=None,
+        decided_s=60.0,
+        settled=True,
+        current=(read,),
+    )
+    unexplained = named.model_copy(update={"current": (), "candidates": (), "outside_model": True})
+    reserves = []
+    for number, verdict in enumerate((named, named, named, unexplained, unexplained, named)):
+        book.found(verdict, "it makes no sense" if verdict is unexplained else "", "", number * 5_000_000_000)
+        (alarm,) = (one for one in book.alarms if one.name == "c_bz")
+        reserves.append((alarm.present, alarm.low_confidence))
+    assert reserves == [(False, False)] * 2 + [(True, False), (True, True), (True, True), (True, False)]
+
+
 def test_what_has_its_alarm_raises_no_other_when_it_becomes_less_sure() -> None:
     assert judged([SURE] * 3 + [NOT_SURE] * 6) == ["raised c_bz"]
 

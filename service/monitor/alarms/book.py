@@ -18,6 +18,7 @@ from pydantic import TypeAdapter
 from models.alarm_names import ALARMS, CHANGED, MODEL, alarm_kind, is_alarm
 from models.errors import CheckpointError
 from models.machine import AlarmSettings, SuppressRule
+from models.physics.rotor import PARAMETERS
 from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
 from rotorwatch.records.windows import Verdict
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
@@ -126,6 +127,11 @@ class AlarmBook:
                     evidence=evidence,
                     note="" if reading.vector is None else reading.vector.text,
                 )
+        if verdict.outside_model and not verdict.current:
+            # Of what nothing explains nothing is read, and what was named before is named with reserve from now on.
+            self._alarms |= {
+                name: replace(self._alarms[name], low_confidence=True) for name in PARAMETERS if self.present(name)
+            }
         if verdict.current:
             # Outside the model no candidate need be right, and `model` says so; and one cause has one alarm.
             told = verdict.outside_model or any(self.present(name) for name in probability)
