@@ -27,7 +27,7 @@ from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.misfit import HealthyMisfit
 from models.diagnosis.moments import states_of
 from models.diagnosis.networks.bundle import Bundle, load_bundle
-from models.diagnosis.sensors.reference import SensorReference
+from models.diagnosis.sensors.reference import Naming, SensorReference
 from models.diagnosis.shape import HealthyShape
 from models.diagnosis.window import WindowStatistics
 from models.errors import BundleError
@@ -134,7 +134,7 @@ class OperatingRange(BaseModel, extra="forbid", frozen=True):
             },
         )
 
-    def outside(self, window: WindowStatistics) -> str:
+    def outside(self, window: WindowStatistics, naming: Naming) -> str:
         """Why a window lies outside the commissioned conditions; empty if it does not."""
         if self.speed_rpm is not None and np.isfinite(window.speed_rad_s):
             low, high = self.speed_rpm
@@ -147,8 +147,9 @@ class OperatingRange(BaseModel, extra="forbid", frozen=True):
                 continue
             low, high = self.rms[name]
             if not low / LEVEL_MARGIN <= value <= high * LEVEL_MARGIN:
+                found, least, most = (naming.value(name, each) for each in (value, low, high))
                 return (
-                    f"random vibration of {name} is {value:.3g} rms (SI), commissioned is {low:.3g} to {high:.3g}, and "
+                    f"random vibration of {naming.name(name)} is {found} rms, commissioned is {least} to {most}, and "
                     f"up to {LEVEL_MARGIN:g} times less or more"
                 )
         return ""

@@ -22,6 +22,7 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading
+from models.diagnosis.sensors.reference import Naming
 from models.diagnosis.verdict.calibration import agreements, beside
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import determined, with_shared_error
@@ -317,6 +318,7 @@ class BaselineEvaluator(WindowEvaluator):
     def __init__(self, machine: MachineFile, commissioned: Commissioned) -> None:
         self._place = f"{machine.site}/{machine.name}"
         self._conditions = commissioned.conditions
+        self._naming = Naming(machine.sensors)
         self._diagnosed = states_of(machine) != ()
         self._shape = commissioned.shape
         self._length_s = machine.window_data_s
@@ -331,7 +333,7 @@ class BaselineEvaluator(WindowEvaluator):
     def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`; outside the commissioned conditions it is not evaluable."""
         _ = short
-        outside = self._conditions.outside(window)
+        outside = self._conditions.outside(window, self._naming)
         if outside:
             here = "not evaluable here" if self._diagnosed else "levels are judged by the nearest commissioned speed"
             raise EstimationError(f"{self._place}: {here}: {outside}")
@@ -348,7 +350,7 @@ class BaselineEvaluator(WindowEvaluator):
         """The baseline of these conditions."""
         reasons = []
         for conditions, baseline in self._baselines:
-            outside = conditions.outside(window)
+            outside = conditions.outside(window, self._naming)
             if not outside:
                 return baseline
             reasons.append(outside)

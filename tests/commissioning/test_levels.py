@@ -22,6 +22,7 @@ from models.commissioning.commissioned import (
 )
 from models.diagnosis.misfit import AlternativeTest, Goodness, HealthyMisfit
 from models.diagnosis.readings import Diagnosis
+from models.diagnosis.sensors.reference import Naming
 from models.errors import BundleError
 from models.machine import MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETERS
@@ -208,14 +209,14 @@ def test_a_bundle_is_refused_for_another_machine_or_when_damaged(tmp_path: Path)
 
 def test_outside_the_commissioned_conditions_is_said_so() -> None:
     windows = windows_of(healthy(NOTHING, HEALTHY_S, 41))
-    conditions = OperatingRange.of(windows)
-    assert all(conditions.outside(window) == "" for window in windows)
+    conditions, naming = OperatingRange.of(windows), Naming(NOTHING.sensors)
+    assert all(conditions.outside(window, naming) == "" for window in windows)
     faster = Event(at_s=0.0, speed_rpm=1.12 * LAB.operation.speed_rpm)
     (window,) = windows_of(recording(NOTHING, stream(66.0, 44, faster)))
-    assert conditions.outside(window).startswith("speed is 1478 rpm, commissioned is 1320 rpm")
+    assert conditions.outside(window, naming).startswith("speed is 1478 rpm, commissioned is 1320 rpm")
     quiet = Event(at_s=0.0, excitation_level=0.01)
     (window,) = windows_of(recording(NOTHING, stream(66.0, 45, quiet)))
-    assert conditions.outside(window).startswith("random vibration of")
+    assert re.match(r"random vibration of y1 is \S+ um rms, commissioned is", conditions.outside(window, naming))
 
 
 @pytest.mark.slow
