@@ -7,6 +7,8 @@ import numpy as np
 from models.signals.block import lowest_valid_hz, settling_s
 from service.interchange.importing import Imported
 
+_NOTED = 0.01
+"""Part of the rows whose loss is pointed out."""
 _LISTED = 10
 
 
@@ -99,6 +101,12 @@ def _pulse_lines(done: Imported) -> list[str]:
     ]
     if done.unknown_angle:
         lines.append(f"rows left out because the shaft angle is not known: {done.unknown_angle}")
+        share = done.unknown_angle / max(1, done.read.rows)
+        if share > _NOTED:
+            lines.append(
+                f"note: that is {share:.0%} of the file, in which the keyphasor gives no pulses or uneven ones; look "
+                "at its signal and threshold, or leave the shaft angle out of the machine file"
+            )
     operation = done.machine.operation
     if operation is not None and abs(speed_rpm / operation.speed_rpm - 1) > operation.speed_tolerance:
         lines.append(

@@ -286,3 +286,11 @@ def test_a_machine_that_moves_more_is_no_sensors_fault() -> None:
     samples[70_000:, :4] *= 1.5
     (window,) = windows_of(plan, samples)
     assert sensor_findings(window) == ()
+
+
+@pytest.mark.parametrize(("factor", "told"), [(2.0, "pulses too many"), (0.5, "pulses are missing")])
+def test_an_angle_of_another_speed_is_named_with_what_the_pulses_do(factor: float, told: str) -> None:
+    samples = recorded("lab", 1).copy()
+    samples[:, -1] = factor * np.unwrap(samples[:, -1]) % (2 * np.pi)
+    (finding,) = [one for one in found_in(samples, reference_of("lab")) if one.states == ("theta",)]
+    assert told in finding.text

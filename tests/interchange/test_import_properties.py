@@ -15,6 +15,7 @@ from models.signals.block import FloatArray
 from models.signals.channels import unit_factor
 from models.signals.keyphasor import EdgeDetector, pulse_train, shaft_angle
 from service.interchange.source import SourceError
+from service.interchange.summary import summary_lines
 from tests.interchange.material import (
     CHANNELS,
     RATE_HZ,
@@ -330,6 +331,7 @@ def test_where_the_shaft_stood_there_is_a_gap(tmp_path: Path) -> None:
     first, second = stretches(recording)
     assert first.samples.shape[0] + second.samples.shape[0] + done.unknown_angle == 20_000
     assert 2 * RATE_HZ - 2.1 * RATE_HZ / SPEED_HZ < done.unknown_angle < 2 * RATE_HZ
+    assert "note: that is 20% of the file, in which the keyphasor gives no pulses" in "\n".join(summary_lines(done))
 
 
 def test_pulses_that_do_not_ascend_are_named(tmp_path: Path) -> None:

@@ -151,9 +151,10 @@ def _elsewhere(
     if not 1 / _THERE < float(np.median(seen)) < _THERE:
         return None
     rpm, own_rpm = 60 * window.frequencies_hz[at], window.speed_rad_s * 30 / np.pi
+    pulses = "there are pulses too many throughout" if abs(own_rpm) > rpm else "pulses are missing throughout"
     text = (
         f"{name}: turns at {own_rpm:.5g} rpm, but the rotation stands in the vibration at {rpm:.5g} rpm and not there: "
-        "the angle is not this shaft's, or pulses are missing throughout"
+        f"the angle is not this shaft's, or {pulses}"
     )
     return _theta(FaultKind.INCOHERENT, text, float(own_rpm / rpm))
 
