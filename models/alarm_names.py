@@ -65,7 +65,11 @@ ALARMS: Mapping[str, AlarmKind] = MappingProxyType(
         CONFLICT: AlarmKind(
             "data health, conflict of publishers", "data", "one publisher sends, and does not contradict itself"
         ),
-        PHASE_REFERENCE: AlarmKind("data health, phase reference", "data", "the phase reference is there again"),
+        PHASE_REFERENCE: AlarmKind(
+            "data health, phase reference",
+            "data",
+            "the phase reference is steady again; after a jump, phases are still off",
+        ),
         **{
             data_alarm(kind): AlarmKind(
                 f"data health, {kind.text}", "data", f"data health, {kind.text}: nothing of it is seen any more"

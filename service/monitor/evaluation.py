@@ -80,11 +80,14 @@ class Evaluation:
     @property
     def unlike_healthy(self) -> str:
         """What has been seen, where no equation can be evaluated."""
-        changed = [shape.text for shape in self.shapes if shape.verdict == "changed"]
-        return "; ".join(filter(None, (self.deciding.suspect, *changed)))
+        return "; ".join(filter(None, (self.deciding.suspect, *self._changed)))
+
+    @property
+    def _changed(self) -> list[str]:
+        return [shape.text for shape in self.shapes if shape.verdict == "changed"]
 
     def reason(self, *, told: bool) -> str:
-        """Why no parameter could be read, every reason once.
+        """Why no parameter could be read, every reason once; first what has changed, where channels alone are compared.
 
         Parameters
         ----------
@@ -93,7 +96,8 @@ class Evaluation:
         """
         if self.deciding.unexplained or self.deciding.evaluable:
             return "" if told else self.deciding.unexplained
-        return "; ".join(dict.fromkeys(one.reason for one in self.deciding.parameters if one.reason))
+        reasons = (one.reason for one in self.deciding.parameters if one.reason)
+        return "; ".join(dict.fromkeys([*self._changed, *reasons]))
 
     def named(self, channels: Sequence[Channel], foreign: str) -> "Evaluation":
         """The same with sentences in the names of a machine's channels.

@@ -228,6 +228,7 @@ def test_with_too_few_sensors_only_changed_or_not_changed_is_said() -> None:
     windows, events = feed(MachineMonitor(few), of_sensors(bearing, stream(65.0, SEED + 5, softer)))
     assert {event.alarm.name for event in events} == {"shape", "level:y1", "level:y1_dot"}
     assert full(windows)[-1].state in {HealthState.ALERT, HealthState.DANGER}
+    assert "has changed shape" in full(windows)[-1].reason.partition("; ")[0]
     assert all(reading.relative_change is None for reading in full(windows)[-1].parameters)
 
 
