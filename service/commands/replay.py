@@ -175,6 +175,9 @@ def replay(
     with _stoppable(wishes), orders(wishes, lines=control, keyboard=not offline and progress == "auto"):
         if offline:
             wanted = _machines_of(config, machine)
+            for one in set_ or ():
+                if "=" not in one:
+                    raise MachineFileError(f"--set {one}: expected FIELD=VALUE, as alarms.on_delay_s=60")
             changes = "\n".join(set_ or ())
             if ray is not None:
                 asked = [

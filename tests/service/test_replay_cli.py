@@ -72,6 +72,8 @@ def test_what_if_with_lines_instead_of_the_machine_files(faulty: Path, tmp_path:
         refused = run(faulty, "--offline", "--set", wrong, "--out", tmp_path / "p")
         assert refused.returncode == 2
         assert "delay_s" in refused.stderr or "changes: " in refused.stderr
+    refused = run(faulty, "--offline", "--set", "alarms.on_delay_s", "--out", tmp_path / "p")
+    assert "--set alarms.on_delay_s: expected FIELD=VALUE" in refused.stderr
 
 
 def test_channels_that_do_not_fit_are_said(faulty: Path, tmp_path: Path) -> None:
