@@ -20,7 +20,6 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from models.alarm_names import ALARMS, LEVEL, is_alarm
 from models.errors import MachineFileError
 from models.levels.settings import LevelSettings
-from models.levels.unmeasured import unmeasured
 from models.mistakes import changed, checked, did_you_mean, read_toml
 from models.physics.rotor import PARAMETERS, KnownRotor, RotorParameters
 from models.signals.channels import Channel, ChannelDescriptor, Quantity, Sensor
@@ -363,11 +362,12 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
                 "reference there is no vector at running speed that it could be taken from"
             )
         if self.window.band_hz[1] >= self.rate_hz / 2:
-            end_hz = self.window.band_hz[1]
-            raise ValueError(f"window.band_hz ends at {end_hz} Hz, above half of rate_hz {self.rate_hz}")
+            raise ValueError(f"window.band_hz {self.window.band_hz} ends above half of rate_hz {self.rate_hz}")
         _ = self.descriptor  # refuses double channels
         names = [channel.name for channel in self.sensors if channel.quantity != "shaft_angle"]
-        speed_rpm = self.operation.speed_rpm if self.operation else None
+        from models.levels.unmeasured import unmeasured  # noqa: PLC0415  # it imports scipy, for which no --help waits
+
+        speed_rpm = None if self.operation is None else self.operation.speed_rpm
         if missing := unmeasured(self.levels, self.sensors, self.rate_hz, speed_rpm):
             raise ValueError(missing)
         for name in (*self.alarms.latching, *(name for rule in self.alarms.suppress for name in rule.alarms)):
