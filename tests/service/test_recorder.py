@@ -414,7 +414,7 @@ def test_what_a_crash_left_is_recovered_at_the_start(tmp_path: Path) -> None:
     (folder / "20261121T141000Z.mcap.part").write_bytes(b"\x89MCAP0\r\n" + bytes(500))
     (folder / "20261121T141500Z.mcap.recovered.part").write_bytes(b"left by a crash during recovery")
     with recording(tmp_path) as recorder:
-        until(lambda: len(files(recorder)) == 1 and files(recorder)[0].suffix == ".mcap", "recovered file")
+        until(lambda: [one.suffix for one in files(recorder)] == [".mcap"], "recovered file")
     assert 0 < len(recorded(recorder)) <= 100
     assert recorded(recorder) == blocks(100)[: len(recorded(recorder))]
     names = {path.name for path in folder.iterdir()}
