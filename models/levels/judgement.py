@@ -343,7 +343,6 @@ class ChannelState:
     beyond: bool
     danger: bool
     absolute: bool  # beyond a limit of the machine file or of a standard, not only of a reference
-    fallen: bool  # a level is below its limit
     small: bool  # every level is back by a tenth of its limit: the deadband of ISA-18.2
     text: str
 
@@ -354,13 +353,15 @@ def channel_state(levels: ChannelLevels) -> ChannelState:
     small = all(one.state == "normal" and not _near(getattr(levels, one.measure), one) for one in limits)
     texts = sorted((one.state != "danger", not one.absolute, one.text) for one in limits if one.text)
     absolute = any(one.state != "normal" and one.absolute for one in limits)
-    fallen = any(
-        one.fall is not None and value is not None and value < one.fall
-        for one in limits
-        for value in (getattr(levels, one.measure),)
+    return ChannelState(
+        levels.beyond != "", levels.beyond == "danger", absolute, small, "; ".join(text for *_, text in texts)
     )
-    text = "; ".join(text for *_, text in texts)
-    return ChannelState(levels.beyond != "", levels.beyond == "danger", absolute, fallen, small, text)
+
+
+def fallen(levels: ChannelLevels) -> bool:
+    """Whether a level of a channel is below its limit."""
+    found = [(getattr(levels, one.measure), one.fall) for one in levels.limits]
+    return any(value is not None and fall is not None and value < fall for value, fall in found)
 
 
 def _near(value: float | None, limits: LevelLimits) -> bool:

@@ -21,8 +21,7 @@ _Level = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _SAME_SPEED = 0.03
 """Windows whose speeds differ by less, relative, are of one operating state."""
 QUIET = 0.25
-"""Part of the running vibration below which a machine may stand: ISO 10816-1 has more than that looked into where one
-does (background)."""
+"""Part of the running vibration below which a machine may stand; what its neighbours shake it with should be less."""
 
 
 class ReferenceLevel(BaseModel):

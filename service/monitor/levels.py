@@ -10,7 +10,7 @@ from models.commissioning.commissioned import Installed
 from models.diagnosis.lines import new_line, steady_lines
 from models.diagnosis.moments import Plan
 from models.diagnosis.window import SlidingWindow, WindowStatistics
-from models.levels.judgement import LevelJudge, channel_state
+from models.levels.judgement import LevelJudge, channel_state, fallen
 from models.levels.measures import WindowLevels
 from models.levels.reference import FirstWindows, LevelReference
 from models.machine import MachineFile
@@ -137,7 +137,7 @@ class LevelWatch:
         for state, levels in zip(self._states, self.latest, strict=False):
             now, name = channel_state(levels), f"{LEVEL}{levels.channel}"
             held = state in faulty or (explained and not alarms.present(name))
-            held |= unlike and (self._by_angle or not now.fallen)
+            held |= unlike and (self._by_angle or not fallen(levels))
             beyond = now.beyond and (now.absolute or now.danger or not held)
             # In the deadband, or while a sensor is at fault, an alarm stays as it is.
             alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=now.small)
