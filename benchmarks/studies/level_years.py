@@ -23,7 +23,6 @@ from models.levels.bands import band_edges
 from models.levels.judgement import LevelJudge
 from models.levels.measures import (
     NYQUIST_PART,
-    ORDERS,
     HopLevels,
     LevelPlan,
     WindowLevels,
@@ -31,6 +30,7 @@ from models.levels.measures import (
     level_plan,
     window_levels,
 )
+from models.levels.orders import ORDERS
 from models.levels.reference import learn_levels
 from models.levels.settings import LevelSettings
 from models.signals.block import FloatArray

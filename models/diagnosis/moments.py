@@ -278,13 +278,18 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
     if theta is not None:
         np.cos(theta, out=a[-2])
         np.sin(theta, out=a[-1])
-    segments = _segment_spectra(a, plan)
+    spectra = _segment_spectra(a, plan)
+    segments = np.ascontiguousarray(spectra[:, :, plan.bins[0] : plan.bins[-1] + 1].transpose(1, 2, 0))
     own = rows[:, -plan.fresh :].T
     waveform, deviations = waveform_of(own)
     levels = None
     if plan.levels is not None:
         turned = None if theta is None or (line is None and plan.angle_column is None) else theta[-plan.fresh :]
-        levels = hop_levels(plan.levels, waveform, deviations, turned)
+        spectrum = None
+        if plan.segment == plan.fresh and plan.segment % 2 == 0 and not plan.others:
+            spectrum = spectra[:n_states, -1]  # the last segment is the hop itself
+            spectrum[:, :2] -= (waveform.mean[:n_states] - level)[:, None] * spectra[n_states, -1, :2]
+        levels = hop_levels(plan.levels, waveform, deviations, turned, spectrum)
     if plan.angle_column is not None and plan.others:
         last = own.shape[1] - 1
         waveform = waveform.of([*range(n_states), last, *range(n_states, last)])
@@ -329,13 +334,12 @@ def _lagged_products(a: FloatArray, plan: Plan) -> FloatArray:
 
 
 def _segment_spectra(a: FloatArray, plan: Plan) -> ComplexArray:
-    """Fourier coefficients of the half-overlapping segments that end within the hop."""
+    """Fourier coefficients of the half-overlapping segments that end within the hop; (n, n_segments, n_frequencies)."""
     half = plan.segment // 2
     taper = _hann(plan.segment, plan.rate_hz)
     first = plan.preamble + half - plan.segment
     pieces = np.lib.stride_tricks.sliding_window_view(a[:, first:], plan.segment, axis=1)[:, ::half]
-    spectra = np.fft.rfft(pieces[:, : plan.hop // half] * taper)
-    return np.ascontiguousarray(spectra[:, :, plan.bins[0] : plan.bins[-1] + 1].transpose(1, 2, 0))
+    return np.fft.rfft(pieces[:, : plan.hop // half] * taper)
 
 
 @lru_cache(maxsize=8)

@@ -39,12 +39,11 @@ import scipy  # its sub-packages are loaded when they are first used
 from models.checkpoint import checked
 from models.levels.bands import BandLevels, band_edges
 from models.levels.kurtosis import random_kurtosis
+from models.levels.orders import ORDERS, Spectrum, hann_taper, order_vectors
 from models.signals.block import FloatArray
 from models.signals.channels import LEAST_APART_DEG, Channel, Quantity, apart_deg
 from models.signals.waveform import Waveform
 
-ORDERS = {"x_half": 0.5, "x1": 1.0, "x2": 2.0, "x3": 3.0}
-"""Multiples of running speed, by the name of their measure."""
 COMPARED = ("overall", "velocity", "s_max", "x1", "x2", "high", "envelope")
 """Those that are compared with a reference."""
 
@@ -53,16 +52,12 @@ _SQUARES = [1, 5, 6, 7]  # those of which a root is shown
 _HIGH_HZ = 1000.0
 NYQUIST_PART = 0.8
 """Part of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
-_MANY_REVOLUTIONS = 8.0
-_SAMPLES_A_TURN = 8.0
-"""At least: products of two orders go up to six times running speed."""
 _HANN_BINS = 1.5
 """Bins of a tapered spectrum that say as much as one of an untapered one."""
 STANDS_RAD_S = 2 * np.pi * 0.5
 """Slower than this, rad/s, a shaft is not taken to turn."""
 
 _ComplexArray = npt.NDArray[np.complex128]
-_SingleArray = npt.NDArray[np.float32]
 _Number = TypeVar("_Number", np.float64, np.complex128)
 
 
@@ -210,7 +205,13 @@ class HopLevels:
         )
 
 
-def hop_levels(plan: LevelPlan, waveform: Waveform, deviations: FloatArray, angle_rad: FloatArray | None) -> HopLevels:
+def hop_levels(
+    plan: LevelPlan,
+    waveform: Waveform,
+    deviations: FloatArray,
+    angle_rad: FloatArray | None,
+    spectrum: Spectrum | None = None,
+) -> HopLevels:
     """Take the levels of one hop.
 
     Parameters
@@ -222,55 +223,58 @@ def hop_levels(plan: LevelPlan, waveform: Waveform, deviations: FloatArray, angl
         From the mean, SI units, see `waveform_of`.
     angle_rad : ndarray, shape (n_samples,), or None
         Shaft angle, or one that turns with it from an unknown zero.
+    spectrum : ndarray of complex, shape (n, n_samples // 2 + 1), optional
+        Fourier transform of the deviations under Hann's taper, its squared magnitude the two-sided power spectral
+        density per Hz, where it is known already; otherwise it is taken here.
     """
-    n, n_samples = len(plan.quantities), deviations.shape[1]
+    x = deviations[: len(plan.quantities)]
+    n, n_samples = x.shape
     mean, rms, low, high = (one[:n] for one in (waveform.mean, waveform.rms, waveform.minimum, waveform.maximum))
-    peak = np.maximum(high - mean, mean - low)
-    # Single precision is enough for what is left without the mean, and quicker. In parts of the peak: fourth powers of
-    # metres would leave its range.
-    unit = np.where(peak > 0, peak, 1.0)
-    x = np.multiply(deviations[:n], (1 / unit)[:, None], out=np.empty((n, n_samples), np.float32), casting="same_kind")
-    square = x * x
+    square, peak = x * x, np.maximum(high - mean, mean - low)
     sums = np.full((len(_SUMS), n), np.nan)
-    sums[:5] = mean, rms**2, peak, high - low, unit**4 * np.vecdot(square, square) / n_samples
+    sums[:5] = mean, rms**2, peak, high - low, np.vecdot(square, square) / n_samples
     # Strong lines must not leak into the low end of a band, where integration would magnify them.
-    taper, scale = _taper(n_samples)
-    spectrum = scipy.fft.rfft(x * taper, axis=1)
-    parts = spectrum.view(np.float32)  # real, imaginary, real ...
+    taper, scale = hann_taper(n_samples)
+    # In parts of the peak single precision is enough, and quicker.
+    unit = amplitude = np.where(peak > 0, peak, 1.0)
+    if spectrum is None:
+        tapered = np.multiply(x, (1 / unit)[:, None], out=np.empty(x.shape, np.float32), casting="same_kind")
+        tapered *= taper
+        spectrum = scipy.fft.rfft(tapered, axis=1)
+    else:
+        amplitude = np.full(n, np.sqrt(2 * plan.rate_hz / (n_samples * scale)))
+    parts = spectrum.view(spectrum.real.dtype)[:, : int(NYQUIST_PART * n_samples) + 4]  # real, imaginary, real ...
     parts = parts * parts
     casing = plan.columns(Quantity.VELOCITY, Quantity.ACCELERATION)
     if casing.size:
-        sums[5:, casing] = unit[casing] ** 2 * _band_squares(plan, spectrum, parts, n_samples, casing)
+        sums[5:, casing] = amplitude[casing] ** 2 * _band_squares(plan, spectrum, parts, n_samples, casing)
     edges = band_edges(n_samples, NYQUIST_PART)
-    bands = (scale * unit**2)[:, None] * np.add.reduceat(parts[:, : 2 * edges[-1]], 2 * edges[:-1], axis=1)
-    radius = []
-    for (y, z), skew in zip(plan.pairs, plan.skew, strict=True):
-        larger, smaller = (y, z) if unit[y] >= unit[z] else (z, y)
-        ratio = float(unit[smaller] / unit[larger])
-        distance = ratio**2 * square[smaller]
-        distance += square[larger]
+    bands = (scale * amplitude**2)[:, None] * np.add.reduceat(parts[:, : 2 * edges[-1]], 2 * edges[:-1], axis=1)
+    radius = np.empty(len(plan.pairs))
+    for pair, ((y, z), skew) in enumerate(zip(plan.pairs, plan.skew, strict=True)):
+        distance = square[y] + square[z]
         if skew:
-            distance -= 2 * skew * ratio * x[y] * x[z]
-        radius.append(unit[larger] * np.sqrt(float(distance.max()) / (1 - skew**2)))
-    orders = unit * _orders(x, spectrum, angle_rad)
-    return HopLevels(n_samples, sums, orders, np.array(radius), np.ascontiguousarray(bands.T))
+            distance -= 2 * skew * x[y] * x[z]
+        radius[pair] = np.sqrt(distance.max() / (1 - skew**2))
+    orders = unit * order_vectors(x, unit, spectrum, amplitude, angle_rad)
+    return HopLevels(n_samples, sums, orders, radius, np.ascontiguousarray(bands.T))
 
 
 def _band_squares(
     plan: LevelPlan,
-    spectrum: npt.NDArray[np.complex64],
-    parts: _SingleArray,
+    spectrum: Spectrum,
+    parts: FloatArray | npt.NDArray[np.float32],
     n_samples: int,
     casing: npt.NDArray[np.intp],
 ) -> FloatArray:
     """Mean squares of velocity in the band, of the high-frequency band and of its envelope; shape (3, n)."""
-    taper, scale = _taper(n_samples)
+    taper, scale = hann_taper(n_samples)
     step_hz = plan.rate_hz / n_samples
     first, last = (round(edge / step_hz) for edge in plan.band_hz)
     first = max(first, 1)
     found = np.full((3, casing.size), np.nan)
     band = parts[:, 2 * first : 2 * last + 2]
-    found[0] = scale * (band @ np.ones(band.shape[1], np.float32))[casing]
+    found[0] = scale * (band @ np.ones(band.shape[1], band.dtype))[casing]
     accelerations = plan.columns(Quantity.ACCELERATION)
     if not accelerations.size:
         return found
@@ -287,69 +291,6 @@ def _band_squares(
         level = envelope.sum(axis=1) / weights.sum()  # the taper is on the envelope too: compared with its like
         found[2, at] = np.sum((envelope - level[:, None] * weights) ** 2, axis=1) / np.sum(weights**2)
     return found
-
-
-def _orders(x: _SingleArray, spectrum: npt.NDArray[np.complex64], angle_rad: FloatArray | None) -> _ComplexArray:
-    """Amplitudes at the orders, by weighted least squares: exact for orders, whatever the number of revolutions.
-
-    Over many revolutions the samples are tapered, so that other lines stay out, and thinned out: tapered, they begin
-    and end with nothing, so the low end of their spectrum is the same signal in fewer samples, in which nothing that
-    the orders see is missing.
-
-    Parameters
-    ----------
-    x : ndarray, shape (n, n_samples)
-    spectrum : ndarray, shape (n, n_samples // 2 + 1)
-        Of the tapered samples.
-    """
-    n, n_samples = x.shape
-    if angle_rad is None:
-        return np.full((len(ORDERS), n), np.nan, dtype=np.complex128)
-    tapered: FloatArray | _SingleArray
-    weights: FloatArray | _SingleArray
-    steps = angle_rad[1:] - angle_rad[:-1]
-    size = np.abs(steps)
-    (whole,) = (size > np.pi).nonzero()  # where it begins anew from zero
-    turns = np.rint(steps[whole] / (2 * np.pi)).sum()
-    if abs(angle_rad[-1] - angle_rad[0] - 2 * np.pi * turns) < 2 * np.pi * _MANY_REVOLUTIONS:
-        # Orders are nearly alike then: what tells them apart needs all digits.
-        angle, tapered, weights, every = angle_rad, x.astype(np.float64), np.ones(n_samples), 1
-    else:
-        size[whole] = 0  # a whole turn beside a step like all others
-        slowest = 2 * np.pi * _MANY_REVOLUTIONS / n_samples  # slower, and it has jumped
-        most = int(2 * np.pi / (_SAMPLES_A_TURN * max(slowest, size.max())))
-        every = next((step for step in range(most, 1, -1) if n_samples % step == 0), 1)
-        angle, kept = angle_rad[::every], n_samples // every
-        tapered = scipy.fft.irfft(spectrum[:, : kept // 2 + 1], n=kept, axis=1)
-        weights, _ = _taper(kept)
-    # Halves of a turn, near zero: single precision has few digits for the angle after many turns.
-    halves = angle / (2 * np.pi)
-    halves[1:] -= np.rint(halves[1:] - halves[:-1]).cumsum()
-    halves /= 2
-    halves -= np.rint(halves)
-    half = (2 * np.pi * halves).astype(tapered.dtype)
-    turning = np.empty((len(ORDERS), half.size), np.result_type(half, np.complex64))  # e^{jkθ}
-    turning[0].real, turning[0].imag = np.cos(half), np.sin(half)
-    for row, first, second in ((1, 0, 0), (2, 1, 1), (3, 2, 1)):
-        np.multiply(turning[first], turning[second], out=turning[row])
-    regressors = np.empty((1 + 2 * len(ORDERS), half.size), half.dtype)
-    regressors[0], regressors[1::2], regressors[2::2] = 1, turning.real, turning.imag
-    try:
-        solved = np.linalg.solve(
-            every * ((regressors * weights) @ regressors.T).astype(np.float64),
-            (regressors @ tapered.T).astype(np.float64),
-        )
-    except np.linalg.LinAlgError:  # a shaft that stands still
-        return np.full((len(ORDERS), n), np.nan, dtype=np.complex128)
-    return np.asarray(solved[1::2] - 1j * solved[2::2], dtype=np.complex128)
-
-
-@lru_cache(maxsize=8)
-def _taper(size: int) -> tuple[_SingleArray, float]:
-    """Hann's, of so many samples, and what makes mean squares of the squares of its bins."""
-    taper = np.hanning(size + 1)[:-1].astype(np.float32)
-    taper.flags.writeable = False
-    return taper, 2 / (size * float(taper @ taper))
 
 
 @dataclass(frozen=True, slots=True)
@@ -413,7 +354,7 @@ def window_levels(
     orders = every_order if turning.all() else every_order[turning]
     speed_rad_s, vectors, amplitudes = None, None, np.full((len(ORDERS), n), np.nan)
     if len(orders):
-        speed_rad_s = float(speeds_rad_s[turning].mean())
+        speed_rad_s = float(_mean(speeds_rad_s[turning]))
         amplitudes = np.sqrt(_mean(orders.real**2 + orders.imag**2))
         if phase_reference:
             vectors = _mean(orders)

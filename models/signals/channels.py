@@ -24,6 +24,7 @@ class Quantity(StrEnum):
     TILT = "tilt"
     TILT_RATE = "tilt_rate"
     SHAFT_ANGLE = "shaft_angle"
+    __hash__ = str.__hash__  # an enumeration's own is computed in Python
 
 
 UNIT_TO_SI: dict[Quantity, dict[str, float]] = {

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from models.errors import MachineFileError, RotorwatchError
-from models.levels.measures import ORDERS
+from models.levels.orders import ORDERS
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from service.analysis.past import Past

@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from models.diagnosis.rotation import rotation_line
 from models.errors import MachineFileError, RotorwatchError
-from models.levels.measures import ORDERS, hop_levels, level_plan
+from models.levels.measures import hop_levels, level_plan
+from models.levels.orders import ORDERS
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from models.signals.waveform import waveform_of

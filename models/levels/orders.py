@@ -1,0 +1,94 @@
+"""Amplitudes and phases at orders of running speed (ISO 13373-2), in one hop."""
+
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+import scipy  # its sub-packages are loaded when they are first used
+
+from models.signals.block import FloatArray
+
+ORDERS = {"x_half": 0.5, "x1": 1.0, "x2": 2.0, "x3": 3.0}
+"""Multiples of running speed, by the name of their measure."""
+
+_MANY_REVOLUTIONS = 8.0
+_SAMPLES_A_TURN = 8.0
+"""At least: products of two orders go up to six times running speed."""
+_NEAR = 8
+"""Samples over which a shaft's speed does not change."""
+
+ComplexArray = npt.NDArray[np.complex128]
+Spectrum = npt.NDArray[np.complex64] | ComplexArray
+_SingleArray = npt.NDArray[np.float32]
+
+
+def order_vectors(
+    x: FloatArray, unit: FloatArray, spectrum: Spectrum, amplitude: FloatArray, angle_rad: FloatArray | None
+) -> ComplexArray:
+    """Amplitudes at the orders, by weighted least squares: exact for orders, whatever the number of revolutions.
+
+    Over many revolutions the samples are tapered, so that other lines stay out, and thinned out: tapered, they begin
+    and end with nothing, so the low end of their spectrum is the same signal in fewer samples, in which nothing that
+    the orders see is missing.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n, n_samples)
+    unit : ndarray, shape (n,)
+        What the amplitudes are given in parts of: single precision has no range for those of anything.
+    spectrum : ndarray, shape (n, n_samples // 2 + 1)
+        Of the tapered samples.
+    amplitude : ndarray, shape (n,)
+        What the spectrum is times, to be that of x.
+    angle_rad : ndarray, shape (n_samples,), or None
+        See `models.levels.measures.hop_levels`.
+
+    Returns
+    -------
+    ndarray of complex, shape (4, n)
+        q of x = Re{q e^{jkθ}} for the orders k of `ORDERS`; nan without a rotation.
+    """
+    n, n_samples = x.shape
+    if angle_rad is None:
+        return np.full((len(ORDERS), n), np.nan, dtype=np.complex128)
+    steps = angle_rad[1::_NEAR] - angle_rad[:-1:_NEAR]  # of neighbours, here and there
+    steps -= 2 * np.pi * np.rint(steps / (2 * np.pi))  # where it begins anew from zero
+    weights: FloatArray | _SingleArray
+    if abs(steps.mean()) * n_samples < 2 * np.pi * _MANY_REVOLUTIONS:
+        # Orders are nearly alike then: what tells them apart needs all digits.
+        angle, tapered, weights, every = angle_rad, x / unit[:, None], np.ones(n_samples), 1
+    else:
+        most = int(2 * np.pi / (_SAMPLES_A_TURN * np.abs(steps).max()))
+        every = next((step for step in range(most, 1, -1) if n_samples % step == 0), 1)
+        angle, kept = angle_rad[::every], n_samples // every
+        tapered = scipy.fft.irfft(spectrum[:, : kept // 2 + 1], n=kept, axis=1)
+        tapered = (tapered * (amplitude / unit)[:, None]).astype(np.float32)
+        weights, _ = hann_taper(kept)
+    # Halves of a turn, near zero: single precision has few digits for the angle after many turns.
+    halves = angle / (2 * np.pi)
+    halves[1:] -= np.rint(halves[1:] - halves[:-1]).cumsum()
+    halves /= 2
+    halves -= np.rint(halves)
+    half = (2 * np.pi * halves).astype(tapered.dtype)
+    turning = np.empty((len(ORDERS), half.size), np.result_type(half, np.complex64))  # e^{jkθ}
+    turning[0].real, turning[0].imag = np.cos(half), np.sin(half)
+    for row, first, second in ((1, 0, 0), (2, 1, 1), (3, 2, 1)):
+        np.multiply(turning[first], turning[second], out=turning[row])
+    regressors = np.empty((1 + 2 * len(ORDERS), half.size), half.dtype)
+    regressors[0], regressors[1::2], regressors[2::2] = 1, turning.real, turning.imag
+    try:
+        solved = np.linalg.solve(
+            every * ((regressors * weights) @ regressors.T).astype(np.float64),
+            (regressors @ tapered.T).astype(np.float64),
+        )
+    except np.linalg.LinAlgError:  # a shaft that stands still
+        return np.full((len(ORDERS), n), np.nan, dtype=np.complex128)
+    return np.asarray(solved[1::2] - 1j * solved[2::2], dtype=np.complex128)
+
+
+@lru_cache(maxsize=8)
+def hann_taper(size: int) -> tuple[_SingleArray, float]:
+    """Hann's, of so many samples, and what makes mean squares of the squares of its bins."""
+    taper = np.hanning(size + 1)[:-1].astype(np.float32)
+    taper.flags.writeable = False
+    return taper, 2 / (size * float(taper @ taper))
