@@ -258,6 +258,11 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
         expect(page.locator("level-table details")).to_have_attribute("open", "")
         expect(page.locator("rotor-drawing .sensor.danger")).to_contain_text("DE-H ◆ danger")
         expect(page.locator("rotor-drawing svg")).to_contain_text(re.compile(r"[\d.]+ (mm/s|m/s²) rms"))
+    told |= {"alarms": [], "state": "not-evaluable"}
+    with looking(browser, url) as page:
+        route_events(page, instead)
+        page.goto(f"{url}/#/")
+        expect(page.locator("machine-tile .worst")).to_have_text("<b>reason</b> & more")  # not one of its levels
 
 
 def test_machines_stand_by_site_and_only_lines_that_are_seen_are_asked_for(browser: Browser, plant: Plant) -> None:

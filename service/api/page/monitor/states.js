@@ -111,7 +111,7 @@ export function worst(health) {
   const rank = (/** @type {Alarm} */ one) => (ofMachine(one) ? 0 : 2) + (one.severity === "danger" ? 0 : 1);
   const alarm = health.alarms.filter((one) => one.raised).sort(byUrgency).sort((one, other) => rank(one) - rank(other))[0];
   const found = [...parameters(health), ...levels(health)].sort((one, other) => other.nearness - one.nearness);
-  if (!alarm) return found[0] ?? null;
+  if (!alarm) return health.state === "not-evaluable" ? null : (found[0] ?? null); // why it is not comes before a level of a machine that stands
   const same = found.find((one) => one.series === alarm.name || `level:${one.series}`.startsWith(`${alarm.name}:`));
   const value = alarm.relative_change !== null && alarm.standard_error !== null ? within(alarm.relative_change, Z95 * alarm.standard_error) : "";
   return { title: alarm.text, value: same?.value ?? value, limit: same?.limit ?? "", quantity: same?.quantity ?? "", series: same?.series ?? "" };

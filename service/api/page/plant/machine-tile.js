@@ -53,7 +53,7 @@ class MachineTile extends MachineElement {
     this.className = ABNORMAL.has(health.state) ? `tile ${health.state}` : silent ? "tile no-data" : "tile";
     if (!this.childElementCount) lay(this, this.#states, html("h3", {}, html("a", { href: `#/machines/${this.place}` }, html("small", {}, `${health.site}/`), health.machine)), this.#worst, this.#line, html("p", { class: "foot" }, this.#count, this.#age));
     lay(this.#states, html("state-mark", { state: health.state }), silent && health.state !== "no-data" && html("state-mark", { state: "no-data" }));
-    lay(this.#worst, ...(found ? [html("span", {}, found.title), html("b", { class: "number" }, found.value), html("small", {}, found.limit)] : [html("span", {}, health.reason || "Nothing has been evaluated yet.")]));
+    lay(this.#worst, ...(found ? [html("span", {}, found.title), html("b", { class: "number" }, found.value), html("small", {}, found.limit)] : [html("span", { title: health.reason }, health.reason || "Nothing has been evaluated yet.")]));
     this.#count.textContent = unseen ? `${unseen} unacknowledged` : standing ? `${standing} acknowledged` : "no alarm";
     const line = this.#line.firstElementChild;
     if ((line?.getAttribute("series") ?? "") !== (found?.series ?? "")) lay(this.#line, found?.series && html("spark-line", { place: this.place, quantity: found.quantity, series: found.series }));
