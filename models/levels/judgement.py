@@ -1,5 +1,6 @@
 """Levels against their limits: absolute ones, and those relative to a reference."""
 
+import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -182,11 +183,18 @@ class LevelJudge:
         channel, relative = self._channels[column], None if alike is None else self._relatives[alike]
         standard = self._standard(channel, levels.speed_rad_s)
         zone = "" if standard is None else zone_of(values[_ROW[standard[1]]], standard[2])
-        edge, region = None, None if relative is None else relative.regions[column]
+        edge, out, region = None, "", None if relative is None else relative.regions[column]
         if region is not None and levels.vectors is not None:
             moved = complex(levels.vectors[1, column])
             if abs(moved - region.centre) > region.radius:
                 edge = min(values[_ROW["x1"]], shown_level(channel, "x1", region.alert))  # beyond it in any case
+                was_deg = (
+                    math.degrees(-math.copysign(1.0, levels.speed_rad_s or 0.0) * cmath.phase(region.centre)) % 360
+                )
+                out = (
+                    f"phase lag {values[_ROW['x1_phase_lag_deg']]:.0f}°: out of its acceptance region about "
+                    f"{shown_level(channel, 'x1', region.mean):.3g} {channel.unit} at {was_deg:.0f}°"
+                )
         key, words = (column, alike, standard, zone, edge), _WORDS
         limits = self._limits.get(key)
         if limits is None:
@@ -201,7 +209,7 @@ class LevelJudge:
             [
                 near.normal
                 if near.low <= values[_ROW[name]] < near.high
-                else self._limited(channel, name, values[_ROW[name]], near, words[name])
+                else self._limited(channel, name, values[_ROW[name]], near, words[name], out)
                 for name, near in limits.items()
             ]
         )
@@ -264,15 +272,23 @@ class LevelJudge:
             self._relatives[alike] = relative_limits(levels, reference, self._channels, self._settings)
         return alike
 
-    def _limited(self, channel: Channel, name: str, value: float, nearest: _Nearest, words: str) -> LevelLimits:
-        """On which side of its limits a level is that is not well within them."""
+    def _limited(
+        self, channel: Channel, name: str, value: float, nearest: _Nearest, words: str, out: str
+    ) -> LevelLimits:
+        """On which side of its limits a level is that is not well within them.
+
+        Parameters
+        ----------
+        out : str
+            What is said of a 1x vector that is out of its acceptance region.
+        """
         danger, alert, fall = nearest.danger, nearest.alert, nearest.fall
         if danger is not None and value >= (danger.danger or math.inf):
             state, decided, what = "danger", danger, f"danger from {danger.danger:.3g} ({danger.source})"
         elif alert is not None and value >= (alert.alert or math.inf):
             state, decided, what = "alert", alert, f"alert from {alert.alert:.3g} ({alert.source})"
             if alert.source == _TURNED_OUT:
-                what = "has moved out of its acceptance region"
+                what = out
         elif fall is not None and value < (fall.fall or 0.0):
             state, decided, what = "alert", fall, f"alert below {fall.fall:.3g} ({fall.source})"
         else:  # not a number, or a gap on the other side of zero

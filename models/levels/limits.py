@@ -54,7 +54,9 @@ class Region:
 
     centre: complex
     radius: float
-    alert: float  # limit of the amplitude, SI units
+    # Limit of the level, and what it was, SI units.
+    alert: float
+    mean: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +110,7 @@ def _region(channel: Channel, one: ReferenceLevel, centre: complex, alert: float
     factor = _level_per_amplitude(channel)
     farthest = max(BEYOND_RANGE * one.turned, one.turned + _filling(one, shorter) * one.mean / factor)
     by_chance = ERRORS * one.error * shorter / factor
-    return Region(centre, max(_TURNED * abs(centre), farthest, by_chance), alert)
+    return Region(centre, max(_TURNED * abs(centre), farthest, by_chance), alert, one.mean)
 
 
 def _level_per_amplitude(channel: Channel) -> float:
