@@ -243,8 +243,7 @@ def beyond_memory(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMomen
     What the row leaves out of the machine may be felt for longer than the force remembers. Where no relation fits,
     longer lags are tried; the last value is the one at which one does, 0 if none had to be.
     """
-    parts, lags = _beyond_force(row, windows)
-    fits = fit_row(row, parts)
+    parts, fits, lags = _beyond_force(row, windows)
     if any(fit.fits for fit in fits):
         return parts, fits, 0.0
     for longer in _LONGER_LAGS_S:
@@ -255,14 +254,14 @@ def beyond_memory(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMomen
     return parts, fits, 0.0
 
 
-def _beyond_force(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMoments], list[float]]:
+def _beyond_force(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMoments], tuple[Fit, Fit], list[float]]:
     parts, lags, used = (
         [window.beyond(LAG_FROM_S) for window in windows],
         [0.0] * len(windows),
         [LAG_FROM_S] * len(windows),
     )
+    fits = fit_row(row, parts)
     for _ in range(_LAG_ROUNDS):
-        fits = fit_row(row, parts)
         for fit in fits:
             combination = np.concatenate([[1.0], -fit.coefficients])
             found = [lag_beyond_memory(window, combination) for window in windows]
@@ -270,7 +269,8 @@ def _beyond_force(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMomen
         if lags == used:
             break
         parts, used = [window.beyond(lag) for window, lag in zip(windows, lags, strict=True)], lags
-    return parts, used
+        fits = fit_row(row, parts)
+    return parts, fits, used
 
 
 def fit_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Fit, Fit]:
