@@ -246,11 +246,12 @@ def program(
     cwd: Path = ROOT,
     alone: dict[str, str] | None = None,
     within: tuple[str, ...] = (),
+    network: str = "",
     **environment: str,
 ) -> Iterator[Program]:
     """Run ``python -m ARGUMENTS`` from the checkout or elsewhere; `alone` is an environment of its own.
 
-    The words `within` come before the command. It is gone when the block is left.
+    The words `within` come before the command; `network` is that of a host. It is gone when the block is left.
     """
     number = len(list(folder.glob("*.out")))
     out, err = folder / f"{number}.out", folder / f"{number}.err"
@@ -267,7 +268,7 @@ def program(
                 env=variables,
             )
         else:
-            process = Preloaded(arguments, cwd, out, err, variables)
+            process = Preloaded(arguments, cwd, out, err, variables, network)
     try:
         yield Program(process, out, err)
     finally:

@@ -13,6 +13,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from tests.service.hosts import move_to
+
 _ROOT = Path(__file__).parents[2]
 
 PROGRAMS = [
@@ -29,10 +31,16 @@ class Preloaded:
     """``python -m ARGUMENTS``, as `subprocess.Popen` would start it."""
 
     def __init__(
-        self, arguments: tuple[str, ...], cwd: Path, out: Path, err: Path, environment: dict[str, str]
+        self,
+        arguments: tuple[str, ...],
+        cwd: Path,
+        out: Path,
+        err: Path,
+        environment: dict[str, str],
+        network: str = "",
     ) -> None:
         self.args = arguments
-        self._process = CONTEXT.Process(target=_run, args=(arguments, cwd, out, err, environment))
+        self._process = CONTEXT.Process(target=_run, args=(arguments, cwd, out, err, environment, network))
         self._process.start()
 
     @property
@@ -97,8 +105,12 @@ def rotorwatch(*arguments: str | Path, **environment: str) -> subprocess.Complet
     return ran("service.rotorwatch", *arguments, environment=clean)
 
 
-def _run(arguments: tuple[str, ...], cwd: Path, out: Path, err: Path, environment: dict[str, str]) -> None:
+def _run(
+    arguments: tuple[str, ...], cwd: Path, out: Path, err: Path, environment: dict[str, str], network: str
+) -> None:
     gc.freeze()  # looking through what is shared would copy it
+    if network:
+        move_to(network)
     for number, path in ((0, os.devnull), (1, out), (2, err)):
         opened = os.open(path, os.O_RDWR | os.O_APPEND)
         os.dup2(opened, number)

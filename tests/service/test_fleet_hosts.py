@@ -153,7 +153,7 @@ def test_a_cut_cable_and_a_lost_host_leave_the_alarm_logs_of_a_fleet_as_they_wou
         # The path of a socket may have a hundred letters.
         rays = Path(running.enter_context(tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True)))
         listening = ("--listen", "tcp/0.0.0.0:7447", "--without-grants")
-        router = program(tmp_path, "service.rotorwatch", "router", *listening, within=net.within(MIDDLE))
+        router = program(tmp_path, "service.rotorwatch", "router", *listening, network=net.network(MIDDLE))
         running.enter_context(router).wait_for("router listening")
 
         def node(host: str, *options: str) -> Group:
@@ -177,7 +177,7 @@ def test_a_cut_cable_and_a_lost_host_leave_the_alarm_logs_of_a_fleet_as_they_wou
             str(settings),
         )
         alone = {key: value for key, value in os.environ.items() if not key.startswith("ROTORWATCH_")} | _VARIABLES
-        served = running.enter_context(program(tmp_path, *command, within=net.within("first"), alone=alone))
+        served = running.enter_context(program(tmp_path, *command, network=net.network("first"), alone=alone))
         url = served.url()
 
         def health(name: str) -> Health:
@@ -201,7 +201,7 @@ def test_a_cut_cable_and_a_lost_host_leave_the_alarm_logs_of_a_fleet_as_they_wou
                 program(
                     tmp_path,
                     *("simulator.rotorsim", "publish", "healthy", "--duration", "900", "--start", start, *where, *what),
-                    within=net.within("machine"),
+                    network=net.network("machine"),
                 )
             )
         sent_s = time.monotonic()

@@ -55,7 +55,7 @@ def test_what_a_cut_cable_and_a_lost_host_cost_is_stated_and_the_alarm_log_arriv
             made = program(
                 tmp_path,
                 *arguments,
-                within=net.within(host),
+                network=net.network(host),
                 ROTORWATCH_HISTORY__URL=f"sqlite:///{history}",
                 ROTORWATCH_QUEUE__WHEN_FULL="drop",
             )
