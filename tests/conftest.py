@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -19,6 +20,7 @@ import hypothesis
 import pytest
 import structlog
 import typer.testing
+from _pytest.assertion import rewrite
 
 ROOT = Path(__file__).parents[1]
 if str(ROOT) not in sys.path:
@@ -85,11 +87,27 @@ _LONGEST = (
 """Modules that take long for the number of their tests, longest first."""
 
 
-def pytest_xdist_setupnodes() -> None:
-    """Have workers forked, which makes them start at once."""
+def pytest_xdist_setupnodes(config: pytest.Config) -> None:
+    """Have workers forked, which makes them start at once, and modules compiled once, and not by each of them."""
     from tests.forked_workers import ForkedIO  # noqa: PLC0415  # nobody else needs it
 
     execnet.gateway_io.Popen2IOMaster = ForkedIO  # type: ignore[assignment, misc]
+    if sys.dont_write_bytecode:
+        return
+    for asked in config.args:
+        place = Path(config.invocation_params.dir, asked.partition("::")[0])
+        for module in place.glob("**/test_*.py") if place.is_dir() else [place]:
+            _compile(module, config)
+
+
+def _compile(module: Path, config: pytest.Config) -> None:
+    """Leave a module's code, with its assertions rewritten, where importing it looks for that."""
+    kept_in = rewrite.get_cache_dir(module)
+    kept = kept_in / f"{module.stem}{rewrite.PYC_TAIL}"
+    if module.is_file() and rewrite._read_pyc(module, kept) is None and rewrite.try_makedirs(kept_in):
+        with suppress(SyntaxError):  # which is told where the module is imported
+            stat, code = rewrite._rewrite_test(module, config)
+            rewrite._write_pyc(config.stash[rewrite.assertstate_key], code, stat, kept)
 
 
 @pytest.hookimpl(trylast=True)
