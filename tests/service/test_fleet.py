@@ -2,9 +2,9 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
-from ray.cluster_utils import Cluster
 from typer.testing import CliRunner
 
 from benchmarks.studies.study import spread_over
@@ -25,6 +25,9 @@ from tests.service.postgres import postgres_server
 from tests.service.replaying import recording
 from tests.service.test_shards import SECONDS, plan_for
 
+if TYPE_CHECKING:
+    from ray.cluster_utils import Cluster
+
 
 def fleet_plan(folder: Path, database: str, count: int = 2) -> ServiceSettings:
     """Two machines, each in a shard of its own if there are two."""
@@ -38,8 +41,10 @@ def fleet_plan(folder: Path, database: str, count: int = 2) -> ServiceSettings:
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
+def cluster() -> Iterator["Cluster"]:
     """A Ray cluster of two computers with a core each, beside one without any; all are this computer."""
+    from ray.cluster_utils import Cluster  # noqa: PLC0415  # half a second, and every worker reads this module
+
     head = {"num_cpus": 0, "include_dashboard": False, "_system_config": {"worker_niceness": 0}}
     made = Cluster(initialize_head=True, head_node_args=head)
     try:
@@ -56,7 +61,7 @@ def computers_of(runtime: Runtime) -> list[str]:
     return [shard.process.computer for shard in runtime._machines._shards]  # type: ignore[attr-defined]  # actors
 
 
-def test_a_computer_that_is_lost_and_one_that_comes(cluster: Cluster, tmp_path: Path) -> None:
+def test_a_computer_that_is_lost_and_one_that_comes(cluster: "Cluster", tmp_path: Path) -> None:
     blocks = scenario_blocks(SECONDS, parse_fault("k_by=-0.33@10"))
     with postgres_server() as server:
         plan = fleet_plan(tmp_path, server.new_database("fleet"))
@@ -104,7 +109,7 @@ def test_a_computer_that_is_lost_and_one_that_comes(cluster: Cluster, tmp_path: 
                 assert [event.alarm for event in after if event.kind == "raised"].count("k_by") == 1
 
 
-def test_an_archive_and_a_study_on_a_cluster(cluster: Cluster, tmp_path: Path) -> None:
+def test_an_archive_and_a_study_on_a_cluster(cluster: "Cluster", tmp_path: Path) -> None:
     plan = plan_for(tmp_path, 1)
     kits = [load_machine(entry.file) for entry in plan.machines]
     files = [
