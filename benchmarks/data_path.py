@@ -63,6 +63,8 @@ def main() -> None:
     rows = np.ascontiguousarray(piece.T)  # as the moments have them
     seen, angle, measured = waveform_of(rows[:-1, -plan.hop :].T), rows[-1, -plan.hop :], plan.levels
     assert measured is not None  # noqa: S101  # planned above
+    taper = np.hanning(plan.segment + 1)[:-1] / np.sqrt(3 / 8 * plan.segment * plan.rate_hz)
+    spectrum = np.fft.rfft(seen[1] * taper)  # as the moments have it: a hop is a segment here
     channels = [machine.sensors[column] for column in plan.columns]
     judge = LevelJudge(measured, channels, machine.levels)
     healthy = learn_levels("commissioned", [channel.name for channel in channels], measures)
@@ -93,7 +95,7 @@ def main() -> None:
     costs = {
         "Fourier transforms alone (yardstick)": median_s(yardstick, 1),
         "moments of a hop": median_s(lambda: hop_moments(plan, piece, level, 0), 1),
-        "  of which levels of the hop": often(lambda: hop_levels(measured, *seen, angle)),
+        "  of which levels of the hop": often(lambda: hop_levels(measured, *seen, angle, spectrum)),
         "levels of a window": often(lambda: window.levels(errors=False)),
         "  judged, known machine": often(lambda: judge.judge(measures[-1], None)),
         "  judged against commissioning": often(lambda: judge.judge(measures[-1], healthy)),
