@@ -1,6 +1,6 @@
 """What alarms quote of a step while the monitor watches it, beside the truth: how large it is, and when it came."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -158,19 +158,6 @@ def _dated(one: Finding | None, step_ns: int) -> dict[str, Value]:
     return {"since_s": (one.since_ns - step_ns) / 1e9, "since": holds}
 
 
-def _rms(column: str) -> Callable[[Sequence[Record]], float | None]:
-    def of(rows: Sequence[Record]) -> float | None:
-        values = r.floats(row.get(column) for row in rows)
-        return float(np.sqrt(np.mean(values**2))) if values.size else None
-
-    return of
-
-
-def _off(rows: Sequence[Record]) -> float | None:
-    values = np.abs(r.floats(row.get("since_s") for row in rows))
-    return float(np.quantile(values, 0.95)) if values.size else None
-
-
 def _alarms(records: Sequence[Record]) -> list[Record]:
     return [row for row in records if "true" in row]
 
@@ -178,13 +165,13 @@ def _alarms(records: Sequence[Record]) -> list[Record]:
 _COLUMNS = {
     "changes by name": r.share("named"),
     "first: covers": r.share("first"),
-    "first: z rms": _rms("first z"),
+    "first: z rms": r.number("first z", r.rms),
     "after a window": r.share("window"),
     "settled": r.share("settled"),
-    "settled: z rms": _rms("settled z"),
+    "settled: z rms": r.number("settled z", r.rms),
     "wrong names": r.share("wrong"),
     "limits of `since` hold": r.share("since"),
-    "`since` off, 95 %, s": _off,
+    "`since` off, 95 %, s": r.number("since_s", lambda x: np.quantile(np.abs(x), 0.95)),
 }
 TABLES = (
     Table("delay-alarms", ("level",), _COLUMNS, _alarms, "What alarms quote, lab watched by the whole monitor:"),

@@ -17,10 +17,15 @@ import numpy as np
 from models.diagnosis.likelihood.motions import BinGroups, Motions
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, SHAPES, STRUCTURAL, SpectralModel
 from models.diagnosis.likelihood.unbalance import estimate_unbalance
+from models.diagnosis.moments import plan_for
 from models.machine import Machine
+from models.physics.excitation import source_spectrum
 from models.physics.response import synchronous_response
 from models.physics.rotor import STATE_INDEX, changed
 from models.signals.block import FloatArray
+from simulator.plant import theoretical_rms
+from simulator.scenario import Scenario
+from simulator.timeline import Condition
 
 _PULL = 1e-6
 """Keeps directions invertible that the sensors do not see at all."""
@@ -56,22 +61,9 @@ class TrueCondition:
 def cramer_rao(
     machine: Machine, states: tuple[str, ...], true: TrueCondition, duration_s: float, *, shape_known: bool = True
 ) -> dict[str, float]:
-    """Smallest standard error of each parameter's relative change.
+    """Smallest standard error of the relative change of ``k_by, c_by, k_bz, c_bz, EI, e``, read from measured states.
 
-    Parameters
-    ----------
-    machine : Machine
-    states : tuple of str
-        Measured states.
-    true : TrueCondition
-    duration_s : float
-    shape_known : bool
-        Whether the excitation is known to be a second-order low-pass.
-
-    Returns
-    -------
-    dict of str to float
-        ``k_by, c_by, k_bz, c_bz, EI, e``.
+    `shape_known`: whether the excitation is known to be a second-order low-pass.
     """
     low, high = machine.window.band_hz
     spacing = 1 / machine.window.segment_s
@@ -126,3 +118,36 @@ def _theta(model: SpectralModel, true: TrueCondition, levels: FloatArray) -> Flo
     relative = relative + 1e-12 * np.trace(relative) * np.eye(6)
     theta[model.level_at] = np.linalg.cholesky(relative)[ROWS, COLUMNS]
     return theta
+
+
+def bound_of(scenario: Scenario, machine: Machine) -> dict[str, float]:
+    """The bound for one window of a scenario, as it is from its first sample on."""
+    states = plan_for(machine).states
+    return cramer_rao(machine, states, _true_condition(scenario, machine), machine.window.length_s)
+
+
+def _true_condition(scenario: Scenario, machine: Machine) -> TrueCondition:
+    changes = {one.parameter: one.relative_change for one in scenario.events if one.parameter}
+    truth = {name: float(change) for name, change in changes.items() if change is not None}
+    speed_rpm = [one.speed_rpm for one in scenario.events if one.speed_rpm is not None][-1]
+    rms = theoretical_rms(machine, Condition(truth, speed_rpm, scenario.sources))
+    states = [STATE_INDEX[name] for name in plan_for(machine).states]
+    low_hz, high_hz = machine.window.band_hz
+    frequencies_hz = np.linspace(low_hz, high_hz, 64)
+    corner_hz = scenario.sensors.noise_corner_hz
+    memory = 0.0 if corner_hz is None else float(np.exp(-2 * np.pi * corner_hz / machine.rate_hz))
+    density = (1 - memory**2) / np.abs(1 - memory * np.exp(-2j * np.pi * frequencies_hz / machine.rate_hz)) ** 2
+    colour = np.stack([np.ones(64), np.log1p((frequencies_hz / (2 / 3 * high_hz)) ** 2)], axis=1)
+    (level, exponent), *_ = np.linalg.lstsq(colour, np.log(density / machine.rate_hz), rcond=None)
+    variance = (scenario.sensors.noise_relative * rms[states]) ** 2
+    levels = np.zeros((6, 6))
+    for source in scenario.sources:
+        levels += np.outer(source.direction, source.direction) * float(source_spectrum(np.array([1e-6]), source)[0])
+    return TrueCondition(
+        changes=truth,
+        speed_rad_s=speed_rpm * 2 * np.pi / 60,
+        cutoff_hz=scenario.sources[0].cutoff_hz,
+        levels=levels,
+        noise=np.asarray(np.exp(level) * variance, dtype=np.float64),
+        noise_colour=np.full(len(states), float(exponent)),
+    )

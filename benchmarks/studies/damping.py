@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 from scipy.special import ndtr
 
-from benchmarks.finite_elements.machines import rotor_named
+from benchmarks.finite_elements.machines import ROTORS, rotor_named
 from benchmarks.finite_elements.observed import (
     RunCondition,
     WindowSizes,
@@ -27,7 +27,7 @@ from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_
 from benchmarks.studies import results as r
 from benchmarks.studies.damping_bound import DampingBound, damping_bound, expected
 from benchmarks.studies.opinions import changed_in
-from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
+from benchmarks.studies.results import Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from benchmarks.studies.watched import commissioned, raised
 from models.commissioning.commissioned import Installed
@@ -35,7 +35,6 @@ from models.diagnosis.baseline.rows import ROWS, Row
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import to_scale
 from models.diagnosis.window import WindowStatistics
-from models.errors import MachineFileError
 from models.physics.rotor import PARAMETERS
 from service.monitor.monitor import MachineMonitor
 
@@ -152,16 +151,6 @@ def _by_the_bound(own: Mapping[str, Value], changes: Mapping[str, float], settin
     return probability if damping else None
 
 
-def _mean(column: str, rows: Sequence[Record]) -> float | None:
-    found = r.floats(row.get(column) for row in rows)
-    return float(found.mean()) if found.size else None
-
-
-def _rms(column: str, rows: Sequence[Record]) -> Estimate | None:
-    found = r.floats(row.get(column) for row in rows)
-    return r.resampled(lambda x: np.sqrt(np.mean(x**2, axis=-1)), found) if found.size else None
-
-
 def _dampings(records: Sequence[Record]) -> Iterator[Record]:
     """One row for each plane's damping of every stream."""
     for record in records:
@@ -184,7 +173,7 @@ _TABLES = (
             "exactly named within 120 s": r.share("in time"),
             "by 135 s": r.share("by its end"),
             "another named": r.share("wrong"),
-            "by the bound": partial(_mean, "by the bound"),
+            "by the bound": r.number("by the bound", np.mean),
         },
         page="*Exactly named*: an alarm of every changed parameter and of no other one. *By the bound*: how often an "
         "estimator with the smallest errors would have named the changed damping at the same limits, from 120 s.",
@@ -195,10 +184,10 @@ _TABLES = (
         {
             "readings": len,
             "bound, median": r.middle("bound"),
-            "error over bound, rms": partial(_rms, "in bounds"),
+            "error over bound, rms": r.estimated("in bounds", r.rms, 1),
             "stated error over bound, median": r.middle("stated"),
-            "error over stated error, rms": partial(_rms, "in errors"),
-            "oracle's error over bound, rms": partial(_rms, "oracle"),
+            "error over stated error, rms": r.estimated("in errors", r.rms, 1),
+            "oracle's error over bound, rms": r.estimated("oracle", r.rms, 1),
         },
         _dampings,
         "Readings of damping in the first 30 s. *Not quite true*: what the relation leaves out of this rotor moves its "
@@ -217,18 +206,13 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
             1.0,
         )
     yield r.at_most("another one named", r.share("wrong")(list(records)), 0.01)
-    holding = r.where(_dampings(records), relation="holds")
-    yield r.at_most("error of damping over its bound, rms, where the relation holds", _rms("in bounds", holding), 1.3)
+    of_bound = r.estimated("in bounds", r.rms, 1)(r.where(_dampings(records), relation="holds"))
+    yield r.at_most("error of damping over its bound, rms, where the relation holds", of_bound, 1.3)
 
 
 def damping(options: Options) -> Study:
     """Damping of an overhung rotor without parameters."""
-    machines = options.machines or ("overhung",)
-    for name in machines:
-        try:
-            rotor_named(name)
-        except KeyError as error:
-            raise MachineFileError(f"--machine {name}: not a rotor of finite elements") from error
+    machines = options.machines_among([rotor.name for rotor in ROTORS], "overhung")
     lengths = _HEALTHY_S[:1] if options.small else _HEALTHY_S
     cells = tuple(
         Cell({"machine": name, "healthy_s": healthy_s}, options.windows, (name, healthy_s))

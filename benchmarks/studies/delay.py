@@ -14,10 +14,9 @@ from scipy.special import ndtri
 
 from benchmarks.studies import alarm_readings as t
 from benchmarks.studies import results as r
-from benchmarks.studies.bound import cramer_rao
-from benchmarks.studies.evaluate import true_condition
+from benchmarks.studies.bound import bound_of
 from benchmarks.studies.opinions import LAYOUTS, SEVERAL
-from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value
+from benchmarks.studies.results import Chart, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from models.commissioning.commissioned import KnowledgeLevel
 from models.diagnosis.likelihood.fit import LengthFits
@@ -27,7 +26,7 @@ from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTe
 from models.diagnosis.verdict.stretch import Stretch, determined, stretch_of, to_scale
 from models.diagnosis.window import SlidingWindow
 from models.errors import EstimationError
-from models.machine import Machine
+from models.machine import Machine, load_machine
 from models.physics.rotor import PARAMETERS
 from simulator.scenario import Event, Scenario
 from simulator.stream import blocks
@@ -61,9 +60,7 @@ class _Case:
         rng = np.random.default_rng([self.seed, Purpose.EVALUATION, self.stream, number, _STREAM])
         step_s = healthy.duration_s + self.machine.window.hop_s * float(rng.uniform(0, _HEALTHY_HOPS))
         step = Event(at_s=step_s, parameter=self.parameter, relative_change=self.change)
-        states, length_s = plan_for(self.machine).states, self.machine.window.length_s
-        bound = cramer_rao(self.machine, states, true_condition(healthy, self.machine), length_s)
-        return healthy.overridden(duration_s=step_s + _AFTER_S, faults=[step]), step_s, bound
+        return healthy.overridden(duration_s=step_s + _AFTER_S, faults=[step]), step_s, bound_of(healthy, self.machine)
 
     def times(self, settings: SequentialSettings, bound: dict[str, float]) -> dict[str, Value]:
         """The bound's time at the threshold of a test of the window alone, and at this test's."""
@@ -244,17 +241,18 @@ def _goals(own_s: float, records: Sequence[Record]) -> Iterator[Goal]:
     yield from t.goals(records)
 
 
+def _shares(rows: Sequence[Record]) -> list[tuple[float, float]]:
+    """Delays, and the share of streams in which the change was found by then."""
+    found = np.sort([float(row["found"] or 0.0) for row in rows])
+    return [(float(x), (n + 1) / found.size) for n, x in enumerate(found) if np.isfinite(x)]
+
+
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
-    panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {}
-    for (changed, declared), rows in r.grouped(
-        _judged(r.where(records, layout=SEVERAL, early=False)), "changed", "rate"
-    ).items():
-        panel = panels.setdefault(f"{changed}, {declared}", {})
-        for (hop_s,), group in r.grouped(rows, "hop_s").items():
-            found = np.sort([float(row["found"] or 0.0) for row in group])
-            panel[f"hop {hop_s:g} s"] = [
-                (float(x), (n + 1) / found.size) for n, x in enumerate(found) if np.isfinite(x)
-            ]
+    found = _judged(r.where(records, layout=SEVERAL, early=False))
+    panels = r.panels(
+        (f"{changed}, {declared}", f"hop {hop_s:g} s", _shares(rows))
+        for (changed, declared, hop_s), rows in r.grouped(found, "changed", "rate", "hop_s").items()
+    )
     yield Chart(
         "delay", "Share of streams in which the change is found, over the time since",
         panels, "time since the change, s", "found", steps=True, lines=(0.95,),
@@ -263,7 +261,7 @@ def _charts(records: Sequence[Record]) -> Iterator[Chart]:
 
 def delay(options: Options) -> Study:
     """Step changes on streams."""
-    machine = options.machine()
+    machine = load_machine(options.machine)
     own = machine.window.hop_s
     hops = [own / 2] if (own / machine.window.segment_s).is_integer() else []  # a hop holds whole half segments
     cells = []
@@ -288,7 +286,7 @@ def delay(options: Options) -> Study:
     for level in (KnowledgeLevel.FULL, KnowledgeLevel.NONE):
         keys = {"layout": "either", "changed": "one or two", "hop_s": own, "short_s": "", "level": level.value}
         trials = 1 if options.small else round(2.5 * options.windows)
-        cells.append(Cell(keys, trials, t.Told((options.machines or ("lab",))[0], level, options.seed)))
+        cells.append(Cell(keys, trials, t.Told(options.machine, level, options.seed)))
     return Study(
         name="delay",
         cells=tuple(cells),

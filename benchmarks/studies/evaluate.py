@@ -1,41 +1,23 @@
 """How sharp the readings are, whether their intervals hold what they promise, what is named and how often falsely."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 from scipy.special import ndtr
 
+from benchmarks.studies import opinions as o
 from benchmarks.studies import results as r
-from benchmarks.studies.bound import TrueCondition, cramer_rao
-from benchmarks.studies.opinions import (
-    LAYOUTS,
-    ONE,
-    RATES,
-    SEVERAL,
-    TITLES,
-    changed_in,
-    diagnosticians,
-    judged,
-    opinion,
-    readings,
-    truth,
-)  # fmt: skip
+from benchmarks.studies.bound import bound_of
 from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.moments import plan_for
-from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.readings import Z95
 from models.diagnosis.verdict.calibration import detectable_changes, window_thresholds
 from models.diagnosis.verdict.stretch import stretch_of, to_scale
 from models.machine import Machine, load_machine
-from models.physics.excitation import source_spectrum
-from models.physics.rotor import PARAMETERS, STATE_INDEX
-from simulator.plant import theoretical_rms
-from simulator.scenario import Scenario
-from simulator.timeline import Condition
+from models.physics.rotor import PARAMETERS
 from simulator.training.draws import Anomaly, Draw, Excitation, Layout, Purpose, draw_condition, simulate_scenario
 
 _EXCITATIONS = {
@@ -99,63 +81,32 @@ def _kinds(*, whole: bool) -> Iterator[_Kind]:
     )
 
 
-def true_condition(scenario: Scenario, machine: Machine) -> TrueCondition:
-    """What the scenario makes of the machine from its first sample on, as the bound needs it."""
-    changes = {one.parameter: one.relative_change for one in scenario.events if one.parameter}
-    truth = {name: float(change) for name, change in changes.items() if change is not None}
-    speed_rpm = [one.speed_rpm for one in scenario.events if one.speed_rpm is not None][-1]
-    rms = theoretical_rms(machine, Condition(truth, speed_rpm, scenario.sources))
-    states = [STATE_INDEX[name] for name in plan_for(machine).states]
-    low_hz, high_hz = machine.window.band_hz
-    frequencies_hz = np.linspace(low_hz, high_hz, 64)
-    corner_hz = scenario.sensors.noise_corner_hz
-    memory = 0.0 if corner_hz is None else float(np.exp(-2 * np.pi * corner_hz / machine.rate_hz))
-    density = (1 - memory**2) / np.abs(1 - memory * np.exp(-2j * np.pi * frequencies_hz / machine.rate_hz)) ** 2
-    colour = np.stack([np.ones(64), np.log1p((frequencies_hz / (2 / 3 * high_hz)) ** 2)], axis=1)
-    (level, exponent), *_ = np.linalg.lstsq(colour, np.log(density / machine.rate_hz), rcond=None)
-    variance = (scenario.sensors.noise_relative * rms[states]) ** 2
-    levels = np.zeros((6, 6))
-    for source in scenario.sources:
-        levels += np.outer(source.direction, source.direction) * float(source_spectrum(np.array([1e-6]), source)[0])
-    return TrueCondition(
-        changes=truth,
-        speed_rad_s=speed_rpm * 2 * np.pi / 60,
-        cutoff_hz=scenario.sources[0].cutoff_hz,
-        levels=levels,
-        noise=np.asarray(np.exp(level) * variance, dtype=np.float64),
-        noise_colour=np.full(len(states), float(exponent)),
-    )
-
-
-def _measure(
-    machines: dict[str, tuple[Machine, Bundle | None]], seed: int, _: None, cell: Cell, number: int
-) -> list[dict[str, Value]]:
+def _measure(machines: dict[str, o.Trained], seed: int, _: None, cell: Cell, number: int) -> list[dict[str, Value]]:
     stream, kind = cell.given
-    machine, bundle = machines[str(cell.keys["machine"])]
+    trained = machines[str(cell.keys["machine"])]
     if kind.length_s is not None:
-        machine, bundle = _with_length(machine, kind.length_s), None
-    faults = kind.faults
+        trained = o.Trained(_with_length(trained.machine, kind.length_s), None)
+    machine, faults = trained.machine, kind.faults
     draw = Draw(
         machine, seed, Purpose.EVALUATION, stream, faults=faults,
         layout=kind.layout, excitation=kind.excitation, anomaly=kind.anomaly,
     )  # fmt: skip
     if kind.topic == "detectable":
         faults = _quoted(draw, number)
-        draw = Draw(machine, seed, Purpose.EVALUATION, stream, faults=faults)
+        draw = replace(draw, faults=faults)
     scenario = draw_condition(draw, number)
     if kind.topic == "detectable":
         scenario = scenario.model_copy(update={"seed": scenario.seed ^ _OTHER_REALISATION})
     window = simulate_scenario(scenario, machine)
     known: dict[str, Value] = {
-        "layout": LAYOUTS[Layout.INDEPENDENT if len(scenario.sources) > 1 else Layout.ONE_SOURCE],
+        "layout": o.LAYOUTS[Layout.INDEPENDENT if len(scenario.sources) > 1 else Layout.ONE_SOURCE],
         "cutoff_hz": scenario.sources[0].cutoff_hz,
         "noise": scenario.sensors.noise_relative,
-        **truth(faults),
+        **o.truth(faults),
     }
     if kind.topic in ("healthy", "length"):
-        bound = cramer_rao(machine, window.states, true_condition(scenario, machine), window.duration_s)
-        known |= {f"{name} bound": value for name, value in bound.items()}
-    return [known | opinion(one, window) for one in diagnosticians(machine, bundle)]
+        known |= {f"{name} bound": value for name, value in bound_of(scenario, machine).items()}
+    return [known | o.opinion(one, window) for one in trained.diagnosticians()]
 
 
 def _quoted(draw: Draw, number: int) -> dict[str, float]:
@@ -163,7 +114,7 @@ def _quoted(draw: Draw, number: int) -> dict[str, float]:
     diagnosis = LikelihoodFit(draw.machine).diagnose(simulate_scenario(draw_condition(draw, number), draw.machine))
     rng = np.random.default_rng([draw.seed, _OTHER_REALISATION, number])
     stretch = stretch_of(diagnosis, 0, 0)
-    thresholds = window_thresholds(RATES[0], len(stretch.known))
+    thresholds = window_thresholds(o.RATES[0], len(stretch.known))
     quoted = detectable_changes(stretch, thresholds, draw.machine.window.length_s)
     one = quoted[int(rng.integers(len(quoted)))]
     # A loss of everything, quoted where not even that would be found for certain, cannot be simulated.
@@ -178,11 +129,6 @@ def _with_length(machine: Machine, length_s: float) -> Machine:
     return machine.model_copy(update={"window": window.model_copy(update=changed)})
 
 
-def _biased(rows: Sequence[Record]) -> Estimate | None:
-    found = r.floats(row.get("in errors") for row in rows)
-    return r.resampled(lambda x: np.asarray(np.mean(x, axis=-1)), found) if len(found) > 1 else None
-
-
 _KIND = ("machine", "topic", "changed", "excitation", "anomaly", "length_s", "layout", "method")
 _TABLES = (
     Table(
@@ -191,31 +137,15 @@ _TABLES = (
         {
             "bound, median": lambda rows: f"{100 * (r.middle('bound')(rows) or 0):.2g} %",
             **{
-                f"{TITLES[by]}: {text}": partial(lambda by, figure, rows: figure(r.where(rows, method=by)), by, figure)
-                for text, figure in (("spread / bound", r.scatter("in bounds")), ("95 % covers", r.share("covered")))
+                f"{o.TITLES[by]}: {text}": r.among(o.READING_COLUMNS[name], method=by)
+                for text, name in (("spread / bound", "spread / bound"), ("95 % covers", "covered"))
                 for by in ("likelihood", "network")
             },
         },
-        lambda records: readings(r.where(records, machine="lab", topic="healthy", layout=SEVERAL)),
+        lambda records: o.readings(r.where(records, machine="lab", topic="healthy", layout=o.SEVERAL)),
         "Sharpness on healthy windows of `lab`, independent sources:",
     ),
-    Table(
-        "evaluate-readings",
-        (*_KIND, "parameter"),
-        {
-            "read": lambda rows: sum("off" in row for row in rows),
-            "median deviation": r.middle("off"),
-            "bias / stated": _biased,
-            "spread": r.scatter("off"),
-            "stated, median": r.middle("error"),
-            "spread / stated": r.scatter("in errors"),
-            "bound, median": r.middle("bound"),
-            "spread / bound": r.scatter("in bounds"),
-            "covered": r.share("covered"),
-            "named": r.share("is named"),
-        },
-        readings,
-    ),
+    Table("evaluate-readings", (*_KIND, "parameter"), o.READING_COLUMNS, o.readings),
     Table(
         "evaluate-windows",
         _KIND,
@@ -231,7 +161,7 @@ _TABLES = (
             "misfit, median": r.middle("misfit"),
             "processor time, s": r.middle("seconds"),
         },
-        judged,
+        o.judged,
     ),
 )
 
@@ -242,7 +172,7 @@ _READ = ("k_by", "k_bz", "c_by", "c_bz", "e")
 
 def _goals(records: Sequence[Record]) -> Iterator[Goal]:
     """The declared goals; what asked for more than the bound allows is held to what a reading at the bound finds."""
-    rows, windows = list(readings(records)), list(judged(records))
+    rows, windows = list(o.readings(records)), list(o.judged(records))
     asked = [by for by in ("likelihood", "network") if r.where(records, method=by)]
     lab, whole = r.where(rows, machine="lab"), r.where(windows, machine="lab")
     if lab:
@@ -254,25 +184,23 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
         wrong = r.share("wrong")(r.where(whole, topic="paper", method="likelihood"))
         yield r.at_most("likelihood: an unchanged one named, paper's eight conditions", wrong, 0.005)
     for machine, by, layout, names, column, most in (
-        ("lab", "likelihood", SEVERAL, _READ, "in bounds", 1.15),
-        ("lab", "network", SEVERAL, ("k_by", "k_bz"), "in bounds", 2.0),
-        ("lab", "network", SEVERAL, ("c_by", "c_bz"), "in bounds", 1.5),
-        ("light", "likelihood", SEVERAL, _READ, "in bounds", 1.3),
-        ("lab", "likelihood", ONE, ("k_by", "k_bz"), "off %", 0.08),
-        ("lab", "likelihood", ONE, ("c_by", "c_bz"), "off %", 0.3),
+        ("lab", "likelihood", o.SEVERAL, _READ, "in bounds", 1.15),
+        ("lab", "network", o.SEVERAL, ("k_by", "k_bz"), "in bounds", 2.0),
+        ("lab", "network", o.SEVERAL, ("c_by", "c_bz"), "in bounds", 1.5),
+        ("light", "likelihood", o.SEVERAL, _READ, "in bounds", 1.3),
+        ("lab", "likelihood", o.ONE, ("k_by", "k_bz"), "off %", 0.08),
+        ("lab", "likelihood", o.ONE, ("c_by", "c_bz"), "off %", 0.3),
     ):
         own = r.where(rows, topic="healthy", machine=machine, method=by, layout=layout)
-        spreads = r.each([row for row in own if row["parameter"] in names], ("parameter",), r.scatter(column))
+        spreads = r.each(r.where(own, parameter=names), ("parameter",), r.scatter(column))
         over = " over the bound" if column == "in bounds" else " in %"
         of = "" if names == _READ else f" of {', '.join(names)}"
         if own:
             yield r.within(f"{by}: spread{of}{over}, {layout}, {machine}", spreads, 0.0, most)
     for by in asked:
-        for column, declared in zip(("any", "strict any"), RATES, strict=True):
-            alarms = r.each(r.where(windows, topic="healthy", method=by), ("machine",), r.share(column))
-            yield r.holding(f"{by}: false alarms of healthy windows", alarms, declared)
+        yield from o.false_alarms(by, r.where(windows, topic="healthy", method=by), ("machine",))
         for text, topics in (("healthy", ("healthy",)), ("changed", ("small", "paper"))):
-            own = [row for row in r.where(rows, method=by) if row["topic"] in topics]
+            own = r.where(rows, method=by, topic=topics)
             covered = r.each(own, ("parameter", "machine", "layout"), r.share("covered"))
             yield r.within(f"{by}: 95 % intervals cover, {text} windows", covered, 0.93, 0.97)
     if lab:
@@ -286,12 +214,12 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
 
 def _detection(lab: Sequence[Record], asked: Sequence[str]) -> Iterator[Goal]:
     for name, true in _SMALL:
-        found, possible = _found(lab, "likelihood", SEVERAL, name, true), _found_at_bound(lab, SEVERAL, name, true)
+        found, possible = _found(lab, "likelihood", o.SEVERAL, name, true), _found_at_bound(lab, o.SEVERAL, name, true)
         declared = f"≥ {100 * possible:.1f} %, as at the bound"
-        yield r.at_least(f"likelihood: {name} {true:+.0%} detected, {SEVERAL}", found, possible, declared)
-    one = {f"{name} {true:+.0%}": _found(lab, "likelihood", ONE, name, true) for name, true in _SMALL}
-    yield r.within(f"likelihood: the same changes, {ONE}", one, 0.99, 1.0)
-    for layout in (SEVERAL, ONE) if "network" in asked else ():
+        yield r.at_least(f"likelihood: {name} {true:+.0%} detected, {o.SEVERAL}", found, possible, declared)
+    one = {f"{name} {true:+.0%}": _found(lab, "likelihood", o.ONE, name, true) for name, true in _SMALL}
+    yield r.within(f"likelihood: the same changes, {o.ONE}", one, 0.99, 1.0)
+    for layout in (o.SEVERAL, o.ONE) if "network" in asked else ():
         rates = {f"{name} {true:+.0%}": _found(lab, "network", layout, name, true) for name, true in _NETWORK}
         yield r.within(f"network: k −5 %, c −20 %, e +20 % detected, {layout}", rates, 0.99, 1.0)
 
@@ -301,26 +229,22 @@ def _strained(lab: Sequence[Record]) -> Iterator[Goal]:
     own = r.where(lab, method="likelihood")
     power = r.rate(row["is named"] for row in r.where(own, topic="detectable") if row["true"])
     yield r.within("likelihood: found at the quoted minimum detectable change", {"all": power}, 0.92, 0.98)
-    untold = [row for row in r.where(own, topic="excitation") if row["parameter"] != "EI"]
+    untold = r.where(own, topic="excitation", parameter=_READ)
     for what, figure, low, high in (
         ("95 % intervals cover", r.share("covered"), 0.93, 0.97),
-        ("bias / stated error", _biased, -0.5, 0.5),
+        ("bias / stated error", o.BIAS, -0.5, 0.5),
         ("spread / stated error", r.scatter("in errors"), 0.0, 1.5),
     ):
         figures = r.each(untold, ("parameter", "excitation", "layout"), figure)
         yield r.within(f"likelihood: {what}, another excitation than assumed", figures, low, high)
-    lengths = [row for row in own if "bound" in row and row["parameter"] != "EI"]
+    lengths = [row for row in r.where(own, parameter=_READ) if "bound" in row]
     exponents = r.each(lengths, ("parameter", "layout"), _exponent)
     yield r.within("likelihood: exponent of the window length in the spread", exponents, -0.6, -0.4)
 
 
 def _found(rows: Iterable[Record], by: str, layout: str, name: str, true: float) -> Estimate | None:
     """Windows in which a change is named; alone, where that was measured: beside another it needs stronger evidence."""
-    same = [
-        row
-        for row in r.where(rows, method=by, layout=layout, parameter=name, true=true)
-        if row["topic"] in ("small", "paper")
-    ]
+    same = r.where(rows, method=by, layout=layout, parameter=name, true=true, topic=("small", "paper"))
     alone = [row for row in same if sum(bool(row[f"{other} true"]) for other in PARAMETERS) == 1]
     return r.share("is named")(alone or r.where(same, topic="small"))
 
@@ -331,7 +255,7 @@ def _found_at_bound(rows: Iterable[Record], layout: str, name: str, true: float)
     Over the conditions of the healthy windows, which are drawn as those of the changed ones are.
     """
     healthy = r.where(rows, method="likelihood", layout=layout, parameter=name, topic="healthy")
-    threshold = window_thresholds(RATES[0], len(PARAMETERS)).first
+    threshold = window_thresholds(o.RATES[0], len(PARAMETERS)).first
     z = abs(to_scale(name, true)) / r.floats(row.get("bound") for row in healthy)
     return float(np.mean(ndtr(z - threshold) + ndtr(-z - threshold)))
 
@@ -356,41 +280,46 @@ def _exponent(rows: Sequence[Record]) -> Estimate | None:
 
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
     """What is named over the size of the change, and what would be named at the bound."""
-    lab = list(readings(r.where(records, machine="lab")))
-    panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {SEVERAL: {}, ONE: {}}
-    for layout, panel in panels.items() if lab else ():
-        for name, true in (*_SMALL, *_NETWORK):
-            found = {title: _found(lab, by, layout, name, true) for by, title in TITLES.items()}
-            for title, one in (found | {"at the Cramér–Rao bound": _found_at_bound(lab, layout, name, true)}).items():
-                if one is not None:
-                    panel.setdefault(title, []).append((f"{name} {true:+.0%}", one))
+    lab = list(o.readings(r.where(records, machine="lab")))
+    if not lab:
+        return
+    at_bound = "at the Cramér–Rao bound"
+    panels = r.panels(
+        (layout, title, [(f"{name} {true:+.0%}", one)])
+        for layout in (o.SEVERAL, o.ONE)
+        for name, true in (*_SMALL, *_NETWORK)
+        for title, one in (
+            *((title, _found(lab, by, layout, name, true)) for by, title in o.TITLES.items()),
+            (at_bound, _found_at_bound(lab, layout, name, true)),
+        )
+        if one is not None
+    )
     text = "Windows of lab in which a change is named at 1 % false alarms, with 95 % intervals"
     yield Chart("results-detection", text, panels, "true change", "share of windows")
 
 
 def evaluate(options: Options) -> Study:
     """Healthy, changed and foreign machines in conditions drawn at random."""
-    names = options.machines or ("lab", "heavy", "light")
-    machines: dict[str, tuple[Machine, Bundle | None]] = {}
-    for name in names:
-        machine = load_machine(name)
-        machines[machine.name] = (machine, None if name == "light" else load_bundle(name, machine))
+    machines: dict[str, o.Trained] = {}
+    for name in options.machines or ("lab", "heavy", "light"):
+        one = o.Trained(load_machine(name), None) if name == "light" else o.Trained.named(name)
+        machines[one.machine.name] = one
     cells = tuple(
         Cell(
             {
-                "machine": machine.name,
+                "machine": name,
                 "topic": kind.topic,
-                "changed": "one, as quoted" if kind.topic == "detectable" else changed_in(kind.faults),
-                "force": LAYOUTS[kind.layout],
+                "changed": "one, as quoted" if kind.topic == "detectable" else o.changed_in(kind.faults),
+                "force": o.LAYOUTS[kind.layout],
                 "excitation": _EXCITATIONS[kind.excitation],
                 "anomaly": _ANOMALIES[kind.anomaly],
-                "length_s": kind.length_s or machine.window.length_s,
+                "length_s": kind.length_s or one.machine.window.length_s,
             },
-            max(2, round(options.windows * kind.share * (1.0 if machine.name in _WHOLE else 0.32))),
+            max(2, round(options.windows * kind.share * (1.0 if name in _WHOLE else 0.32))),
             (stream, kind),
         )
-        for machine, _ in machines.values()
-        for stream, kind in enumerate(_kinds(whole=machine.name in _WHOLE))
+        for name, one in machines.items()
+        for stream, kind in enumerate(_kinds(whole=name in _WHOLE))
     )
     return Study(
         name="evaluate",
@@ -399,5 +328,5 @@ def evaluate(options: Options) -> Study:
         tables=_TABLES,
         goals=_goals,
         charts=_charts,
-        made_with={name: f"{one.physics_hash} {two.identity if two else ''}" for name, (one, two) in machines.items()},
+        made_with=o.made_with(machines.values()),
     )

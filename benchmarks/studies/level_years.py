@@ -207,16 +207,12 @@ def _level(levels: WindowLevels, name: str) -> FloatArray:
     return levels.bands.rms
 
 
-def summed(column: str, rows: Sequence[Record]) -> float:
-    """Sum of a column."""
-    return float(r.floats(row.get(column) for row in rows).sum())
-
-
 def per_month(rows: Sequence[Record]) -> Estimate | None:
     """Alarms per machine and month, with the exact interval of a Poisson count."""
-    count, months = round(summed("alarms", rows)), summed("hours", rows) * 3600 / MONTH_S
-    if not months:
+    hours = r.number("hours", np.sum)(rows)
+    if not hours:
         return None
+    count, months = round(r.number("alarms", np.sum)(rows) or 0), hours * 3600 / MONTH_S
     low = 0.0 if not count else float(scipy.stats.chi2.ppf(0.025, 2 * count)) / 2
     high = float(scipy.stats.chi2.ppf(0.975, 2 * count + 2)) / 2
     return Estimate(count / months, low / months, high / months, len(rows))
@@ -234,12 +230,12 @@ _TABLES = (
         "level-years",
         ("machine", "excitation"),
         {
-            "days": lambda rows: summed("hours", rows) / 24,
-            "windows beyond a limit": partial(summed, "alarms"),
-            "of the overall": partial(summed, "by_overall"),
-            "of 1x": partial(summed, "by_x1"),
-            "of 2x": partial(summed, "by_x2"),
-            "of a band": partial(summed, "by_growth"),
+            "days": r.number("hours", lambda hours: np.sum(hours) / 24),
+            "windows beyond a limit": r.number("alarms", np.sum),
+            "of the overall": r.number("by_overall", np.sum),
+            "of 1x": r.number("by_x1", np.sum),
+            "of 2x": r.number("by_x2", np.sum),
+            "of a band": r.number("by_growth", np.sum),
             "per machine and month": per_month,
         },
         partial(r.where, topic="years"),
@@ -249,7 +245,7 @@ _TABLES = (
         "level-drawing",
         ("measure",),
         {
-            "windows": partial(summed, "windows"),
+            "windows": r.number("windows", np.sum),
             "mean of the logarithm, drawn less simulated, median": r.middle("mean"),
             "scatter, drawn over simulated, median": r.middle("scatter"),
             "97.5 % quantile, drawn over simulated, median": r.middle("far"),

@@ -1,20 +1,22 @@
 """What the diagnosticians say of one window, as columns of a record, and whether that is right."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from time import process_time
 
 import numpy as np
 
-from benchmarks.studies.results import Record, Value
+from benchmarks.studies import results as r
+from benchmarks.studies.results import Goal, Record, Value
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.networks.amortised import NetworkDiagnostician
-from models.diagnosis.networks.bundle import Bundle
+from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Z95, Diagnostician
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
-from models.machine import Machine
+from models.machine import Machine, load_machine
 from models.physics.rotor import PARAMETERS
 from simulator.training.draws import Layout
 
@@ -30,15 +32,35 @@ ONE, SEVERAL = "one source", "independent sources"
 LAYOUTS = {None: "either", Layout.ONE_SOURCE: ONE, Layout.INDEPENDENT: SEVERAL}
 
 
-def diagnosticians(machine: Machine, bundle: Bundle | None) -> tuple[Diagnostician, ...]:
-    """The equations' networks and the amortised networks where there are some, and the likelihood, all cold."""
-    likelihood = LikelihoodFit(machine)
-    if bundle is None:
-        return (likelihood,)
-    relation = RelationDiagnostician(machine, bundle.networks)
-    if bundle.amortised is None:
-        return relation, likelihood
-    return relation, NetworkDiagnostician(machine, bundle.amortised), likelihood
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """A machine, and the networks that were trained for it, if there are some."""
+
+    machine: Machine
+    bundle: Bundle | None
+
+    @classmethod
+    def named(cls, name: str) -> "Trained":
+        """A shipped machine, or one of a file, with the networks of its name."""
+        machine = load_machine(name)
+        return cls(machine, load_bundle(machine.name, machine))
+
+    def diagnosticians(self) -> tuple[Diagnostician, ...]:
+        """The equations' networks and the amortised networks where there are some, and the likelihood, all cold."""
+        likelihood = LikelihoodFit(self.machine)
+        if self.bundle is None:
+            return (likelihood,)
+        relation = RelationDiagnostician(self.machine, self.bundle.networks)
+        if self.bundle.amortised is None:
+            return relation, likelihood
+        return relation, NetworkDiagnostician(self.machine, self.bundle.amortised), likelihood
+
+
+def made_with(machines: Iterable[Trained]) -> dict[str, str]:
+    """What all records of a study of these machines must share."""
+    return {
+        one.machine.name: f"{one.machine.physics_hash} {one.bundle.identity if one.bundle else ''}" for one in machines
+    }
 
 
 def opinion(one: Diagnostician, window: WindowStatistics, rates: tuple[float, ...] = RATES) -> dict[str, Value]:
@@ -119,3 +141,25 @@ def readings(records: Iterable[Record]) -> Iterator[Record]:
 def changed_in(faults: Mapping[str, float]) -> str:
     """True changes in words."""
     return ", ".join(f"{name} {change:+.0%}" for name, change in faults.items()) or "healthy"
+
+
+BIAS = r.estimated("in errors", lambda x: np.asarray(np.mean(x, axis=-1)), 2)
+READING_COLUMNS: dict[str, r.Of[r.Figure]] = {
+    "read": lambda rows: sum("off" in row for row in rows),
+    "median deviation": r.middle("off"),
+    "bias / stated": BIAS,
+    "spread": r.scatter("off"),
+    "stated, median": r.middle("error"),
+    "spread / stated": r.scatter("in errors"),
+    "bound, median": r.middle("bound"),
+    "spread / bound": r.scatter("in bounds"),
+    "covered": r.share("covered"),
+    "named": r.share("is named"),
+}
+"""Of `readings`."""
+
+
+def false_alarms(by: str, healthy: Sequence[Record], groups: Sequence[str]) -> Iterator[Goal]:
+    """The declared rates on healthy windows, from what `judged` makes of them."""
+    for column, declared in zip(("any", "strict any"), RATES, strict=True):
+        yield r.holding(f"{by}: false alarms of healthy windows", r.each(healthy, groups, r.share(column)), declared)

@@ -11,14 +11,12 @@ from functools import partial
 import numpy as np
 
 from benchmarks.studies import results as r
-from benchmarks.studies.opinions import TITLES, changed_in, diagnosticians, named_in, opinion
+from benchmarks.studies.opinions import TITLES, Trained, changed_in, made_with, named_in, opinion
 from benchmarks.studies.other_methods import FeatureVector, SubspaceModes
-from benchmarks.studies.paper import PAPER_EQUATIONS, PaperDiagnostician, calibrate_paper
-from benchmarks.studies.paper_training import train_paper_network
-from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value
+from benchmarks.studies.paper import PAPER_EQUATIONS, PaperDiagnostician, train_paper_network
+from benchmarks.studies.results import Chart, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Over, Study
 from models.diagnosis.moments import plan_for
-from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray
@@ -104,23 +102,22 @@ def _learn(machine: Machine, options: Options, over: Over) -> Mapping[str, _Lear
             peer.fit(np.stack([features[n] for features, _ in fit]))
             limits.append(r.limit_of(np.array([peer.score(features[n]) for features, _ in limit]), options.rate))
         windows = [window for _, window in fit]
-        measured = {*windows[0].states, *(() if windows[0].synchronous is None else ("theta",))}
         networks = [
             train_paper_network(equation, windows, machine, options.seed)
             for equation in PAPER_EQUATIONS
-            if set(equation.channels) <= measured
+            if equation.measured_in(windows[0])
         ]
-        healthy = calibrate_paper(networks, [window for _, window in limit], machine, options.rate)
-        found[setting] = _Learned(methods, tuple(limits), PaperDiagnostician(machine, networks, healthy))
+        paper = PaperDiagnostician.calibrated(networks, [window for _, window in limit], options.rate)
+        found[setting] = _Learned(methods, tuple(limits), paper)
     return found
 
 
 def _measure(
-    machine: Machine, bundle: Bundle, options: Options, learned: Mapping[str, _Learned], cell: Cell, number: int
+    trained: Trained, options: Options, learned: Mapping[str, _Learned], cell: Cell, number: int
 ) -> list[dict[str, Value]]:
     series: _Series = cell.given
     own = learned[series[0]]
-    samples, window = _simulate(machine, options.seed, series, number)
+    samples, window = _simulate(trained.machine, options.seed, series, number)
     rows: list[dict[str, Value]] = []
     for peer, limit in zip(own.peers, own.limits, strict=True):
         score = peer.score(peer.features(samples))
@@ -129,9 +126,9 @@ def _measure(
             {"method": peer.name, "score": score if judged else None, "detected": score > limit, "refused": not judged}
         )
     equations = {equation.number for equation in PAPER_EQUATIONS if set(equation.parameters) & set(series[2])}
-    flagged = own.paper.flagged_equations(own.paper.diagnose(window))
+    flagged = own.paper.flagged(own.paper.deviations(window))
     said: list[dict[str, Value]] = [{"method": "paper", "named": " ".join(flagged), "refused": ""}]
-    said += [opinion(one, window, (options.rate,)) for one in diagnosticians(machine, bundle)]
+    said += [opinion(one, window, (options.rate,)) for one in trained.diagnosticians()]
     for one in said:
         named, true = named_in(one), equations if one["method"] == "paper" else set(series[2])
         row: dict[str, Value] = {"method": one["method"], "named": one.get("named") or "", "detected": bool(named)}
@@ -180,21 +177,19 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
 
 
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
-    panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {}
-    for (setting, changed, method), rows in r.grouped(records, "setting", "changed", "method").items():
-        for column, title in (("detected", "something changed"), ("exact", "exactly the right set")):
-            found = r.share(column)(rows)
-            if found is not None:
-                panel = panels.setdefault(f"{setting}: {title}", {})
-                panel.setdefault(_HEADS[str(method)], []).append((str(changed), found))
+    panels = r.panels(
+        (f"{setting}: {title}", _HEADS[str(method)], [(str(changed), found)])
+        for (setting, changed, method), rows in r.grouped(records, "setting", "changed", "method").items()
+        for column, title in (("detected", "something changed"), ("exact", "exactly the right set"))
+        if (found := r.share(column)(rows)) is not None
+    )
     text = "Every method on the same windows, with 95 % intervals"
     yield Chart("peers", text, panels, "true change", "share of windows")
 
 
 def peers(options: Options) -> Study:
     """Beside operational modal analysis, a feature vector and the networks as printed."""
-    machine = options.machine()
-    bundle = load_bundle(machine.name, machine)
+    trained = Trained.named(options.machine)
     changes = (_CHANGES[0], _CHANGES[3], _CHANGES[6]) if options.small else _CHANGES
     cells = tuple(
         Cell({"setting": setting, "changed": changed_in(faults)}, options.windows, (setting, at + 2, faults))
@@ -204,10 +199,10 @@ def peers(options: Options) -> Study:
     return Study(
         name="peers",
         cells=cells,
-        measure=partial(_measure, machine, bundle, options),
-        learn=partial(_learn, machine, options),
+        measure=partial(_measure, trained, options),
+        learn=partial(_learn, trained.machine, options),
         tables=_TABLES,
         goals=_goals,
         charts=_charts,
-        made_with={machine.name: f"{machine.physics_hash} {bundle.identity}"},
+        made_with=made_with([trained]),
     )

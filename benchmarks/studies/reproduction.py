@@ -5,20 +5,18 @@ trained on, as the paper evidently had it, and on independent realisations. The 
 one source of fixed direction and level, fixed speed, the paper's four cutoffs.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from benchmarks.studies import results as r
-from benchmarks.studies.opinions import TITLES, diagnosticians, named_in
-from benchmarks.studies.paper import PAPER_EQUATIONS, PaperDiagnostician, PaperHealthy, PaperNetwork, calibrate_paper
-from benchmarks.studies.paper_training import train_paper_network
+from benchmarks.studies.opinions import TITLES, Trained, made_with, named_in
+from benchmarks.studies.paper import PAPER_EQUATIONS, PaperDiagnostician, train_paper_network
 from benchmarks.studies.results import Chart, Estimate, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Over, Study
 from models.diagnosis.moments import plan_for
-from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
@@ -59,7 +57,6 @@ def own_equations(parameters: Iterable[str]) -> tuple[str, ...]:
 
 _Run = tuple[dict[str, float], float, float, tuple[int, ...]]
 """True changes, cutoff, noise, and all that decides the random numbers beside the seed."""
-_Learned = tuple[tuple[PaperNetwork, ...], dict[str, PaperHealthy]]
 
 
 def _source(machine: Machine, cutoff_hz: float) -> NamedSource:
@@ -100,8 +97,8 @@ def simulate(machine: Machine, seed: int, run: _Run) -> WindowStatistics:
 
 def _learn(
     machine: Machine, seed: int, windows: int, cutoffs: tuple[float, ...], options: Options, over: Over
-) -> _Learned:
-    """The printed networks on healthy windows, and the limits of their MSD."""
+) -> dict[str, PaperDiagnostician]:
+    """The printed networks on healthy windows, with the limits of their MSD for either kind of realisation."""
     count = 9 if options.small else 199
     runs: list[_Run] = [
         ({}, cutoff, _NOISE_LEVELS[0], (Purpose.TRAINING, n, r))
@@ -113,38 +110,40 @@ def _learn(
     networks = tuple(train_paper_network(equation, training, rig, seed) for equation in PAPER_EQUATIONS)
     runs = [({}, cutoffs[n % len(cutoffs)], _NOISE_LEVELS[0], (Purpose.CALIBRATION, n)) for n in range(count)]
     calibration = over("calibration windows", partial(simulate, machine, seed), runs)
-    return networks, {
+    return {
         # Who compares with the very runs that were trained on finds the largest healthy deviation among those.
-        "shared": calibrate_paper(networks, training, rig, 1 / (len(training) + 1)),
-        "independent": calibrate_paper(networks, calibration, rig, options.rate),
+        "shared": PaperDiagnostician.calibrated(networks, training, 1 / (len(training) + 1)),
+        "independent": PaperDiagnostician.calibrated(networks, calibration, options.rate),
     }
 
 
 def _measure(
-    machine: Machine, bundle: Bundle, options: Options, learned: _Learned, cell: Cell, number: int
+    trained: Trained, options: Options, learned: dict[str, PaperDiagnostician], cell: Cell, number: int
 ) -> list[dict[str, Value]]:
-    networks, limits = learned
     faults, realisation = cell.given
     run = (faults, float(cell.keys["cutoff_hz"] or 0), float(cell.keys["noise"] or 0), (*realisation, number))
-    whole = simulate(machine, options.seed, run)
-    seen = _seen_by(machine, whole)
-    paper = PaperDiagnostician(machine, networks, limits[str(cell.keys["realisation"])])
-    found: list[dict[str, Value]] = []
-    for one in (paper, *diagnosticians(machine, bundle)):
-        row: dict[str, Value] = {"method": one.by, "own": " ".join(own_equations(faults)), "named": None}
+    whole = simulate(trained.machine, options.seed, run)
+    seen = _seen_by(trained.machine, whole)
+    own = " ".join(own_equations(faults))
+    paper = learned[str(cell.keys["realisation"])]
+    msd = paper.deviations(whole)
+    found = [_row("paper", own, " ".join(paper.flagged(msd)), msd)]
+    for one in trained.diagnosticians():
         try:
             # Equation 30 needs tilt; the likelihood and the amortised networks judge by the machine's own channels.
-            opinion = one.diagnose(whole if one.by in ("paper", "relation") else seen)
+            opinion = one.diagnose(whole if one.by == "relation" else seen)
         except EstimationError:  # a refused window is a result: it is counted
-            found.append(row)
+            found.append(_row(one.by, own, None, {}))
             continue
-        if one is paper:
-            row["named"] = " ".join(paper.flagged_equations(opinion))
-        elif opinion.evaluable:
-            row["named"] = " ".join(own_equations(isolate_window(opinion, options.rate).changed))
-        row |= {f"msd {read.equation}": read.msd for read in opinion.equations if read.msd is not None}
-        found.append(row)
+        changed = isolate_window(opinion, options.rate).changed if opinion.evaluable else ()
+        named = " ".join(own_equations(changed)) if opinion.evaluable else None
+        found.append(_row(one.by, own, named, {read.equation: read.msd for read in opinion.equations}))
     return found
+
+
+def _row(by: str, own: str, named: str | None, msd: Mapping[str, float | None]) -> dict[str, Value]:
+    known = {f"msd {number}": one for number, one in msd.items() if one is not None}
+    return {"method": by, "own": own, "named": named, **known}
 
 
 def _seen_by(machine: Machine, window: WindowStatistics) -> WindowStatistics:
@@ -181,9 +180,8 @@ def _eight(records: Sequence[Record]) -> Iterator[Record]:
     return _judged(r.where(records, part="conditions"))
 
 
-def _quantile(number: str, level: float, rows: Sequence[Record]) -> float | None:
-    found = r.floats(row.get(f"msd {number}") for row in rows)
-    return float(np.quantile(found, level)) if found.size else None
+def _msd(number: str, level: float) -> r.Of[float | None]:
+    return r.number(f"msd {number}", lambda found: np.quantile(found, level))
 
 
 _TABLES = (
@@ -217,11 +215,11 @@ _TABLES = (
         "reproduction-msd",
         ("part", "realisation", "method", "condition", "cutoff_hz", "noise"),
         {
-            f"({number}) MSD, {100 * level:g} %": partial(_quantile, number, level)
+            f"({number}) MSD, {100 * level:g} %": _msd(number, level)
             for number in _EQUATIONS
             for level in (0.05, 0.5, 0.95)
         },
-        lambda records: (row for row in records if row["method"] in ("paper", "relation")),
+        partial(r.where, method=("paper", "relation")),
     ),
 )
 
@@ -229,22 +227,26 @@ _TABLES = (
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
     """The paper's Figs. 5 and 6: MSD of every printed network over the cutoff, for every condition."""
     for realisation in _REALISATIONS:
-        panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {}
         rows = r.where(records, part="conditions", method="paper", realisation=realisation)
-        for (condition, cutoff_hz), group in r.grouped(rows, "condition", "cutoff_hz").items():
-            for number in _EQUATIONS:
-                low, middle, high = (_quantile(number, level, group) or 0.0 for level in (0.05, 0.5, 0.95))
-                series = panels.setdefault(str(condition), {}).setdefault(f"equation {number}", [])
-                series.append((f"{cutoff_hz:g}", Estimate(middle, low, high, len(group))))
+        groups = r.grouped(rows, "condition", "cutoff_hz")
+        panels = r.panels(
+            (str(condition), f"equation {number}", [(f"{cutoff_hz:g}", _band(number, group))])
+            for (condition, cutoff_hz), group in groups.items()
+            for number in _EQUATIONS
+        )
         text = f"MSD of the networks as printed, {realisation} realisations: median and 5–95 % of the windows"
         yield Chart(f"reproduction-msd-{realisation}", text, panels, "cutoff of the excitation, Hz",
                     "MSD, of the target's mean square", log=True)  # fmt: skip
 
 
+def _band(number: str, rows: Sequence[Record]) -> Estimate:
+    low, middle, high = (_msd(number, level)(rows) or 0.0 for level in (0.05, 0.5, 0.95))
+    return Estimate(middle, low, high, len(rows))
+
+
 def reproduction(options: Options) -> Study:
     """The paper's eight conditions before its own networks and all diagnosticians."""
-    machine = options.machine()
-    bundle = load_bundle(machine.name, machine)
+    trained = Trained.named(options.machine)
     cutoffs = _CUTOFFS_HZ[1:3] if options.small else _CUTOFFS_HZ
     noises = _NOISE_LEVELS[::4] if options.small else _NOISE_LEVELS
     noise_hz = min(cutoffs, key=lambda cutoff: abs(cutoff - _NOISE_CUTOFF_HZ))
@@ -270,9 +272,9 @@ def reproduction(options: Options) -> Study:
     return Study(
         name="reproduction",
         cells=cells,
-        measure=partial(_measure, machine, bundle, options),
-        learn=partial(_learn, machine, options.seed, options.windows, cutoffs, options),
+        measure=partial(_measure, trained, options),
+        learn=partial(_learn, trained.machine, options.seed, options.windows, cutoffs, options),
         tables=_TABLES,
         charts=_charts,
-        made_with={machine.name: f"{machine.physics_hash} {bundle.identity}", "windows": str(options.windows)},
+        made_with={**made_with([trained]), "windows": str(options.windows)},
     )

@@ -7,19 +7,23 @@ Clopper-Pearson, those of everything else come from resampling the windows.
 import csv
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import scipy.stats
 
 from models.diagnosis.readings import Z95
+from models.errors import EstimationError
 
 Value = str | float | bool | None
 """Of a record: what JSON has, none of it nested."""
 Record = Mapping[str, Value]
 FloatArray = npt.NDArray[np.float64]
+_T = TypeVar("_T")
+Of = Callable[[Sequence[Record]], _T]
+"""A figure of some records."""
 
 _RESAMPLINGS = 400
 _RESAMPLING_SEED = 20261
@@ -65,6 +69,11 @@ def resampled(statistic: Callable[[FloatArray], FloatArray], values: FloatArray)
     return Estimate(float(statistic(values)), low, high, len(values))
 
 
+def rms(values: FloatArray) -> FloatArray:
+    """Root mean square over the last axis."""
+    return np.asarray(np.sqrt(np.mean(values**2, axis=-1)), dtype=np.float64)
+
+
 def robust(values: FloatArray) -> FloatArray:
     """1.4826 times the median distance from the median, over the last axis."""
     middle = np.median(values, axis=-1, keepdims=True)
@@ -76,18 +85,6 @@ def floats(values: Iterable[Value]) -> FloatArray:
     return np.array([value for value in values if value is not None and not isinstance(value, str)], dtype=np.float64)
 
 
-def spread(values: Iterable[Value]) -> Estimate | None:
-    """Robust standard deviation; None of too few."""
-    found = floats(values)
-    return resampled(robust, found) if len(found) >= _FEWEST else None
-
-
-def median(values: Iterable[Value]) -> float | None:
-    """Median; None without any."""
-    found = floats(values)
-    return float(np.median(found)) if len(found) else None
-
-
 def limit_of(healthy: FloatArray, false_alarm_rate: float) -> float:
     """Limit that a further healthy window exceeds with the declared probability at most, whatever the distribution.
 
@@ -96,10 +93,23 @@ def limit_of(healthy: FloatArray, false_alarm_rate: float) -> float:
     rank = int(np.ceil((healthy.size + 1) * (1 - false_alarm_rate) - 1e-9))
     if rank > healthy.size:
         fewest = int(np.ceil(1 / false_alarm_rate - 1e-9)) - 1
-        raise ValueError(
+        raise EstimationError(
             f"{healthy.size} healthy scores for a rate of {false_alarm_rate:g}, expected at least {fewest}"
         )
     return float(np.sort(healthy)[rank - 1])
+
+
+def limits_of(healthy: Sequence[Mapping[str, float]], false_alarm_rate: float) -> dict[str, float]:
+    """Limits of several test values, of which a further healthy window exceeds any with the declared probability.
+
+    Each counts in units of its own 90 % quantile, so that none decides the limits of another. An upper quantile, not a
+    median: operating conditions make some values many times larger than the rest.
+    """
+    names = sorted({name for one in healthy for name in one})
+    scale = {name: float(np.quantile([one[name] for one in healthy if name in one], 0.9)) for name in names}
+    largest = [max((value / scale[name] for name, value in one.items()), default=0.0) for one in healthy]
+    limit = limit_of(np.array(largest), false_alarm_rate) * (1 + 1e-12)  # whoever sets it is not above it by rounding
+    return {name: limit * one for name, one in scale.items()}
 
 
 def grouped(records: Iterable[Record], *by: str) -> dict[tuple[Value, ...], list[Record]]:
@@ -110,29 +120,53 @@ def grouped(records: Iterable[Record], *by: str) -> dict[tuple[Value, ...], list
     return groups
 
 
-def where(records: Iterable[Record], **wanted: Value) -> list[Record]:
-    """Records with these values."""
-    return [record for record in records if all(record.get(name) == value for name, value in wanted.items())]
+def where(records: Iterable[Record], **wanted: Value | tuple[Value, ...]) -> list[Record]:
+    """Records with these values; of several in parentheses with any of them."""
+    one_of = {name: value if isinstance(value, tuple) else (value,) for name, value in wanted.items()}
+    return [record for record in records if all(record.get(name) in values for name, values in one_of.items())]
 
 
-def share(column: str) -> Callable[[Sequence[Record]], Estimate | None]:
+def among(figure: Callable[[Sequence[Record]], _T], **wanted: Value | tuple[Value, ...]) -> Of[_T]:
+    """A figure of the records with these values alone."""
+    return lambda rows: figure(where(rows, **wanted))
+
+
+def share(column: str) -> Of[Estimate | None]:
     """Rate of the records that have the column in which it holds."""
-    return partial(lambda name, rows: rate(row[name] for row in rows if row.get(name) is not None), column)
+    return lambda rows: rate(row[column] for row in rows if row.get(column) is not None)
 
 
-def scatter(column: str) -> Callable[[Sequence[Record]], Estimate | None]:
-    """Spread of a column."""
-    return partial(lambda name, rows: spread(row.get(name) for row in rows), column)
+def number(column: str, statistic: Callable[[FloatArray], float | FloatArray]) -> Of[float | None]:
+    """A statistic of the numbers in a column; None without any."""
+
+    def of(rows: Sequence[Record]) -> float | None:
+        found = floats(row.get(column) for row in rows)
+        return float(statistic(found)) if found.size else None
+
+    return of
 
 
-def middle(column: str) -> Callable[[Sequence[Record]], float | None]:
+def middle(column: str) -> Of[float | None]:
     """Median of a column."""
-    return partial(lambda name, rows: median(row.get(name) for row in rows), column)
+    return number(column, np.median)
 
 
-def each(
-    records: Iterable[Record], by: Sequence[str], figure: Callable[[Sequence[Record]], Estimate | None]
-) -> dict[str, Estimate | None]:
+def estimated(column: str, statistic: Callable[[FloatArray], FloatArray], fewest: int) -> Of[Estimate | None]:
+    """A statistic of the numbers in a column with its interval; None of fewer."""
+
+    def of(rows: Sequence[Record]) -> Estimate | None:
+        found = floats(row.get(column) for row in rows)
+        return resampled(statistic, found) if found.size >= fewest else None
+
+    return of
+
+
+def scatter(column: str) -> Of[Estimate | None]:
+    """Spread of a column."""
+    return estimated(column, robust, _FEWEST)
+
+
+def each(records: Iterable[Record], by: Sequence[str], figure: Of[Estimate | None]) -> dict[str, Estimate | None]:
     """A figure of every group, under the values that make it."""
     return {", ".join(map(str, key)): figure(group) for key, group in grouped(records, *by).items()}
 
@@ -147,7 +181,7 @@ class Table:
     name: str
     """Of its CSV file."""
     by: tuple[str, ...]
-    columns: Mapping[str, Callable[[Sequence[Record]], Figure]]
+    columns: Mapping[str, Of[Figure]]
     rows: Callable[[Sequence[Record]], Iterable[Record]] = field(default=lambda records: records)
     """What is grouped, from the records: themselves, or one for each parameter."""
     page: str = ""
@@ -192,13 +226,14 @@ class Goal:
 
 
 def at_least(what: str, measured: Estimate | None, least: float, declared: str = "") -> Goal:
-    """Goal of a figure that should not be below a limit."""
-    return _judged(what, measured, least, np.inf, declared or f"≥ {_limit(measured, least)}")
+    """Goal of a rate that should not be below a limit."""
+    goal = within(what, {"": measured}, least, 1.0)
+    return replace(goal, declared=declared) if declared else goal
 
 
-def at_most(what: str, measured: Estimate | None, most: float, declared: str = "") -> Goal:
+def at_most(what: str, measured: Estimate | None, most: float) -> Goal:
     """Goal of a figure that should not be above a limit."""
-    return _judged(what, measured, -np.inf, most, declared or f"≤ {_limit(measured, most)}")
+    return within(what, {"": measured}, 0.0, most)
 
 
 def within(what: str, figures: Mapping[str, Estimate | None], low: float, high: float) -> Goal:
@@ -209,11 +244,10 @@ def within(what: str, figures: Mapping[str, Estimate | None], low: float, high: 
     found = {name: one for name, one in figures.items() if one is not None}
     if not found:
         return Goal(what, "", "–", "–")
-    judged = {name: _judged(what, _together(one, len(found)), low, high, "") for name, one in found.items()}
     are_rates = all(one.count is not None for one in found.values())
     best = low if low == 0 else high if high >= 1 and are_rates else (low + high) / 2
     name = max(found, key=lambda name: abs(found[name].value - best))
-    verdicts = [one.verdict for one in judged.values()]
+    verdicts = [_verdict(one, _together(one, len(found)), low, high) for one in found.values()]
     verdict = next((one for one in ("missed", "within chance") if one in verdicts), "met")
     several = f"{verdicts.count('met')} of {len(found)} inside; worst {name}: " if len(found) > 1 else ""
     declared = f"{_limit(found[name], low)} to {_limit(found[name], high)}"
@@ -239,16 +273,17 @@ def holding(what: str, rates: Mapping[str, Estimate | None], declared: float) ->
     return Goal(what, f"{100 * declared:g} % inside", text or "–", ("met" if met else "missed") if found else "–")
 
 
-def _limit(measured: Estimate | None, value: float) -> str:
-    return f"{value:.3g}" if measured is None or measured.count is None else f"{100 * value:.3g} %"
+def _limit(measured: Estimate, value: float) -> str:
+    return f"{value:.3g}" if measured.count is None else f"{100 * value:.3g} %"
 
 
-def _judged(what: str, one: Estimate | None, low: float, high: float, declared: str) -> Goal:
-    if one is None:
-        return Goal(what, declared, "–", "–")
+def _verdict(one: Estimate, wide: Estimate, low: float, high: float) -> str:
     if low <= one.value <= high:
-        return Goal(what, declared, str(one), "met")
-    return Goal(what, declared, str(one), "missed" if one.high < low or one.low > high else "within chance")
+        return "met"
+    return "missed" if wide.high < low or wide.low > high else "within chance"
+
+
+_Point = tuple[str | float, Estimate | float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,7 +292,7 @@ class Chart:
 
     name: str
     caption: str
-    panels: Mapping[str, Mapping[str, Sequence[tuple[str | float, Estimate | float]]]]
+    panels: Mapping[str, Mapping[str, Sequence[_Point]]]
     """Title to series; the points of a series have an abscissa, a number or a word, and a figure."""
     x: str
     y: str
@@ -265,3 +300,11 @@ class Chart:
     log: bool = False
     lines: tuple[float, ...] = ()
     """Rules across."""
+
+
+def panels(parts: Iterable[tuple[str, str, Iterable[_Point]]]) -> dict[str, dict[str, list[_Point]]]:
+    """Panels of a chart, from the title of each, a series of it and some of its points."""
+    found: dict[str, dict[str, list[_Point]]] = {}
+    for title, name, points in parts:
+        found.setdefault(title, {}).setdefault(name, []).extend(points)
+    return found

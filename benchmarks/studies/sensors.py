@@ -1,19 +1,18 @@
 """Sensors at fault on a healthy machine: named, called a matter of data health, or taken for a fault of the machine."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 
 import numpy as np
 
 from benchmarks.studies import results as r
 from benchmarks.studies.opinions import opinion
-from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
+from benchmarks.studies.results import Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from benchmarks.studies.subjects import SHIPPED, commissioned, subject_named
 from models.commissioning.commissioned import KnowledgeLevel
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import SensorReference, learn_sensor_reference
-from models.errors import MachineFileError
 from models.machine import Machine
 from models.physics.rotor import STATE_INDEX
 from models.signals.channels import Channel, Quantity, state_name
@@ -116,10 +115,6 @@ _COLUMNS = {
 }
 
 
-def _at(level: str, figure: Callable[[Sequence[Record]], Estimate | None], rows: Sequence[Record]) -> Estimate | None:
-    return figure(r.where(rows, level=level))
-
-
 def _goals(records: Sequence[Record]) -> Iterator[Goal]:
     rows, by = list(_judged(records)), ("machine", "fault", "level")
     healthy, faulty = ([row for row in rows if row["at fault"] is one] for one in (False, True))
@@ -129,13 +124,9 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
 
 def sensors(options: Options) -> Study:
     """One channel of a healthy machine at fault."""
-    machines = options.machines or ("lab",)
-    for name in machines:
-        if name not in SHIPPED:
-            raise MachineFileError(f"--machine {name}: not among {', '.join(SHIPPED)}")
     cells = tuple(
         Cell({"machine": name, "level": level.value, "fault": text}, options.windows, (name, level, fault))
-        for name in machines
+        for name in options.machines_among(SHIPPED, "lab")
         for level in _LEVELS
         for fault, (text, _) in _FAULTS.items()
     )
@@ -150,8 +141,8 @@ def sensors(options: Options) -> Study:
                 ("fault",),
                 {
                     # Sensors are checked before the machine is read: both levels have the same findings.
-                    **{name: partial(_at, KnowledgeLevel.FULL, of) for name, of in list(_COLUMNS.items())[:2]},
-                    **{f"machine blamed, {level}": partial(_at, level, r.share("blamed")) for level in _LEVELS},
+                    **{name: r.among(of, level=KnowledgeLevel.FULL) for name, of in list(_COLUMNS.items())[:2]},
+                    **{f"machine blamed, {level}": r.among(r.share("blamed"), level=level) for level in _LEVELS},
                 },
                 _judged,
                 "All machines:",

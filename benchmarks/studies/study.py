@@ -22,7 +22,6 @@ from typing import Any, TypeVar
 
 from benchmarks.studies.results import Chart, Goal, Record, Table, Value
 from models.errors import MachineFileError, RecordingError
-from models.machine import Machine, load_machine
 from simulator.commands import labelled_bars
 
 _Task = TypeVar("_Task")
@@ -41,7 +40,8 @@ class Options:
     small: bool = False
     """The smallest plan that exercises everything, at a declared rate of 10 % false alarms: a check, not a result."""
 
-    def machine(self) -> Machine:
+    @property
+    def machine(self) -> str:
         """The machine of a study that has one.
 
         Raises
@@ -51,7 +51,20 @@ class Options:
         """
         if len(self.machines) > 1:
             raise MachineFileError(f"--machine {', '.join(self.machines)}: this study takes one machine")
-        return load_machine((self.machines or ("lab",))[0])
+        return (self.machines or ("lab",))[0]
+
+    def machines_among(self, known: Sequence[str], *own: str) -> tuple[str, ...]:
+        """Those that are asked for, or the study's own.
+
+        Raises
+        ------
+        MachineFileError
+            If one is not among the known ones.
+        """
+        for name in self.machines:
+            if name not in known:
+                raise MachineFileError(f"--machine {name}: not among {', '.join(known)}")
+        return self.machines or own
 
     @property
     def rate(self) -> float:

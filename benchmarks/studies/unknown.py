@@ -14,7 +14,6 @@ from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from benchmarks.studies.subjects import SUBJECTS, commissioned, subject_named
 from models.commissioning.commissioned import KnowledgeLevel
-from models.errors import MachineFileError
 from simulator.training.draws import Layout
 
 _CHANGES: tuple[dict[str, float], ...] = (
@@ -43,16 +42,13 @@ def _measure(options: Options, _learned: None, cell: Cell, number: int) -> list[
     return [known | opinion(diagnostician, window, (0.01,))]
 
 
-def _located(kind: str, rows: Sequence[Record]) -> Estimate | None:
-    return r.share("exact")([row for row in rows if str(row["changed"]).startswith(kind)])
-
-
-def _among_changed(column: str, rows: Sequence[Record]) -> Estimate | None:
-    return r.share(column)([row for row in rows if row["changed"] != "healthy"])
-
-
-def _false_alarms(rows: Sequence[Record]) -> Estimate | None:
-    return r.share("any")(r.where(rows, changed="healthy"))
+_KINDS = {
+    "k_by, k_bz −10 %": r.among(r.share("exact"), changed=("k_by -10%", "k_bz -10%")),
+    "c_by, c_bz −30 %": r.among(r.share("exact"), changed=("c_by -30%", "c_bz -30%")),
+    "e +20 %": r.among(r.share("exact"), changed="e +20%"),
+}
+_FALSE_ALARMS = r.among(r.share("any"), changed="healthy")
+_CHANGED = tuple(changed_in(changes) for changes in _CHANGES[1:])
 
 
 def _beyond_limit(rows: Sequence[Record]) -> Estimate | None:
@@ -71,13 +67,10 @@ _TABLES = (
         ("level", "machine"),
         {
             "commissioning refused": _refused,
-            "healthy: any named": _false_alarms,
+            "healthy: any named": _FALSE_ALARMS,
             "healthy: named beyond 10 %": _beyond_limit,
-            **{
-                f"{kind} located": partial(_located, kind[:2])
-                for kind in ("k_by, k_bz −10 %", "c_by, c_bz −30 %", "e +20 %")
-            },
-            "another named": partial(_among_changed, "wrong"),
+            **{f"{kind} located": located for kind, located in _KINDS.items()},
+            "another named": r.among(r.share("wrong"), changed=_CHANGED),
         },
         judged,
         "*Located*: exactly the changed parameter is named.",
@@ -109,19 +102,15 @@ _TABLES = (
 
 def _goals(records: Sequence[Record]) -> Iterator[Goal]:
     rows, by = list(judged(records)), ("machine", "level")
-    for kind in ("k_by, k_bz −10 %", "c_by, c_bz −30 %"):
-        yield r.within(f"{kind} located", r.each(rows, by, partial(_located, kind[:2])), 0.95, 1.0)
-    bearing = [row for row in rows if str(row["changed"])[0] in "kc"]
+    for kind in list(_KINDS)[:2]:
+        yield r.within(f"{kind} located", r.each(rows, by, _KINDS[kind]), 0.95, 1.0)
+    bearing = r.where(rows, changed=_CHANGED[:4])
     yield r.within("bearing changed, another parameter named", r.each(bearing, by, r.share("wrong")), 0.0, 0.01)
-    yield r.within("false alarms of healthy windows", r.each(rows, by, _false_alarms), 0.0, 0.01)
+    yield r.within("false alarms of healthy windows", r.each(rows, by, _FALSE_ALARMS), 0.0, 0.01)
 
 
 def unknown(options: Options) -> Study:
     """Machines commissioned without their parameters."""
-    machines = options.machines or SUBJECTS
-    for name in machines:
-        if name not in SUBJECTS:
-            raise MachineFileError(f"--machine {name}: not among {', '.join(SUBJECTS)}")
     commissionings = 1 if options.small else _COMMISSIONINGS
     plan = [options.windows * (1 if changes or options.small else _HEALTHY_WEIGHT) for changes in _CHANGES]
     cells = tuple(
@@ -131,7 +120,7 @@ def unknown(options: Options) -> Study:
             (level, name, commissioning, at),
         )
         for level in (KnowledgeLevel.NONE, KnowledgeLevel.PARTIAL, KnowledgeLevel.FULL)
-        for name in machines
+        for name in options.machines_among(SUBJECTS, *SUBJECTS)
         if subject_named(name).file(level) is not None
         for commissioning in range(commissionings)
         for at, changes in enumerate(_CHANGES)

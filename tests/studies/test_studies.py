@@ -31,7 +31,7 @@ from benchmarks.studies.results import (
     rate,
     resampled,
     robust,
-    spread,
+    scatter,
     within,
 )
 from benchmarks.studies.study import Cell, Options, Over, Study, read, run, spread_over
@@ -41,7 +41,7 @@ from models.commissioning.commissioned import KnowledgeLevel, knowledge_of
 from models.diagnosis.networks.equations import EQUATIONS
 from models.diagnosis.networks.relation import window_view
 from models.diagnosis.window import WindowStatistics
-from models.errors import RecordingError
+from models.errors import EstimationError, RecordingError
 from models.machine import load_machine
 from simulator.training.draws import Draw, Purpose, simulate_window
 
@@ -219,10 +219,10 @@ def test_intervals_by_resampling_are_those_of_the_normal_distribution() -> None:
 
 def test_a_spread_is_robust_and_needs_four_windows() -> None:
     # Median 0.005, distances 0.025, 0.005, 0.005, 0.045 with the median 0.015.
-    found = spread([-0.02, 0.0, 0.01, 0.05, None])
+    found = scatter("off")([{"off": off} for off in (-0.02, 0.0, 0.01, 0.05, None)])
     assert found is not None
     assert found.value == pytest.approx(1.4826 * 0.015)
-    assert spread([0.1, 0.2, 0.3]) is None
+    assert scatter("off")([{"off": off} for off in (0.1, 0.2, 0.3)]) is None
     assert robust(np.array([1.0, 2.0, 1e9])) == pytest.approx(1.4826)
 
 
@@ -256,7 +256,7 @@ def test_limits_keep_the_declared_rate() -> None:
     rng = np.random.default_rng(8)
     exceeded = [np.mean(rng.lognormal(size=50) > limit_of(rng.lognormal(size=99), 0.05)) for _ in range(400)]
     assert np.mean(exceeded) == pytest.approx(0.05, abs=0.006)
-    with pytest.raises(ValueError, match="expected at least 99"):
+    with pytest.raises(EstimationError, match="expected at least 99"):
         limit_of(np.ones(98), 0.01)
 
 

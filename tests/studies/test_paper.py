@@ -1,17 +1,11 @@
 """The paper's own diagnostician on independent windows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from benchmarks.studies.paper import (
-    PAPER_EQUATIONS,
-    PaperDiagnostician,
-    PaperNetwork,
-    calibrate_paper,
-    mean_squared_deviation,
-    paper_rows,
-)
-from benchmarks.studies.paper_training import train_paper_network
+from benchmarks.studies.paper import PAPER_EQUATIONS, PaperDiagnostician, PaperNetwork, paper_rows, train_paper_network
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
@@ -48,7 +42,7 @@ def healthy(rig: Machine) -> list[WindowStatistics]:
 @pytest.fixture(scope="module")
 def networks(rig: Machine, training: list[WindowStatistics]) -> list[PaperNetwork]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("benchmarks.studies.paper_training._STEPS", 50)
+        patch.setattr("benchmarks.studies.paper._STEPS", 50)
         return [train_paper_network(equation, training, rig, seed=1) for equation in PAPER_EQUATIONS]
 
 
@@ -64,43 +58,36 @@ def test_training_fits_its_own_windows_and_is_repeatable(
     rig: Machine, networks: list[PaperNetwork], training: list[WindowStatistics], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = networks[0]
-    monkeypatch.setattr("benchmarks.studies.paper_training._STEPS", 50)
+    monkeypatch.setattr("benchmarks.studies.paper._STEPS", 50)
     again = train_paper_network(PAPER_EQUATIONS[0], training, rig, seed=1)
     assert np.array_equal(first.network.W1, again.network.W1)
-    assert np.mean([mean_squared_deviation(first, window, rig) for window in training]) < 0.05
+    assert np.mean([first.deviation(window) for window in training]) < 0.05
 
 
-def test_diagnostician_names_equations_and_no_sizes(
+def test_diagnostician_names_equations(
     rig: Machine, networks: list[PaperNetwork], healthy: list[WindowStatistics]
 ) -> None:
-    limits = calibrate_paper(networks, healthy, rig, false_alarm_rate=0.2)
-    paper = PaperDiagnostician(rig, networks, limits)
+    paper = PaperDiagnostician.calibrated(networks, healthy, false_alarm_rate=0.2)
     # As calibrated: of the six windows exactly the largest score is at the limit, none above it.
-    assert not any(paper.flagged_equations(paper.diagnose(window)) for window in healthy)
+    assert not any(paper.flagged(paper.deviations(window)) for window in healthy)
     changed = Draw(rig, _SEED, Purpose.TRAINING, faults={"k_by": -0.6}, layout=Layout.ONE_SOURCE, fixed_condition=True)
-    diagnosis = paper.diagnose(simulate_window(changed, 50))
-    assert diagnosis.by == "paper"
-    assert [reading.equation for reading in diagnosis.equations] == ["28", "29", "30", "31"]
-    assert all(reading.msd is not None and reading.msd_healthy is not None for reading in diagnosis.equations)
-    assert all(reading.relative_change is None and reading.reason for reading in diagnosis.parameters)
-    assert "28" in paper.flagged_equations(diagnosis)
+    deviations = paper.deviations(simulate_window(changed, 50))
+    assert list(deviations) == ["28", "29", "30", "31"]
+    assert "28" in paper.flagged(deviations)
 
 
 def test_an_equation_without_its_channels_is_not_evaluated(
-    rig: Machine, networks: list[PaperNetwork], healthy: list[WindowStatistics]
+    networks: list[PaperNetwork], healthy: list[WindowStatistics]
 ) -> None:
-    paper = PaperDiagnostician(rig, networks, calibrate_paper(networks, healthy, rig, false_alarm_rate=0.2))
-    lab = load_machine("lab")
-    diagnosis = paper.diagnose(simulate_window(Draw(lab, _SEED, Purpose.EVALUATION), 0))
-    tilt = diagnosis.equations[2]
-    assert not tilt.evaluable
-    assert "psi_dot" in tilt.reason
-    assert tilt.msd is None
-    assert "30" not in paper.flagged_equations(diagnosis)
+    paper = PaperDiagnostician.calibrated(networks, healthy, false_alarm_rate=0.2)
+    window = simulate_window(Draw(load_machine("lab"), _SEED, Purpose.EVALUATION), 0)
+    assert list(paper.deviations(window)) == ["28", "29", "31"]
+    without_angle = replace(window, synchronous=None, hop_synchronous=None)
+    assert list(paper.deviations(without_angle)) == ["28", "31"]
 
 
 def test_too_few_windows_for_the_declared_rate_are_refused(
-    rig: Machine, networks: list[PaperNetwork], healthy: list[WindowStatistics]
+    networks: list[PaperNetwork], healthy: list[WindowStatistics]
 ) -> None:
     with pytest.raises(EstimationError, match="expected at least 99"):
-        calibrate_paper(networks[:1], healthy, rig, false_alarm_rate=0.01)
+        PaperDiagnostician.calibrated(networks[:1], healthy, false_alarm_rate=0.01)
