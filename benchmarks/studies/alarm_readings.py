@@ -8,10 +8,11 @@ import numpy as np
 
 from benchmarks.studies import results as r
 from benchmarks.studies.results import Goal, Record, Table, Value
+from benchmarks.studies.subjects import drawn_in_one_condition, without_parameters
 from benchmarks.studies.watched import commissioned
 from models.commissioning.commissioned import Installed, KnowledgeLevel
 from models.diagnosis.readings import Z95
-from models.machine import ConditionRange, Machine, MachineFile, load_machine
+from models.machine import Machine, load_machine
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from rotorwatch.records.alarms import EventKind
@@ -58,40 +59,32 @@ class Told:
     def stream(self, number: int, changes: dict[str, float], step_s: float) -> Iterator[SampleBlock]:
         """The machine in a condition of its own, or in one of the commissioned ones."""
         if self.level is KnowledgeLevel.FULL:
-            drawn, condition = self.machine, number
-            draw = Draw(drawn, self.seed, Purpose.EVALUATION, _STREAM, layout=Layout(number % 2))
+            condition = number
+            draw = Draw(self.machine, self.seed, Purpose.EVALUATION, _STREAM, layout=Layout(number % 2))
         else:
-            drawn, draw = _condition(self, number // _STREAMS, number % _CONDITIONS)
             condition = 2 + number
+            draw = _condition(self, number // _STREAMS, number % _CONDITIONS)
         steps = [Event(at_s=step_s, parameter=name, relative_change=size) for name, size in changes.items()]
         duration_s = step_s + _WATCHED_WINDOWS * self.machine.window.length_s
         scenario = draw_condition(draw, condition).overridden(duration_s=duration_s, faults=steps)
-        return (block for block, _ in blocks(scenario, drawn, _BLOCK_S))
+        return (block for block, _ in blocks(scenario, draw.machine, _BLOCK_S))
 
 
-def _condition(case: Told, commissioning: int, at: int) -> tuple[Machine, Draw]:
+def _condition(case: Told, commissioning: int, at: int) -> Draw:
     rng = np.random.default_rng([case.seed, commissioning, 78, at])
-    cutoff_hz = float(np.exp(rng.uniform(np.log(40.0), np.log(160.0))))
-    limits = ConditionRange(
-        cutoff_hz=(cutoff_hz, cutoff_hz), stochastic_to_1x=(1.35, 1.65), noise_relative=(0.02, 0.02)
-    )
-    operation = case.machine.operation.model_copy(update={"speed_tolerance": 0.01})
-    drawn = case.machine.model_copy(update={"condition": limits, "operation": operation})
-    own = int(rng.integers(2**62))
-    return drawn, Draw(drawn, own, Purpose.EVALUATION, layout=Layout(at % 2), fixed_condition=True)
+    return drawn_in_one_condition(case.machine, rng, at)
 
 
 @lru_cache(maxsize=2)
 def _installed(case: Told, commissioning: int) -> Installed | str:
     if case.level is KnowledgeLevel.FULL:
         return Installed(case.machine, None, None)
-    content = case.machine.model_dump(mode="json", exclude={"rotor", "operation", "condition"})
     streams = []
     for at in range(_CONDITIONS):
-        drawn, draw = _condition(case, commissioning, at)
+        draw = _condition(case, commissioning, at)
         healthy = draw_condition(draw, 1).overridden(duration_s=_HEALTHY_WINDOWS * case.machine.window.length_s)
-        streams.append([block for block, _ in blocks(healthy, drawn, _BLOCK_S)])
-    return commissioned(MachineFile.model_validate(content), *streams)
+        streams.append([block for block, _ in blocks(healthy, draw.machine, _BLOCK_S)])
+    return commissioned(without_parameters(case.machine), *streams)
 
 
 def told(case: Told, number: int) -> list[dict[str, Value]]:

@@ -33,19 +33,115 @@ SHIPPED = ("lab", "heavy", "light")
 SUBJECTS: tuple[str, ...] = (*(rotor.name for rotor in ROTORS), *SHIPPED)
 """Machines of another model class first, then the shipped ones."""
 
-_COMMISSIONED_CUTOFFS_HZ = (40.0, 160.0)
 _OTHER_CUTOFF = math.log(1.25)
-_SPEED_TOLERANCE = 0.01
 _SETTLING_S = 0.1
-_ALIKE = (1.35, 1.65)
-"""Level of a rotor with cubic stiffness, within a tenth of the commissioned one: at another level its stiffness is
-another one, which is no fault and no error of reading."""
+ALIKE = (1.35, 1.65)
+"""Level of the excitation, within a tenth of the commissioned one: at another level a rotor with cubic stiffness has
+another stiffness, which is no fault and no error of reading, and levels would rightly alarm."""
 _GEOMETRY = ("m1_kg", "m2_kg", "I2_kg_m2", "I2p_kg_m2", "shaft_length_m", "shaft_diameter_m", "shaft_E_Pa")
 
 
-def subject_named(name: str) -> "Shipped | Beam":
+def commissioned_cutoff_hz(rng: np.random.Generator) -> float:
+    """Cutoff of the excitation while a machine is commissioned."""
+    return float(np.exp(rng.uniform(np.log(40.0), np.log(160.0))))
+
+
+def in_condition(machine: Machine, limits: ConditionRange) -> Machine:
+    """The machine at its commissioned speed, with other ranges of the condition."""
+    operation = machine.operation.model_copy(update={"speed_tolerance": 0.01})
+    return machine.model_copy(update={"operation": operation, "condition": limits})
+
+
+def in_one_condition(machine: Machine, cutoff_hz: float, level: tuple[float, float] = ALIKE) -> Machine:
+    """As while it is commissioned."""
+    noise = (0.02, 0.02)
+    limits = ConditionRange(cutoff_hz=(cutoff_hz, cutoff_hz), stochastic_to_1x=level, noise_relative=noise)
+    return in_condition(machine, limits)
+
+
+def drawn_in_one_condition(machine: Machine, rng: np.random.Generator, at: int) -> Draw:
+    """Streams in one of the conditions of a commissioning: one source if it is even, independent ones if it is odd."""
+    drawn = in_one_condition(machine, commissioned_cutoff_hz(rng))
+    own = int(rng.integers(2**62))
+    return Draw(drawn, own, Purpose.EVALUATION, layout=Layout(at % 2), fixed_condition=True)
+
+
+def without_parameters(machine: Machine, level: KnowledgeLevel = KnowledgeLevel.NONE) -> MachineFile:
+    """Its file at level none, or partial."""
+    content = machine.model_dump(mode="json", exclude={"rotor", "operation", "condition"})
+    if level is KnowledgeLevel.PARTIAL:
+        content["rotor"] = machine.rotor.model_dump(include=set(_GEOMETRY))
+    return MachineFile.model_validate(content)
+
+
+@dataclass(frozen=True, slots=True)
+class StudiedMachine:
+    """A machine to commission, of finite elements or a shipped one, and windows of it of 60 s, which do not overlap."""
+
+    rotor: BeamRotor | Machine
+
+    def file(self, level: KnowledgeLevel) -> MachineFile | None:
+        """Machine file at a level of knowledge; None where there is none, as of finite elements at all but none."""
+        if isinstance(self.rotor, BeamRotor):
+            return machine_of(self.rotor, WindowSizes()) if level is KnowledgeLevel.NONE else None
+        if level is KnowledgeLevel.FULL:
+            return in_condition(self.rotor, self.rotor.condition)
+        return without_parameters(self.rotor, level)
+
+    def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
+        """Windows of one commissioning."""
+        cutoff_hz = commissioned_cutoff_hz(self._generator(seed, commissioning, 1, 1))
+        rng = self._generator(seed, commissioning, 1)
+        if isinstance(self.rotor, BeamRotor):
+            limits = replace(COMMISSIONED, cutoff_hz=(cutoff_hz, cutoff_hz))
+            return _of_beam(self.rotor, SourceLayout.ONE_SOURCE, limits, {}, rng, count)
+        machine, own = in_one_condition(self.rotor, cutoff_hz, (1.5, 1.5)), int(rng.integers(2**62))
+        draw = Draw(machine, own, Purpose.TRAINING, layout=Layout.ONE_SOURCE, fixed_condition=True)
+        return tuple(simulate_window(draw, number) for number in range(1, count + 1))
+
+    def later(
+        self, seed: int, commissioning: int, cell: int, number: int, changes: dict[str, float]
+    ) -> tuple[WindowStatistics, float]:
+        """One window, and the cutoff of its excitation, Hz, at least a quarter off the commissioned one."""
+        rng = self._generator(seed, commissioning, 2, cell, number)
+        scene = SceneRange() if isinstance(self.rotor, BeamRotor) else self.rotor.condition
+        cutoff_hz = commissioned_hz = commissioned_cutoff_hz(self._generator(seed, commissioning, 1, 1))
+        while abs(math.log(cutoff_hz / commissioned_hz)) <= _OTHER_CUTOFF:
+            cutoff_hz = float(rng.uniform(*scene.cutoff_hz))
+        if isinstance(self.rotor, BeamRotor):
+            limits = replace(SceneRange(), cutoff_hz=(cutoff_hz, cutoff_hz))
+            if not self.rotor.linear:
+                limits = replace(limits, stochastic_to_1x=ALIKE)
+            beam_layout = SourceLayout.INDEPENDENT if number % 2 else SourceLayout.ONE_SOURCE
+            return _of_beam(self.rotor, beam_layout, limits, changes, rng, 1)[0], cutoff_hz
+        drawn = self.rotor.condition.model_copy(update={"cutoff_hz": (cutoff_hz, cutoff_hz)})
+        machine, own = in_condition(self.rotor, drawn), int(rng.integers(2**62))
+        draw = Draw(machine, own, Purpose.EVALUATION, faults=changes, layout=Layout(number % 2))
+        return simulate_window(draw, number), cutoff_hz
+
+    def _generator(self, seed: int, commissioning: int, *which: int) -> np.random.Generator:
+        """Random numbers of a commissioning (1, ...) or of a window of a later day (2, ...)."""
+        own = int.from_bytes(hashlib.sha256(self.rotor.name.encode()).digest()[:4], "big")
+        return np.random.default_rng([seed, own, commissioning, *which])
+
+
+def _of_beam(
+    rotor: BeamRotor,
+    layout: SourceLayout,
+    limits: SceneRange,
+    changes: dict[str, float],
+    rng: np.random.Generator,
+    count: int,
+) -> tuple[WindowStatistics, ...]:
+    condition = drawn_condition(rotor, layout, limits, changes, rng)
+    sizes = plan(rotor, WindowSizes())
+    duration_s = (sizes.preamble + count * sizes.hops * sizes.hop) / sizes.rate_hz + _SETTLING_S
+    return tuple(windows_of(sampled(rotor, condition, duration_s, int(rng.integers(2**62))), sizes)[:count])
+
+
+def subject_named(name: str) -> StudiedMachine:
     """Look a machine of `SUBJECTS` up; a KeyError if it is not among them."""
-    return Shipped(load_machine(name)) if name in SHIPPED else Beam(rotor_named(name))
+    return StudiedMachine(load_machine(name) if name in SHIPPED else rotor_named(name))
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,108 +177,3 @@ def commissioned(
         return _Compared(identified.machine, identified.covariance), windows
     except EstimationError as error:
         return f"not commissioned: {error}", windows
-
-
-def _generator(name: str, seed: int, commissioning: int, *which: int) -> np.random.Generator:
-    """Random numbers of a commissioning (1, ...) or of a window of a later day (2, ...)."""
-    own = int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big")
-    return np.random.default_rng([seed, own, commissioning, *which])
-
-
-def _commissioned_cutoff(name: str, seed: int, commissioning: int) -> float:
-    low, high = np.log(_COMMISSIONED_CUTOFFS_HZ)
-    return float(np.exp(_generator(name, seed, commissioning, 1, 1).uniform(low, high)))
-
-
-def _other_cutoff(limits: tuple[float, float], commissioned: float, rng: np.random.Generator) -> float:
-    """A cutoff that is at least a quarter off the commissioned one."""
-    while True:
-        cutoff_hz = float(rng.uniform(*limits))
-        if abs(math.log(cutoff_hz / commissioned)) > _OTHER_CUTOFF:
-            return cutoff_hz
-
-
-@dataclass(frozen=True, slots=True)
-class Beam:
-    """A rotor of finite elements; it has a machine file at level none alone."""
-
-    rotor: BeamRotor
-
-    def file(self, level: KnowledgeLevel) -> MachineFile | None:
-        """Machine file at a level of knowledge; None where there is none."""
-        return machine_of(self.rotor, WindowSizes()) if level is KnowledgeLevel.NONE else None
-
-    def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
-        """Windows of 60 s of one commissioning, which do not overlap."""
-        cutoff_hz = _commissioned_cutoff(self.rotor.name, seed, commissioning)
-        rng = _generator(self.rotor.name, seed, commissioning, 1)
-        limits = replace(COMMISSIONED, cutoff_hz=(cutoff_hz, cutoff_hz))
-        return self._windows(SourceLayout.ONE_SOURCE, limits, {}, rng, count)
-
-    def later(
-        self, seed: int, commissioning: int, cell: int, number: int, changes: dict[str, float]
-    ) -> tuple[WindowStatistics, float]:
-        """One window of 60 s, and the cutoff of its excitation, Hz."""
-        rng = _generator(self.rotor.name, seed, commissioning, 2, cell, number)
-        other = _commissioned_cutoff(self.rotor.name, seed, commissioning)
-        cutoff_hz = _other_cutoff(SceneRange().cutoff_hz, other, rng)
-        layout = SourceLayout.INDEPENDENT if number % 2 else SourceLayout.ONE_SOURCE
-        limits = replace(SceneRange(), cutoff_hz=(cutoff_hz, cutoff_hz))
-        if not self.rotor.linear:
-            limits = replace(limits, stochastic_to_1x=_ALIKE)
-        return self._windows(layout, limits, changes, rng, 1)[0], cutoff_hz
-
-    def _windows(
-        self, layout: SourceLayout, limits: SceneRange, changes: dict[str, float], rng: np.random.Generator, count: int
-    ) -> tuple[WindowStatistics, ...]:
-        condition = drawn_condition(self.rotor, layout, limits, changes, rng)
-        sizes = plan(self.rotor, WindowSizes())
-        duration_s = (sizes.preamble + count * sizes.hops * sizes.hop) / sizes.rate_hz + _SETTLING_S
-        return tuple(windows_of(sampled(self.rotor, condition, duration_s, int(rng.integers(2**62))), sizes)[:count])
-
-
-@dataclass(frozen=True, slots=True)
-class Shipped:
-    """A shipped machine, in windows of 60 s."""
-
-    machine: Machine
-
-    def file(self, level: KnowledgeLevel) -> MachineFile | None:
-        """Machine file at a level of knowledge; None where there is none."""
-        machine = _within(self.machine, self.machine.condition)
-        if level is KnowledgeLevel.FULL:
-            return machine
-        content = machine.model_dump(mode="json", exclude={"rotor", "operation", "condition"})
-        if level is KnowledgeLevel.PARTIAL:
-            content["rotor"] = machine.rotor.model_dump(include=set(_GEOMETRY))
-        return MachineFile.model_validate(content)
-
-    def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
-        """Windows of 60 s of one commissioning, which do not overlap."""
-        cutoff_hz = _commissioned_cutoff(self.machine.name, seed, commissioning)
-        rng = _generator(self.machine.name, seed, commissioning, 1)
-        limits = ConditionRange(
-            cutoff_hz=(cutoff_hz, cutoff_hz), stochastic_to_1x=(1.5, 1.5), noise_relative=(0.02, 0.02)
-        )
-        machine, own = _within(self.machine, limits), int(rng.integers(2**62))
-        draw = Draw(machine, own, Purpose.TRAINING, layout=Layout.ONE_SOURCE, fixed_condition=True)
-        return tuple(simulate_window(draw, number) for number in range(1, count + 1))
-
-    def later(
-        self, seed: int, commissioning: int, cell: int, number: int, changes: dict[str, float]
-    ) -> tuple[WindowStatistics, float]:
-        """One window of 60 s, and the cutoff of its excitation, Hz."""
-        rng = _generator(self.machine.name, seed, commissioning, 2, cell, number)
-        own, other = self.machine.condition, _commissioned_cutoff(self.machine.name, seed, commissioning)
-        cutoff_hz = _other_cutoff(own.cutoff_hz, other, rng)
-        machine = _within(self.machine, own.model_copy(update={"cutoff_hz": (cutoff_hz, cutoff_hz)}))
-        own_seed, layout = int(rng.integers(2**62)), Layout(number % 2)
-        draw = Draw(machine, own_seed, Purpose.EVALUATION, faults=changes, layout=layout)
-        return simulate_window(draw, number), cutoff_hz
-
-
-def _within(machine: Machine, limits: ConditionRange) -> Machine:
-    """The machine in windows of 60 s, at its commissioned speed, with other ranges of the condition."""
-    window = machine.window.model_copy(update={"length_s": 60.0, "max_span_s": 90.0})
-    operation = machine.operation.model_copy(update={"speed_tolerance": _SPEED_TOLERANCE})
-    return machine.model_copy(update={"window": window, "operation": operation, "condition": limits})

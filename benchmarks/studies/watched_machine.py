@@ -6,23 +6,31 @@ from functools import partial
 
 import numpy as np
 
+from benchmarks.finite_elements import observed
 from benchmarks.finite_elements.assembly import ComplexArray, Equations, assemble, probed
 from benchmarks.finite_elements.machines import rotor_named
-from benchmarks.finite_elements.observed import RATE_HZ, RunCondition, WindowSizes, machine_of, sampled
+from benchmarks.finite_elements.observed import RATE_HZ, RunCondition, sampled
 from benchmarks.finite_elements.rotor import BeamRotor
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
 from benchmarks.studies.fault_kinds import CRACK, MOTIONS, RUBS, Change, Rotor, Seen, as_simulated
-from benchmarks.studies.subjects import SHIPPED, SUBJECTS
+from benchmarks.studies.subjects import (
+    ALIKE,
+    SHIPPED,
+    SUBJECTS,
+    commissioned_cutoff_hz,
+    drawn_in_one_condition,
+    subject_named,
+)
 from models.commissioning.commissioned import KnowledgeLevel
 from models.errors import EstimationError
-from models.machine import ConditionRange, Machine, MachineFile, load_machine
+from models.machine import Machine, MachineFile, load_machine
 from models.physics.response import stochastic_covariance
 from models.physics.rotor import STATE_INDEX, M_matrix, P_matrix, Q_matrix
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.channels import Channel, Quantity
 from simulator.scenario import Event, Rub, Scenario
-from simulator.stream import DEFAULT_START_NS, blocks
-from simulator.training.draws import Draw, Layout, Purpose, draw_condition
+from simulator.stream import blocks
+from simulator.training.draws import draw_condition
 
 CONDITIONS = 3
 _HEALTHY, AFTER = 4.1, 2.5
@@ -30,8 +38,6 @@ _HEALTHY, AFTER = 4.1, 2.5
 _BEFORE_S = 10.0
 """Healthy, once the window is full, or the first windows that a machine is compared with that is not commissioned."""
 _BLOCK_S = 0.5
-_ALIKE = (1.35, 1.65)
-"""Level of the excitation; as commissioned within a tenth, or levels would rightly alarm before the fault begins."""
 
 
 def displacement_response(equations: Equations, kept: Sequence[int], f: FloatArray) -> ComplexArray:
@@ -46,32 +52,25 @@ def displacement_response(equations: Equations, kept: Sequence[int], f: FloatArr
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """A machine of one model class in one commissioning: file, healthy streams, later streams.
-
-    Attributes
-    ----------
-    always : callable
-        What is so from the beginning, in healthy recordings too.
-    windows : int
-        That are full before a fault begins.
-    """
+    """A machine of one model class in one commissioning: file, healthy streams, later streams."""
 
     name: str
     level: KnowledgeLevel
     seed: int
     number: int
     always: Change = as_simulated
+    """What is so from the beginning, in healthy recordings too."""
     windows: int = 1
+    """That are full before a fault begins."""
 
     @property
     def file(self) -> MachineFile:
         """What the monitor knows of it."""
-        if self.name not in SHIPPED:
-            return machine_of(rotor_named(self.name), WindowSizes())
-        machine = load_machine(self.name)
         if self.level is KnowledgeLevel.FULL:
-            return machine
-        return MachineFile.model_validate(machine.model_dump(mode="json", exclude={"rotor", "operation", "condition"}))
+            return load_machine(self.name)
+        file = subject_named(self.name).file(self.level)
+        assert file is not None  # noqa: S101  # no study asks for a level that a machine has no file of
+        return file
 
     def healthy(self, condition: int) -> Iterator[SampleBlock]:
         """A recording in one of the conditions."""
@@ -83,17 +82,7 @@ class Subject:
         return (at + self.number) % CONDITIONS
 
     def faulty(self, at: int, name: str, change: Change) -> Iterator[SampleBlock]:
-        """A stream in one of the conditions in which something begins.
-
-        Parameters
-        ----------
-        at : int
-            Number of the stream.
-        name : str
-            Of what begins; a rub or a crack is simulated.
-        change : Change
-            What it does to the motion.
-        """
+        """Stream `at`, in one of the conditions, in which something begins; of its name a rub or crack is made."""
         rotor, seen = self._moved(self.condition(at), 2 + at, self.begins_s + AFTER * self._window_s, name)
         seen = self.always(rotor, seen, self._rng(2))
         changed = change(rotor, seen, self._rng(1, at))
@@ -115,21 +104,14 @@ class Subject:
 
     def _moved(self, condition: int, realisation: int, seconds: float, fault: str) -> tuple[Rotor, Seen]:
         rng = self._rng(0, condition)
-        cutoff_hz = float(np.exp(rng.uniform(np.log(40.0), np.log(160.0))))
         if self.name in SHIPPED:
             machine = load_machine(self.name)
-            limits = ConditionRange(
-                cutoff_hz=(cutoff_hz, cutoff_hz), stochastic_to_1x=_ALIKE, noise_relative=(0.02, 0.02)
-            )
-            operation = machine.operation.model_copy(update={"speed_tolerance": 0.01})
-            drawn = machine.model_copy(update={"condition": limits, "operation": operation})
-            draw = Draw(
-                drawn, int(rng.integers(2**62)), Purpose.EVALUATION, layout=Layout(condition % 2), fixed_condition=True
-            )
+            draw = drawn_in_one_condition(machine, rng, condition)
             scenario = draw_condition(draw, realisation).overridden(duration_s=seconds)
             return _of_shipped(machine, _with_anomaly(scenario, machine, fault, self.begins_s))
+        cutoff_hz = commissioned_cutoff_hz(rng)
         layout = SourceLayout.INDEPENDENT if condition % 2 else SourceLayout.ONE_SOURCE
-        scene = replace(COMMISSIONED, cutoff_hz=(cutoff_hz, cutoff_hz), stochastic_to_1x=_ALIKE)
+        scene = replace(COMMISSIONED, cutoff_hz=(cutoff_hz, cutoff_hz), stochastic_to_1x=ALIKE)
         beam = rotor_named(self.name)
         ran = drawn_condition(beam, layout, scene, {}, rng)
         return _of_beam(beam, ran, seconds, [self.seed, self.number, condition, realisation])
@@ -188,7 +170,7 @@ def _with_anomaly(scenario: Scenario, machine: Machine, fault: str, begins_s: fl
     if clearance is not None:
         variance = np.diag(stochastic_covariance(machine.rotor, _speed_rad_s(scenario), scenario.sources))
         radial = float(np.sqrt(variance[STATE_INDEX["y2"]] + variance[STATE_INDEX["z2"]]))
-        kind, rub = "rub", Rub(clearance_m=clearance * radial * np.hypot(1, 1 / _ALIKE[0]))
+        kind, rub = "rub", Rub(clearance_m=clearance * radial * np.hypot(1, 1 / ALIKE[0]))
     while True:
         event = Event(at_s=begins_s, anomaly=kind, size=size)
         yield scenario.model_copy(update={"rub": rub, "events": (*scenario.events, event)})
@@ -196,15 +178,8 @@ def _with_anomaly(scenario: Scenario, machine: Machine, fault: str, begins_s: fl
 
 
 def _blocks(file: MachineFile, seen: Seen) -> Iterator[SampleBlock]:
-    columns = [_column(one, seen) / one.to_si for one in file.sensors]
-    samples = np.column_stack(columns).astype(np.float32)
-    for n, one in enumerate(file.sensors):
-        if one.quantity is Quantity.SHAFT_ANGLE:
-            samples[:, n] = np.where(samples[:, n] >= 2 * np.pi, 0.0, samples[:, n])
-    size = round(_BLOCK_S * file.rate_hz)
-    for number, first in enumerate(range(0, len(samples), size)):
-        start_ns = DEFAULT_START_NS + round(first * 1e9 / file.rate_hz)
-        yield SampleBlock(start_ns, number, 1, file.rate_hz, samples[first : first + size])
+    samples = np.column_stack([_column(one, seen) for one in file.sensors])
+    return observed.blocks(samples, file.descriptor, _BLOCK_S)
 
 
 def _column(channel: Channel, seen: Seen) -> FloatArray:
