@@ -33,29 +33,14 @@ _PULL = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class TrueCondition:
-    """What is true of a window, SI units.
+    """What is true of a window, SI units."""
 
-    Attributes
-    ----------
-    changes : dict of str to float
-        Relative changes of parameters.
-    speed_rad_s : float
-    cutoff_hz : float
-        Of the second-order low-pass that colours all forces.
-    levels : ndarray, shape (6, 6)
-        Two-sided spectral density of the forces far below the cutoff, N²/Hz and Nm²/Hz.
-    noise : ndarray, shape (n_states,)
-        Two-sided density of the sensor noise at the lower end of the band.
-    noise_colour : ndarray, shape (n_states,)
-        Exponent b of the noise's colour.
-    """
-
-    changes: dict[str, float]
+    changes: dict[str, float]  # relative, of parameters
     speed_rad_s: float
-    cutoff_hz: float
-    levels: FloatArray
-    noise: FloatArray
-    noise_colour: FloatArray
+    cutoff_hz: float  # of the second-order low-pass that colours all forces
+    levels: FloatArray  # (6, 6): two-sided density of the forces far below the cutoff, N²/Hz and Nm²/Hz
+    noise: FloatArray  # (n_states,): two-sided density of the sensor noise at the lower end of the band
+    noise_colour: FloatArray  # (n_states,): exponent b of the noise's colour
 
 
 def cramer_rao(

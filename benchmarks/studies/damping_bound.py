@@ -68,19 +68,11 @@ def expected(rotor: BeamRotor, condition: RunCondition, like: WindowStatistics) 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Score:
-    """What the moments of a window say beyond their mean, in units of the information.
-
-    Attributes
-    ----------
-    mean : LagMoments
-    combination : ndarray, shape (n_terms,)
-        Of the terms, that is the force.
-    weights : ndarray, shape (n_information, n_moments)
-    """
+    """What the moments of a window say beyond their mean, in units of the information."""
 
     mean: LagMoments
-    combination: FloatArray
-    weights: FloatArray
+    combination: FloatArray  # of the terms, that is the force
+    weights: FloatArray  # (n_information, n_moments)
 
     def of(self, row: Row, window: WindowStatistics) -> FloatArray:
         """Score of a simulated window."""
@@ -90,21 +82,14 @@ class Score:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DampingBound:
-    """Information on the changes of a row's own parameters and on its coefficients, from one window and one recording.
-
-    Attributes
-    ----------
-    information : ndarray, shape (n_own + n_coefficients, n_own + n_coefficients)
-    left : float
-        χ² that the relation leaves of the healthy recording on average, beyond chance: what it is not quite true by.
-    scores : tuple of Score
-        Of a later window, and of a healthy one.
-    """
+    """Information on the changes of a row's own parameters and on its coefficients, from a window and a recording."""
 
     row: Row
-    information: FloatArray
-    left: float
-    scores: tuple[Score, Score]
+    information: FloatArray  # (n_own + n_coefficients, n_own + n_coefficients)
+    left: (
+        float  # χ² that the relation leaves of the healthy recording on average, beyond chance: what it is not true by
+    )
+    scores: tuple[Score, Score]  # of a later window, and of a healthy one
 
     def error(self, parameter: str, *, alone: bool) -> float:
         """Smallest standard error of a parameter's relative change; `alone`: if no other one has changed."""
@@ -126,14 +111,9 @@ class DampingBound:
 def damping_bound(
     row: Row, healthy: WindowStatistics, later: WindowStatistics, changes: dict[str, float], durations_s: FloatArray
 ) -> DampingBound:
-    """Information from expected statistics.
+    """Information from statistics of `expected`, the later ones with the changes.
 
-    Parameters
-    ----------
-    healthy, later : WindowStatistics
-        From `expected`, of equal length; `later` with the changes.
-    durations_s : ndarray, shape (2,)
-        Of the healthy recording, and of what is read later.
+    `durations_s`: of the healthy recording, and of what is read later.
     """
     references = references_of(MOTION)
     before, after = (row_window(row, one, MOTION, references).beyond(SHORTEST_LAG_FROM_S) for one in (healthy, later))

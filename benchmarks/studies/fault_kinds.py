@@ -18,34 +18,22 @@ _BEARING_Y, _DISC_Y, _BEARING_Z, _DISC_Z = range(4)
 
 @dataclass(frozen=True, slots=True)
 class Rotor:
-    """A rotor at its speed, as far as a fault needs it.
-
-    Attributes
-    ----------
-    response : callable
-        Of displacements to unit forces at `MOTIONS` at frequencies, Hz: shape (n, 4, 4), m/N.
-    bearing : (float, float)
-        Stiffness, N/m, and damping, Ns/m, of the probed one, mean of both planes.
-    """
+    """A rotor at its speed, as far as a fault needs it."""
 
     speed_hz: float
     rate_hz: float
     response: Callable[[FloatArray], ComplexArray]
+    """Of displacements to unit forces at `MOTIONS` at frequencies, Hz: shape (n, 4, 4), m/N."""
     bearing: tuple[float, float]
+    """Stiffness, N/m, and damping, Ns/m, of the probed one, mean of both planes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """Motion as sensors see it, SI: displacements and velocities at `MOTIONS`, and the shaft angle.
+    """Motion as sensors see it, SI: displacements and velocities at `MOTIONS`, and the shaft angle."""
 
-    Attributes
-    ----------
-    displacement, velocity : ndarray, shape (n_samples, 4)
-    angle_rad : ndarray, shape (n_samples,)
-    """
-
-    displacement: FloatArray
-    velocity: FloatArray
+    displacement: FloatArray  # (n_samples, 4)
+    velocity: FloatArray  # (n_samples, 4)
     angle_rad: FloatArray
 
     def plus(self, displacement: FloatArray, velocity: FloatArray) -> "Seen":

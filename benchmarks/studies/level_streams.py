@@ -73,11 +73,8 @@ Course = Callable[[FloatArray], Gains]
 class Defect:
     """A damaged raceway at the first sensor: impacts that excite a resonance, and a fifth of it at the second.
 
-    Attributes
-    ----------
-    begins_s, growth_s : float
-        The rms of the impacts' response grows from a fiftieth to twenty times the healthy overall rms of its channel,
-        by the same ratio in equal times.
+    The rms of the response grows from a fiftieth to twenty times the healthy overall rms of its channel, by the same
+    ratio in equal times.
     """
 
     begins_s: float
@@ -190,13 +187,7 @@ def _file(kind: Kind, speed_rpm: float) -> MachineFile:
 
 
 def drawn(kind: Kind, rng: np.random.Generator, noise_over_1x: tuple[float, float] = (0.3, 3.0)) -> Scene:
-    """Draw a machine: 900 to 3600 rpm, within 1 % of what its file says; 2x a tenth of 1x to as large.
-
-    Parameters
-    ----------
-    noise_over_1x : tuple of float
-        Rms of the noise over that of 1x, from and to.
-    """
+    """Draw a machine: 900 to 3600 rpm, within 1 % of what its file says; 2x a tenth of 1x to as large."""
     nominal_rpm = round(float(rng.uniform(900, 3600)))
     of_1x = np.stack([np.ones(2), _spread(rng, 0.1, 1.0), _spread(rng, 0.05, 0.3)])
     lines = kind.size * _spread(rng, 0.5, 2.0) * of_1x

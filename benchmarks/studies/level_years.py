@@ -49,31 +49,18 @@ _COMPARED = ("overall", "x1", "x2", "bands")
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """Sampling distribution of what one hop of a scene adds to levels; SI units, by channel.
-
-    Attributes
-    ----------
-    plan : LevelPlan
-    noise, averages : ndarray, shape (n_bands, n), (n_bands,)
-        Mean squares of the noise, and how many independent squares each is a mean of.
-    line, product : ndarray, shape (n_bands, n)
-        Mean squares of the lines, and standard deviation of twice their product with the noise.
-    orders, order_noise : ndarray, shape (4, n)
-        Amplitudes at the orders of `ORDERS`, and mean squares of the noise of a vector there.
-    in_band : ndarray, shape (n_bands,)
-        Part of each band that is inside that of velocities.
-    """
+    """Sampling distribution of what one hop of a scene adds to levels; SI units, by channel."""
 
     plan: LevelPlan
     n_samples: int
     speed_rad_s: float
-    noise: FloatArray
-    averages: FloatArray
-    line: FloatArray
-    product: FloatArray
-    orders: FloatArray
-    order_noise: FloatArray
-    in_band: FloatArray
+    noise: FloatArray  # (n_bands, n): mean squares
+    averages: FloatArray  # (n_bands,): of how many independent squares each is a mean
+    line: FloatArray  # (n_bands, n): mean squares of the lines
+    product: FloatArray  # (n_bands, n): standard deviation of twice their product with the noise
+    orders: FloatArray  # (4, n): amplitudes at the orders of `ORDERS`
+    order_noise: FloatArray  # (4, n): mean squares of the noise of a vector there
+    in_band: FloatArray  # (n_bands,): part of each band that is inside that of velocities
 
     @classmethod
     def of(cls, scene: Scene) -> Self:

@@ -144,11 +144,7 @@ class FeatureVector(Hotelling):
 def reference_modes(machine: Machine) -> tuple[FloatArray, FloatArray]:
     """Modes of the nominal machine within the likelihood's band: what a user would pick from the diagram.
 
-    Returns
-    -------
-    frequencies_hz : ndarray, shape (n_modes,)
-    shapes : ndarray of complex, shape (n_modes, n_states)
-        At the measured states, velocities divided by the mode's own frequency.
+    Their frequencies, Hz, and shapes at the measured states, (n_modes, n_states), velocities divided by the mode's own.
     """
     values, vectors = np.linalg.eig(system_A(machine.rotor, machine.operation.speed_rad_s))
     frequency = np.abs(values) / (2 * np.pi)

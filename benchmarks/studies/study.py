@@ -140,12 +140,7 @@ def spread_over(processes: int, ray_address: str | None = None) -> Iterator[Call
 
 
 def run(study: Study, options: Options, folder: Path, spread: Callable[..., Iterable[Any]]) -> Path:
-    """Measure what is missing of a study; returns the file of records.
-
-    Parameters
-    ----------
-    spread : callable
-        From `spread_over`.
+    """Measure what is missing of a study, with the map of `spread_over`; returns the file of records.
 
     Raises
     ------
