@@ -124,10 +124,9 @@ def _fit(task: tuple[Variant, str, Sequence[WindowStatistics], Machine, int]) ->
     return _Fitted(variant, machine, train_network(equation, windows, machine, seed))
 
 
-def _measure(trained: Trained, seed: int, networks: _Networks, cell: Cell, number: int) -> list[dict[str, Value]]:
+def _measure(trained: Trained, draw: Draw, networks: _Networks, number: int) -> list[dict[str, Value]]:
     """One row for every variant of every equation."""
-    purpose, stream, faults, layout = cell.given
-    window = simulate_window(Draw(trained.machine, seed, purpose, stream, faults=faults, layout=layout), number)
+    window = simulate_window(draw, number)
     fitted = cache(lambda key: networks[key].values(window))
     others = cache(lambda reader: _others(trained, reader, window))
     rows: list[dict[str, Value]] = []
@@ -238,21 +237,20 @@ def ablation(options: Options) -> Study:
     calibration = 9 if options.small else 199
     cells = []
     for layout in (None, Layout.INDEPENDENT):
-        given: object = (Purpose.CALIBRATION, _FIXED_STREAM, {}, layout)
-        fewer = calibration if options.small or layout is None else 99
-        cells.append(Cell({"layout": LAYOUTS[layout], "purpose": "calibration", "changed": "healthy"}, fewer, given))
-        cells += [
-            Cell(
-                {"layout": LAYOUTS[layout], "purpose": "evaluation", "changed": changed_in(faults)},
-                options.windows if layout is None else max(2, options.windows // 2),
-                (Purpose.EVALUATION, at, faults, layout),
-            )
+        few = not options.small and layout is not None  # as many again with both layouts mixed
+        drawn = partial(Draw, trained.machine, options.seed, layout=layout)
+        plan = [("calibration", "healthy", 99 if few else calibration, drawn(Purpose.CALIBRATION, _FIXED_STREAM))]
+        windows = options.windows if layout is None else max(2, options.windows // 2)
+        plan += [
+            ("evaluation", changed_in(faults), windows, drawn(Purpose.EVALUATION, at, faults=faults))
             for at, faults in enumerate(_FAULTS)
         ]
+        for purpose, changed, count, draw in plan:
+            keys: dict[str, Value] = {"layout": LAYOUTS[layout], "purpose": purpose, "changed": changed}
+            cells.append(Cell(keys, count, partial(_measure, trained, draw)))
     return Study(
         name="ablation",
         cells=tuple(cells),
-        measure=partial(_measure, trained, options.seed),
         learn=partial(_learn, trained.machine, options),
         tables=_tables(options.rate),
         made_with=made_with([trained]),

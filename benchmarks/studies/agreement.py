@@ -1,7 +1,6 @@
 """How often the networks are said to disagree with the likelihood, on machines that are healthy or have settled."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -24,26 +23,22 @@ _DISAGREE = 0.001  # declared, per window
 _STREAM = 700
 
 
-def _measure(machines: dict[str, o.Trained], seed: int, _: None, cell: Cell, number: int) -> list[dict[str, Value]]:
-    trained = machines[str(cell.keys["machine"])]
-    machine = trained.machine
-    scenario = draw_condition(replace(cell.given, machine=machine, seed=seed), number)
-    window = simulate_scenario(scenario, machine)
+def _measure(trained: o.Trained, draw: Draw, bounded: bool, _: None, number: int) -> Iterator[dict[str, Value]]:
+    scenario = draw_condition(draw, number)
+    window = simulate_scenario(scenario, trained.machine)
     events = {event.parameter: event.relative_change or 0.0 for event in scenario.events if event.parameter}
     known: dict[str, Value] = dict(o.truth({str(name): change for name, change in events.items()}))
-    if cell.keys["changed"] == _HEALTHY and cell.keys["layout"] == o.SEVERAL:
-        known |= {f"{name} bound": value for name, value in bound_of(scenario, machine).items()}
+    if bounded:
+        known |= {f"{name} bound": value for name, value in bound_of(scenario, trained.machine).items()}
     *others, likelihood = trained.diagnosticians()
     deciding = _diagnosis(likelihood, window)
-    found: list[dict[str, Value]] = []
     for other in others:
         said = agreements(deciding, beside(deciding, _diagnosis(other, window)))
         apart: dict[str, Value] = {
             "compared": any(one.difference_z is not None for one in said),
             "disagrees": " ".join(one.name for one in said if one.verdict == "disagree"),
         }
-        found.append(known | o.opinion(other, window) | apart)
-    return found
+        yield known | o.opinion(other, window) | apart
 
 
 def _diagnosis(one: Diagnostician, window: WindowStatistics) -> Diagnosis:
@@ -143,17 +138,23 @@ def agreement(options: Options) -> Study:
         Cell(
             {"machine": name, "changed": text, "layout": o.LAYOUTS[layout]},
             max(2, round(options.windows * share)),
-            Draw(one.machine, 0, Purpose.EVALUATION, _STREAM + 2 * stream + layout, kept, faults=faults, layout=layout),
+            partial(
+                _measure,
+                one,
+                Draw(
+                    one.machine,
+                    options.seed,
+                    Purpose.EVALUATION,
+                    _STREAM + 2 * stream + layout,
+                    kept,
+                    faults=faults,
+                    layout=layout,
+                ),
+                text == _HEALTHY and layout is Layout.INDEPENDENT,
+            ),
         )
         for name, one in machines.items()
         for stream, (text, kept, faults, share) in enumerate(kinds)
         for layout in Layout
     )
-    return Study(
-        name="agreement",
-        cells=cells,
-        measure=partial(_measure, machines, options.seed),
-        tables=_TABLES,
-        goals=_goals,
-        made_with=o.made_with(machines.values()),
-    )
+    return Study(name="agreement", cells=cells, tables=_TABLES, goals=_goals, made_with=o.made_with(machines.values()))

@@ -87,7 +87,7 @@ def _installed(case: Told, commissioning: int) -> Installed | str:
     return commissioned(without_parameters(case.machine), *streams)
 
 
-def told(case: Told, number: int) -> list[dict[str, Value]]:
+def told(case: Told, _: None, number: int) -> list[dict[str, Value]]:
     """One record for each changed parameter, each wrong name, and each parameter that is read before the step."""
     installed = _installed(case, 0 if case.level is KnowledgeLevel.FULL else number // _STREAMS)
     if isinstance(installed, str):

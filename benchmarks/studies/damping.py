@@ -59,8 +59,7 @@ _CHANGES: tuple[dict[str, float], ...] = (
 _DAMPING = slice(1, 4)
 
 
-def _measure(options: Options, _learned: None, cell: Cell, number: int) -> list[dict[str, Value]]:
-    name, healthy_s = cell.given
+def _measure(options: Options, name: str, healthy_s: float, _: None, number: int) -> list[dict[str, Value]]:
     rotor, seed = rotor_named(name), [options.seed, number]
     condition = drawn_condition(rotor, SourceLayout.ONE_SOURCE, COMMISSIONED, {}, np.random.default_rng(seed))
     file, sizes, described = machine_of(rotor, _SIZES), plan(rotor, _SIZES), descriptor(rotor)
@@ -215,8 +214,8 @@ def damping(options: Options) -> Study:
     machines = options.machines_among([rotor.name for rotor in ROTORS], "overhung")
     lengths = _HEALTHY_S[:1] if options.small else _HEALTHY_S
     cells = tuple(
-        Cell({"machine": name, "healthy_s": healthy_s}, options.windows, (name, healthy_s))
+        Cell({"machine": name, "healthy_s": healthy_s}, options.windows, partial(_measure, options, name, healthy_s))
         for name in machines
         for healthy_s in lengths
     )
-    return Study("damping", cells, partial(_measure, options), _TABLES, _goals)
+    return Study("damping", cells, _TABLES, _goals)

@@ -121,10 +121,7 @@ def _rates(machine: Machine) -> dict[str, float]:
     return {"machine file": machine.alarms.false_alarms_per_month, "1 % per window": per_window}
 
 
-def _measure(_: None, cell: Cell, number: int) -> list[dict[str, Value]]:
-    if isinstance(cell.given, t.Told):
-        return t.told(cell.given, number)
-    case: _Case = cell.given
+def _measure(case: _Case, _: None, number: int) -> list[dict[str, Value]]:
     machine, plan = case.machine, plan_for(case.machine)
     scenario, step_s, bound = case.trial(number)
     settings = [SequentialSettings.for_machine(machine, rate) for rate in _rates(machine).values()]
@@ -282,15 +279,14 @@ def delay(options: Options) -> Study:
                 "short_s": f"{short} s",
             }
             case = _Case(one, options.seed, _STREAM + 10 * layout + at, layout, name, change)
-            cells.append(Cell(keys, trials, case))
+            cells.append(Cell(keys, trials, partial(_measure, case)))
     for level in (KnowledgeLevel.FULL, KnowledgeLevel.NONE):
         keys = {"layout": "either", "changed": "one or two", "hop_s": own, "short_s": "", "level": level.value}
         trials = 1 if options.small else round(2.5 * options.windows)
-        cells.append(Cell(keys, trials, t.Told(options.machine, level, options.seed)))
+        cells.append(Cell(keys, trials, partial(t.told, t.Told(options.machine, level, options.seed))))
     return Study(
         name="delay",
         cells=tuple(cells),
-        measure=_measure,
         tables=_tables(own),
         goals=partial(_goals, own),
         charts=_charts,

@@ -81,9 +81,7 @@ def _kinds(*, whole: bool) -> Iterator[_Kind]:
     )
 
 
-def _measure(machines: dict[str, o.Trained], seed: int, _: None, cell: Cell, number: int) -> list[dict[str, Value]]:
-    stream, kind = cell.given
-    trained = machines[str(cell.keys["machine"])]
+def _measure(trained: o.Trained, seed: int, stream: int, kind: _Kind, _: None, number: int) -> list[dict[str, Value]]:
     if kind.length_s is not None:
         trained = o.Trained(_with_length(trained.machine, kind.length_s), None)
     machine, faults = trained.machine, kind.faults
@@ -316,7 +314,7 @@ def evaluate(options: Options) -> Study:
                 "length_s": kind.length_s or one.machine.window.length_s,
             },
             max(2, round(options.windows * kind.share * (1.0 if name in _WHOLE else 0.32))),
-            (stream, kind),
+            partial(_measure, one, options.seed, stream, kind),
         )
         for name, one in machines.items()
         for stream, kind in enumerate(_kinds(whole=name in _WHOLE))
@@ -324,7 +322,6 @@ def evaluate(options: Options) -> Study:
     return Study(
         name="evaluate",
         cells=cells,
-        measure=partial(_measure, machines, options.seed),
         tables=_TABLES,
         goals=_goals,
         charts=_charts,

@@ -130,9 +130,10 @@ def _windows(plan: LevelPlan, hops: Sequence[HopLevels], speed_rad_s: float) -> 
         yield window_levels(plan, hops[first : first + _HOPS], speeds, phase_reference=False)
 
 
-def _years(options: Options, case: int, reference: str, varied: str, number: int) -> Iterator[dict[str, Value]]:
+def _years(
+    options: Options, reference: str, spread: float, how: str, case: int, _: None, number: int
+) -> Iterator[dict[str, Value]]:
     """A machine's day, in windows that do not overlap; the noise of each has a level of its own."""
-    spread = next(one for one in SPREADS if varied.startswith(f"{one:g}"))
     scene = drawn(_KIND, generator(options.seed, case, number, At.CONDITION), noise_over_1x=(1.0, 3.0))
     learned, watched = (generator(options.seed, case, number, at) for at in (At.REFERENCE, At.EVALUATION))
     drawing, given = Drawing.of(scene), LevelSettings()
@@ -140,7 +141,7 @@ def _years(options: Options, case: int, reference: str, varied: str, number: int
     known = learn_levels(reference, [one.name for one in scene.machine.sensors], list(drawing.windows(learned, seen)))
     count = round((_DAY_S / 100 if options.small else _DAY_S) / _LENGTH_S)
     gains = np.exp(spread * watched.standard_normal(count))
-    if varied.endswith(DRAWN[0]):
+    if how == DRAWN[0]:
         gains = watched.uniform(seen.min(), seen.max(), count)
     judge = LevelJudge(drawing.plan, scene.machine.sensors, given)
     beyond = [_beyond(judge.judge(levels, known)) for levels in drawing.windows(watched, gains)]
@@ -155,7 +156,7 @@ def _beyond(levels: Sequence[ChannelLevels]) -> set[str]:
     return {limit.measure for one in levels for limit in one.limits if limit.state != "normal"}
 
 
-def _beside(options: Options, case: int, number: int) -> Iterator[dict[str, Value]]:
+def _beside(options: Options, case: int, _: None, number: int) -> Iterator[dict[str, Value]]:
     """Two hours of one machine simulated in time, beside as many drawn: mean and scatter of the levels' logarithms."""
     scene = drawn(_KIND, generator(options.seed, case, number, At.CONDITION), noise_over_1x=(1.0, 3.0))
     rng, own = (generator(options.seed, case, number, at) for at in (At.REFERENCE, At.EVALUATION))
@@ -205,13 +206,6 @@ def per_month(rows: Sequence[Record]) -> Estimate | None:
     return Estimate(count / months, low / months, high / months, len(rows))
 
 
-def _measure(options: Options, _: None, cell: Cell, number: int) -> list[dict[str, Value]]:
-    case, reference, varied = cell.given
-    if cell.keys["topic"] == "beside":
-        return list(_beside(options, case, number))
-    return list(_years(options, case, reference, varied, number))
-
-
 _TABLES = (
     Table(
         "level-years",
@@ -251,20 +245,18 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
 def level_years(options: Options) -> Study:
     """Levels of healthy machines over years."""
     plan = [
-        *(
-            ("years", of, f"{spread:g}, {how}", weight)
-            for of in REFERENCES
-            for spread in SPREADS
-            for how, weight in zip(DRAWN, (13.0, 1.0), strict=True)
-        ),
-        ("beside", "", "", 1.72),
+        ("years", of, f"{spread:g}, {how}", weight, partial(_years, options, of, spread, how))
+        for of in REFERENCES
+        for spread in SPREADS
+        for how, weight in zip(DRAWN, (13.0, 1.0), strict=True)
     ]
+    plan.append(("beside", "", "", 1.72, partial(_beside, options)))
     cells = tuple(
         Cell(
             {"topic": topic, "machine": of, "excitation": varied},
             max(1, round(options.windows * (1.0 if options.small else weight))),
-            (3000 + 100 * at, of, varied),
+            partial(measure, 3000 + 100 * at),
         )
-        for at, (topic, of, varied, weight) in enumerate(plan)
+        for at, (topic, of, varied, weight, measure) in enumerate(plan)
     )
-    return Study(name="level_years", cells=cells, measure=partial(_measure, options), tables=_TABLES, goals=_goals)
+    return Study(name="level_years", cells=cells, tables=_TABLES, goals=_goals)

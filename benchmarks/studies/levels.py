@@ -51,7 +51,7 @@ def _outcome(doubled: str, step_s: float, length_s: float, of: Iterable[Raised],
     }
 
 
-def _doublings(options: Options, case: int, machine: str, number: int) -> Iterator[dict[str, Value]]:
+def _doublings(options: Options, machine: str, case: int, _: None, number: int) -> Iterator[dict[str, Value]]:
     """One machine, in three streams of its own that differ in what doubles at one of its sensors."""
     kind = replace(KINDS[machine], window_s=20.0) if options.small else KINDS[machine]
     scene = drawn(kind, generator(options.seed, case, number, At.CONDITION))
@@ -75,12 +75,12 @@ def _stepped(doubled: str, step_s: float, channel: int, t: FloatArray) -> Gains:
     return Gains(lines, noise)
 
 
-def _rotor_doublings(options: Options, case: int, machine: str, number: int) -> Iterator[dict[str, Value]]:
+def _rotor_doublings(options: Options, machine: str, case: int, _: None, number: int) -> Iterator[dict[str, Value]]:
     """One commissioning of a rotor, and three streams against it.
 
     A force at the bearing moves it at 2x by a tenth of its 1x to as much, in healthy recordings too.
     """
-    name, _, level = machine.partition(", level ")
+    name, level = machine.split(", level ")
     rng = generator(options.seed, case, number, At.CONDITION)
     part, start_rad = float(np.exp(rng.uniform(np.log(0.1), 0.0))), float(rng.uniform(0, 2 * np.pi))
     force = np.array([1, 0, 1, 0]) * (rng.standard_normal(4) + 1j * rng.standard_normal(4))
@@ -131,7 +131,7 @@ def _errors_of_2x(installed: Installed) -> float:
 # A rolling bearing
 
 
-def _bearing(options: Options, case: int, machine: str, number: int) -> Iterator[dict[str, Value]]:
+def _bearing(options: Options, machine: str, case: int, _: None, number: int) -> Iterator[dict[str, Value]]:
     """A defect that grows until the first alarm, or until its impacts have twenty times the healthy rms."""
     rng = generator(options.seed, case, number, At.CONDITION)
     kind = replace(KINDS["accelerometers, speed in the machine file"], rate_hz=12800.0, window_s=_BEARING_WINDOW_S)
@@ -166,15 +166,6 @@ def _steady(_: FloatArray) -> Gains:
 
 
 # What is added up
-
-
-def _measure(options: Options, _: None, cell: Cell, number: int) -> list[dict[str, Value]]:
-    topic, case = cell.given
-    machine = str(cell.keys["machine"])
-    if topic == "bearing":
-        return list(_bearing(options, case, machine, number))
-    measured = _doublings if machine in KINDS else _rotor_doublings
-    return list(measured(options, case, machine, number))
 
 
 def _of(topic: str) -> Callable[[Sequence[Record]], list[Record]]:
@@ -222,15 +213,15 @@ def levels(options: Options) -> Study:
     """Vibration levels on streams."""
     rotors = [f"{name}, level {level}" for name in SHIPPED for level in ("full", "none")]
     rotors += [f"{name}, level none" for name in SUBJECTS if name not in SHIPPED]
-    plan = [("doubling", machine, 14.0) for machine in KINDS]
-    plan += [("doubling", machine, 1.0) for machine in (rotors[1:2] if options.small else rotors)]
-    plan += [("bearing", machine, 25.0) for machine in (_BEARING, _IN_SNAPSHOTS)]
+    plan = [("doubling", _doublings, machine, 14.0) for machine in KINDS]
+    plan += [("doubling", _rotor_doublings, machine, 1.0) for machine in (rotors[1:2] if options.small else rotors)]
+    plan += [("bearing", _bearing, machine, 25.0) for machine in (_BEARING, _IN_SNAPSHOTS)]
     cells = tuple(
         Cell(
             {"topic": topic, "machine": machine},
             max(1, round(options.windows * (1.0 if options.small else weight))),
-            (topic, 100 * (at + 1)),
+            partial(measure, options, machine, 100 * (at + 1)),
         )
-        for at, (topic, machine, weight) in enumerate(plan)
+        for at, (topic, measure, machine, weight) in enumerate(plan)
     )
-    return Study(name="levels", cells=cells, measure=partial(_measure, options), tables=_TABLES, goals=_goals)
+    return Study(name="levels", cells=cells, tables=_TABLES, goals=_goals)

@@ -24,9 +24,8 @@ _FIRST_WINDOWS = 6
 """What is not commissioned is compared with its first five; one more fills before they are told apart."""
 
 
-def _measure(options: Options, _: None, cell: Cell, number: int) -> list[dict[str, Value]]:
-    name, level = cell.given
-    subject = Subject(name, level, options.seed, number)
+def _measure(seed: int, name: str, level: KnowledgeLevel, _: None, number: int) -> list[dict[str, Value]]:
+    subject = Subject(name, level, seed, number)
     installed = commissioned(subject.file, *map(subject.healthy, range(CONDITIONS)))
     # The rotor of finite elements touches nothing and does not crack.
     faults = [fault for fault in FAULTS if name in SHIPPED or fault not in {*RUBS, CRACK}]
@@ -121,5 +120,8 @@ def other_faults(options: Options) -> Study:
     plan += [(name, KnowledgeLevel.NONE) for name in SUBJECTS if name not in SHIPPED]
     if options.small:
         plan = [("lab", KnowledgeLevel.NONE)]
-    cells = tuple(Cell({"machine": name, "level": level.value}, options.windows, (name, level)) for name, level in plan)
-    return Study("other_faults", cells, partial(_measure, options), _TABLES, _goals)
+    cells = tuple(
+        Cell({"machine": name, "level": level.value}, options.windows, partial(_measure, options.seed, name, level))
+        for name, level in plan
+    )
+    return Study("other_faults", cells, _TABLES, _goals)

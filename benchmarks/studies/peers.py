@@ -113,9 +113,8 @@ def _learn(machine: Machine, options: Options, over: Over) -> Mapping[str, _Lear
 
 
 def _measure(
-    trained: Trained, options: Options, learned: Mapping[str, _Learned], cell: Cell, number: int
+    trained: Trained, options: Options, series: _Series, learned: Mapping[str, _Learned], number: int
 ) -> list[dict[str, Value]]:
-    series: _Series = cell.given
     own = learned[series[0]]
     samples, window = _simulate(trained.machine, options.seed, series, number)
     rows: list[dict[str, Value]] = []
@@ -192,14 +191,17 @@ def peers(options: Options) -> Study:
     trained = Trained.named(options.machine)
     changes = (_CHANGES[0], _CHANGES[3], _CHANGES[6]) if options.small else _CHANGES
     cells = tuple(
-        Cell({"setting": setting, "changed": changed_in(faults)}, options.windows, (setting, at + 2, faults))
+        Cell(
+            {"setting": setting, "changed": changed_in(faults)},
+            options.windows,
+            partial(_measure, trained, options, (setting, at + 2, faults)),
+        )
         for setting in _SETTINGS
         for at, faults in enumerate(changes)
     )
     return Study(
         name="peers",
         cells=cells,
-        measure=partial(_measure, trained, options),
         learn=partial(_learn, trained.machine, options),
         tables=_TABLES,
         goals=_goals,

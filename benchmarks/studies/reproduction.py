@@ -118,14 +118,14 @@ def _learn(
 
 
 def _measure(
-    trained: Trained, options: Options, learned: dict[str, PaperDiagnostician], cell: Cell, number: int
+    trained: Trained, options: Options, kind: str, run: _Run, learned: dict[str, PaperDiagnostician], number: int
 ) -> list[dict[str, Value]]:
-    faults, realisation = cell.given
-    run = (faults, float(cell.keys["cutoff_hz"] or 0), float(cell.keys["noise"] or 0), (*realisation, number))
+    faults, cutoff_hz, noise, realisation = run
+    run = (faults, cutoff_hz, noise, (*realisation, number))
     whole = simulate(trained.machine, options.seed, run)
     seen = _seen_by(trained.machine, whole)
     own = " ".join(own_equations(faults))
-    paper = learned[str(cell.keys["realisation"])]
+    paper = learned[kind]
     msd = paper.deviations(whole)
     found = [_row("paper", own, " ".join(paper.flagged(msd)), msd)]
     for one in trained.diagnosticians():
@@ -257,22 +257,22 @@ def reproduction(options: Options) -> Study:
         for cutoff in cutoffs
     ]
     plan += [("noise", kind, "healthy", noise_hz, noise) for kind in _REALISATIONS for noise in noises]
-    cells = tuple(
-        Cell(
-            {"part": part, "realisation": kind, "condition": name, "cutoff_hz": cutoff, "noise": noise},
-            options.windows,
-            # The training's realisations again, or ones that no other cell has.
-            (
-                CONDITIONS[name],
-                (Purpose.TRAINING, cutoffs.index(cutoff)) if kind == "shared" else (Purpose.EVALUATION, at),
-            ),
-        )
-        for at, (part, kind, name, cutoff, noise) in enumerate(plan)
-    )
+    cells = []
+    for at, (part, kind, name, cutoff, noise) in enumerate(plan):
+        # The training's realisations again, or ones that no other cell has.
+        own = (Purpose.TRAINING, cutoffs.index(cutoff)) if kind == "shared" else (Purpose.EVALUATION, at)
+        measure = partial(_measure, trained, options, kind, (CONDITIONS[name], cutoff, noise, own))
+        keys: dict[str, Value] = {
+            "part": part,
+            "realisation": kind,
+            "condition": name,
+            "cutoff_hz": cutoff,
+            "noise": noise,
+        }
+        cells.append(Cell(keys | {"noise": noise}, options.windows, measure))
     return Study(
         name="reproduction",
-        cells=cells,
-        measure=partial(_measure, trained, options),
+        cells=tuple(cells),
         learn=partial(_learn, trained.machine, options.seed, options.windows, cutoffs, options),
         tables=_TABLES,
         charts=_charts,

@@ -40,8 +40,9 @@ def _reference(name: str, level: KnowledgeLevel, seed: int, healthy: int) -> Sen
     return learn_sensor_reference(commissioned(name, level, seed, 0, healthy)[1])
 
 
-def _measure(options: Options, _learned: None, cell: Cell, number: int) -> list[dict[str, Value]]:
-    name, level, fault = cell.given
+def _measure(
+    options: Options, name: str, level: KnowledgeLevel, fault: str, _learned: None, number: int
+) -> list[dict[str, Value]]:
     made_with = (name, level, options.seed, 2 if options.small else 6)
     reference, (diagnostician, _) = _reference(*made_with), commissioned(*made_with[:3], 0, made_with[3])
     assert not isinstance(diagnostician, str)  # noqa: S101  # a shipped machine can be commissioned
@@ -125,7 +126,11 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
 def sensors(options: Options) -> Study:
     """One channel of a healthy machine at fault."""
     cells = tuple(
-        Cell({"machine": name, "level": level.value, "fault": text}, options.windows, (name, level, fault))
+        Cell(
+            {"machine": name, "level": level.value, "fault": text},
+            options.windows,
+            partial(_measure, options, name, level, fault),
+        )
         for name in options.machines_among(SHIPPED, "lab")
         for level in _LEVELS
         for fault, (text, _) in _FAULTS.items()
@@ -133,7 +138,6 @@ def sensors(options: Options) -> Study:
     return Study(
         name="sensors",
         cells=cells,
-        measure=partial(_measure, options),
         tables=(
             Table("sensors", ("machine", "level", "fault"), _COLUMNS, _judged),
             Table(

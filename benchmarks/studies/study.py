@@ -6,7 +6,7 @@ an interrupted study carries on where it stopped; windows of another plan are ne
 
 ::
 
-    Options ──> Study.cells ──> measure(learned, cell, number) ──> records ──> tables (CSV), goals, charts, page
+    Options ──> Study.cells ──> measure(learned, number) ──> records ──> tables (CSV), goals, charts, page
 """
 
 import importlib
@@ -79,8 +79,8 @@ class Cell:
     keys: Mapping[str, Value]
     """What tells them from all others; columns of their records."""
     windows: int
-    given: Any = None
-    """What `Study.measure` needs besides to make one."""
+    measure: Callable[[Any, int], Iterable[Mapping[str, Value]]]
+    """Records of one window, from what was learned and the window's number."""
 
     @property
     def name(self) -> str:
@@ -108,13 +108,14 @@ class Over:
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """One study, declared. What is sent to the workers is at the top level of a module, or a partial of it."""
+    """One study, declared.
+
+    What is sent to the workers, how cells measure, is at the top level of a module, or a partial of such a function.
+    """
 
     name: str
     """Of its records, and of its words in ``texts.toml``."""
     cells: tuple[Cell, ...]
-    measure: Callable[[Any, Cell, int], Sequence[Mapping[str, Value]]]
-    """Records of one window, from what was learned, the cell and the window's number."""
     tables: tuple[Table, ...]
     goals: Callable[[Sequence[Record]], Iterable[Goal]] = field(default=lambda _: ())
     charts: Callable[[Sequence[Record]], Iterable[Chart]] = field(default=lambda _: ())
@@ -167,7 +168,7 @@ def run(study: Study, options: Options, folder: Path, spread: Callable[..., Iter
         return kept
     with labelled_bars(remaining=True) as progress:
         learned = None if study.learn is None else study.learn(Over(study.name, spread, progress))
-        found = spread(partial(_measured, study.measure, learned), tasks)
+        found = spread(partial(_measured, learned), tasks)
         before = sum(cell.windows for cell in study.cells) - len(tasks)
         with kept.open("a", encoding="utf-8") as out:
             for at, line in enumerate(found, start=before + 1):
@@ -177,11 +178,9 @@ def run(study: Study, options: Options, folder: Path, spread: Callable[..., Iter
     return kept
 
 
-def _measured(
-    measure: Callable[[Any, Cell, int], Sequence[Mapping[str, Value]]], learned: object, task: tuple[Cell, int]
-) -> dict[str, Any]:
+def _measured(learned: object, task: tuple[Cell, int]) -> dict[str, Any]:
     cell, number = task
-    return {"cell": cell.name, "number": number, "found": [dict(found) for found in measure(learned, cell, number)]}
+    return {"cell": cell.name, "number": number, "found": [dict(found) for found in cell.measure(learned, number)]}
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:

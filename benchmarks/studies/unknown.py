@@ -32,8 +32,9 @@ _HEALTHY_WEIGHT = 8
 """Windows of the healthy machine for each one of a change: false alarms are rare."""
 
 
-def _measure(options: Options, _learned: None, cell: Cell, number: int) -> list[dict[str, Value]]:
-    level, name, commissioning, at = cell.given
+def _measure(
+    options: Options, level: KnowledgeLevel, name: str, commissioning: int, at: int, _learned: None, number: int
+) -> list[dict[str, Value]]:
     diagnostician, _ = commissioned(name, level, options.seed, commissioning, 3 if options.small else 6)
     window, cutoff_hz = subject_named(name).later(options.seed, commissioning, at, number, _CHANGES[at])
     known: dict[str, Value] = {"layout": LAYOUTS[Layout(number % 2)], "cutoff_hz": cutoff_hz, **truth(_CHANGES[at])}
@@ -117,7 +118,7 @@ def unknown(options: Options) -> Study:
         Cell(
             {"level": level.value, "machine": name, "commissioning": commissioning, "changed": changed_in(changes)},
             plan[at] // commissionings + (commissioning < plan[at] % commissionings),
-            (level, name, commissioning, at),
+            partial(_measure, options, level, name, commissioning, at),
         )
         for level in (KnowledgeLevel.NONE, KnowledgeLevel.PARTIAL, KnowledgeLevel.FULL)
         for name in options.machines_among(SUBJECTS, *SUBJECTS)
@@ -125,4 +126,4 @@ def unknown(options: Options) -> Study:
         for commissioning in range(commissionings)
         for at, changes in enumerate(_CHANGES)
     )
-    return Study(name="unknown", cells=cells, measure=partial(_measure, options), tables=_TABLES, goals=_goals)
+    return Study(name="unknown", cells=cells, tables=_TABLES, goals=_goals)

@@ -52,7 +52,7 @@ def _learn(over: Over) -> int:
     return sum(over("adding", abs, [1, -2, 3]))
 
 
-def _measure(learned: int, cell: Cell, number: int) -> list[dict[str, Value]]:
+def _measure(learned: int, number: int) -> list[dict[str, Value]]:
     return [{"method": by, "named": number % 2 == 0, "sum": learned} for by in ("likelihood", "network")]
 
 
@@ -72,8 +72,7 @@ def toy(windows: int = 4, machine: str = "none") -> Study:
     columns = {"named": lambda rows: rate(row["named"] for row in rows)}
     return Study(
         name="sensors",
-        cells=tuple(Cell({"changed": changed}, windows) for changed in ("healthy", "e +20%")),
-        measure=_measure,
+        cells=tuple(Cell({"changed": changed}, windows, _measure) for changed in ("healthy", "e +20%")),
         tables=(Table("toy", ("changed", "method"), columns, page="Everything:"),),
         goals=_goals,
         charts=_charts,
@@ -138,8 +137,7 @@ def test_wrong_arguments_exit_with_2_and_a_sentence(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", command.STUDIES)
 def test_what_a_study_sends_to_other_processes_can_be_sent(name: str) -> None:
     study = command.STUDIES[name](Options(windows=2, small=True))
-    for sent in (study.measure, study.cells):
-        assert pickle.loads(pickle.dumps(sent))  # noqa: S301  # what was just written
+    assert pickle.loads(pickle.dumps(study.cells))  # noqa: S301  # what was just written
 
 
 @pytest.mark.long
