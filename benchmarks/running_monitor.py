@@ -69,17 +69,7 @@ def serving(
 
 @contextmanager
 def monitor(folder: Path, files: int, settings: dict[str, str], *publish: str) -> Iterator[Monitor]:
-    """A monitor that may open so many files, and a machine that sends to it.
-
-    Parameters
-    ----------
-    folder : Path
-    files : int
-    settings : dict of str to str
-        Environment variables of the monitor.
-    *publish : str
-        Options of the publisher.
-    """
+    """A monitor that may open so many files, with environment variables, and a machine that sends with options."""
     environment, endpoint = on_loopback(folder)
     send = ["simulator.rotorsim", "publish", "--connect", endpoint, "--wait-for-subscriber", "120", *publish]
     out, log, published = folder / "out", folder / "log", folder / "published"

@@ -1,7 +1,7 @@
 """A million messages that no machine sends, against a monitor that is at work.
 
-Run: ``python benchmarks/wire_fuzz.py`` (about half an hour), ``--small`` for some seconds; ``python
-benchmarks/wire_fuzz.py --flood 10000`` for as many bad messages a second of one kind after the other.
+Run: ``python benchmarks/wire_fuzz.py`` (about half an hour), ``--small`` for some seconds.
+Many bad messages a second of one kind after the other are sent by ``wire_flood.py``.
 
 A monitor is started on loopback. A simulated rotor kit sends to it at pace 1, while `wire_grammar` makes blocks,
 descriptors, records, liveliness tokens and queries that are wrong in one way or another. Two further machines are there

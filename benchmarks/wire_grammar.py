@@ -62,35 +62,21 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """What is to be done on the network.
-
-    Attributes
-    ----------
-    number : int
-    kind : str
-        The rule that made it.
-    act : {"put", "delete", "declare", "ask"}
-        On the key: publish, delete, declare a liveliness token, or ask, with the encoding as parameters.
-    """
+    """What is to be done on the network, on the key: publish, delete, declare a liveliness token, or ask."""
 
     number: int
     kind: str
+    """The rule that made it."""
     act: Literal["put", "delete", "declare", "ask"]
     key: str
     payload: bytes = b""
     attachment: bytes = b""
     encoding: str = ""
+    """Of a question its parameters."""
 
 
 class Grammar:
-    """Makes messages.
-
-    Parameters
-    ----------
-    seed : int
-    first, second, third : Machine
-        All with the channels and the rate of the first.
-    """
+    """Makes messages for three machines, all with the channels and the rate of the first."""
 
     def __init__(self, seed: int, first: Machine, second: Machine, third: Machine) -> None:
         self._seed = seed

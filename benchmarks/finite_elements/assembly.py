@@ -18,13 +18,7 @@ ComplexArray = npt.NDArray[np.complex128]
 
 @dataclass(frozen=True, slots=True)
 class Equations:
-    """M ξ̈ + C ξ̇ + K ξ = f.
-
-    Attributes
-    ----------
-    M, C, K : ndarray, shape (n, n)
-        C holds damping and the gyroscopic part.
-    """
+    """M ξ̈ + C ξ̇ + K ξ = f, shape (n, n) each; C holds damping and the gyroscopic part."""
 
     M: FloatArray
     C: FloatArray

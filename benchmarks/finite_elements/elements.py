@@ -43,13 +43,8 @@ def beam_mass(length_m: float, mass_per_m: float, phi: float) -> FloatArray:
 def beam_inertia(length_m: float, inertia_kg_m: float, phi: float) -> FloatArray:
     """Consistent rotary inertia, shape (4, 4); twice that times the speed is the shaft's gyroscopic matrix.
 
-    Parameters
-    ----------
-    length_m : float
-    inertia_kg_m : float
-        Density times second moment of area: moment of inertia about a diameter per length, kg m.
-    phi : float
-        From `shear_ratio`.
+    `inertia_kg_m`: density times second moment of area, moment of inertia about a diameter per length; `phi` is that of
+    `shear_ratio`.
     """
     L, p = length_m, phi
     a = 36.0

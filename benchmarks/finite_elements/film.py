@@ -19,18 +19,11 @@ from models.signals.block import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Film:
-    """Oil film of a bearing that carries a constant load downwards, against z.
-
-    Attributes
-    ----------
-    diameter_m, length_m, clearance_m : float
-        The clearance is radial.
-    viscosity_Pa_s, load_N : float
-    """
+    """Oil film of a bearing that carries a constant load downwards, against z."""
 
     diameter_m: float
     length_m: float
-    clearance_m: float
+    clearance_m: float  # radial
     viscosity_Pa_s: float
     load_N: float
 

@@ -43,18 +43,10 @@ _PIECE = 20_000
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Samples of a run.
+    """Samples of a run."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (n_samples, 12)
-        Of `PROBES`, SI.
-    angle_rad : ndarray, shape (n_samples,)
-        Shaft angle, unwrapped.
-    """
-
-    values: FloatArray
-    angle_rad: FloatArray
+    values: FloatArray  # (n_samples, 12): of `PROBES`, SI
+    angle_rad: FloatArray  # shaft angle, unwrapped
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,17 +70,7 @@ def move(
     *,
     oversampling: int = 2,
 ) -> Motion:
-    """Run a rotor at constant speed.
-
-    Parameters
-    ----------
-    rotor : BeamRotor
-    speed_rad_s : float
-    forces : tuple of Force
-    duration_s, rate_hz : float
-    rng : numpy.random.Generator
-    oversampling : int
-        Steps per sample of a rotor with cubic stiffness.
+    """Run a rotor at constant speed; one with cubic stiffness in several steps a sample.
 
     Raises
     ------

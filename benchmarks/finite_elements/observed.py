@@ -26,25 +26,13 @@ _UNITS = {"displacement": ("um", 1e-6), "velocity": ("mm/s", 1e-3), "acceleratio
 
 @dataclass(frozen=True, slots=True)
 class RunCondition:
-    """How a rotor runs and how it is measured.
-
-    Attributes
-    ----------
-    forces : tuple of Force
-    speed_rad_s : float
-    changes : mapping of str to float
-        Relative changes of `benchmarks.finite_elements.rotor.CHANGEABLE`.
-    noise_relative : float
-        Sensor noise over each channel's own rms.
-    noise_corner_hz : float or None
-        Of first-order coloured noise; None is white.
-    """
+    """How a rotor runs and how it is measured."""
 
     forces: tuple[Force, ...]
     speed_rad_s: float
-    changes: Mapping[str, float] = field(default_factory=dict)
-    noise_relative: float = 0.02
-    noise_corner_hz: float | None = None
+    changes: Mapping[str, float] = field(default_factory=dict)  # relative, of `rotor.CHANGEABLE`
+    noise_relative: float = 0.02  # over each channel's own rms
+    noise_corner_hz: float | None = None  # of first-order coloured noise; none is white
 
 
 @dataclass(frozen=True, slots=True)

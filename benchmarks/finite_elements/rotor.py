@@ -15,57 +15,30 @@ CHANGEABLE = ("k_by", "c_by", "k_bz", "c_bz", "e")
 
 @dataclass(frozen=True, slots=True)
 class Disc:
-    """A rigid disc of even thickness.
-
-    Attributes
-    ----------
-    node : int
-    mass_kg, radius_m : float
-        Moments of inertia follow: mr²/4 about a diameter, mr²/2 polar.
-    unbalance_kg_m : float
-    phase_rad : float
-        Of the heavy spot from the phase reference.
-    """
+    """A rigid disc of even thickness; its moments of inertia are mr²/4 about a diameter and mr²/2 polar."""
 
     node: int
     mass_kg: float
     radius_m: float
     unbalance_kg_m: float = 0.0
-    phase_rad: float = 0.0
+    phase_rad: float = 0.0  # of the heavy spot from the phase reference
 
 
 @dataclass(frozen=True, slots=True)
 class Bearing:
-    """A bearing in a housing on its support.
-
-    Attributes
-    ----------
-    node : int
-    k_y, k_z, c_y, c_z : float
-        Stiffness, N/m, and damping, Ns/m, horizontal and vertical.
-    k_yz, k_zy : float
-        Force in the first direction per displacement in the second, N/m.
-    housing_kg : float
-        Mass that moves with it.
-    cubic_N_per_m3 : float
-        Force over the third power of the displacement, in y.
-    cubic_ratio_z : float
-        The same in z over that in y.
-    film : Film or None
-        What carries; k_y, k_z, c_y and c_z are then factors on its own, and k_yz and k_zy are left out.
-    """
+    """A bearing in a housing on its support: stiffness, N/m, and damping, Ns/m, horizontal and vertical."""
 
     node: int
     k_y: float
     k_z: float
     c_y: float
     c_z: float
-    k_yz: float = 0.0
+    k_yz: float = 0.0  # force in the first direction per displacement in the second
     k_zy: float = 0.0
-    housing_kg: float = 0.0
-    cubic_N_per_m3: float = 0.0
-    cubic_ratio_z: float = 1.0
-    film: Film | None = None
+    housing_kg: float = 0.0  # moves with it
+    cubic_N_per_m3: float = 0.0  # force over the third power of the displacement, in y
+    cubic_ratio_z: float = 1.0  # the same in z over that in y
+    film: Film | None = None  # what carries; k and c are then factors on its own, and k_yz and k_zy are left out
 
     def coefficients(self, speed_rad_s: float) -> tuple[FloatArray, FloatArray]:
         """Stiffness, N/m, and damping, Ns/m, on (y, z), shape (2, 2) each; cubic stiffness left out."""
@@ -80,16 +53,10 @@ class Bearing:
 
 @dataclass(frozen=True, slots=True)
 class Stand:
-    """What all bearings stand on: a mass that yields sideways, alike in y and z.
-
-    Attributes
-    ----------
-    mass_kg, k, c : float
-        Stiffness, N/m, and damping, Ns/m, between it and the ground.
-    """
+    """What all bearings stand on: a mass that yields sideways, alike in y and z."""
 
     mass_kg: float
-    k: float
+    k: float  # stiffness, N/m, and damping, Ns/m, between it and the ground
     c: float
 
 
@@ -98,25 +65,14 @@ class Gear:
     """A wheel in mesh with one that does not move sideways: a spring along the line of pressure, and its tone.
 
     What turns is left out: torsion, and how the mesh's stiffness varies from tooth to tooth but for the tone.
-
-    Attributes
-    ----------
-    node : int
-    k, c : float
-        Mean stiffness, N/m, and damping, Ns/m, of the mesh.
-    pressure_rad : float
-        Of the line of pressure from y towards z.
-    teeth : int
-    error_m : float
-        Amplitude of the transmission error at the tooth frequency.
     """
 
     node: int
-    k: float
+    k: float  # mean stiffness, N/m, and damping, Ns/m, of the mesh
     c: float
-    pressure_rad: float
+    pressure_rad: float  # of the line of pressure from y towards z
     teeth: int
-    error_m: float
+    error_m: float  # amplitude of the transmission error at the tooth frequency
 
     @property
     def along(self) -> FloatArray:
@@ -126,43 +82,22 @@ class Gear:
 
 @dataclass(frozen=True, slots=True)
 class BeamRotor:
-    """A round shaft of equally long beam elements with discs and bearings at its nodes.
-
-    Attributes
-    ----------
-    name, description : str
-    length_m, diameter_m : float
-        Of the whole shaft, solid.
-    elements : int
-        Nodes are numbered from 0 to this.
-    bearings, discs : tuple
-        The first one of each carries the probes.
-    speed_rad_s : float
-        Nominal speed.
-    shaft_damping_s : float
-        Distributed damping: this times the shaft's stiffness matrix.
-    E_Pa, poisson, density_kg_m3 : float
-    shear : bool
-        Timoshenko's beam with rotary inertia; otherwise Euler and Bernoulli's.
-    stand : Stand or None
-        What the bearings stand on; None is the ground.
-    gear : Gear or None
-    """
+    """A round shaft of equally long beam elements; the probes are at the first bearing and the first disc."""
 
     name: str
     description: str
     length_m: float
     diameter_m: float
-    elements: int
+    elements: int  # nodes are numbered from 0 to this
     bearings: tuple[Bearing, ...]
     discs: tuple[Disc, ...]
-    speed_rad_s: float
-    shaft_damping_s: float = 2.0e-5
+    speed_rad_s: float  # nominal
+    shaft_damping_s: float = 2.0e-5  # distributed damping: this times the shaft's stiffness matrix
     E_Pa: float = 2.1e11
     poisson: float = 0.3
     density_kg_m3: float = 7850.0
-    shear: bool = True
-    stand: Stand | None = None
+    shear: bool = True  # Timoshenko's beam with rotary inertia; otherwise Euler and Bernoulli's
+    stand: Stand | None = None  # none is the ground
     gear: Gear | None = None
 
     @property

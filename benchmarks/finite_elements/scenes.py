@@ -22,22 +22,12 @@ class SourceLayout(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SceneRange:
-    """From and to of everything that is drawn, uniformly.
-
-    Attributes
-    ----------
-    cutoff_hz : tuple of float
-    stochastic_to_1x : tuple of float
-        Stochastic displacement of the measured disc over its 1x displacement, both rms.
-    noise_relative : tuple of float
-    speed_relative : tuple of float
-        Over nominal.
-    """
+    """From and to of everything that is drawn, uniformly."""
 
     cutoff_hz: tuple[float, float] = (25.0, 200.0)
-    stochastic_to_1x: tuple[float, float] = (0.7, 3.0)
+    stochastic_to_1x: tuple[float, float] = (0.7, 3.0)  # displacement of the measured disc, both rms
     noise_relative: tuple[float, float] = (0.01, 0.05)
-    speed_relative: tuple[float, float] = (0.99, 1.01)
+    speed_relative: tuple[float, float] = (0.99, 1.01)  # over nominal
 
 
 COMMISSIONED = SceneRange(cutoff_hz=(80.0, 80.0), stochastic_to_1x=(1.5, 1.5), noise_relative=(0.02, 0.02))
