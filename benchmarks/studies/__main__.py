@@ -23,20 +23,12 @@ from benchmarks.studies.unknown import unknown
 from models.errors import RotorwatchError
 
 STUDIES = {
-    "evaluate": evaluate,
-    "agreement": agreement,
-    "peers": peers,
-    "unknown": unknown,
-    "damping": damping,
-    "sensors": sensors,
-    "ablation": ablation,
-    "delay": delay,
-    "levels": levels,
-    "level_years": level_years,
-    "other_faults": other_faults,
-    "reproduction": reproduction,
+    one.__name__: one
+    for one in (
+        *(evaluate, agreement, peers, unknown, damping, sensors, ablation, delay),
+        *(levels, level_years, other_faults, reproduction),
+    )
 }
-
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 

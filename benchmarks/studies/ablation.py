@@ -18,7 +18,7 @@ from benchmarks.studies.results import Estimate, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Over, Study
 from benchmarks.studies.variants import VARIANTS, Measure, Reader, Variant
 from models.diagnosis.networks.equations import EQUATIONS
-from models.diagnosis.networks.relation import EquationNetwork, read_equation, window_view
+from models.diagnosis.networks.relation import EquationNetwork, equation_by_number, read_equation, window_view
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
@@ -74,7 +74,7 @@ _Networks = dict[tuple[Variant, str], _Fitted]
 def _learn(machine: Machine, options: Options, over: Over) -> _Networks:
     count = 4 if options.small else 60
     drawn = partial(Draw, machine, options.seed, Purpose.TRAINING)
-    draws = {n: drawn(int(n), kept_nominal=v.equation_numbered(n).kept_nominal) for n in _NUMBERS}
+    draws = {n: drawn(int(n), kept_nominal=equation_by_number(n).kept_nominal) for n in _NUMBERS}
     draws["one"] = drawn(_FIXED_STREAM, layout=Layout.ONE_SOURCE, fixed_condition=True)
     training = {
         name: over(f"training windows, {name}", _training_window, [(draw, k) for k in range(count)])

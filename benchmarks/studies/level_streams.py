@@ -69,6 +69,11 @@ Course = Callable[[FloatArray], Gains]
 """Gains at times, s from the first sample."""
 
 
+def steady(_: FloatArray) -> Gains:
+    """As it is when healthy."""
+    return Gains(np.ones((3, 2)), np.ones(2))
+
+
 @dataclass(frozen=True, slots=True)
 class Defect:
     """A damaged raceway at the first sensor: impacts that excite a resonance, and a fifth of it at the second.

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.stats
 
 from benchmarks.studies import results as r
-from benchmarks.studies.level_streams import KINDS, At, Gains, Scene, drawn, generator
+from benchmarks.studies.level_streams import KINDS, At, Scene, drawn, generator, steady
 from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from models.diagnosis.verdict.calibration import MONTH_S
@@ -164,8 +164,7 @@ def _beside(options: Options, case: int, _: None, number: int) -> Iterator[dict[
     count = round((_DAY_S / 100 if options.small else _DAY_S / 12) / _LENGTH_S)
     to_si = np.array([one.to_si for one in scene.machine.sensors])
     hops, pieces = list[HopLevels](), list[FloatArray]()
-    steady = Gains(np.ones((3, 2)), np.ones(2))
-    for block in scene.blocks(rng, count * _LENGTH_S, lambda _: steady):
+    for block in scene.blocks(rng, count * _LENGTH_S, steady):
         pieces.append(block.samples.astype(np.float64) * to_si)
         if len(pieces) == round(_HOP_S):
             angle = drawing.speed_rad_s * (np.arange(drawing.n_samples) / _KIND.rate_hz + len(hops) * _HOP_S)

@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.studies import results as r
 from benchmarks.studies.fault_kinds import Rotor, Seen, as_simulated, line
-from benchmarks.studies.level_streams import KINDS, At, Defect, Gains, drawn, generator
+from benchmarks.studies.level_streams import KINDS, At, Defect, Gains, drawn, generator, steady
 from benchmarks.studies.results import Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from benchmarks.studies.subjects import SHIPPED, SUBJECTS
@@ -149,7 +149,7 @@ def _bearing(options: Options, machine: str, case: int, _: None, number: int) ->
         damping=float(rng.uniform(0.01, 0.05)),
     )
     own = generator(options.seed, case, number, At.EVALUATION)
-    stream = replace(scene, defect=defect).blocks(own, defect.begins_s + defect.growth_s + length_s, _steady)
+    stream = replace(scene, defect=defect).blocks(own, defect.begins_s + defect.growth_s + length_s, steady)
     first = next(raised(MachineMonitor(Installed(scene.machine)), stream), None)
     early = first is not None and first.at_s <= defect.begins_s
     ratio = None if first is None or early else defect.overall(first.at_s)
@@ -159,10 +159,6 @@ def _bearing(options: Options, machine: str, case: int, _: None, number: int) ->
         "found": ratio is not None and ratio < 2,
         "first": "" if first is None else first.name,
     }
-
-
-def _steady(_: FloatArray) -> Gains:
-    return Gains(np.ones((3, 2)), np.ones(2))
 
 
 # What is added up

@@ -64,15 +64,13 @@ def _simulate(machine: Machine, seed: int, series: _Series, number: int) -> tupl
     events = [Event(at_s=0, parameter=name, relative_change=change) for name, change in faults.items()]
     scenario = draw_condition(draw, number).overridden(faults=events)
     sizes = plan_for(machine)
-    statistics = SlidingWindow(sizes)
-    parts = []
-    for block, _ in blocks(scenario, machine, block_s=_BLOCK_S):
-        parts.append(sizes.to_si(block.samples))
-        for _ in statistics.feed(parts[-1], block.start_ns):
-            pass
+    parts = [(sizes.to_si(block.samples), block.start_ns) for block, _ in blocks(scenario, machine, block_s=_BLOCK_S)]
+    samples, statistics = np.concatenate([part for part, _ in parts]), SlidingWindow(sizes)
+    for _ in statistics.feed(samples, parts[0][1]):
+        pass
     window = statistics.statistics()
     assert window is not None  # noqa: S101  # the drawn scenario lasts one window by construction
-    return np.concatenate(parts), window
+    return samples, window
 
 
 def _looked(machine: Machine, seed: int, job: tuple[_Series, int]) -> tuple[tuple[FloatArray, ...], WindowStatistics]:

@@ -21,10 +21,8 @@ from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
-from models.physics.response import stochastic_covariance, synchronous_response
-from models.physics.rotor import STATE_INDEX
 from simulator.scenario import Event, NamedSource, Scenario, Sensors
-from simulator.training.draws import Purpose, simulate_scenario, with_tilt
+from simulator.training.draws import Purpose, scaled, simulate_scenario, with_tilt
 
 _CUTOFFS_HZ = (25.0, 50.0, 100.0, 200.0)
 """Cutoffs of the excitation; the paper's own four (its Table 3) are lost."""
@@ -70,12 +68,7 @@ def _source(machine: Machine, cutoff_hz: float) -> NamedSource:
     unit = NamedSource.model_validate(
         {"name": "source", "cutoff_hz": cutoff_hz, "direction": direction, "force_rms_N": 1.0}
     )
-    speed = machine.operation.speed_rad_s
-    variance = np.diag(stochastic_covariance(machine.rotor, speed, (unit,)))
-    q1, q2 = synchronous_response(machine.rotor, speed)
-    disc = [STATE_INDEX["y2"], STATE_INDEX["z2"]]
-    level = float(np.sqrt(np.sum(q1[disc] ** 2 + q2[disc] ** 2) / 2 / np.sum(variance[disc])))
-    return unit.model_copy(update={"force_rms_N": level})
+    return scaled((unit,), 1.0, machine, {}, machine.operation.speed_rpm)[0]
 
 
 def simulate(machine: Machine, seed: int, run: _Run) -> WindowStatistics:

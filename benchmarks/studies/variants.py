@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from models.diagnosis.networks.equations import EQUATIONS, Equation, EquationRows, StatisticsView, SynchronousEquation
-from models.diagnosis.networks.relation import Network, window_view
+from models.diagnosis.networks.equations import Equation, EquationRows, StatisticsView, SynchronousEquation
+from models.diagnosis.networks.relation import Network, equation_by_number, window_view
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray
@@ -173,18 +173,13 @@ def linear_fit(
     return LinearRelation(scale, none, none, weights[:-1], weights[-1:])
 
 
-def equation_numbered(number: str) -> Equation | SynchronousEquation:
-    """The equation with the paper's number."""
-    return next(equation for equation in EQUATIONS if equation.number == number)
-
-
 def _first(function: Callable[..., tuple[float, ...]], count: int, rotor: object) -> tuple[float, ...]:
     return function(rotor)[:count]
 
 
 def variant_equation(variant: Variant, number: str) -> Equation | SynchronousEquation:
     """The variant's equation, still without a unit."""
-    equation = equation_numbered(number)
+    equation = equation_by_number(number)
     if isinstance(equation, SynchronousEquation):
         kind = SynchronousEquation if "powers" in variant.has else _FixedSpeedEquation
         return kind(equation.number, equation.title)

@@ -129,7 +129,7 @@ def draw_condition(draw: Draw, number: int) -> Scenario:
     ratio = float(rng.uniform(*condition.stochastic_to_1x))
     excitation_rng = _generator(draw, condition_number, _EXCITATION)
     coloured = _coloured(_sources(layout, cutoff_hz, machine, rng), draw, excitation_rng)
-    sources = _scaled(coloured, ratio, machine, changes, speed_rpm)
+    sources = scaled(coloured, ratio, machine, changes, speed_rpm)
     corner_hz = None if rng.random() < 0.5 else float(np.exp(rng.uniform(np.log(50), np.log(500))))
     sensors = Sensors(noise_relative=float(rng.uniform(*condition.noise_relative)), noise_corner_hz=corner_hz)
     events = [Event(at_s=0, parameter=name, relative_change=change) for name, change in changes.items()]
@@ -247,7 +247,7 @@ def _stable_crack(size: float, machine: Machine, condition: Condition) -> float:
             return size
 
 
-def _scaled(
+def scaled(
     sources: tuple[NamedSource, ...], ratio: float, machine: Machine, changes: dict[str, float], speed_rpm: float
 ) -> tuple[NamedSource, ...]:
     """Scale the forces so that the stochastic displacement at the disc is `ratio` times its 1x amplitude, both rms."""

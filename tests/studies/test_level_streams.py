@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.studies.level_streams import KINDS, At, Defect, Gains, drawn, generator
+from benchmarks.studies.level_streams import KINDS, At, Defect, drawn, generator, steady
 from benchmarks.studies.level_years import Drawing, level_years
 from benchmarks.studies.levels import levels
 from benchmarks.studies.results import Record
@@ -14,13 +14,8 @@ from models.diagnosis.verdict.calibration import MONTH_S
 from models.levels.judgement import LevelJudge
 from models.levels.reference import learn_levels
 from models.levels.settings import LevelSettings
-from models.signals.block import FloatArray
 
 VELOCITY = "velocity sensors, speed in the machine file"
-
-
-def steady(_: FloatArray) -> Gains:
-    return Gains(np.ones((3, 2)), np.ones(2))
 
 
 def test_a_stream_has_the_lines_and_the_noise_that_were_drawn() -> None:
