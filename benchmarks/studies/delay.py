@@ -29,7 +29,7 @@ from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.rotor import PARAMETERS
 from simulator.scenario import Event, Scenario
-from simulator.stream import blocks
+from simulator.stream import DEFAULT_START_NS, blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 
 _CHANGES = (("k_by", -0.05), ("c_by", -0.2), ("c_by", -0.1), ("e", 0.2))
@@ -46,27 +46,23 @@ _STREAM = 40
 class _Case:
     """One change in one layout at one hop: what trials have in common."""
 
-    machine: Machine
-    seed: int
-    stream: int
-    layout: Layout
+    draw: Draw
     parameter: str
     change: float
 
     def trial(self, number: int) -> tuple[Scenario, float, dict[str, float]]:
         """The stream with its step, when that comes, and the bound of a window of the unchanged machine."""
-        draw = Draw(self.machine, self.seed, Purpose.EVALUATION, self.stream, layout=self.layout)
-        healthy = draw_condition(draw, number)
-        rng = np.random.default_rng([self.seed, Purpose.EVALUATION, self.stream, number, _STREAM])
-        step_s = healthy.duration_s + self.machine.window.hop_s * float(rng.uniform(0, _HEALTHY_HOPS))
+        draw, healthy = self.draw, draw_condition(self.draw, number)
+        rng = np.random.default_rng([draw.seed, Purpose.EVALUATION, draw.stream, number, _STREAM])
+        step_s = healthy.duration_s + draw.machine.window.hop_s * float(rng.uniform(0, _HEALTHY_HOPS))
         step = Event(at_s=step_s, parameter=self.parameter, relative_change=self.change)
-        return healthy.overridden(duration_s=step_s + _AFTER_S, faults=[step]), step_s, bound_of(healthy, self.machine)
+        return healthy.overridden(duration_s=step_s + _AFTER_S, faults=[step]), step_s, bound_of(healthy, draw.machine)
 
     def times(self, settings: SequentialSettings, bound: dict[str, float]) -> dict[str, Value]:
         """The bound's time at the threshold of a test of the window alone, and at this test's."""
         hops, own = settings.window_hops, settings.thresholds(settings.window_hops).first
         fixed = month_thresholds(settings.false_alarms_per_month, settings.hop_s, hops, len(PARAMETERS)).first
-        length_s, error = self.machine.window.length_s, bound[self.parameter]
+        length_s, error = self.draw.machine.window.length_s, bound[self.parameter]
         return {
             name: _rounded(bound_time_s(error, length_s, self.parameter, self.change, threshold))
             for name, threshold in (("bound_fixed_s", fixed), ("bound_s", own))
@@ -88,31 +84,28 @@ def bound_time_s(error: float, duration_s: float, parameter: str, change: float,
 
 
 class _Watch:
-    """One sequential test on one stream."""
+    """One sequential test on one stream, and what it says as columns of a record."""
 
     def __init__(self, settings: SequentialSettings, step_ns: int, parameter: str) -> None:
-        self.test = SequentialTest(settings)
+        self.settings, self.test = settings, SequentialTest(settings)
         self._step_ns, self._parameter = step_ns, parameter
-        self.detected_s: float | None = None
-        self.named_s: float | None = None
-        self.early = self.wrong = False
+        self.said: dict[str, Value] = {"detected_s": None, "named_s": None, "early": False, "wrong": False}
 
     @property
     def finished(self) -> bool:
-        return self.early or self.named_s is not None
+        return bool(self.said["early"]) or self.said["named_s"] is not None
 
     def update(self, looks: dict[int, Stretch], end_ns: int) -> None:
-        verdict = self.test.update(looks)
-        delay_s = (end_ns - self._step_ns) / 1e9
+        verdict, delay_s = self.test.update(looks), (end_ns - self._step_ns) / 1e9
         if delay_s <= 0:
-            self.early = self.early or verdict.detected
+            self.said["early"] = verdict.detected
             return
-        said = {finding.name for finding in verdict.changed}
-        self.wrong = self.wrong or bool(said - {self._parameter})
-        if verdict.detected and self.detected_s is None:
-            self.detected_s = delay_s
-        if said == {self._parameter} and self.named_s is None:
-            self.named_s = delay_s
+        names = {finding.name for finding in verdict.changed}
+        self.said["wrong"] = bool(self.said["wrong"]) or bool(names - {self._parameter})
+        if verdict.detected and self.said["detected_s"] is None:
+            self.said["detected_s"] = _rounded(delay_s)
+        if names == {self._parameter} and self.said["named_s"] is None:
+            self.said["named_s"] = _rounded(delay_s)
 
 
 def _rates(machine: Machine) -> dict[str, float]:
@@ -122,11 +115,14 @@ def _rates(machine: Machine) -> dict[str, float]:
 
 
 def _measure(case: _Case, _: None, number: int) -> list[dict[str, Value]]:
-    machine, plan = case.machine, plan_for(case.machine)
+    machine, plan = case.draw.machine, plan_for(case.draw.machine)
     scenario, step_s, bound = case.trial(number)
-    settings = [SequentialSettings.for_machine(machine, rate) for rate in _rates(machine).values()]
+    step_ns = DEFAULT_START_NS + round(step_s * 1e9)
+    watches = {
+        name: _Watch(SequentialSettings.for_machine(machine, rate), step_ns, case.parameter)
+        for name, rate in _rates(machine).items()
+    }
     window, whole, fits = SlidingWindow(plan), plan.hops, LengthFits(machine)
-    watches: list[_Watch] = []
 
     def look(hops: int) -> Stretch | None:
         statistics = window.statistics(hops)
@@ -140,46 +136,32 @@ def _measure(case: _Case, _: None, number: int) -> list[dict[str, Value]]:
         return stretch_of(known, statistics.start_ns, statistics.end_ns)
 
     for block, _truth in blocks(scenario, machine, block_s=_BLOCK_S):
-        if not watches:
-            step_ns = block.start_ns + round(step_s * 1e9)
-            watches = [_Watch(one, step_ns, case.parameter) for one in settings]
         for end_ns in window.feed(plan.to_si(block.samples), block.start_ns):
             full = look(whole)
             if full is None:
                 continue
-            wanted = {hops for watch in watches if not watch.finished for hops in watch.test.wanted()}
+            going = [watch for watch in watches.values() if not watch.finished]
+            wanted = {hops for watch in going for hops in watch.test.wanted()}
             short = {hops: found for hops in sorted(wanted) if (found := look(hops)) is not None}
-            for watch in watches:
-                if not watch.finished:
-                    mine = {hops: short[hops] for hops in watch.test.wanted() if hops in short}
-                    watch.update(mine | {whole: full}, end_ns)
-        if all(watch.finished for watch in watches):
+            for watch in going:
+                mine = {hops: short[hops] for hops in watch.test.wanted() if hops in short}
+                watch.update(mine | {whole: full}, end_ns)
+        if all(watch.finished for watch in watches.values()):
             break
-    return [
-        {
-            "rate": rate,
-            "detected_s": _rounded(watch.detected_s),
-            "named_s": _rounded(watch.named_s),
-            "early": watch.early,
-            "wrong": watch.wrong,
-            **case.times(one, bound),
-        }
-        for rate, one, watch in zip(_rates(machine), settings, watches, strict=True)
-    ]
+    return [{"rate": rate, **one.said, **case.times(one.settings, bound)} for rate, one in watches.items()]
 
 
-def _rounded(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(f"{value:.5g}")
+def _rounded(value: float) -> float | None:
+    return float(f"{value:.5g}") if np.isfinite(value) else None
 
 
 def _judged(records: Sequence[Record]) -> Iterator[Record]:
     """With the delay over the bound's time; infinite where it was not found while it was watched."""
     for row in (row for row in records if "detected_s" in row):
-        valid = row | {"found": np.inf if row["detected_s"] is None else row["detected_s"]}  # type: ignore[operator]
-        valid["named"] = np.inf if row["named_s"] is None else row["named_s"]
-        for name, bound in (("ratio", "bound_s"), ("fixed ratio", "bound_fixed_s")):
-            valid[name] = float(valid["found"]) / float(row[bound] or 1.0)
-        yield valid | {"within": None if row["early"] else valid["ratio"] <= 2}
+        found, named = (np.inf if row[name] is None else float(row[name] or 0.0) for name in ("detected_s", "named_s"))
+        ratio, fixed = (found / float(row[bound] or 1.0) for bound in ("bound_s", "bound_fixed_s"))
+        within = None if row["early"] else ratio <= 2
+        yield {**row, "found": found, "named": named, "ratio": ratio, "fixed ratio": fixed, "within": within}
 
 
 def _quantile(column: str, level: float) -> Callable[[Sequence[Record]], str]:
@@ -278,8 +260,8 @@ def delay(options: Options) -> Study:
                 "hop_s": hop_s,
                 "short_s": f"{short} s",
             }
-            case = _Case(one, options.seed, _STREAM + 10 * layout + at, layout, name, change)
-            cells.append(Cell(keys, trials, partial(_measure, case)))
+            draw = Draw(one, options.seed, Purpose.EVALUATION, _STREAM + 10 * layout + at, layout=layout)
+            cells.append(Cell(keys, trials, partial(_measure, _Case(draw, name, change))))
     for level in (KnowledgeLevel.FULL, KnowledgeLevel.NONE):
         keys = {"layout": "either", "changed": "one or two", "hop_s": own, "short_s": "", "level": level.value}
         trials = 1 if options.small else round(2.5 * options.windows)
