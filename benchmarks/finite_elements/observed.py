@@ -13,7 +13,7 @@ from models.diagnosis.moments import Plan, plan_for
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
-from models.signals.channels import Channel, ChannelDescriptor
+from models.signals.channels import ChannelDescriptor
 
 RATE_HZ = 2000.0
 SITE = "beams"
@@ -21,7 +21,7 @@ MOTION = PROBES[:8]
 """Displacement and velocity of bearing and disc in both planes: what is measured unless said otherwise."""
 
 _START_NS = 1_767_225_600_000_000_000
-_UNITS = {"displacement": ("um", 1e-6), "velocity": ("mm/s", 1e-3), "acceleration": ("m/s2", 1.0)}
+_UNITS = {"displacement": "um", "velocity": "mm/s", "acceleration": "m/s2"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,54 +82,31 @@ def _noise(shape: tuple[int, int], corner_hz: float | None, rng: np.random.Gener
     return np.asarray(lfilter([innovation], [1.0, -memory], white, axis=0, zi=carried)[0], dtype=np.float64)
 
 
-def descriptor(
-    rotor: BeamRotor, probes: tuple[str, ...] = MOTION, *, phase_reference: bool = True
-) -> ChannelDescriptor:
-    """Channels of the stream, in usual units."""
-    channels = [_channel(name) for name in probes]
-    if phase_reference:
-        channels.append(
-            Channel.model_validate(
-                {
-                    "name": "theta",
-                    "quantity": "shaft_angle",
-                    "location": "shaft",
-                    "direction": "rotation",
-                    "unit": "rad",
-                }
-            )
-        )
-    return ChannelDescriptor(site=SITE, machine=rotor.name, rate_hz=RATE_HZ, dtype="float32", channels=tuple(channels))
-
-
-def _channel(probe: str) -> Channel:
-    place, _, rate = probe.partition("_")
-    quantity = {"": "displacement", "dot": "velocity", "ddot": "acceleration"}[rate]
-    return Channel.model_validate(
-        {
-            "name": probe,
-            "quantity": quantity,
-            "location": "bearing" if place[1] == "1" else "disc",
-            "direction": place[0],
-            "unit": _UNITS[quantity][0],
-        }
-    )
-
-
 def machine_of(
     rotor: BeamRotor, sizes: WindowSizes, probes: tuple[str, ...] = MOTION, *, phase_reference: bool = True
 ) -> MachineFile:
-    """Machine file with channels and sampling alone: nothing about the rotor."""
-    described = descriptor(rotor, probes, phase_reference=phase_reference)
+    """Machine file with channels, in usual units, and sampling alone: nothing about the rotor."""
+    sensors = [_channel(name) for name in probes]
+    if phase_reference:
+        theta = {"name": "theta", "quantity": "shaft_angle", "location": "shaft", "direction": "rotation"}
+        sensors.append(theta | {"unit": "rad"})
     fields = {
-        "site": described.site,
-        "name": described.machine,
+        "site": SITE,
+        "name": rotor.name,
         "description": f"{rotor.description}; its parameters are not given",
-        "rate_hz": described.rate_hz,
+        "rate_hz": RATE_HZ,
         "window": {**asdict(sizes), "max_span_s": 1.5 * sizes.length_s},
-        "sensors": described.channels,
+        "sensors": sensors,
     }
     return MachineFile.model_validate(fields)
+
+
+def _channel(probe: str) -> dict[str, str]:
+    place, _, rate = probe.partition("_")
+    quantity = {"": "displacement", "dot": "velocity", "ddot": "acceleration"}[rate]
+    location = "bearing" if place[1] == "1" else "disc"
+    unit = _UNITS[quantity]
+    return {"name": probe, "quantity": quantity, "location": location, "direction": place[0], "unit": unit}
 
 
 def plan(

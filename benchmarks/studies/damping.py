@@ -12,16 +12,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from benchmarks.finite_elements.machines import ROTORS, rotor_named
-from benchmarks.finite_elements.observed import (
-    RunCondition,
-    WindowSizes,
-    blocks,
-    descriptor,
-    machine_of,
-    plan,
-    sampled,
-    windows_of,
-)
+from benchmarks.finite_elements.observed import RunCondition, WindowSizes, blocks, machine_of, plan, sampled, windows_of
 from benchmarks.finite_elements.rotor import BeamRotor
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
 from benchmarks.studies import results as r
@@ -62,13 +53,13 @@ _DAMPING = slice(1, 4)
 def _measure(options: Options, name: str, healthy_s: float, _: None, number: int) -> list[dict[str, Value]]:
     rotor, seed = rotor_named(name), [options.seed, number]
     condition = drawn_condition(rotor, SourceLayout.ONE_SOURCE, COMMISSIONED, {}, np.random.default_rng(seed))
-    file, sizes, described = machine_of(rotor, _SIZES), plan(rotor, _SIZES), descriptor(rotor)
+    file, sizes = machine_of(rotor, _SIZES), plan(rotor, _SIZES)
     lead_s = sizes.preamble / sizes.rate_hz + _SETTLING_S
     chosen = _CHANGES[:2] if options.small else _CHANGES[_DAMPING] if healthy_s < _HEALTHY_S[-1] else _CHANGES
     # Of the longest recording, so that shorter ones are its beginning.
     recording = sampled(rotor, condition, _HEALTHY_S[-1] + lead_s, [*seed, 1])
     recording = recording[: round((healthy_s + lead_s) * sizes.rate_hz)]
-    installed = commissioned(file, blocks(recording, described))
+    installed = commissioned(file, blocks(recording, file.descriptor))
     if isinstance(installed, str):
         return [{"changed": changed_in(changes), "refused": installed} for changes in chosen]
     healthy, settings = windows_of(recording, sizes), SequentialSettings.for_machine(file, short=False)
@@ -77,7 +68,7 @@ def _measure(options: Options, name: str, healthy_s: float, _: None, number: int
         seen = [*seed, 2 + _CHANGES.index(changes)]
         changed = replace(condition, changes=changes)
         samples = sampled(rotor, changed, _WITHIN_S + _DELAY_S + lead_s, seen)
-        events = list(raised(MachineMonitor(installed), blocks(samples, described)))
+        events = list(raised(MachineMonitor(installed), blocks(samples, file.descriptor)))
         raised_at = {one.name: one.at_s for one in reversed(events) if one.name in PARAMETERS}
         own = {"changed": changed_in(changes), "refused": "", **_judged(raised_at, changes)}
         window = windows_of(samples, sizes)[0]

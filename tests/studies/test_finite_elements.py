@@ -26,7 +26,6 @@ from benchmarks.finite_elements.observed import (
     RunCondition,
     WindowSizes,
     blocks,
-    descriptor,
     machine_of,
     plan,
     sampled,
@@ -327,7 +326,7 @@ def test_the_stream_is_what_a_live_machine_sends() -> None:
     rotor = rotor_named("overhung")
     probes = ("y1", "z1", "y2_ddot")
     expected = sampled(rotor, RunCondition(forces(rotor), rotor.speed_rad_s), 1.05, 3, probes)
-    sent = list(blocks(expected, descriptor(rotor, probes), 0.1))
+    sent = list(blocks(expected, machine_of(rotor, WindowSizes(), probes).descriptor, 0.1))
     assert [block.sequence for block in sent] == list(range(11))
     assert all(after.start_ns == before.end_ns for before, after in pairwise(sent))
     stored = np.concatenate([block.samples for block in sent]).astype(float)
