@@ -108,7 +108,7 @@ class Subject:
             machine = load_machine(self.name)
             draw = drawn_in_one_condition(machine, rng, condition)
             scenario = draw_condition(draw, realisation).overridden(duration_s=seconds)
-            return _of_shipped(machine, _with_anomaly(scenario, machine, fault, self.begins_s))
+            return _of_shipped(machine, _speed_rad_s(scenario), _samples(machine, scenario, fault, self.begins_s))
         cutoff_hz = commissioned_cutoff_hz(rng)
         layout = SourceLayout.INDEPENDENT if condition % 2 else SourceLayout.ONE_SOURCE
         scene = replace(COMMISSIONED, cutoff_hz=(cutoff_hz, cutoff_hz), stochastic_to_1x=ALIKE)
@@ -126,15 +126,14 @@ def _of_beam(beam: BeamRotor, ran: RunCondition, seconds: float, seed: list[int]
     return Rotor(speed_hz, RATE_HZ, response, both), Seen(found[:, :4], found[:, 4:8], found[:, 8])
 
 
-def _of_shipped(machine: Machine, scenarios: Iterator[Scenario]) -> tuple[Rotor, Seen]:
-    samples, scenario = _simulated(scenarios, machine)
+def _of_shipped(machine: Machine, speed_rad_s: float, samples: FloatArray) -> tuple[Rotor, Seen]:
     si = samples * np.array([one.to_si for one in machine.sensors])
     columns = {(one.quantity, one.location, one.direction): n for n, one in enumerate(machine.sensors)}
     motion, rate = (
         si[:, [columns[quantity, *at] for at in MOTIONS]] for quantity in (Quantity.DISPLACEMENT, Quantity.VELOCITY)
     )
     angle = si[:, columns[Quantity.SHAFT_ANGLE, "shaft", "rotation"]]
-    rotor, speed_rad_s = machine.rotor, _speed_rad_s(scenario)
+    rotor = machine.rotor
     kept = [STATE_INDEX[name] for name in ("y1", "y2", "z1", "z2")]
     equations = Equations(M_matrix(rotor), P_matrix(rotor, speed_rad_s), Q_matrix(rotor))
     response = partial(displacement_response, equations, kept)
@@ -149,32 +148,25 @@ def _speed_rad_s(scenario: Scenario) -> float:
 _FIELDS = ("displacement", "velocity", "angle_rad")
 
 
-def _simulated(scenarios: Iterator[Scenario], machine: Machine) -> tuple[FloatArray, Scenario]:
-    """Samples of the first scenario in which the machine is stable, and that scenario."""
-    for scenario in scenarios:
-        try:
-            found = [block.samples for block, _ in blocks(scenario, machine, _BLOCK_S)]
-        except EstimationError:
-            continue
-        return np.concatenate(found).astype(np.float64), scenario
-    raise AssertionError
-
-
-def _with_anomaly(scenario: Scenario, machine: Machine, fault: str, begins_s: float) -> Iterator[Scenario]:
-    """The scenario with a rub or a crack, halved until the machine can be run."""
-    if fault not in RUBS and fault != CRACK:
-        yield scenario
-        return
-    size, clearance = RUBS.get(fault, (0.3, None))
-    kind, rub = "crack", None
-    if clearance is not None:
+def _samples(machine: Machine, scenario: Scenario, fault: str, begins_s: float) -> FloatArray:
+    """Of the scenario, from some time on with a rub or a crack, halved until the machine is stable."""
+    size, rub = 0.3, None
+    if fault in RUBS:
+        size, clearance = RUBS[fault]
         variance = np.diag(stochastic_covariance(machine.rotor, _speed_rad_s(scenario), scenario.sources))
         radial = float(np.sqrt(variance[STATE_INDEX["y2"]] + variance[STATE_INDEX["z2"]]))
-        kind, rub = "rub", Rub(clearance_m=clearance * radial * np.hypot(1, 1 / ALIKE[0]))
+        rub = Rub(clearance_m=clearance * radial * np.hypot(1, 1 / ALIKE[0]))
     while True:
-        event = Event(at_s=begins_s, anomaly=kind, size=size)
-        yield scenario.model_copy(update={"rub": rub, "events": (*scenario.events, event)})
-        size /= 2
+        events = scenario.events
+        if fault in RUBS or fault == CRACK:
+            events += (Event(at_s=begins_s, anomaly="rub" if rub else "crack", size=size),)
+        ran = scenario.model_copy(update={"rub": rub, "events": events})
+        try:
+            return np.concatenate([one.samples for one, _ in blocks(ran, machine, _BLOCK_S)]).astype(np.float64)
+        except EstimationError:
+            if events is scenario.events:
+                raise
+            size /= 2
 
 
 def _blocks(file: MachineFile, seen: Seen) -> Iterator[SampleBlock]:
