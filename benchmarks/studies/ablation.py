@@ -193,7 +193,7 @@ def _reads(rows: Sequence[Record]) -> str:
 
 def _spread(rows: Sequence[Record]) -> str:
     healthy = r.where(rows, changed="healthy")
-    spreads = {name: r.number(name, r.robust)(healthy) for name in _OWN[str(rows[0]["equation"])]}
+    spreads = {name: r.statistic(name, r.robust)(healthy) for name in _OWN[str(rows[0]["equation"])]}
     return ", ".join(f"{name} {100 * one:.2f} %" for name, one in spreads.items() if one is not None)
 
 

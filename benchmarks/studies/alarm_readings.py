@@ -158,13 +158,13 @@ def _alarms(records: Sequence[Record]) -> list[Record]:
 _COLUMNS = {
     "changes by name": r.share("named"),
     "first: covers": r.share("first"),
-    "first: z rms": r.number("first z", r.rms),
+    "first: z rms": r.statistic("first z", r.rms),
     "after a window": r.share("window"),
     "settled": r.share("settled"),
-    "settled: z rms": r.number("settled z", r.rms),
+    "settled: z rms": r.statistic("settled z", r.rms),
     "wrong names": r.share("wrong"),
     "limits of `since` hold": r.share("since"),
-    "`since` off, 95 %, s": r.number("since_s", lambda x: np.quantile(np.abs(x), 0.95)),
+    "`since` off, 95 %, s": r.statistic("since_s", lambda x: np.quantile(np.abs(x), 0.95)),
 }
 TABLES = (
     Table("delay-alarms", ("level",), _COLUMNS, _alarms, "What alarms quote, lab watched by the whole monitor:"),

@@ -163,7 +163,7 @@ _TABLES = (
             "exactly named within 120 s": r.share("in time"),
             "by 135 s": r.share("by its end"),
             "another named": r.share("wrong"),
-            "by the bound": r.number("by the bound", np.mean),
+            "by the bound": r.statistic("by the bound", np.mean),
         },
         page="*Exactly named*: an alarm of every changed parameter and of no other one. *By the bound*: how often an "
         "estimator with the smallest errors would have named the changed damping at the same limits, from 120 s.",

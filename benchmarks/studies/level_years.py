@@ -196,10 +196,10 @@ def _level(levels: WindowLevels, name: str) -> FloatArray:
 
 def per_month(rows: Sequence[Record]) -> Estimate | None:
     """Alarms per machine and month, with the exact interval of a Poisson count."""
-    hours = r.number("hours", np.sum)(rows)
+    hours = r.statistic("hours", np.sum)(rows)
     if not hours:
         return None
-    count, months = round(r.number("alarms", np.sum)(rows) or 0), hours * 3600 / MONTH_S
+    count, months = round(r.statistic("alarms", np.sum)(rows) or 0), hours * 3600 / MONTH_S
     low = 0.0 if not count else float(scipy.stats.chi2.ppf(0.025, 2 * count)) / 2
     high = float(scipy.stats.chi2.ppf(0.975, 2 * count + 2)) / 2
     return Estimate(count / months, low / months, high / months, len(rows))
@@ -210,12 +210,12 @@ _TABLES = (
         "level-years",
         ("machine", "excitation"),
         {
-            "days": r.number("hours", lambda hours: np.sum(hours) / 24),
-            "windows beyond a limit": r.number("alarms", np.sum),
-            "of the overall": r.number("by_overall", np.sum),
-            "of 1x": r.number("by_x1", np.sum),
-            "of 2x": r.number("by_x2", np.sum),
-            "of a band": r.number("by_growth", np.sum),
+            "days": r.statistic("hours", lambda hours: np.sum(hours) / 24),
+            "windows beyond a limit": r.statistic("alarms", np.sum),
+            "of the overall": r.statistic("by_overall", np.sum),
+            "of 1x": r.statistic("by_x1", np.sum),
+            "of 2x": r.statistic("by_x2", np.sum),
+            "of a band": r.statistic("by_growth", np.sum),
             "per machine and month": per_month,
         },
         partial(r.where, topic="years"),
@@ -225,7 +225,7 @@ _TABLES = (
         "level-drawing",
         ("measure",),
         {
-            "windows": r.number("windows", np.sum),
+            "windows": r.statistic("windows", np.sum),
             "mean of the logarithm, drawn less simulated, median": r.middle("mean"),
             "scatter, drawn over simulated, median": r.middle("scatter"),
             "97.5 % quantile, drawn over simulated, median": r.middle("far"),

@@ -174,7 +174,7 @@ def _eight(records: Sequence[Record]) -> Iterator[Record]:
 
 
 def _msd(number: str, level: float) -> r.Of[float | None]:
-    return r.number(f"msd {number}", lambda found: np.quantile(found, level))
+    return r.statistic(f"msd {number}", lambda found: np.quantile(found, level))
 
 
 _TABLES = (

@@ -126,7 +126,7 @@ def where(records: Iterable[Record], **wanted: Value | tuple[Value, ...]) -> lis
     return [record for record in records if all(record.get(name) in values for name, values in one_of.items())]
 
 
-def among(figure: Callable[[Sequence[Record]], _T], **wanted: Value | tuple[Value, ...]) -> Of[_T]:
+def among(figure: Of[_T], **wanted: Value | tuple[Value, ...]) -> Of[_T]:
     """A figure of the records with these values alone."""
     return lambda rows: figure(where(rows, **wanted))
 
@@ -136,27 +136,27 @@ def share(column: str) -> Of[Estimate | None]:
     return lambda rows: rate(row[column] for row in rows if row.get(column) is not None)
 
 
-def number(column: str, statistic: Callable[[FloatArray], float | FloatArray]) -> Of[float | None]:
-    """A statistic of the numbers in a column; None without any."""
+def statistic(column: str, make: Callable[[FloatArray], float | FloatArray]) -> Of[float | None]:
+    """What is made of the numbers in a column; None without any."""
 
     def of(rows: Sequence[Record]) -> float | None:
         found = floats(row.get(column) for row in rows)
-        return float(statistic(found)) if found.size else None
+        return float(make(found)) if found.size else None
 
     return of
 
 
 def middle(column: str) -> Of[float | None]:
     """Median of a column."""
-    return number(column, np.median)
+    return statistic(column, np.median)
 
 
-def estimated(column: str, statistic: Callable[[FloatArray], FloatArray], fewest: int) -> Of[Estimate | None]:
-    """A statistic of the numbers in a column with its interval; None of fewer."""
+def estimated(column: str, make: Callable[[FloatArray], FloatArray], fewest: int) -> Of[Estimate | None]:
+    """The same with its interval, and None of fewer."""
 
     def of(rows: Sequence[Record]) -> Estimate | None:
         found = floats(row.get(column) for row in rows)
-        return resampled(statistic, found) if found.size >= fewest else None
+        return resampled(make, found) if found.size >= fewest else None
 
     return of
 

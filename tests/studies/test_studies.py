@@ -24,14 +24,18 @@ from benchmarks.studies.results import (
     Record,
     Table,
     Value,
+    among,
     at_least,
     at_most,
     holding,
     limit_of,
+    limits_of,
     rate,
     resampled,
     robust,
     scatter,
+    share,
+    where,
     within,
 )
 from benchmarks.studies.study import Cell, Options, Over, Study, read, run, spread_over
@@ -256,6 +260,30 @@ def test_limits_keep_the_declared_rate() -> None:
     assert np.mean(exceeded) == pytest.approx(0.05, abs=0.006)
     with pytest.raises(EstimationError, match="expected at least 99"):
         limit_of(np.ones(98), 0.01)
+
+
+def test_limits_of_several_values_keep_the_rate_together_and_none_decides_those_of_another() -> None:
+    """400 repetitions of 99 healthy windows and 50 further ones; seed 9."""
+    rng = np.random.default_rng(9)
+
+    def drawn(count: int) -> list[dict[str, float]]:
+        return [{"small": one, "large": 1000 * other} for one, other in rng.lognormal(size=(count, 2)).tolist()]
+
+    exceeded, alone = [], []
+    for _ in range(400):
+        limits = limits_of(drawn(99), 0.05)
+        found = [{name for name, value in one.items() if value > limits[name]} for one in drawn(50)]
+        exceeded.append(np.mean([bool(one) for one in found]))
+        alone += [name for one in found for name in one]
+    assert np.mean(exceeded) == pytest.approx(0.05, abs=0.006)
+    assert alone.count("small") / len(alone) == pytest.approx(0.5, abs=0.1)
+
+
+def test_figures_are_of_the_records_that_are_asked_for() -> None:
+    records = [{"method": by, "named": by != "paper", "e": None} for by in ("likelihood", "network", "paper")]
+    assert [row["method"] for row in where(records, method=("paper", "network"), e=None)] == ["network", "paper"]
+    assert among(share("named"), method=("likelihood", "network"))(records) == shares(2, 2)
+    assert among(share("named"), method="nobody")(records) is None
 
 
 def test_a_table_has_a_row_for_every_group_and_is_written_with_intervals(tmp_path: Path) -> None:
