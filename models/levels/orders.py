@@ -61,7 +61,7 @@ def order_vectors(
         most = int(2 * np.pi / (_SAMPLES_A_TURN * np.abs(steps).max()))
         every = next((step for step in range(most, 1, -1) if n_samples % step == 0), 1)
         angle, kept = angle_rad[::every], n_samples // every
-        tapered = scipy.fft.irfft(spectrum[:, : kept // 2 + 1], n=kept, axis=1)
+        tapered = np.fft.irfft(spectrum[:, : kept // 2 + 1], n=kept, axis=1)
         tapered = (tapered * (amplitude / unit)[:, None]).astype(np.float32)
         weights, _ = hann_taper(kept)
     # Halves of a turn, near zero: single precision has few digits for the angle after many turns.
@@ -76,12 +76,10 @@ def order_vectors(
         np.multiply(turning[first], turning[second], out=turning[row])
     regressors = np.empty((1 + 2 * len(ORDERS), half.size), half.dtype)
     regressors[0], regressors[1::2], regressors[2::2] = 1, turning.real, turning.imag
-    try:
-        solved = np.linalg.solve(
-            every * ((regressors * weights) @ regressors.T).astype(np.float64),
-            (regressors @ tapered.T).astype(np.float64),
-        )
-    except np.linalg.LinAlgError:  # a shaft that stands still
+    _, solved, singular = scipy.linalg.lapack.dposv(
+        every * ((regressors * weights) @ regressors.T).astype(np.float64), (regressors @ tapered.T).astype(np.float64)
+    )
+    if singular:  # a shaft that stands still
         return np.full((len(ORDERS), n), np.nan, dtype=np.complex128)
     return np.asarray(solved[1::2] - 1j * solved[2::2], dtype=np.complex128)
 
