@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from models.diagnosis.moments import hop_moments, plan_for
 from models.levels.measures import LevelPlan, WindowLevels, hop_levels, level_plan, window_levels
+from models.machine import load_machine
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity
 from models.signals.waveform import waveform_of
@@ -221,3 +223,20 @@ def test_whatever_the_size_of_a_vibration_its_levels_have_all_their_digits(size:
     assert scaled.radius / size == pytest.approx(one.radius, rel=1e-6)
     assert scaled.sums[1:5] / size ** np.array([[2], [1], [1], [4]]) == pytest.approx(one.sums[1:5], rel=1e-6)
     assert scaled.bands / size**2 == pytest.approx(one.bands, rel=1e-4, abs=1e-9)
+
+
+def test_levels_are_the_same_by_the_spectrum_that_the_moments_have() -> None:
+    machine = load_machine("lab")
+    plan = plan_for(machine, levels=True)
+    assert plan.levels is not None
+    rng = np.random.default_rng(20261126)
+    t = np.arange(plan.need) / plan.rate_hz
+    theta = 2 * np.pi * 22.3 * t
+    gap = np.linspace(1e3, 3e3, len(plan.states))  # a million times the vibration, and not what is subtracted
+    seen = gap + 1e-3 * (np.cos(theta)[:, None] + rng.standard_normal((plan.need, len(plan.states))))
+    moments = hop_moments(plan, np.column_stack([seen, theta % (2 * np.pi)]), 0.9 * gap, 0).levels
+    alone = hop_levels(plan.levels, *waveform_of(seen[-plan.hop :]), theta[-plan.hop :])
+    assert moments is not None
+    assert moments.sums == pytest.approx(alone.sums, rel=1e-5, abs=0, nan_ok=True)
+    assert moments.bands == pytest.approx(alone.bands, rel=1e-4, abs=0)
+    assert moments.orders[1:] == pytest.approx(alone.orders[1:], rel=1e-4, abs=1e-8)
