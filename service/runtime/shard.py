@@ -115,8 +115,10 @@ class _Shard:
         worker = self._workers[place]
         with self._looking:  # so that what has a larger number was seen later
             number = time.monotonic_ns()
+            sequence = worker.history.last_sequence()  # first: who hears of an event finds it in the health
+            changed = changed or sequence != self._told.get(place)
+            self._told[place] = sequence
             health = worker.health()
-            sequence = self._told[place] = worker.history.last_sequence()
             status = worker.status()
         status = replace(status, history_trouble=self._store.trouble, session_open=self._machines.session_open)
         return Standing(
