@@ -109,7 +109,10 @@ def pytest_xdist_setupnodes(config: pytest.Config) -> None:
 
 
 def _compile(module: Path, config: pytest.Config) -> None:
-    """Leave a module's code, with its assertions rewritten, where importing it looks for that."""
+    """Leave a module's code, with its assertions rewritten, where importing it looks for that.
+
+    By functions of pytest's that are not public: its version is pinned in constraints.txt.
+    """
     kept_in = rewrite.get_cache_dir(module)
     kept = kept_in / f"{module.stem}{rewrite.PYC_TAIL}"
     if module.is_file() and rewrite._read_pyc(module, kept) is None and rewrite.try_makedirs(kept_in):

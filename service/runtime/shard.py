@@ -99,7 +99,7 @@ class _Shard:
 
     def wake(self) -> None:
         for place, worker in self._workers.items():
-            if worker.history.last_sequence() != self._told.get(place):
+            if worker.told - 1 != self._told.get(place):
                 self._tell(place, changed=True)
 
     def tell_all(self) -> None:
@@ -115,7 +115,7 @@ class _Shard:
         worker = self._workers[place]
         with self._looking:  # so that what has a larger number was seen later
             number = time.monotonic_ns()
-            sequence = worker.history.last_sequence()  # first: who hears of an event finds it in the health
+            sequence = worker.told - 1  # before the health: who hears of an event finds it there
             changed = changed or sequence != self._told.get(place)
             self._told[place] = sequence
             health = worker.health()

@@ -103,7 +103,7 @@ class MachineWorker:
         self._snapshot: MachineHealth = self._monitor.health()
         self._latest_data_s: float | None = None
         self._operated_ns = 0
-        self._told = self._monitor.next_sequence
+        self.told = self._monitor.next_sequence  # of the first alarm event that `health` does not show yet
         self._begin_s = self._ticked_s = self._held_up_s = clocks.monotonic_s()
         self._missed = 0
         self._publisher_alive = self._replay_announced = False
@@ -425,11 +425,11 @@ class MachineWorker:
         finally:
             self._snapshot = snapshot
             self.latest = self._held()
-        texts = tuple(one.text for one in told if one.sequence >= self._told)
+        texts = tuple(one.text for one in told if one.sequence >= self.told)
         for event in events:
             self._log.warning("alarm", kind=event.kind.value, text=event.text, time_ns=event.time_ns)
         if texts:
-            self._told = told[-1].sequence + 1
+            self.told = told[-1].sequence + 1
             self._on_events()
         try:
             self._publish([one.text for one in reports], texts)
