@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, Route, sync_playwright
+from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
 
 from service.runtime.runtime import Runtime, running
 from service.settings.service import MachineEntry
@@ -50,6 +50,7 @@ def chromium() -> Iterator[Browser]:
         sync_playwright() as playwright,
         playwright.chromium.launch(executable_path=path, args=FLAGS, timeout=PATIENCE_MS) as found,
     ):
+        expect.set_options(timeout=PATIENCE_MS)  # of every test of this process, whichever is the first
         yield found
 
 

@@ -48,7 +48,6 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
 
 def test_who_signs_in_with_a_token_sees_the_machine_until_signing_out(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
-    expect.set_options(timeout=PATIENCE_MS)
     with browser.new_context() as context:
         context.set_default_timeout(PATIENCE_MS)
         page = context.new_page()
@@ -96,7 +95,6 @@ def test_a_browser_that_shows_the_page_of_the_api_asks_for_a_password(browser: B
 
 def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Plant) -> None:
     url = plant.runtime.http_url
-    expect.set_options(timeout=PATIENCE_MS)
     with looking(browser, url) as page, looking(browser, url) as second, client(plant.runtime) as http:
         shown = page.goto(url)
         assert shown is not None
@@ -263,6 +261,26 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
         route_events(page, instead)
         page.goto(f"{url}/#/")
         expect(page.locator("machine-tile .worst")).to_have_text("<b>reason</b> & more")  # not one of its levels
+
+
+def test_a_view_that_comes_late_does_not_take_the_place_of_the_one_chosen_since(browser: Browser, plant: Plant) -> None:
+    url = plant.runtime.http_url
+    late = "await new Promise((come) => { globalThis.letCome = come; document.body.id = 'comes' });"
+    with looking(browser, url) as page:
+        page.route(
+            "**/machine-view.js",
+            lambda route: route.fulfill(body=late + route.fetch().text(), content_type="text/javascript"),
+        )
+        page.goto(f"{url}/#/machines/demo/lab")
+        expect(page.locator("main")).to_have_text("Loading …")
+        expect(page.locator("body#comes")).to_be_visible()
+        page.get_by_role("link", name="Plant").click()
+        expect(page.locator("plant-view")).to_be_visible()
+        page.evaluate("letCome(), customElements.whenDefined('machine-view').then(() => null)")
+        page.wait_for_timeout(200)
+        expect(page.locator("plant-view")).to_be_visible()
+        page.go_back()
+        expect(page.locator("machine-view h1")).to_have_text("demo/lab")
 
 
 def test_machines_stand_by_site_and_only_lines_that_are_seen_are_asked_for(browser: Browser, plant: Plant) -> None:

@@ -53,7 +53,6 @@ def test_what_there_is_none_of_has_its_heading(browser: Browser, tmp_path: Path)
 
 def test_a_token_is_created_used_to_sign_in_and_revoked(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
-    expect.set_options(timeout=PATIENCE_MS)
     faults: list[str] = []
     with browser.new_context(viewport={"width": 1360, "height": 850}) as context, browser.new_context() as other:
         for one in (context, other):

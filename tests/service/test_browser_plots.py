@@ -14,7 +14,7 @@ from rotorwatch.records.example import example
 from rotorwatch.records.health import Health
 from rotorwatch.records.windows import SensorFault, UnbalanceVector
 from service.runtime.runtime import Runtime
-from tests.service.browsing import PATIENCE_MS, kept, looking, route_events, violations
+from tests.service.browsing import kept, looking, route_events, violations
 from tests.service.live import ROOT
 from tests.service.monitored import faulty
 from tests.service.replaying import recording
@@ -51,7 +51,6 @@ def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
 
 def test_plots_are_drawn_when_they_are_opened_and_say_what_they_show(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
-    expect.set_options(timeout=PATIENCE_MS)
     with looking(browser, url) as page:
         asked: list[str] = []
         page.on("request", lambda request: asked.append(request.url.partition("?")[0].rsplit("/", 1)[1]))

@@ -13,7 +13,7 @@ from rotorwatch.records.snapshots import OrbitSnapshot, SpectrumSnapshot
 from service.runtime.runtime import Runtime, running
 from service.settings.service import RecordingSettings
 from simulator.scenario import parse_fault
-from tests.service.browsing import PATIENCE_MS, kept, looking, unreached, violations
+from tests.service.browsing import kept, looking, unreached, violations
 from tests.service.live import SHORT, START_NS, endpoint, machine_file, scenario_blocks, send, settings, until
 from tests.service.monitored import PLACE, answered, client
 from tests.service.replaying import recording
@@ -64,7 +64,6 @@ def chosen(page: Page, url: str) -> None:
 
 def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
-    expect.set_options(timeout=PATIENCE_MS)
     with looking(browser, url) as page:
         chosen(page, url)
         kept(page, "recordings-light")
@@ -192,7 +191,6 @@ def diameters(snapshot: OrbitSnapshot) -> list[float]:
 
 def test_orbits_and_spectra_of_any_window_of_a_replay(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
-    expect.set_options(timeout=PATIENCE_MS)
     with client(runtime) as http:
         answer = http.post("/api/v1/replays", json={"recordings": [ID]}).raise_for_status()
         job_id = ReplayJob.model_validate_json(answer.content).id
@@ -270,7 +268,6 @@ def test_orbits_and_spectra_of_any_window_of_a_replay(browser: Browser, runtime:
 
 def test_a_paced_replay_is_paused_and_moved(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
-    expect.set_options(timeout=PATIENCE_MS)
     with looking(browser, url) as page, client(runtime) as http:
         chosen(page, url)
         page.get_by_label("How").select_option("paced")

@@ -45,11 +45,14 @@ class RotorwatchPage extends HTMLElement {
 
   /** @param {boolean} moved */
   async #go(moved) {
-    const [name, ...rest] = location.hash.replace(/^#\/?/, "").split("/").map(decodeURIComponent);
+    const asked = location.hash;
+    const [name, ...rest] = asked.replace(/^#\/?/, "").split("/").map(decodeURIComponent);
     monitor.look(name === "machines" ? rest.join("/") : "");
     const [tag, load] = VIEWS[name] ?? ["plant-view", async () => {}];
+    if (!this.#main.firstChild) this.#main.append(html("p", { class: "note" }, "Loading …"));
     try {
       await load();
+      if (location.hash !== asked) return; // gone on meanwhile
     } catch {
       this.#main.replaceChildren(html("p", {}, "The monitor serves another page by now: load this one again."));
       return;
