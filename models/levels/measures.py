@@ -47,8 +47,17 @@ from models.signals.waveform import Waveform
 COMPARED = ("overall", "velocity", "s_max", "x1", "x2", "high", "envelope")
 """Those that are compared with a reference."""
 
-_SUMS = ("mean", "mean_square", "peak", "peak_to_peak", "fourth", "velocity_square", "high_square", "envelope_square")
-_SQUARES = [1, 5, 6, 7]  # those of which a root is shown
+_SUMS = (
+    "mean",
+    "peak",
+    "peak_to_peak",
+    "fourth",
+    "radius",
+    "mean_square",
+    "velocity_square",
+    "high_square",
+    "envelope_square",
+)
 _HIGH_HZ = 1000.0
 NYQUIST_PART = 0.8
 """Part of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
@@ -157,15 +166,13 @@ class HopLevels:
     Attributes
     ----------
     n_samples : int
-    sums : ndarray, shape (8, n)
-        Mean, mean square about it, largest deviation from it, peak to peak, fourth moment, mean square velocity in
-        the band, mean squares of the high-frequency band and of its envelope about its mean; nan where a quantity has
-        none.
+    sums : ndarray, shape (9, n)
+        Mean, largest deviation from it, peak to peak, fourth moment, at the first channel of a pair the largest
+        distance from the mean position; mean square about the mean, mean square velocity in the band, mean squares of
+        the high-frequency band and of its envelope about its mean. Nan where a quantity has none.
     orders : ndarray of complex, shape (4, n)
         q of x = Re{q e^{jkθ}} for the orders k of `ORDERS`; nan without a rotation. At half running speed its angle
         means nothing: the shaft angle is known to a whole turn.
-    radius : ndarray, shape (n_pairs,)
-        Largest distance from the mean position.
     bands : ndarray, shape (n_bands, n)
         Mean squares in the bands of `models.levels.bands`.
     """
@@ -173,7 +180,6 @@ class HopLevels:
     n_samples: int
     sums: FloatArray
     orders: _ComplexArray
-    radius: FloatArray
     bands: FloatArray
 
     def checkpoint(self) -> dict[str, np.ndarray]:
@@ -182,7 +188,6 @@ class HopLevels:
             "n_samples": np.array(self.n_samples, dtype=np.int64),
             "sums": self.sums,
             "orders": self.orders,
-            "radius": self.radius,
             "bands": self.bands,
         }
 
@@ -200,7 +205,6 @@ class HopLevels:
             int(checked(arrays, "n_samples", np.int64, ())),
             sums,
             checked(arrays, "orders", np.complex128, (len(ORDERS), sums.shape[1])),
-            checked(arrays, "radius", np.float64, (None,)),
             checked(arrays, "bands", np.float64, (None, sums.shape[1])),
         )
 
@@ -232,7 +236,8 @@ def hop_levels(
     mean, rms, low, high = (one[:n] for one in (waveform.mean, waveform.rms, waveform.minimum, waveform.maximum))
     square, peak = x * x, np.maximum(high - mean, mean - low)
     sums = np.full((len(_SUMS), n), np.nan)
-    sums[:5] = mean, rms**2, peak, high - low, np.vecdot(square, square) / n_samples
+    sums[:4] = mean, peak, high - low, np.vecdot(square, square) / n_samples
+    sums[5] = rms**2
     # Strong lines must not leak into the low end of a band, where integration would magnify them.
     taper, scale = hann_taper(n_samples)
     # In parts of the peak single precision is enough, and quicker.
@@ -245,51 +250,59 @@ def hop_levels(
         amplitude = np.full(n, np.sqrt(2 * plan.rate_hz / (n_samples * scale)))
     parts = spectrum.view(spectrum.real.dtype)[:, : int(NYQUIST_PART * n_samples) + 4]  # real, imaginary, real ...
     parts = parts * parts
-    casing = plan.columns(Quantity.VELOCITY, Quantity.ACCELERATION)
-    if casing.size:
-        sums[5:, casing] = amplitude[casing] ** 2 * _band_squares(plan, spectrum, parts, n_samples, casing)
-    edges = band_edges(n_samples, NYQUIST_PART)
-    bands = (scale * amplitude**2)[:, None] * np.add.reduceat(parts[:, : 2 * edges[-1]], 2 * edges[:-1], axis=1)
-    radius = np.empty(len(plan.pairs))
-    for pair, ((y, z), skew) in enumerate(zip(plan.pairs, plan.skew, strict=True)):
+    cuts, edges, (first, last) = _band_cuts(n_samples, plan.rate_hz, plan.band_hz)
+    power = (scale * amplitude**2)[:, None]
+    between = power * np.add.reduceat(parts[:, : 2 * cuts[-1]], 2 * cuts[:-1], axis=1)
+    bands = np.add.reduceat(between[:, : edges[-1]], edges[:-1], axis=1)
+    if (velocities := plan.columns(Quantity.VELOCITY)).size:
+        sums[6, velocities] = np.add.reduce(between[:, first:last], axis=1)[velocities]
+    if (accelerations := plan.columns(Quantity.ACCELERATION)).size:
+        band = slice(cuts[first], cuts[last])
+        sums[6:, accelerations] = power[accelerations, 0] * _acceleration_squares(
+            plan, spectrum[accelerations], parts[accelerations], band, n_samples
+        )
+    for (y, z), skew in zip(plan.pairs, plan.skew, strict=True):
         distance = square[y] + square[z]
         if skew:
             distance -= 2 * skew * x[y] * x[z]
-        radius[pair] = np.sqrt(distance.max() / (1 - skew**2))
+        sums[4, y] = np.sqrt(distance.max() / (1 - skew**2))
     orders = unit * order_vectors(x, unit, spectrum, amplitude, angle_rad)
-    return HopLevels(n_samples, sums, orders, radius, np.ascontiguousarray(bands.T))
+    return HopLevels(n_samples, sums, orders, np.ascontiguousarray(bands.T))
 
 
-def _band_squares(
-    plan: LevelPlan,
-    spectrum: Spectrum,
-    parts: FloatArray | npt.NDArray[np.float32],
-    n_samples: int,
-    casing: npt.NDArray[np.intp],
+@lru_cache(maxsize=8)
+def _band_cuts(
+    n_samples: int, rate_hz: float, band_hz: tuple[float, float]
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Bins at which a band begins or ends, and which of them are edges of narrow bands, and of that of velocities."""
+    edges = band_edges(n_samples, NYQUIST_PART)
+    low, high = (round(edge_hz / (rate_hz / n_samples)) for edge_hz in band_hz)
+    band = np.array([min(max(low, 1), high + 1), high + 1])
+    cuts = np.union1d(edges, band)
+    return cuts, cuts.searchsorted(edges), cuts.searchsorted(band)
+
+
+def _acceleration_squares(
+    plan: LevelPlan, spectrum: Spectrum, parts: FloatArray | npt.NDArray[np.float32], band: slice, n_samples: int
 ) -> FloatArray:
-    """Mean squares of velocity in the band, of the high-frequency band and of its envelope; shape (3, n)."""
-    taper, scale = hann_taper(n_samples)
+    """Of accelerations: squares of velocity in the band, of the high-frequency band and of its envelope; shape (3, n).
+
+    In parts of what makes mean squares of the squares of the spectrum's bins.
+    """
     step_hz = plan.rate_hz / n_samples
-    first, last = (round(edge / step_hz) for edge in plan.band_hz)
-    first = max(first, 1)
-    found = np.full((3, casing.size), np.nan)
-    band = parts[:, 2 * first : 2 * last + 2]
-    found[0] = scale * (band @ np.ones(band.shape[1], band.dtype))[casing]
-    accelerations = plan.columns(Quantity.ACCELERATION)
-    if not accelerations.size:
-        return found
-    at = casing.searchsorted(accelerations)
-    omega = 2 * np.pi * step_hz * np.arange(first, first + band.shape[1] // 2)
-    found[0, at] = scale * (band[accelerations] @ np.repeat(omega**-2, 2))
+    found = np.full((3, len(spectrum)), np.nan)
+    omega = 2 * np.pi * step_hz * np.arange(band.start, band.stop)
+    found[0] = parts[:, 2 * band.start : 2 * band.stop] @ np.repeat(omega**-2, 2)
     if plan.high_hz is not None:
+        taper, scale = hann_taper(n_samples)
         first, last = (round(edge / step_hz) for edge in plan.high_hz)
-        high = spectrum[accelerations, first : last + 1]
-        found[1, at] = scale * np.sum(np.abs(high) ** 2, axis=1)
+        high = spectrum[:, first : last + 1]
+        found[1] = np.sum(np.abs(high) ** 2, axis=1)
         # The band shifted to zero frequency: its magnitude is the envelope, a sample for each of its bins.
         envelope = np.abs(scipy.fft.ifft(high, axis=1)) * (2 * high.shape[1] / n_samples)
         weights = np.interp(np.arange(high.shape[1]) / high.shape[1], np.arange(n_samples) / n_samples, taper)
         level = envelope.sum(axis=1) / weights.sum()  # the taper is on the envelope too: compared with its like
-        found[2, at] = np.sum((envelope - level[:, None] * weights) ** 2, axis=1) / np.sum(weights**2)
+        found[2] = np.sum((envelope - level[:, None] * weights) ** 2, axis=1) / np.sum(weights**2) / scale
     return found
 
 
@@ -348,14 +361,12 @@ def window_levels(
     sums = np.concatenate([hop.sums for hop in hops]).reshape(count, len(_SUMS), n)
     in_bands = np.concatenate([hop.bands for hop in hops]).reshape(count, -1, n)
     every_order = np.concatenate([hop.orders for hop in hops]).reshape(count, len(ORDERS), n)
-    s_max = np.full((count, n), np.nan)
-    s_max[:, [y for y, _ in plan.pairs]] = np.concatenate([hop.radius for hop in hops]).reshape(count, -1)
     turning = np.abs(speeds_rad_s) > STANDS_RAD_S  # not where it is not known
     orders = every_order if turning.all() else every_order[turning]
     speed_rad_s, vectors, amplitudes = None, None, np.full((len(ORDERS), n), np.nan)
     if len(orders):
         speed_rad_s = float(_mean(speeds_rad_s[turning]))
-        amplitudes = np.sqrt(_mean(orders.real**2 + orders.imag**2))
+        amplitudes = np.sqrt(_mean((orders * orders.conj()).real))
         if phase_reference:
             vectors = _mean(orders)
             amplitudes[1:] = np.abs(vectors[1:])
@@ -364,7 +375,7 @@ def window_levels(
     scatter: dict[str, FloatArray] = {}
     if errors:
         root = np.sqrt(max(1, count - 1))
-        by_hop = _compared(plan, sums[:, _SQUARES].swapaxes(0, 1), sums[:, 3], s_max)
+        by_hop = _compared(plan, sums.swapaxes(0, 1))
         scatter = {name: each.std(axis=0) / root for name, each in by_hop.items()}
         scatter |= dict(zip(ORDERS, shown * _order_errors(orders, vectors), strict=True))
     measured_1x = amplitudes[1]
@@ -374,17 +385,17 @@ def window_levels(
         amplitudes[1] = np.where(plan.runout == 0, amplitudes[1], np.abs(vectors[1]))
     # Peak to peak is a mean of the hops, what is rms that of the whole window.
     average = _mean(sums)
-    square = average[1] + _mean((sums[:, 0] - average[0]) ** 2)
-    peak = sums[:, 2].max(axis=0)
+    square = average[5] + _mean((sums[:, 0] - average[0]) ** 2)
+    peak = np.maximum.reduce(sums[:, 1])
     with np.errstate(divide="ignore", invalid="ignore"):
         values = {
-            **_compared(plan, average[_SQUARES], average[3], _mean(s_max)),
+            **_compared(plan, average),
             **dict(zip(ORDERS, shown * amplitudes, strict=True)),
             "peak": peak,
             "not_x1": np.sqrt(np.maximum(square - measured_1x**2 / 2, 0.0)),
             "mean": np.where(displacements, average[0], np.nan),
             "crest": peak / np.sqrt(square),
-            "kurtosis": average[4] / average[1] ** 2,
+            "kurtosis": average[3] / average[5] ** 2,
         }
     edges_hz, freedom = _band_grid(plan.rate_hz, hops[0].n_samples, count)
     bands = BandLevels(
@@ -393,7 +404,7 @@ def window_levels(
         np.sqrt(in_bands).std(axis=0) / np.sqrt(max(1, count - 1)) if errors else None,
         freedom,
     )
-    moments = sums[:, 1], sums[:, 4], every_order[:, 1:], in_bands
+    moments = sums[:, 5], sums[:, 3], every_order[:, 1:], in_bands
     return WindowLevels(values, scatter, vectors, speed_rad_s, count, bands, moments)
 
 
@@ -403,18 +414,16 @@ def _mean(values: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
     return total / len(values)
 
 
-def _compared(
-    plan: LevelPlan, mean_squares: FloatArray, peak_to_peak: FloatArray, s_max: FloatArray
-) -> dict[str, FloatArray]:
-    """Levels but for the orders, of a window or of each hop, of those sums that `_SQUARES` are."""
+def _compared(plan: LevelPlan, sums: FloatArray) -> dict[str, FloatArray]:
+    """Levels but for the orders, of a window or of each hop, of sums as those of `HopLevels`."""
     accelerations = plan.has(Quantity.ACCELERATION)
-    rms, velocity, high, envelope = np.sqrt(mean_squares)
+    rms, velocity, high, envelope = np.sqrt(sums[5:])
     return {
         "overall": np.where(
-            plan.has(Quantity.DISPLACEMENT, Quantity.TILT), peak_to_peak, np.where(accelerations, rms, velocity)
+            plan.has(Quantity.DISPLACEMENT, Quantity.TILT), sums[2], np.where(accelerations, rms, velocity)
         ),
         "velocity": np.where(accelerations, velocity, np.nan),
-        "s_max": s_max,
+        "s_max": sums[4],
         "high": high,
         "envelope": envelope,
     }

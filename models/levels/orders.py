@@ -51,14 +51,14 @@ def order_vectors(
     n, n_samples = x.shape
     if angle_rad is None:
         return np.full((len(ORDERS), n), np.nan, dtype=np.complex128)
-    steps = angle_rad[1::_NEAR] - angle_rad[:-1:_NEAR]  # of neighbours, here and there
-    steps -= 2 * np.pi * np.rint(steps / (2 * np.pi))  # where it begins anew from zero
+    steps = (angle_rad[1::_NEAR] - angle_rad[:-1:_NEAR]) / (2 * np.pi)  # of neighbours, here and there
+    steps -= np.rint(steps)  # where it begins anew from zero
     weights: FloatArray | _SingleArray
-    if abs(steps.mean()) * n_samples < 2 * np.pi * _MANY_REVOLUTIONS:
+    if abs(np.add.reduce(steps)) * n_samples < _MANY_REVOLUTIONS * steps.size:
         # Orders are nearly alike then: what tells them apart needs all digits.
         angle, tapered, weights, every = angle_rad, x / unit[:, None], np.ones(n_samples), 1
     else:
-        most = int(2 * np.pi / (_SAMPLES_A_TURN * np.abs(steps).max()))
+        most = int(1 / (_SAMPLES_A_TURN * np.abs(steps).max()))
         every = next((step for step in range(most, 1, -1) if n_samples % step == 0), 1)
         angle, kept = angle_rad[::every], n_samples // every
         tapered = np.fft.irfft(spectrum[:, : kept // 2 + 1], n=kept, axis=1)
