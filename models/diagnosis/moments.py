@@ -26,7 +26,8 @@ from scipy.fft import next_fast_len
 from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.motion import MotionPair, motion_pairs, pair_powers
 from models.diagnosis.rotation import RotationLine, followed_speeds, rotation_line
-from models.levels.measures import HopLevels, LevelPlan, hop_levels, level_plan
+from models.levels.contact import contact
+from models.levels.measures import CONTACT, HopLevels, LevelPlan, hop_levels, level_plan
 from models.machine import MachineFile
 from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray
@@ -290,6 +291,11 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
             spectrum = spectra[:n_states, -1]  # the last segment is the hop itself
             spectrum[:, :2] -= (waveform.mean[:n_states] - level)[:, None] * spectra[n_states, -1, :2]
         levels = hop_levels(plan.levels, waveform, deviations, turned, spectrum)
+        if turned is not None and plan.states:
+            speed_rad_s = turned_rad * plan.rate_hz / plan.hop if line is None else line.speed_rad_s
+            for pair in map(list, plan.levels.pairs):
+                turning, turns = a[-2:, -plan.fresh :], speed_rad_s * plan.fresh / plan.rate_hz / (2 * np.pi)
+                levels.sums[CONTACT, pair] = contact(deviations[pair], turning, turns, plan.rate_hz)
     if plan.angle_column is not None and plan.others:
         last = own.shape[1] - 1
         waveform = waveform.of([*range(n_states), last, *range(n_states, last)])

@@ -32,6 +32,8 @@ from models.levels.zones import ZONES, zone_of
 from models.signals.channels import Channel, Quantity
 from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth, LevelLimits
 
+_ERRORS_OF_CONTACT = 5.0
+"""A contact is on one side alone, and Gaussian in theory: fewer of them are as seldom by chance as six elsewhere."""
 _ERRORS_OF_DOUBT = 4.0
 """Where it decides whether to believe what else has been found, not whether anything has happened."""
 _TURNED_OUT = "1x vector"
@@ -112,8 +114,8 @@ class LevelJudge:
     ) -> str:
         """What the levels of a window show that no change of a parameter makes; empty if nothing.
 
-        A wrong gain of all sensors of a place, a 2x that has grown, or a random part that is not Gaussian as it was on
-        the healthy machine.
+        A shaft that is pushed back where it is far out, a wrong gain of all sensors of a place, a 2x that has grown, or
+        a random part that is not Gaussian as it was on the healthy machine.
 
         Parameters
         ----------
@@ -124,25 +126,27 @@ class LevelJudge:
         """
         if reference is None:
             return ""
-        if reference.gains is not None and levels.bands is not None:
+        state, seen = reference.at(levels.speed_rad_s)
+        found = self._contact(levels, state) if seen else ""
+        if not found and reference.gains is not None and levels.bands is not None:
             wrong = wrong_gain(levels.bands, [place_of(one) for one in self._channels], reference.gains)
             if wrong is not None:
                 own = " and ".join(one.name for one in self._channels if place_of(one) == wrong[0])
-                return f"gain of {own}: {wrong[1]:.2f} times as much at all frequencies, compared with the other places"
-        state, seen = reference.at(levels.speed_rad_s)
-        if not seen:  # at another speed much is otherwise
-            return ""
+                more = f"{wrong[1]:.2f} times as much at all frequencies, compared with the other places"
+                found = f"gain of {own}: {more}"
+        if found or not seen:  # at another speed much is otherwise
+            return found
         kurtosis, twice = levels.random_kurtosis, [one.limit("x2") for one in judged]
         grown = [limits.text for limits in twice if limits and limits.text and not limits.absolute]
         if grown or kurtosis is None:
             return next(iter(grown), "")
         n_errors = _ERRORS_OF_DOUBT if named else ERRORS
-        found = [
+        departures = [
             (self._departure(levels, column, state, n_errors), one)
             for column, one in enumerate(self._channels)
             if one.name in state.kurtosis
         ]
-        most, channel = max(found, key=lambda one: abs(one[0]), default=(0.0, None))
+        most, channel = max(departures, key=lambda one: abs(one[0]), default=(0.0, None))
         if channel is None or not most:
             return ""
         healthy = state.kurtosis[channel.name].mean
@@ -150,6 +154,23 @@ class LevelJudge:
         return (
             f"a vibration at {channel.name} ({channel.location} {channel.direction}) that is {how}: kurtosis of its "
             f"random part {healthy + most:.2f}, {healthy:.2f} on the healthy machine"
+        )
+
+    def _contact(self, levels: WindowLevels, state: OperatingState) -> str:
+        """Where the shaft is pushed back far out, as it was not on the healthy machine; empty if nowhere."""
+        looked = [
+            (departure(levels.contact[:, column], healthy, BEYOND_RANGE, _ERRORS_OF_CONTACT), healthy.mean, pair)
+            for pair in self._plan.pairs
+            for column in pair
+            if levels.contact is not None and (healthy := state.contact.get(self._channels[column].name)) is not None
+        ]
+        most, mean, pair = max(looked, default=(0.0, 0.0, (0, 0)))
+        if most <= 0:
+            return ""
+        y, z = (self._channels[column] for column in pair)
+        return (
+            f"a shaft at {y.name} and {z.name} ({y.location}) that is pushed back where it is far out, as by a rub or "
+            f"a stop: by {mean + most:.1f} standard errors of a hop, {mean:.1f} on the healthy machine"
         )
 
     def _departure(self, levels: WindowLevels, column: int, state: OperatingState, n_errors: float) -> float:

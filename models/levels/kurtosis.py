@@ -30,8 +30,8 @@ def random_kurtosis(square: FloatArray, fourth: FloatArray, lines: npt.NDArray[n
     return np.asarray(found, dtype=np.float64)
 
 
-class KurtosisReference(BaseModel):
-    """That of one channel in the healthy windows."""
+class HopReference(BaseModel):
+    """What a channel's hops have in the healthy windows: kurtosis, or contact (`models.levels.contact`)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -41,16 +41,16 @@ class KurtosisReference(BaseModel):
     range: float = Field(ge=0, allow_inf_nan=False)  # largest distance of a window's mean from `mean`
 
 
-def learn_kurtosis(windows: Sequence[FloatArray]) -> KurtosisReference | None:
-    """Learn a channel's from the hops of healthy windows; None where the lines are not known, or of a single hop."""
+def learn_hops(windows: Sequence[FloatArray], least_scatter: float = 0.0) -> HopReference | None:
+    """Learn a channel's from the hops of healthy windows; None where it is not known, or of a single hop."""
     values = np.concatenate(windows)
     if values.size < 2 or not np.all(np.isfinite(values)):
         return None
     means = [window.mean() for window in windows]
     mean = float(values.mean())
-    return KurtosisReference(
+    return HopReference(
         mean=mean,
-        scatter=float(values.std(ddof=1)),
+        scatter=max(least_scatter, float(values.std(ddof=1))),
         hops=values.size,
         range=float(np.max(np.abs(np.array(means) - mean))),
     )
@@ -110,14 +110,14 @@ def _steady(power: FloatArray, freedom: FloatArray) -> npt.NDArray[np.bool_]:
     return np.asarray(found < _STEADIER**2 * noise)
 
 
-def without_lines(healthy: KurtosisReference) -> KurtosisReference:
+def without_lines(healthy: HopReference) -> HopReference:
     """The same if it is below that of noise because of a line, and this has gone: noise alone scatters more."""
     share = min(1.0, np.sqrt(max(0.0, (GAUSSIAN - healthy.mean) / 1.5)))  # of the power
     scatter = healthy.scatter / max(1 - share, 0.1) ** 2
     return healthy.model_copy(update={"mean": GAUSSIAN, "scatter": float(scatter)})
 
 
-def departure(hops: FloatArray, reference: KurtosisReference, beyond_range: float, n_errors: float) -> float:
+def departure(hops: FloatArray, reference: HopReference, beyond_range: float, n_errors: float) -> float:
     """Difference from the healthy mean, of the newest half of a window or of all of it; 0 within its limit.
 
     It has to hold without the hop that departs most: one in which the level steps, or the machine stops, holds two

@@ -53,11 +53,15 @@ _SUMS = (
     "peak_to_peak",
     "fourth",
     "radius",
+    "contact",
     "mean_square",
     "velocity_square",
     "high_square",
     "envelope_square",
 )
+CONTACT = _SUMS.index("contact")
+"""Row of `HopLevels.sums`."""
+_SQUARES = slice(6, None)  # mean squares, of which a root is shown
 _HIGH_HZ = 1000.0
 NYQUIST_PART = 0.8
 """Part of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
@@ -166,10 +170,11 @@ class HopLevels:
     Attributes
     ----------
     n_samples : int
-    sums : ndarray, shape (9, n)
+    sums : ndarray, shape (10, n)
         Mean, largest deviation from it, peak to peak, fourth moment, at the first channel of a pair the largest
-        distance from the mean position; mean square about the mean, mean square velocity in the band, mean squares of
-        the high-frequency band and of its envelope about its mean. Nan where a quantity has none.
+        distance from the mean position; at the two of a pair what `models.levels.contact` gives, where it is looked
+        for; mean square about the mean, mean square velocity in the band, mean squares of the high-frequency band and
+        of its envelope about its mean. Nan where a quantity has none.
     orders : ndarray of complex, shape (4, n)
         q of x = Re{q e^{jkθ}} for the orders k of `ORDERS`; nan without a rotation. At half running speed its angle
         means nothing: the shaft angle is known to a whole turn.
@@ -237,7 +242,7 @@ def hop_levels(
     square, peak = x * x, np.maximum(high - mean, mean - low)
     sums = np.full((len(_SUMS), n), np.nan)
     sums[:4] = mean, peak, high - low, np.vecdot(square, square) / n_samples
-    sums[5] = rms**2
+    sums[6] = rms**2
     # Strong lines must not leak into the low end of a band, where integration would magnify them.
     taper, scale = hann_taper(n_samples)
     # In parts of the peak single precision is enough, and quicker.
@@ -255,10 +260,10 @@ def hop_levels(
     between = power * np.add.reduceat(parts[:, : 2 * cuts[-1]], 2 * cuts[:-1], axis=1)
     bands = np.add.reduceat(between[:, : edges[-1]], edges[:-1], axis=1)
     if (velocities := plan.columns(Quantity.VELOCITY)).size:
-        sums[6, velocities] = np.add.reduce(between[:, first:last], axis=1)[velocities]
+        sums[7, velocities] = np.add.reduce(between[:, first:last], axis=1)[velocities]
     if (accelerations := plan.columns(Quantity.ACCELERATION)).size:
         band = slice(cuts[first], cuts[last])
-        sums[6:, accelerations] = power[accelerations, 0] * _acceleration_squares(
+        sums[7:, accelerations] = power[accelerations, 0] * _acceleration_squares(
             plan, spectrum[accelerations], parts[accelerations], band, n_samples
         )
     for (y, z), skew in zip(plan.pairs, plan.skew, strict=True):
@@ -324,6 +329,8 @@ class WindowLevels:
     bands : BandLevels or None
     moments : tuple of ndarray, or None
         Of each hop, what `random_kurtosis` is made of, and the mean squares in the bands.
+    contact : ndarray, shape (n_hops, n), or None
+        Of each hop, see `models.levels.contact`.
     """
 
     values: Mapping[str, FloatArray]
@@ -333,6 +340,7 @@ class WindowLevels:
     hops: int = 1
     bands: BandLevels | None = None
     moments: tuple[FloatArray, FloatArray, _ComplexArray, FloatArray] | None = None
+    contact: FloatArray | None = None
 
     @property
     def random_kurtosis(self) -> FloatArray | None:
@@ -385,7 +393,7 @@ def window_levels(
         amplitudes[1] = np.where(plan.runout == 0, amplitudes[1], np.abs(vectors[1]))
     # Peak to peak is a mean of the hops, what is rms that of the whole window.
     average = _mean(sums)
-    square = average[5] + _mean((sums[:, 0] - average[0]) ** 2)
+    square = average[6] + _mean((sums[:, 0] - average[0]) ** 2)
     peak = np.maximum.reduce(sums[:, 1])
     with np.errstate(divide="ignore", invalid="ignore"):
         values = {
@@ -395,7 +403,7 @@ def window_levels(
             "not_x1": np.sqrt(np.maximum(square - measured_1x**2 / 2, 0.0)),
             "mean": np.where(displacements, average[0], np.nan),
             "crest": peak / np.sqrt(square),
-            "kurtosis": average[3] / average[5] ** 2,
+            "kurtosis": average[3] / average[6] ** 2,
         }
     edges_hz, freedom = _band_grid(plan.rate_hz, hops[0].n_samples, count)
     bands = BandLevels(
@@ -404,8 +412,8 @@ def window_levels(
         np.sqrt(in_bands).std(axis=0) / np.sqrt(max(1, count - 1)) if errors else None,
         freedom,
     )
-    moments = sums[:, 5], sums[:, 3], every_order[:, 1:], in_bands
-    return WindowLevels(values, scatter, vectors, speed_rad_s, count, bands, moments)
+    moments = sums[:, 6], sums[:, 3], every_order[:, 1:], in_bands
+    return WindowLevels(values, scatter, vectors, speed_rad_s, count, bands, moments, sums[:, CONTACT])
 
 
 def _mean(values: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
@@ -417,7 +425,7 @@ def _mean(values: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
 def _compared(plan: LevelPlan, sums: FloatArray) -> dict[str, FloatArray]:
     """Levels but for the orders, of a window or of each hop, of sums as those of `HopLevels`."""
     accelerations = plan.has(Quantity.ACCELERATION)
-    rms, velocity, high, envelope = np.sqrt(sums[5:])
+    rms, velocity, high, envelope = np.sqrt(sums[_SQUARES])
     return {
         "overall": np.where(
             plan.has(Quantity.DISPLACEMENT, Quantity.TILT), sums[2], np.where(accelerations, rms, velocity)

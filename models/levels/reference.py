@@ -12,8 +12,9 @@ from models.checkpoint import checked, texts
 from models.errors import CheckpointError
 from models.levels.bands import BandLevels, BandReference, learn_bands
 from models.levels.gains import GainReference
-from models.levels.kurtosis import KurtosisReference, learn_kurtosis
+from models.levels.kurtosis import HopReference, learn_hops
 from models.levels.measures import COMPARED, WindowLevels
+from models.signals.block import FloatArray
 
 _STORED = ConfigDict(extra="forbid", frozen=True, strict=True)
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -50,7 +51,8 @@ class OperatingState(BaseModel):
     hops: float = Field(ge=1)  # mean number of hops in a window
     # By channel.
     bands: dict[str, BandReference] = {}
-    kurtosis: dict[str, KurtosisReference] = Field(default={}, exclude_if=lambda found: not found)
+    kurtosis: dict[str, HopReference] = Field(default={}, exclude_if=lambda found: not found)
+    contact: dict[str, HopReference] = Field(default={}, exclude_if=lambda found: not found)
 
 
 class LevelReference(BaseModel):
@@ -124,7 +126,7 @@ def _speed(levels: WindowLevels) -> float:
 def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingState:
     speeds = [one.speed_rad_s for one in group if one.speed_rad_s is not None]
     bands = [one.bands for one in group if one.bands is not None]
-    kurtosis = [one.random_kurtosis for one in group if one.random_kurtosis is not None]
+    kurtosis, contact = [one.random_kurtosis for one in group], [one.contact for one in group]
     return OperatingState(
         windows=len(group),
         speed_rad_s=(min(speeds), max(speeds)) if speeds else None,
@@ -136,12 +138,20 @@ def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingS
         bands={
             channel: learn_bands(bands, column) for column, channel in enumerate(channels) if len(bands) == len(group)
         },
-        kurtosis={
-            channel: learned
-            for column, channel in enumerate(channels)
-            if len(kurtosis) == len(group) and (learned := learn_kurtosis([one[:, column] for one in kurtosis]))
-        },
+        kurtosis=_hops(channels, kurtosis),
+        contact=_hops(channels, contact, least_scatter=1.0),  # as theory says
     )
+
+
+def _hops(
+    channels: Sequence[str], windows: Sequence[FloatArray | None], least_scatter: float = 0.0
+) -> dict[str, HopReference]:
+    """By channel what its hops have, of those of which every window tells it."""
+    known = [one for one in windows if one is not None]
+    if len(known) < len(windows):
+        return {}
+    learned = [learn_hops([one[:, column] for one in known], least_scatter) for column in range(len(channels))]
+    return {channel: one for channel, one in zip(channels, learned, strict=True) if one is not None}
 
 
 def _reference(name: str, column: int, levels: Sequence[WindowLevels]) -> ReferenceLevel | None:
@@ -207,8 +217,8 @@ class FirstWindows:
         if not self.learning or start_ns < self._end_ns or (before is not None and not self._started(before, levels)):
             return
         self._end_ns = end_ns
-        # Only diagnosis needs a healthy kurtosis, and a machine that is diagnosed is commissioned.
-        self._seen.append(replace(levels, moments=None))
+        # Only diagnosis needs a healthy kurtosis or contact, and a machine that is diagnosed is commissioned.
+        self._seen.append(replace(levels, moments=None, contact=None))
         if len(self._seen) == self._count:
             learned, self._seen = learn_levels(self._source, self._channels, self._seen), []
             states = (*(() if before is None else before.states), *learned.states)

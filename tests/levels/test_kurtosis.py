@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models.levels.judgement import LevelJudge
-from models.levels.kurtosis import KurtosisReference, departure, learn_kurtosis
+from models.levels.kurtosis import HopReference, departure, learn_hops
 from models.levels.measures import LevelPlan, WindowLevels, hop_levels, level_plan, window_levels
 from models.levels.reference import learn_levels
 from models.levels.settings import LevelSettings
@@ -62,11 +62,11 @@ def test_what_clips_is_below_and_what_knocks_above() -> None:
 def test_without_a_known_rotation_nothing_is_said() -> None:
     found = kurtosis(noise(4), turning=False)
     assert np.all(np.isnan(found))
-    assert learn_kurtosis([found]) is None
+    assert learn_hops([found]) is None
 
 
-def reference() -> KurtosisReference:
-    learned = learn_kurtosis([kurtosis(noise(10 + n) + 2 * np.cos(THETA)) for n in range(5)])
+def reference() -> HopReference:
+    learned = learn_hops([kurtosis(noise(10 + n) + 2 * np.cos(THETA)) for n in range(5)])
     assert learned is not None
     return learned
 
@@ -152,7 +152,7 @@ def test_a_rub_is_told_beside_a_line_that_begins() -> None:
 
 
 def test_less_will_do_to_doubt_what_else_was_found() -> None:
-    healthy = KurtosisReference(mean=3.0, scatter=0.1, hops=1000, range=0.0)
+    healthy = HopReference(mean=3.0, scatter=0.1, hops=1000, range=0.0)
     by_five_errors = np.full(HOPS, 3.0 - 5 * 0.1 / np.sqrt(HOPS))
     assert departure(by_five_errors, healthy, 1.25, 6.0) == 0.0
     assert departure(by_five_errors, healthy, 1.25, 4.0) == pytest.approx(-0.144, abs=1e-3)

@@ -82,15 +82,16 @@ def test_another_speed_is_not_evaluable_here_and_raises_nothing_but_levels() -> 
     assert all("commissioned at another speed" in event.alarm.note for event in events)
 
 
-def test_a_rub_is_told_and_what_it_is_taken_for_is_named_with_reserve() -> None:
+@pytest.mark.parametrize(("clearance_m", "size"), [(4e-5, 2.0), (8e-5, 0.5)], ids=["heavy", "light"])
+def test_a_rub_is_told_and_what_it_is_taken_for_is_named_with_reserve(clearance_m: float, size: float) -> None:
     scenario, machine = load_scenario("healthy")
     rubbing = scenario.model_copy(
-        update={"rub": Rub(clearance_m=4e-5), "events": (Event(at_s=0.0, anomaly="rub", size=2.0),)}
+        update={"rub": Rub(clearance_m=clearance_m), "events": (Event(at_s=0.0, anomaly="rub", size=size),)}
     ).overridden(duration_s=66.0, seed=SEED + 7)
     windows, events = feed(MachineMonitor(installed()), [block for block, _ in blocks(rubbing, machine)])
-    assert "clipped, as by a rub" in full(windows)[-1].suspect
+    assert "(disc) that is pushed back where it is far out, as by a rub" in full(windows)[-1].suspect
     raised = {event.alarm.name: event.alarm for event in events}
-    assert "clipped, as by a rub" in raised[MODEL].note
+    assert "as by a rub" in raised[MODEL].note
     named = [alarm for name, alarm in raised.items() if name in PARAMETERS]
     assert all(alarm.low_confidence for alarm in named)
     # Its size would be a danger, were it one of that parameter.
