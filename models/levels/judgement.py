@@ -33,7 +33,7 @@ from models.signals.channels import Channel, Quantity
 from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth, LevelLimits
 
 _ERRORS_OF_CONTACT = 5.0
-"""A contact is on one side alone, and Gaussian in theory: fewer of them are as seldom by chance as six elsewhere."""
+"""A contact is on one side alone, and Gaussian in theory: five are seldom enough."""
 _ERRORS_OF_DOUBT = 4.0
 """Where it decides whether to believe what else has been found, not whether anything has happened."""
 _TURNED_OUT = "1x vector"
@@ -170,7 +170,7 @@ class LevelJudge:
         y, z = (self._channels[column] for column in pair)
         return (
             f"a shaft at {y.name} and {z.name} ({y.location}) that is pushed back where it is far out, as by a rub or "
-            f"a stop: by {mean + most:.1f} standard errors of a hop, {mean:.1f} on the healthy machine"
+            f"a stop: {mean + most:.1f} standard errors in a mean hop, {mean:.1f} on the healthy machine"
         )
 
     def _departure(self, levels: WindowLevels, column: int, state: OperatingState, n_errors: float) -> float:

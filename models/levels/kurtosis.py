@@ -3,6 +3,8 @@
 No change of stiffness, damping or unbalance makes the random part of a vibration anything but Gaussian. A rub or a stop
 clips it, and its kurtosis falls; what knocks, like a loose part or a damaged raceway, lifts it (ISO 13373-3). Cumulants
 of independent parts add up: a line of amplitude a takes 3/8 a⁴ from the fourth one.
+
+What is learned of healthy hops here, and how far later ones depart from it, serves `models.levels.contact` as well.
 """
 
 from collections.abc import Sequence
@@ -41,7 +43,7 @@ class HopReference(BaseModel):
     range: float = Field(ge=0, allow_inf_nan=False)  # largest distance of a window's mean from `mean`
 
 
-def learn_hops(windows: Sequence[FloatArray], least_scatter: float = 0.0) -> HopReference | None:
+def learn_hops(windows: Sequence[FloatArray]) -> HopReference | None:
     """Learn a channel's from the hops of healthy windows; None where it is not known, or of a single hop."""
     values = np.concatenate(windows)
     if values.size < 2 or not np.all(np.isfinite(values)):
@@ -50,7 +52,7 @@ def learn_hops(windows: Sequence[FloatArray], least_scatter: float = 0.0) -> Hop
     mean = float(values.mean())
     return HopReference(
         mean=mean,
-        scatter=max(least_scatter, float(values.std(ddof=1))),
+        scatter=float(values.std(ddof=1)),
         hops=values.size,
         range=float(np.max(np.abs(np.array(means) - mean))),
     )

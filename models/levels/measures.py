@@ -172,9 +172,9 @@ class HopLevels:
     n_samples : int
     sums : ndarray, shape (10, n)
         Mean, largest deviation from it, peak to peak, fourth moment, at the first channel of a pair the largest
-        distance from the mean position; at the two of a pair what `models.levels.contact` gives, where it is looked
-        for; mean square about the mean, mean square velocity in the band, mean squares of the high-frequency band and
-        of its envelope about its mean. Nan where a quantity has none.
+        distance from the mean position; at the two of a pair the two numbers of `models.levels.contact`, where it is
+        looked for; mean square about the mean, mean square velocity in the band, mean squares of the high-frequency
+        band and of its envelope about its mean. Nan where a quantity has none.
     orders : ndarray of complex, shape (4, n)
         q of x = Re{q e^{jkθ}} for the orders k of `ORDERS`; nan without a rotation. At half running speed its angle
         means nothing: the shaft angle is known to a whole turn.

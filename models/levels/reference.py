@@ -139,18 +139,20 @@ def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingS
             channel: learn_bands(bands, column) for column, channel in enumerate(channels) if len(bands) == len(group)
         },
         kurtosis=_hops(channels, kurtosis),
-        contact=_hops(channels, contact, least_scatter=1.0),  # as theory says
+        contact={
+            # As theory says; and no push outwards, which is made by something else, hides one inwards.
+            name: one.model_copy(update={"mean": max(0.0, one.mean), "scatter": max(1.0, one.scatter)})
+            for name, one in _hops(channels, contact).items()
+        },
     )
 
 
-def _hops(
-    channels: Sequence[str], windows: Sequence[FloatArray | None], least_scatter: float = 0.0
-) -> dict[str, HopReference]:
+def _hops(channels: Sequence[str], windows: Sequence[FloatArray | None]) -> dict[str, HopReference]:
     """By channel what its hops have, of those of which every window tells it."""
     known = [one for one in windows if one is not None]
     if len(known) < len(windows):
         return {}
-    learned = [learn_hops([one[:, column] for one in known], least_scatter) for column in range(len(channels))]
+    learned = [learn_hops([one[:, column] for one in known]) for column in range(len(channels))]
     return {channel: one for channel, one in zip(channels, learned, strict=True) if one is not None}
 
 

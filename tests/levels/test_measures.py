@@ -237,7 +237,7 @@ def test_levels_are_the_same_by_the_spectrum_that_the_moments_have() -> None:
     moments = hop_moments(plan, np.column_stack([seen, theta % (2 * np.pi)]), 0.9 * gap, 0).levels
     alone = hop_levels(plan.levels, *waveform_of(seen[-plan.hop :]), theta[-plan.hop :])
     assert moments is not None
-    both = (np.delete(one.sums, CONTACT, axis=0) for one in (moments, alone))  # which is looked for by the moments
-    assert next(both) == pytest.approx(next(both), rel=1e-5, abs=0, nan_ok=True)
+    alone.sums[CONTACT] = moments.sums[CONTACT]  # which only the moments look for
+    assert moments.sums == pytest.approx(alone.sums, rel=1e-5, abs=0, nan_ok=True)
     assert moments.bands == pytest.approx(alone.bands, rel=1e-4, abs=0)
     assert moments.orders[1:] == pytest.approx(alone.orders[1:], rel=1e-4, abs=1e-8)
