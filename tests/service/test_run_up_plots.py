@@ -272,8 +272,12 @@ def without_angle(path: Path, signals: Signals, seconds: float) -> Path:
 def test_without_a_keyphasor_the_speed_is_found_in_the_vibration_and_there_is_no_phase(tmp_path: Path) -> None:
     """1× of 20 µm in noise, from 15 to 30 Hz; the noise alone is no rotation."""
     noise = np.random.default_rng(3).normal(size=round(60 * RATE_HZ))
-    signals: Signals = {"y2": lambda t: noise[: t.size] + 20 * np.cos(2 * np.pi * (15 * t + 0.125 * t**2))}
-    data = recorded(without_angle(tmp_path / "plain.mcap", signals, 60.0))
+
+    def rising(t: FloatArray) -> FloatArray:
+        turned = 15 * t + 0.125 * t**2
+        return np.asarray(noise[: t.size] + 20 * np.cos(2 * np.pi * turned))
+
+    data = recorded(without_angle(tmp_path / "plain.mcap", {"y2": rising}, 60.0))
     channels = data.channels(["y2"])
     with pytest.raises(MachineFileError, match="without it vibration has no phase, and the speed"):
         read_run_up(data, channels, 1, 8)

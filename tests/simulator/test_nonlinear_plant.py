@@ -66,11 +66,12 @@ def _contact(friction: float) -> Callable[[float, FloatArray], FloatArray]:
     k = 0.5 * 3 * LAB.rotor.EI_N_m2 / LAB.rotor.shaft_length_m**3
 
     def force(_: float, x: FloatArray) -> FloatArray:
-        out, radius = np.zeros(6), float(np.hypot(x[1], x[4]))
+        out, y, z = np.zeros(6), float(x[1]), float(x[4])
+        radius = float(np.hypot(y, z))
         if radius > CLEARANCE_M:
             normal = k * (radius - CLEARANCE_M)
-            out[1] = -normal * (x[1] - friction * x[4]) / radius
-            out[4] = -normal * (x[4] + friction * x[1]) / radius
+            out[1] = -normal * (y - friction * z) / radius
+            out[4] = -normal * (z + friction * y) / radius
         return out
 
     return force
