@@ -1,5 +1,6 @@
 """Processes that share the machines of a monitor: the same answers, one that is killed, and what cannot be shared."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -41,6 +42,7 @@ from tests.service.live import (
     worker_of,
 )
 from tests.service.monitored import OPEN, answered, client, problem
+from tests.service.preloaded import CONTEXT
 
 SECONDS = 45.0
 NAMES = ("lab", "pump")
@@ -49,6 +51,12 @@ PATHS = (
     "/orbits?revolutions=4", "/correlations", "/waveforms", "/full-spectra", "/waterfalls",
     "/readings?quantity=parameter&name=k_by",
 )  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes are forked off one that has imported everything; a monitor that is a program starts them as ever."""
+    monkeypatch.setattr("service.runtime.processes.multiprocessing.get_context", lambda _: CONTEXT)
 
 
 def plan_for(folder: Path, count: int | None, address: str | None = None) -> ServiceSettings:
@@ -141,13 +149,13 @@ def test_operators_and_listeners_reach_a_machine_of_another_process(tmp_path: Pa
         assert [one.state for one in states.alarms if one.name == "k_by"] == ["acknowledged"]
 
 
-def children(of: int = 0) -> list[int]:
-    """Processes that a process has started, this one by default, and that run."""
+def children(of: int) -> list[int]:
+    """Processes that a program has started, and that run."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         state, parent = stat.read_text(encoding="utf-8").rsplit(")", 1)[1].split()[:2]
         command = (stat.parent / "cmdline").read_bytes()
-        if int(parent) == (of or os.getpid()) and state != "Z" and b"spawn_main" in command:
+        if int(parent) == of and state != "Z" and b"spawn_main" in command:
             found.append(int(stat.parent.name))
     return sorted(found)
 
@@ -196,8 +204,9 @@ def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -
         assert lab.status().tally.blocks == 440  # what was counted is no less for that
         os.close(held[0])
         until(lambda: bool(http.get("/readyz").is_success), "a new process")
-        assert second in children()
-        assert len(children()) == 2
+        started = [one.pid for one in multiprocessing.active_children()]
+        assert second in started
+        assert len(started) == 2
         until(lambda: lab.health().restart.startswith("went on"), "that it goes on from where it stood")
         assert pump.health().restart == ""
         for block in blocks[440:]:
@@ -287,7 +296,7 @@ def test_a_machine_that_cannot_be_monitored_is_named(tmp_path: Path) -> None:
     failed = Runtime(plan.model_copy(update={"machines": (plan.machines[0], broken)}))
     with pytest.raises(BundleError, match="nothing: not a bundle"):
         failed.start()
-    assert children() == []
+    assert multiprocessing.active_children() == []
 
 
 def test_a_shard_that_takes_nothing_is_cut_off_before_machines_of_others_are_called_silent() -> None:
