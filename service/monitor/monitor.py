@@ -453,10 +453,11 @@ class MachineMonitor:
         whole = self._test.settings.window_hops
         looks[whole] = stretch_of(evaluation.deciding, start_ns, end_ns)
         verdict = self._test.update(looks, foreign=foreign != "")
-        self._alarms.found(verdict, self._test.unexplained, evaluation.deciding.suspect, end_ns)
+        unexplained = evaluation.deciding.unexplained
+        suspect = foreign if unexplained else evaluation.deciding.suspect
+        self._alarms.found(verdict, self._test.unexplained, suspect, end_ns)
         explained = bool(verdict.changed) and not verdict.outside_model
         self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=explained)
-        unexplained = evaluation.deciding.unexplained
         reason = evaluation.reason(told=bool(verdict.current))
         if evaluation.shapes:
             changed, evidence = evaluation.unlike_healthy, Evidence(start_ns=start_ns, end_ns=end_ns)
@@ -472,7 +473,7 @@ class MachineMonitor:
             equations=evaluation.equations,
             opinions=evaluation.opinions,
             misfit_z=evaluation.deciding.misfit_z,
-            suspect=evaluation.deciding.suspect if verdict.outside_model and not unexplained else "",
+            suspect=suspect if verdict.outside_model else "",
             verdict=verdict,
             sensors=findings,
             detectable=() if unexplained else detectable_changes(look, self._test.thresholds(whole), length_s),

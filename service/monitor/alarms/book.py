@@ -150,7 +150,7 @@ class AlarmBook:
                 danger=any(change > limits.danger_above for change, limits in changes),
             )
         if verdict.current or unexplained:
-            note = unexplained or (f"best explained by: {suspect}" if suspect else "")
+            note = "; ".join(filter(None, (unexplained, suspect and f"best explained by: {suspect}")))
             outside = verdict.outside_model
             self.update_state(MODEL, outside, end_ns, note, evidence=evidence)
 
