@@ -1,7 +1,9 @@
 """What several modules of tests of the service ask for by the same name; a module may still say its own."""
 
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from service.history.store import Store
 from tests.service.guarded import Guarded, guarded
 from tests.service.postgres import KINDS, database_url, opened
+from tests.service.preloaded import Piped
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -37,3 +40,10 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 def store(url: str) -> Iterator[Store]:
     with opened(url) as made:
         yield made
+
+
+@pytest.fixture
+def replays_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replays that a service of this process starts need import nothing first, see `tests.service.preloaded`."""
+    started = SimpleNamespace(**{**vars(subprocess), "Popen": Piped})
+    monkeypatch.setattr("service.recordings.replay.jobs.subprocess", started)

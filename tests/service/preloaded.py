@@ -11,7 +11,10 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import IO
 
 from tests.service.hosts import move_to
 
@@ -40,7 +43,10 @@ class Preloaded:
         network: str = "",
     ) -> None:
         self.args = arguments
-        self._process = CONTEXT.Process(target=_run, args=(arguments, cwd, out, err, environment, network))
+        self._begin(arguments, cwd, (Path(os.devnull), out, err), environment, network)
+
+    def _begin(self, *arguments: object) -> None:
+        self._process = CONTEXT.Process(target=_run, args=arguments)
         self._process.start()
 
     @property
@@ -80,6 +86,24 @@ class Preloaded:
         self.send_signal(signal.SIGKILL)
 
 
+class Piped(Preloaded):
+    """The same in a session of its own, with pipes, as a service starts ``PYTHON -m ARGUMENTS`` for a replay."""
+
+    def __init__(
+        self, command: Sequence[str], *, stdin: int, stdout: int, stderr: IO[bytes], start_new_session: bool
+    ) -> None:
+        assert stdin == stdout == subprocess.PIPE
+        assert start_new_session
+        self.args = tuple(command[2:])
+        orders, to_it = CONTEXT.Pipe(duplex=False)
+        from_it, lines = CONTEXT.Pipe(duplex=False)
+        self.stdin: IO[bytes] = os.fdopen(os.dup(to_it.fileno()), "wb")
+        self.stdout: IO[bytes] = os.fdopen(os.dup(from_it.fileno()), "rb")
+        self._begin(self.args, Path.cwd(), (orders, lines, Path(stderr.name)), dict(os.environ))
+        for end in (orders, to_it, from_it, lines):
+            end.close()
+
+
 def ran(
     *arguments: str | Path, cwd: Path = _ROOT, environment: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
@@ -106,15 +130,26 @@ def rotorwatch(*arguments: str | Path, **environment: str) -> subprocess.Complet
 
 
 def _run(
-    arguments: tuple[str, ...], cwd: Path, out: Path, err: Path, environment: dict[str, str], network: str
+    arguments: tuple[str, ...],
+    cwd: Path,
+    ends: tuple[Path | Connection, ...],
+    environment: dict[str, str],
+    network: str = "",
 ) -> None:
     gc.freeze()  # looking through what is shared would copy it
     if network:
         move_to(network)
-    for number, path in ((0, os.devnull), (1, out), (2, err)):
-        opened = os.open(path, os.O_RDWR | os.O_APPEND)
-        os.dup2(opened, number)
-        os.close(opened)
+    for number, end in enumerate(ends):
+        if isinstance(end, Connection):
+            os.dup2(end.fileno(), number)
+            end.close()
+        else:
+            opened = os.open(end, os.O_RDWR | os.O_APPEND)
+            os.dup2(opened, number)
+            os.close(opened)
+    if isinstance(ends[0], Connection):
+        os.setsid()
+        sys.stdin = open(0, encoding="utf-8", closefd=False)  # noqa: SIM115  # which `multiprocessing` has closed
     os.chdir(cwd)
     os.environ.clear()
     os.environ.update(environment)

@@ -20,6 +20,7 @@ from tests.service.replaying import recording
 
 ID = "demo/lab/20260101T000000Z.mcap"
 SECONDS, FAULT_S = 80.0, 30.0
+pytestmark = pytest.mark.usefixtures("replays_at_once")
 # A slow network: the first order to move takes longer than everything ordered after it.
 _LATE_FIRST_SEEK = """() => {
     const ask = window.fetch;

@@ -31,6 +31,7 @@ SECONDS, FAULT_S = 60.0, 25.0
 GAP = range(303, 306)
 NAME = "20260101T000000Z.mcap"
 REPLAYS = "/api/v1/replays"
+pytestmark = pytest.mark.usefixtures("replays_at_once")
 
 
 @pytest.fixture(scope="module")

@@ -65,7 +65,7 @@ def runtime(directory: Path) -> Iterator[Runtime]:
 
 
 @pytest.fixture
-def client(runtime: Runtime) -> Iterator[httpx.Client]:
+def client(runtime: Runtime, replays_at_once: None) -> Iterator[httpx.Client]:
     with monitored.client(runtime) as opened:
         yield opened
 
