@@ -48,7 +48,12 @@ def chromium() -> Iterator[Browser]:
         pytest.skip(f"no browser: ROTORWATCH_CHROMIUM is not set, and none of {', '.join(NAMES)} is there")
     with (
         sync_playwright() as playwright,
-        playwright.chromium.launch(executable_path=path, args=FLAGS, timeout=PATIENCE_MS) as found,
+        playwright.chromium.launch(
+            executable_path=Path(__file__).with_name("chromium"),
+            args=FLAGS,
+            env={**os.environ, "ROTORWATCH_CHROMIUM": path},
+            timeout=PATIENCE_MS,
+        ) as found,
     ):
         expect.set_options(timeout=PATIENCE_MS)  # of every test of this process, whichever is the first
         yield found
