@@ -21,6 +21,8 @@ _FAR_OUT = (0.02, 0.15)
 """Parts of the samples: a light contact is seen best in the first, one that is there in every turn in the second."""
 _LEAST = 1000
 """Samples: of less, hardly any are far out."""
+_FITTED = 4
+"""One of so many samples is enough to fit what predicts the next one."""
 _NOTHING = 1e-6
 """Of the largest distance: less is what numbers are rounded to."""
 _PER_TURN, _LEAST_HZ = 64, 1000.0
@@ -69,10 +71,10 @@ def contact(pair: FloatArray, turning: FloatArray, revolutions: float, rate_hz: 
     pushes = [(np.sqrt(limit / np.maximum(far, max(limit, _NOTHING**2))) - 1) * now for limit in limits]
     orders = np.stack([angle, angle * angle, angle * angle * angle])
     known = np.concatenate([np.ones((1, far.size)), orders.real, orders.imag, *latest, square * now])
-    rows = np.concatenate([known, x[:, first + 1 :], *pushes])
-    sums, n = known @ rows.T, len(known)
-    predicted, *_ = np.linalg.lstsq(sums[:, :n], sums[:, n:], rcond=1e-12)
-    left = rows[n:] - predicted.T @ known  # the remainder, and what is left of the pushes
+    wanted = np.concatenate([x[:, first + 1 :], *pushes])
+    fitted, to = (np.ascontiguousarray(one[:, ::_FITTED]) for one in (known, wanted))
+    predicted, *_ = np.linalg.lstsq(fitted @ fitted.T, fitted @ to.T, rcond=1e-12)
+    left = wanted - predicted.T @ known  # the remainder, and what is left of the pushes
     scale = np.sqrt(np.mean(left[:2] ** 2, axis=1))
     together = left[0] / max(scale[0], _NOTHING) * left[2::2] + left[1] / max(scale[1], _NOTHING) * left[3::2]
     # By their own squares: what shakes the machine may be louder while the shaft is far out.
