@@ -29,7 +29,7 @@ standard error of 1/(2√(BT)) (J. S. Bendat, A. G. Piersol, "Random Data", 4th 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -74,7 +74,7 @@ _ComplexArray = npt.NDArray[np.complex128]
 _Number = TypeVar("_Number", np.float64, np.complex128)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class LevelPlan:
     """Which levels a machine's channels have.
 
@@ -106,23 +106,25 @@ class LevelPlan:
         end_hz = NYQUIST_PART * self.rate_hz / 2
         return (_HIGH_HZ, end_hz) if end_hz >= 2 * _HIGH_HZ else None
 
-    def columns(self, *quantities: Quantity) -> npt.NDArray[np.intp]:
-        """Columns of some quantities."""
-        return _columns(self.quantities, quantities)[0]
+    @cached_property
+    def displacements(self) -> npt.NDArray[np.bool_]:
+        """Which columns are displacements or tilts."""
+        return np.isin(self.quantities, (Quantity.DISPLACEMENT, Quantity.TILT))
 
-    def has(self, *quantities: Quantity) -> npt.NDArray[np.bool_]:
-        """Whether each column is of one of some quantities."""
-        return _columns(self.quantities, quantities)[1]
+    @cached_property
+    def velocities(self) -> npt.NDArray[np.bool_]:
+        """Which columns are velocities."""
+        return np.isin(self.quantities, Quantity.VELOCITY)
 
+    @cached_property
+    def accelerations(self) -> npt.NDArray[np.bool_]:
+        """Which columns are accelerations."""
+        return np.isin(self.quantities, Quantity.ACCELERATION)
 
-@lru_cache(maxsize=64)
-def _columns(
-    every: tuple[Quantity, ...], wanted: tuple[Quantity, ...]
-) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
-    has = np.array([one in wanted for one in every], dtype=np.bool_)
-    (columns,) = has.nonzero()
-    columns.flags.writeable = has.flags.writeable = False
-    return columns, has
+    @cached_property
+    def shown(self) -> FloatArray:
+        """What an amplitude is times, to be shown: peak to peak of displacements, rms of others."""
+        return np.where(self.displacements, 2.0, np.sqrt(0.5))
 
 
 def level_plan(
@@ -259,9 +261,8 @@ def hop_levels(
     power = (scale * amplitude**2)[:, None]
     between = power * np.add.reduceat(parts[:, : 2 * cuts[-1]], 2 * cuts[:-1], axis=1)
     bands = np.add.reduceat(between[:, : edges[-1]], edges[:-1], axis=1)
-    if (velocities := plan.columns(Quantity.VELOCITY)).size:
-        sums[7, velocities] = np.add.reduce(between[:, first:last], axis=1)[velocities]
-    if (accelerations := plan.columns(Quantity.ACCELERATION)).size:
+    sums[7, plan.velocities] = np.add.reduce(between[:, first:last], axis=1)[plan.velocities]
+    if (accelerations := plan.accelerations).any():
         band = slice(cuts[first], cuts[last])
         sums[7:, accelerations] = power[accelerations, 0] * _acceleration_squares(
             plan, spectrum[accelerations], parts[accelerations], band, n_samples
@@ -378,14 +379,12 @@ def window_levels(
         if phase_reference:
             vectors = _mean(orders)
             amplitudes[1:] = np.abs(vectors[1:])
-    displacements = plan.has(Quantity.DISPLACEMENT, Quantity.TILT)
-    shown = np.where(displacements, 2.0, np.sqrt(0.5))
     scatter: dict[str, FloatArray] = {}
     if errors:
         root = np.sqrt(max(1, count - 1))
         by_hop = _compared(plan, sums.swapaxes(0, 1))
         scatter = {name: each.std(axis=0) / root for name, each in by_hop.items()}
-        scatter |= dict(zip(ORDERS, shown * _order_errors(orders, vectors), strict=True))
+        scatter |= dict(zip(ORDERS, plan.shown * _order_errors(orders, vectors), strict=True))
     measured_1x = amplitudes[1]
     if plan.runout is not None and vectors is not None and speed_rad_s is not None:
         vectors, amplitudes = vectors.copy(), amplitudes.copy()
@@ -398,10 +397,10 @@ def window_levels(
     with np.errstate(divide="ignore", invalid="ignore"):
         values = {
             **_compared(plan, average),
-            **dict(zip(ORDERS, shown * amplitudes, strict=True)),
+            **dict(zip(ORDERS, plan.shown * amplitudes, strict=True)),
             "peak": peak,
             "not_x1": np.sqrt(np.maximum(square - measured_1x**2 / 2, 0.0)),
-            "mean": np.where(displacements, average[0], np.nan),
+            "mean": np.where(plan.displacements, average[0], np.nan),
             "crest": peak / np.sqrt(square),
             "kurtosis": average[3] / average[6] ** 2,
         }
@@ -424,13 +423,10 @@ def _mean(values: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
 
 def _compared(plan: LevelPlan, sums: FloatArray) -> dict[str, FloatArray]:
     """Levels but for the orders, of a window or of each hop, of sums as those of `HopLevels`."""
-    accelerations = plan.has(Quantity.ACCELERATION)
     rms, velocity, high, envelope = np.sqrt(sums[_SQUARES])
     return {
-        "overall": np.where(
-            plan.has(Quantity.DISPLACEMENT, Quantity.TILT), sums[2], np.where(accelerations, rms, velocity)
-        ),
-        "velocity": np.where(accelerations, velocity, np.nan),
+        "overall": np.where(plan.displacements, sums[2], np.where(plan.accelerations, rms, velocity)),
+        "velocity": np.where(plan.accelerations, velocity, np.nan),
         "s_max": sums[4],
         "high": high,
         "envelope": envelope,

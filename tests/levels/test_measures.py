@@ -179,7 +179,7 @@ def test_a_band_ends_where_the_sampling_rate_ends_it() -> None:
     sizes = plan("velocity", "acceleration", rate_hz=1000.0)
     assert sizes.band_hz == (10.0, 400.0)
     assert sizes.high_hz is None
-    assert sizes.columns(Quantity.ACCELERATION).tolist() == [1]
+    assert sizes.accelerations.tolist() == [False, True]
     found = taken(sizes, np.random.default_rng(85).standard_normal((5000, 2))).values
     assert np.isnan(found["high"]).all()
 
