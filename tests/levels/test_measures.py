@@ -7,7 +7,7 @@ from models.diagnosis.moments import hop_moments, plan_for
 from models.levels.measures import CONTACT, LevelPlan, WindowLevels, hop_levels, level_plan, window_levels
 from models.machine import load_machine
 from models.signals.block import FloatArray
-from models.signals.channels import Channel, Quantity
+from models.signals.channels import Channel
 from models.signals.waveform import waveform_of
 
 RATE_HZ = 25_600.0
