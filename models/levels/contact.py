@@ -9,8 +9,13 @@ This is a score test of an autoregressive model against one with another regime 
 "Non-linear Time Series", Oxford 1990, chapter 5).
 """
 
-import numpy as np
+from collections import deque
+from collections.abc import Mapping
 
+import numpy as np
+import numpy.typing as npt
+
+from models.checkpoint import checked
 from models.signals.block import FloatArray
 
 _LAGS = (0, 2, 4, 8, 16, 64, 128)
@@ -25,6 +30,7 @@ _FITTED = 4
 """One of so many samples is enough to fit what predicts the next one."""
 _NOTHING = 1e-6
 """Of the largest distance: less is what numbers are rounded to."""
+_Hop = npt.NDArray[np.float32]  # written with every hop
 _PER_TURN, _LEAST_HZ = 64, 1000.0
 """Sampled faster than both, neighbours are averaged: between them a force hardly moves the shaft."""
 
@@ -82,3 +88,49 @@ def contact(pair: FloatArray, turning: FloatArray, revolutions: float, rate_hz: 
     if min(scale.min(), np.sqrt(limits.min())) < _NOTHING or errors.min() == 0:
         return np.full(len(_FAR_OUT), np.nan)
     return np.asarray(together.sum(axis=1) / errors, dtype=np.float64)
+
+
+class LatestContact:
+    """What the latest hops have of a contact, of more than a window: a light one takes minutes to stand out.
+
+    Parameters
+    ----------
+    hops : int
+        Of how many.
+    """
+
+    def __init__(self, hops: int) -> None:
+        self._hops: deque[_Hop] = deque(maxlen=hops)
+        self._state = 0
+
+    def take(self, hop: FloatArray, state: int) -> FloatArray:
+        """Go on with a hop, shape (n,), in the operating state of this number; those of another are forgotten.
+
+        Returns
+        -------
+        ndarray, shape (n_hops, n)
+        """
+        if state != self._state:
+            self._hops.clear()
+        self._state = state
+        self._hops.append(hop.astype(np.float32))
+        return np.array(self._hops, dtype=np.float64)
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything as named arrays."""
+        hops = np.stack(self._hops) if self._hops else np.empty((0, 0), np.float32)
+        return {"contact": hops, "contact_state": np.array(self._state, dtype=np.int64)}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called.
+
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form.
+        """
+        hops, state = (
+            checked(arrays, "contact", np.float32, (None, None)),
+            checked(arrays, "contact_state", np.int64, ()),
+        )
+        self._hops, self._state = deque(hops, self._hops.maxlen), int(state)

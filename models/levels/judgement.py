@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from models.levels.bands import Growth, growth
+from models.levels.contact import LatestContact
 from models.levels.gains import place_of, wrong_gain
 from models.levels.kurtosis import GAUSSIAN, departure, fallen_by_lines, without_lines
 from models.levels.limits import (
@@ -34,6 +35,8 @@ from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth
 
 _ERRORS_OF_CONTACT = 5.0
 """A contact is on one side alone, and Gaussian in theory: five are seldom enough."""
+_STILL = 0.3
+"""Part of what several windows show that the newest one has to show, or the contact is over."""
 _ERRORS_OF_DOUBT = 4.0
 """Where it decides whether to believe what else has been found, not whether anything has happened."""
 _TURNED_OUT = "1x vector"
@@ -110,7 +113,13 @@ class LevelJudge:
         )
 
     def foreign(
-        self, levels: WindowLevels, judged: Sequence[ChannelLevels], reference: LevelReference | None, *, named: bool
+        self,
+        levels: WindowLevels,
+        judged: Sequence[ChannelLevels],
+        reference: LevelReference | None,
+        latest: LatestContact,
+        *,
+        named: bool,
     ) -> str:
         """What the levels of a window show that no change of a parameter makes; empty if nothing.
 
@@ -121,13 +130,15 @@ class LevelJudge:
         ----------
         judged : sequence of ChannelLevels
             What `judge` says of them.
+        latest : LatestContact
+            Of the hops before the latest one, with which it goes on.
         named : bool
             Whether a parameter has been found to have changed, which this would cast doubt on.
         """
         if reference is None:
             return ""
         state, seen = reference.at(levels.speed_rad_s)
-        found = self._contact(levels, state) if seen else ""
+        found = self._contact(levels, state, latest, reference.states.index(state)) if seen else ""
         if not found and reference.gains is not None and levels.bands is not None:
             wrong = wrong_gain(levels.bands, [place_of(one) for one in self._channels], reference.gains)
             if wrong is not None:
@@ -156,14 +167,22 @@ class LevelJudge:
             f"random part {healthy + most:.2f}, {healthy:.2f} on the healthy machine"
         )
 
-    def _contact(self, levels: WindowLevels, state: OperatingState) -> str:
+    def _contact(self, levels: WindowLevels, state: OperatingState, latest: LatestContact, number: int) -> str:
         """Where the shaft is pushed back far out, as it was not on the healthy machine; empty if nowhere."""
-        looked = [
-            (departure(levels.contact[:, column], healthy, BEYOND_RANGE, _ERRORS_OF_CONTACT), healthy.mean, pair)
-            for pair in self._plan.pairs
-            for column in pair
-            if levels.contact is not None and (healthy := state.contact.get(self._channels[column].name)) is not None
-        ]
+        columns = [(column, pair) for pair in self._plan.pairs for column in pair]
+        if levels.contact is None or not columns:
+            return ""
+        window = levels.contact[:, [column for column, _ in columns]]
+        looked, several = [], latest.take(window[-1], number)
+        for at, (column, pair) in enumerate(columns):
+            if (healthy := state.contact.get(self._channels[column].name)) is None:
+                continue
+            now, lasting = (
+                departure(hops[:, at], healthy, BEYOND_RANGE, _ERRORS_OF_CONTACT) for hops in (window, several)
+            )
+            if window[:, at].mean() - healthy.mean > _STILL * lasting:
+                now = max(now, lasting)
+            looked.append((now, healthy.mean, pair))
         most, mean, pair = max(looked, default=(0.0, 0.0, (0, 0)))
         if most <= 0:
             return ""

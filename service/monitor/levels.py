@@ -2,14 +2,17 @@
 
 import hashlib
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
+
+import numpy as np
 
 from models.alarm_names import LEVEL
 from models.commissioning.commissioned import Installed
 from models.diagnosis.lines import new_line, steady_lines
 from models.diagnosis.moments import Plan
 from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.levels.contact import LatestContact
 from models.levels.judgement import LevelJudge, channel_state, fallen
 from models.levels.measures import WindowLevels
 from models.levels.reference import FirstWindows, LevelReference
@@ -25,6 +28,7 @@ _DEPENDS_ON: Any = {
     "levels": {"band_hz", "reference", "reference_windows", "reference_since"},
 }
 """Of a machine file: what levels of first windows depend on. They outlast any other change, and another program."""
+_WINDOWS_OF_CONTACT = 4
 _STILL_RAD = 0.1
 """Less than this in a hop is no turning: an encoder may waver. The slowest kilns turn further."""
 
@@ -43,8 +47,6 @@ class LevelWatch:
     ----------
     latest : tuple of ChannelLevels
         Of the latest window; empty before the first hop.
-    first : FirstWindows
-        What is remembered: the first windows, where they are the reference.
     """
 
     def __init__(self, plan: Plan, machine: MachineFile, installed: Installed) -> None:
@@ -58,13 +60,14 @@ class LevelWatch:
         self._by_angle = plan.angle_column is not None
         turns = self._by_angle or plan.speed_rad_s is not None
         given = machine.levels
-        self.first = FirstWindows(
+        self._first = FirstWindows(
             [one.name for one in channels],
             given.reference_windows,
             turns=turns,
             since=given.reference_since,
             of=hashlib.sha256(machine.model_dump_json(include=_DEPENDS_ON).encode()).hexdigest()[:16],
         )
+        self._contact = LatestContact(_WINDOWS_OF_CONTACT * plan.hops)
         self.latest: tuple[ChannelLevels, ...] = ()
         self._found: WindowLevels | None = None
         self._states = [state_name(channel) for channel in channels]
@@ -74,7 +77,7 @@ class LevelWatch:
     @property
     def reference(self) -> LevelReference | None:
         """What relative limits refer to; None while there is nothing."""
-        return self.first.reference if self._takes_first else self._commissioned
+        return self._first.reference if self._takes_first else self._commissioned
 
     def judged(self, levels: WindowLevels) -> tuple[ChannelLevels, ...]:
         """Levels, channel by channel, against what limits there are."""
@@ -82,14 +85,14 @@ class LevelWatch:
 
     def take(self, window: SlidingWindow) -> None:
         """Take the levels of the window as it is after a hop."""
-        found = window.levels(errors=self._takes_first and self.first.learning)
+        found = window.levels(errors=self._takes_first and self._first.learning)
         if found is None:
             return
         self.latest = self.judged(found)
         self._found = found
         stood = any(abs(hop.turned_rad) < _STILL_RAD for hop in window.hops)  # not where there is no angle: nan
         if self._takes_first and window.filled == 1 and not stood:
-            self.first.take(window.hops[0].start_ns, window.hops[-1].end_ns, found)
+            self._first.take(window.hops[0].start_ns, window.hops[-1].end_ns, found)
 
     def foreign(self, window: SlidingWindow, statistics: WindowStatistics, *, named: bool) -> str:
         """What the latest window shows that no change of a parameter makes: a new line, or see `LevelJudge.foreign`."""
@@ -105,7 +108,28 @@ class LevelWatch:
                     "a neighbouring machine, whirl or looseness"
                 )
                 return with_channel_names(text, self._machine.sensors)
-        return self._judge.foreign(self._found, self.latest, self.reference, named=named)
+        return self._judge.foreign(self._found, self.latest, self.reference, self._contact, named=named)
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """What is remembered, as named arrays: the first windows, and what the latest hops had of a contact."""
+        return {**self._first.checkpoint(), **self._contact.checkpoint()}
+
+    def restore(self, arrays: Mapping[str, np.ndarray], *, first_alone: bool) -> None:
+        """Go on where `checkpoint` was called.
+
+        Parameters
+        ----------
+        first_alone : bool
+            With nothing but the first windows, which outlast a commissioning.
+
+        Raises
+        ------
+        CheckpointError
+            If the arrays are damaged, or of other channels.
+        """
+        self._first.restore(arrays)
+        if not first_alone:
+            self._contact.restore(arrays)
 
     def tell(
         self,

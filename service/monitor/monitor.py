@@ -316,7 +316,7 @@ class MachineMonitor:
             **prefixed("window", self._window.checkpoint(whole=whole)),
             **prefixed("test", self._test.state.checkpoint()),
             **prefixed("evaluator", self._evaluator.checkpoint()),
-            **prefixed("levels", self._levels.first.checkpoint()),
+            **prefixed("levels", self._levels.checkpoint()),
             **prefixed("standstill", self._standstill.checkpoint()),
             "calm": np.array([self._calm.value]),
             "end_ns": np.array([] if self.end_ns is None else [self.end_ns], dtype=np.int64),
@@ -336,7 +336,7 @@ class MachineMonitor:
             If the bytes are damaged or of another form; this monitor is of no use then.
         """
         arrays, hops = joined(state, parts)
-        self._levels.first.restore(unprefixed("levels", arrays))
+        self._levels.restore(unprefixed("levels", arrays), first_alone=levels_alone)
         if levels_alone:
             return
         test = SequentialState.restored(unprefixed("test", arrays), hops)

@@ -3,8 +3,14 @@
 import numpy as np
 import pytest
 
-from models.levels.contact import contact
+from models.levels.contact import LatestContact, contact
+from models.levels.judgement import LevelJudge
+from models.levels.kurtosis import HopReference
+from models.levels.measures import WindowLevels, level_plan
+from models.levels.reference import LevelReference, OperatingState
+from models.levels.settings import LevelSettings
 from models.signals.block import FloatArray
+from tests.levels.test_measures import channel
 
 N, SPEED_HZ, MODE_HZ = 10_000, 22.0, 31.0
 COUNT = 24  # realisations of each, five seconds at 2 kHz
@@ -81,3 +87,69 @@ def test_it_is_not_known_where_nothing_can_be_told(change: str) -> None:
     angle = 0.07 * np.arange(pair.shape[1])
     found = contact(pair, np.stack([np.cos(angle), np.sin(angle)]), 0.07 * pair.shape[1] / (2 * np.pi), 2000.0)
     assert np.all(np.abs(found) < 4.5) if change == "copied" else np.all(np.isnan(found))
+
+
+WINDOW, LATEST = 12, 48
+PAIR = [channel("displacement", way) for way in "yz"]
+HEALTHY = HopReference(mean=0.0, scatter=1.0, hops=144, range=0.5)
+
+
+def heard(hops: FloatArray, *, faster: int | None = None, stop: int | None = None) -> list[int]:
+    """After how many hops, each of the two numbers of a pair, a contact is told; shape (n_hops, 2).
+
+    Parameters
+    ----------
+    faster : int, optional
+        After how many the machine runs at another of its speeds.
+    stop : int, optional
+        After how many another monitor goes on.
+    """
+    contacts = {one.name: HEALTHY for one in PAIR}
+    slow, fast = (
+        OperatingState(windows=12, speed_rad_s=(speed, speed), levels={}, hops=WINDOW, contact=contacts)
+        for speed in (100.0, 200.0)
+    )
+    reference = LevelReference(source="commissioned", states=(slow, fast))
+    judge, latest = LevelJudge(level_plan(PAIR, 2000.0, (10.0, 1000.0)), PAIR, LevelSettings()), LatestContact(LATEST)
+    found = []
+    for end in range(WINDOW, len(hops) + 1):
+        speed_rad_s = 100.0 if faster is None or end <= faster else 200.0
+        levels = WindowLevels({}, {}, None, speed_rad_s, WINDOW, contact=hops[end - WINDOW : end])
+        if end == stop:
+            arrays, latest = latest.checkpoint(), LatestContact(LATEST)
+            latest.restore(arrays)
+        if judge.foreign(levels, (), reference, latest, named=False):
+            found.append(end)
+    return found
+
+
+def hops_of(seed: int, before: int, touching: int, after: int = 0, *, size: float = 1.4) -> FloatArray:
+    found = np.random.default_rng(seed).standard_normal((before + touching + after, 2))
+    found[before : before + touching, 0] += size
+    return found
+
+
+def test_a_light_contact_is_told_after_some_minutes_and_stays_told() -> None:
+    for seed in range(20261201, 20261211):
+        assert set(range(24 + LATEST, 24 + 97)) <= set(heard(hops_of(seed, 24, 96)))
+        assert not heard(hops_of(seed, 960, 0))
+
+
+def test_one_hop_is_no_contact_and_one_that_is_over_is_told_no_more() -> None:
+    once = hops_of(20261211, 120, 0)
+    once[60] += 100.0
+    assert not heard(once)
+    over = heard(hops_of(20261212, 24, 24, 96, size=10.0))
+    assert over
+    assert max(over) < 24 + 24 + WINDOW
+
+
+def test_a_monitor_that_goes_on_knows_the_hops_before() -> None:
+    light = hops_of(20261213, 24, 96)
+    assert heard(light, stop=90) == heard(light)
+
+
+def test_hops_of_another_operating_state_do_not_count() -> None:
+    light = hops_of(20261214, 24, 96)
+    assert not set(heard(light, faster=100)) & set(range(101, 107))
+    assert set(range(101, 107)) <= set(heard(light))

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
+from models.levels.contact import LatestContact
 from models.levels.judgement import LevelJudge
 from models.levels.kurtosis import HopReference, departure, learn_hops
 from models.levels.measures import LevelPlan, WindowLevels, hop_levels, level_plan, window_levels
@@ -98,7 +99,7 @@ def suspects(meshes: Sequence[float], healthy_mesh: float, spoilt: Callable[[Flo
     found, judge = [], LevelJudge(PLAN, [Y], LevelSettings())
     for number, mesh in enumerate(meshes):
         levels = window(spoilt(samples(60160 + number, mesh)))
-        found.append(judge.foreign(levels, judge.judge(levels, healthy), healthy, named=False))
+        found.append(judge.foreign(levels, judge.judge(levels, healthy), healthy, LatestContact(4), named=False))
     return found
 
 
