@@ -35,6 +35,8 @@ from simulator.training.draws import draw_condition
 CONDITIONS = 3
 _HEALTHY, AFTER = 4.1, 2.5
 """Windows of a healthy recording, and of a stream after its fault has begun."""
+_RUBBING = 6.0
+"""Windows of a stream after a rub has begun: a light one is told by four."""
 _BEFORE_S = 10.0
 """Healthy, once the window is full, or the first windows that a machine is compared with that is not commissioned."""
 _BLOCK_S = 0.5
@@ -83,7 +85,8 @@ class Subject:
 
     def faulty(self, at: int, name: str, change: Change) -> Iterator[SampleBlock]:
         """Stream `at`, in one of the conditions, in which something begins; of its name a rub or crack is made."""
-        rotor, seen = self._moved(self.condition(at), 2 + at, self.begins_s + AFTER * self._window_s, name)
+        lasts_s = (_RUBBING if name in RUBS else AFTER) * self._window_s
+        rotor, seen = self._moved(self.condition(at), 2 + at, self.begins_s + lasts_s, name)
         seen = self.always(rotor, seen, self._rng(2))
         changed = change(rotor, seen, self._rng(1, at))
         first = round(self.begins_s * rotor.rate_hz)
