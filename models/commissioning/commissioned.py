@@ -319,6 +319,12 @@ class Installed:
         return self.commissioned is None and self.known is None
 
     @property
+    def knows_contact(self) -> bool:
+        """Whether a contact can be told, see `models.levels.contact`: what the healthy machine has of it is known."""
+        levels = None if self.commissioned is None else self.commissioned.levels
+        return levels is not None and any(state.contact for state in levels.states)
+
+    @property
     def identity(self) -> str | None:
         """Changes with anything that was trained or commissioned; None where there is neither."""
         parts = [part.identity for part in (self.bundle, self.commissioned) if part is not None]
