@@ -27,7 +27,7 @@ from service.api.routes.session import add_session_routes
 from service.api.routes.snapshots import add_snapshot_routes
 from service.api.routes.tokens import add_token_routes
 from service.api.samples import SampleReader
-from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
+from service.api.views import PLACE, InPath, ServiceView
 from service.stream.monitored import NoAnswerError
 
 _DESCRIPTION = """Health of rotating machines: which parameter changed, by how much, how sure.
@@ -91,6 +91,7 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
         docs_url=None,  # the usual pages load their scripts from elsewhere; `add_docs_routes` does not
         redoc_url=None,
     )
+    app.state.service = service
     add_problems(app)
 
     @app.exception_handler(NoAnswerError)
@@ -101,8 +102,8 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     add_history_routes(app, service, guard)
     add_operation_routes(app, service, guard)
     reader = SampleReader(service)
-    add_snapshot_routes(app, service, reader, guard)
-    add_plot_routes(app, service, reader, guard)
+    add_snapshot_routes(app, reader, guard)
+    add_plot_routes(app, reader, guard)
     add_event_routes(app, service, guard)
     add_recording_routes(app, service.catalogue, guard)
     add_replay_routes(app, service.replays, guard)
@@ -126,27 +127,26 @@ def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         return MachineList(machines=tuple(machine.description() for machine in service.machines()))
 
     @app.get(PLACE, responses=responses(MachineDescription, 404, 422), **common)
-    def machine(site: SiteName, machine: MachineName) -> MachineDescription:
+    def machine(view: InPath) -> MachineDescription:
         """One machine: stream, channels, keys, state."""
-        return found_machine(service, site, machine).description()
+        return view.description()
 
     @app.get(f"{PLACE}/configuration", responses=responses(MachineConfiguration, 404, 422, shown=lab), **common)
-    def configuration(site: SiteName, machine: MachineName) -> MachineConfiguration:
+    def configuration(view: InPath) -> MachineConfiguration:
         """The machine file as it is in use, defaults filled in, and what was trained or commissioned for it."""
-        view = found_machine(service, site, machine)
         return MachineConfiguration(
             **view.identity, file=MachineFile.model_validate(view.machine.model_dump()).model_dump(mode="json")
         )
 
     @app.get(f"{PLACE}/health", responses=responses(Health, 404, 422), **common)
-    def health(site: SiteName, machine: MachineName) -> Health:
+    def health(view: InPath) -> Health:
         """Where a machine stands: state, report of the latest window, alarms, quality of the data."""
-        return found_machine(service, site, machine).health()
+        return view.health()
 
     @app.get(f"{PLACE}/detectable", responses=responses(DetectableChanges, 404, 422), **common)
-    def detectable(site: SiteName, machine: MachineName, change: _Change = None) -> DetectableChanges:
+    def detectable(view: InPath, change: _Change = None) -> DetectableChanges:
         """Smallest changes that would be found in a window as the machine runs now, and the data a wished one takes."""
-        return found_machine(service, site, machine).detectable(change)
+        return view.detectable(change)
 
 
 def _add_readiness_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:

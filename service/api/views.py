@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from typing import Annotated, Protocol
 
-from fastapi import HTTPException, Path, Query
+from fastapi import Depends, HTTPException, Path, Query, Request
 from pydantic import AfterValidator
 
 from models.alarm_names import ALARMS, LEVEL, is_alarm
@@ -74,3 +74,11 @@ def found_machine(service: ServiceView, site: str, name: str) -> Monitored:
         known = ", ".join(f"{one.machine.site}/{one.machine.name}" for one in service.machines())
         raise HTTPException(404, f"no machine {site[:64]}/{name[:64]}; there are: {known}")
     return machine
+
+
+async def _in_path(request: Request, site: SiteName, machine: MachineName) -> Monitored:
+    return found_machine(request.app.state.service, site, machine)
+
+
+InPath = Annotated[Monitored, Depends(_in_path)]
+"""The machine that the path of a request names."""

@@ -28,6 +28,7 @@ from service.access.problems import responses
 from service.api.views import (
     PLACE,
     AlarmName,
+    InPath,
     Limit,
     MachineName,
     ServiceView,
@@ -84,8 +85,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
         f"{PLACE}/alarms/events", responses=responses(AlarmEventList, 404, 422), response_model=AlarmEventList, **common
     )
     def alarm_events(
-        site: SiteName,
-        machine: MachineName,
+        view: InPath,
         after: _After = None,
         before: _Before = None,
         since_ns: SinceNs = None,
@@ -96,8 +96,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
         limit: Limit = 100,
     ) -> Response:
         """What happened to alarms, as CloudEvents: newest first, or with `after` oldest first, as followers want it."""
-        history = found_machine(service, site, machine).history
-        found = history.events(
+        found = view.history.events(
             after=after,
             before=before,
             since_ns=since_ns,
@@ -140,24 +139,17 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
 
     @app.get(f"{PLACE}/reports", responses=responses(ReportList, 404, 422), response_model=ReportList, **common)
     def reports(
-        site: SiteName,
-        machine: MachineName,
-        before: _Before = None,
-        since_ns: SinceNs = None,
-        until_ns: UntilNs = None,
-        limit: Limit = 100,
+        view: InPath, before: _Before = None, since_ns: SinceNs = None, until_ns: UntilNs = None, limit: Limit = 100
     ) -> Response:
         """Window reports, the latest to arrive first; since_ns and until_ns are about the window's end."""
-        history = found_machine(service, site, machine).history
-        found = history.reports(since_ns=since_ns, until_ns=until_ns, before=before, limit=limit)
+        found = view.history.reports(since_ns=since_ns, until_ns=until_ns, before=before, limit=limit)
         return _listed(
             "reports", [one.text for _, one in found], next_before=found[-1][0] if len(found) == limit else None
         )
 
     @app.get(f"{PLACE}/readings", responses=responses(ReadingList, 404, 422), response_model=ReadingList, **common)
     def readings(
-        site: SiteName,
-        machine: MachineName,
+        view: InPath,
         quantity: _Quantity = "parameter",
         name: _Names = [],  # noqa: B006  # never changed
         since_ns: SinceNs = None,
@@ -167,7 +159,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
         limit: Limit = 1000,
     ) -> ReadingList | Response:
         """Parameters, residuals and measures over time: one by one, or with `points` for a plot of any length."""
-        history = found_machine(service, site, machine).history
+        history = view.history
         names = name or [quantity] if quantity in MEASURES else name
         if points is not None:
             if after is not None:

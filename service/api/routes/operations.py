@@ -14,7 +14,7 @@ from service.access.audit import AuditNote
 from service.access.guard import Guard
 from service.access.problems import responses
 from service.access.scopes import Caller
-from service.api.views import PLACE, AlarmName, MachineName, ServiceView, SiteName, found_machine
+from service.api.views import PLACE, AlarmName, InPath, MachineName, ServiceView, SiteName, found_machine
 from service.monitor.alarm_conversion import alarm_entries
 from service.monitor.alarms.alarm import Alarm as AlarmRecord
 from service.monitor.alarms.operation import (
@@ -75,15 +75,14 @@ def _add_reading_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
 
     @app.get(f"{PLACE}/alarms", responses=responses(AlarmStates, 404, 422), **common)
     def alarms(
-        site: SiteName,
-        machine: MachineName,
+        view: InPath,
         state: Annotated[list[AlarmState], Query(description="only in this state; may be repeated")] = [],  # noqa: B006  # never changed
         name: Annotated[list[AlarmName], Query(description="only this one; may be repeated")] = [],  # noqa: B006
         raised: Annotated[bool, Query(description="only those that are raised")] = False,
         all_: Annotated[bool, Query(alias="all", description="normal ones as well")] = False,
     ) -> AlarmStates:
         """Alarms that are not normal, or those that are asked for."""
-        states = found_machine(service, site, machine).alarms(include_normal=all_ or bool(state or name))
+        states = view.alarms(include_normal=all_ or bool(state or name))
         chosen = (
             one
             for one in states.alarms

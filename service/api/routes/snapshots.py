@@ -20,7 +20,7 @@ from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
 from service.api.samples import ChosenWindow, SampleReader
-from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
+from service.api.views import PLACE, InPath
 
 _MOST = 64
 _SAMPLES_HOLD_S = 1.0
@@ -86,7 +86,7 @@ class WindowAnswers:
         return oldest_ns > kept.newest_ns
 
 
-def add_snapshot_routes(app: FastAPI, service: ServiceView, reader: SampleReader, guard: Guard) -> None:
+def add_snapshot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
     """Add the routes."""
 
     @app.exception_handler(SnapshotError)
@@ -103,24 +103,18 @@ def add_snapshot_routes(app: FastAPI, service: ServiceView, reader: SampleReader
         **common,
     )
     def correlations(
-        site: SiteName,
-        machine: MachineName,
-        chosen: ChosenWindow,
-        first: _First = _NONE,
-        second: _Second = _NONE,
-        units: _Units = "channel",
+        view: InPath, chosen: ChosenWindow, first: _First = _NONE, second: _Second = _NONE, units: _Units = "channel"
     ) -> Response:
         """Correlation functions of the latest window, or one that was recorded, and theory; a few pairs by default."""
-        shown, data = reader.window(found_machine(service, site, machine), chosen)
-        asked = ("correlations", site, machine, chosen, tuple(first), tuple(second), units)
+        shown, data = reader.window(view, chosen)
+        asked = ("correlations", view, chosen, tuple(first), tuple(second), units)
         return answers.of(asked, data, lambda: shown.correlations(data, first, second, units))
 
     @app.get(
         f"{PLACE}/spectra", responses=responses(SpectrumSnapshot, 404, 422), response_model=SpectrumSnapshot, **common
     )
     def spectra(
-        site: SiteName,
-        machine: MachineName,
+        view: InPath,
         chosen: ChosenWindow,
         channel: _Channels = _NONE,
         first: _First = _NONE,
@@ -130,23 +124,18 @@ def add_snapshot_routes(app: FastAPI, service: ServiceView, reader: SampleReader
         units: _Units = "channel",
     ) -> Response:
         """Power spectral densities of the latest window, or one that was recorded, cross-spectra, and theory."""
-        view = found_machine(service, site, machine)
         band = None if from_hz is None and to_hz is None else (from_hz or 0.0, 1e6 if to_hz is None else to_hz)
         if band is not None and not band[0] < band[1]:
             raise HTTPException(422, f"to_hz: {band[1]:g} is not above from_hz {band[0]:g}")
         shown, data = reader.window(view, chosen)
-        asked = ("spectra", site, machine, chosen, tuple(channel), tuple(first), tuple(second), band, units)
+        asked = ("spectra", view, chosen, tuple(channel), tuple(first), tuple(second), band, units)
         return answers.of(asked, data, lambda: shown.spectra(data, channel, first, second, band, units))
 
     @app.get(f"{PLACE}/orbits", responses=responses(OrbitSnapshot, 404, 422), response_model=OrbitSnapshot, **common)
     def orbits(
-        site: SiteName,
-        machine: MachineName,
-        chosen: ChosenWindow,
-        revolutions: _Revolutions = 0,
-        units: _Units = "channel",
+        view: InPath, chosen: ChosenWindow, revolutions: _Revolutions = 0, units: _Units = "channel"
     ) -> Response:
         """Orbits at running speed of the latest window, or one that was recorded, and revolutions as measured."""
-        shown, data = reader.window(found_machine(service, site, machine), chosen)
-        asked = ("orbits", site, machine, chosen, revolutions, units)
+        shown, data = reader.window(view, chosen)
+        asked = ("orbits", view, chosen, revolutions, units)
         return answers.of(asked, data, lambda: shown.orbits(data, revolutions, units), of_samples=revolutions > 0)
