@@ -15,9 +15,9 @@ from models.machine import AlarmSettings
 from rotorwatch.records.alarms import AlarmState, EventKind
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.alarms.book import AlarmBook
-from service.monitor.alarms.life_cycle import OWED, REFUSED, STAYS, TABLE, Cell, Happening, follow
+from service.monitor.alarms.life_cycle import OWED, REFUSED, STAYS, TABLE, Cell, follow
 from service.monitor.alarms.operation import (
-    HAPPENINGS,
+    KIND_OF_EVENT,
     OperationConflict,
     OperationRefused,
     OperatorAction,
@@ -56,21 +56,21 @@ def test_the_documentation_shows_the_table() -> None:
     rows = [re.split(r"\s*\|\s*", line.strip("| \n")) for line in text.splitlines() if line.startswith("|")]
     head = next(row for row in rows if row[0] == "what happens")
     shown = {
-        (AlarmState(state), Happening(row[0].strip("`"))): cell.replace("`", "")
+        (AlarmState(state), EventKind(row[0].strip("`"))): cell.replace("`", "")
         for row in rows
-        if row[0].strip("`") in set(Happening)
+        if row[0].strip("`") in set(EventKind)
         for state, cell in zip((name.strip("`") for name in head[1:]), row[1:], strict=True)
     }
     assert shown == {key: written(cell) for key, cell in TABLE.items()}
 
 
-@pytest.mark.parametrize("happening", Happening)
-def test_every_cell_leads_where_it_says(happening: Happening) -> None:
+@pytest.mark.parametrize("kind", EventKind)
+def test_every_cell_leads_where_it_says(kind: EventKind) -> None:
     for state, present, latching in product(AlarmState, (False, True), (False, True)):
-        cell, owed = TABLE[state, happening], AlarmState.LATCHED_ACKNOWLEDGED
-        found = follow(state, happening, present=present, latching=latching, owed=owed)
+        cell, owed = TABLE[state, kind], AlarmState.LATCHED_ACKNOWLEDGED
+        found = follow(state, kind, present=present, latching=latching, owed=owed)
         if isinstance(cell, tuple):
-            wanted = cell[latching if happening is Happening.CLEAR else present]
+            wanted = cell[latching if kind is EventKind.CLEARED else present]
             assert found == (owed if wanted == OWED else wanted), state
         else:
             assert found == {REFUSED: None, STAYS: state}.get(cell, cell), state
@@ -78,17 +78,17 @@ def test_every_cell_leads_where_it_says(happening: Happening) -> None:
 
 def test_what_nobody_asks_for_is_never_refused_and_operators_are_told() -> None:
     """Only what operators ask for can be refused: a condition comes and goes in every state."""
-    asked = {happening for happening, _ in HAPPENINGS.values()}
-    assert {happening for (_, happening), cell in TABLE.items() if cell == REFUSED} <= asked
-    assert set(Happening) - asked == {
-        Happening.CONDITION, Happening.CLEAR, Happening.ESCALATE, Happening.SUPPRESS, Happening.UNSUPPRESS
+    asked = set(KIND_OF_EVENT.values())
+    assert {kind for (_, kind), cell in TABLE.items() if cell == REFUSED} <= asked
+    assert set(EventKind) - asked == {
+        EventKind.RAISED, EventKind.CLEARED, EventKind.ESCALATED, EventKind.SUPPRESSED, EventKind.UNSUPPRESSED
     }  # fmt: skip
 
 
 def test_escalation_opens_the_acknowledgement_again_and_a_new_occurrence_too() -> None:
-    assert TABLE[AlarmState.ACKNOWLEDGED, Happening.ESCALATE] is AlarmState.UNACKNOWLEDGED
+    assert TABLE[AlarmState.ACKNOWLEDGED, EventKind.ESCALATED] is AlarmState.UNACKNOWLEDGED
     for state in (AlarmState.RETURNED, AlarmState.LATCHED_ACKNOWLEDGED, AlarmState.LATCHED_UNACKNOWLEDGED):
-        assert TABLE[state, Happening.CONDITION] is AlarmState.UNACKNOWLEDGED
+        assert TABLE[state, EventKind.RAISED] is AlarmState.UNACKNOWLEDGED
 
 
 # The book
@@ -304,7 +304,7 @@ steps = st.one_of(
     st.tuples(st.just("say"), st.sampled_from(NAMES[2:]), st.booleans()),
     st.tuples(st.just("speed"), st.sampled_from([None, 300.0, 1320.0]), st.none()),
     st.tuples(st.just("wait"), st.sampled_from([1, 20, 4000]), st.none()),
-    st.tuples(st.just("do"), st.sampled_from(NAMES), st.sampled_from(sorted(HAPPENINGS))),
+    st.tuples(st.just("do"), st.sampled_from(NAMES), st.sampled_from(sorted(KIND_OF_EVENT))),
     st.tuples(st.just("shelve once"), st.sampled_from(NAMES), st.none()),
     st.tuples(st.just("restart"), st.none(), st.none()),
     st.tuples(st.just("clock"), st.sampled_from([-(10**5), 10**5]), st.none()),

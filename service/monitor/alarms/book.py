@@ -22,9 +22,9 @@ from models.physics.rotor import PARAMETERS
 from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
 from rotorwatch.records.windows import Verdict
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
-from service.monitor.alarms.life_cycle import Happening, follow, owed_after
+from service.monitor.alarms.life_cycle import follow, owed_after
 from service.monitor.alarms.operation import (
-    HAPPENINGS,
+    KIND_OF_EVENT,
     OperationConflict,
     OperationRefused,
     OperatorAction,
@@ -246,9 +246,9 @@ class AlarmBook:
             because = "; ".join(dict.fromkeys(rule.because for rule in holding))
             alarm = replace(alarm, rules=rules, suppressed_by=because)
             if rules and alarm.state is not AlarmState.SUPPRESSED:
-                events += self._happen(alarm, Happening.SUPPRESS, EventKind.SUPPRESSED, time_ns, reason=because)
+                events += self._happen(alarm, EventKind.SUPPRESSED, time_ns, reason=because)
             elif not rules:
-                events += self._happen(alarm, Happening.UNSUPPRESS, EventKind.UNSUPPRESSED, time_ns)
+                events += self._happen(alarm, EventKind.UNSUPPRESSED, time_ns)
             else:
                 self._alarms[name] = alarm
         return tuple(events)
@@ -295,23 +295,23 @@ class AlarmBook:
             raise UnknownAlarm(f"no alarm {operation.alarm}; there are: {', '.join(ALARMS)}")
         alarm = self._known(operation.alarm, time_ns)
         self._must_be_as_seen(alarm, operation)
-        happening, kind = HAPPENINGS[operation.kind]
-        if follow(alarm.state, happening, present=alarm.present, latching=self._latches(alarm)) is None:
-            hint = " (acknowledge needs an alarm that has been raised)" if happening is Happening.ACKNOWLEDGE else ""
+        kind = KIND_OF_EVENT[operation.kind]
+        if follow(alarm.state, kind, present=alarm.present, latching=self._latches(alarm)) is None:
+            hint = " (acknowledge needs an alarm that has been raised)" if kind is EventKind.ACKNOWLEDGED else ""
             raise OperationRefused(f"{alarm.name} is {alarm.state.value}: {operation.kind} is not possible{hint}")
-        if happening in {Happening.SHELVE, Happening.REMOVE_FROM_SERVICE} and not operation.reason.strip():
+        if kind in {EventKind.SHELVED, EventKind.REMOVED_FROM_SERVICE} and not operation.reason.strip():
             raise OperationRefused(f"{operation.kind} of {alarm.name}: reason is empty, expected why")
-        if happening is Happening.SHELVE:
+        if kind is EventKind.SHELVED:
             alarm = replace(alarm, shelf=self._shelf(operation, time_ns))
-        elif happening is Happening.UNSHELVE:
+        elif kind is EventKind.UNSHELVED:
             return self._unshelve(alarm, time_ns, operation.reason, operation.actor)
-        elif happening is Happening.REMOVE_FROM_SERVICE:
+        elif kind is EventKind.REMOVED_FROM_SERVICE:
             alarm = replace(
                 alarm, shelf=None, out_of_service_by=operation.actor, out_of_service_reason=operation.reason
             )
-        elif happening is Happening.RETURN_TO_SERVICE:
+        elif kind is EventKind.RETURNED_TO_SERVICE:
             alarm = replace(alarm, out_of_service_by="", out_of_service_reason="")
-        events = self._happen(alarm, happening, kind, time_ns, actor=operation.actor, reason=operation.reason)
+        events = self._happen(alarm, kind, time_ns, actor=operation.actor, reason=operation.reason)
         return events + self._suppressed_again(alarm.name, time_ns)
 
     # Surviving a restart
@@ -399,23 +399,21 @@ class AlarmBook:
                 occurrence=alarm.occurrence + 1,
                 beyond_ns=None,
             )
-            return self._happen(alarm, Happening.CONDITION, EventKind.RAISED, time_ns)
+            return self._happen(alarm, EventKind.RAISED, time_ns)
         if small_ns is not None and (at_once or (time_ns - small_ns) / 1e9 >= settings.off_delay_s):
             alarm = replace(alarm, present=False, raised_ns=None, small_ns=None)
-            events = self._happen(alarm, Happening.CLEAR, EventKind.CLEARED, time_ns)
+            events = self._happen(alarm, EventKind.CLEARED, time_ns)
             if alarm.shelf is not None and alarm.shelf.one_shot:
                 events += self._unshelve(self._alarms[alarm.name], time_ns, "the condition has cleared")
             return events
         if alarm.present and danger and alarm.severity is Severity.ALERT:
             alarm = replace(alarm, severity=Severity.DANGER)
-            return self._happen(alarm, Happening.ESCALATE, EventKind.ESCALATED, time_ns)
+            return self._happen(alarm, EventKind.ESCALATED, time_ns)
         self._alarms[alarm.name] = alarm
         return ()
 
     def _unshelve(self, alarm: Alarm, time_ns: int, reason: str, actor: str = "") -> tuple[AlarmEvent, ...]:
-        events = self._happen(
-            replace(alarm, shelf=None), Happening.UNSHELVE, EventKind.UNSHELVED, time_ns, actor=actor, reason=reason
-        )
+        events = self._happen(replace(alarm, shelf=None), EventKind.UNSHELVED, time_ns, actor=actor, reason=reason)
         return events + self._suppressed_again(alarm.name, time_ns)
 
     def _suppressed_again(self, name: str, time_ns: int) -> tuple[AlarmEvent, ...]:
@@ -423,22 +421,22 @@ class AlarmBook:
         alarm = self._alarms[name]
         if not alarm.rules or not alarm.state.annunciated:
             return ()
-        return self._happen(alarm, Happening.SUPPRESS, EventKind.SUPPRESSED, time_ns, reason=alarm.suppressed_by)
+        return self._happen(alarm, EventKind.SUPPRESSED, time_ns, reason=alarm.suppressed_by)
 
     def _happen(
-        self, alarm: Alarm, happening: Happening, kind: EventKind, time_ns: int, *, actor: str = "", reason: str = ""
+        self, alarm: Alarm, kind: EventKind, time_ns: int, *, actor: str = "", reason: str = ""
     ) -> tuple[AlarmEvent, ...]:
         """Follow the life cycle and write the event down."""
         before, latching = alarm.state, self._latches(alarm)
-        state = follow(before, happening, present=alarm.present, latching=latching, owed=alarm.owed)
+        state = follow(before, kind, present=alarm.present, latching=latching, owed=alarm.owed)
         if state is None:
-            raise OperationRefused(f"{alarm.name} is {before.value}: {happening.value} is not possible")
-        if state is before and happening in {Happening.SUPPRESS, Happening.UNSUPPRESS}:
+            raise OperationRefused(f"{alarm.name} is {before.value}: it cannot be {kind.value}")
+        if state is before and kind in {EventKind.SUPPRESSED, EventKind.UNSUPPRESSED}:
             self._alarms[alarm.name] = alarm  # the rule is noted; the operator's own silence outranks it
             return ()
         since_ns = alarm.since_ns if state is before else time_ns
         owed = alarm.owed if state is before else AlarmState.NORMAL
-        if happening is Happening.SUPPRESS:
+        if kind is EventKind.SUPPRESSED:
             owed = owed_after(before, latching=latching)
         alarm = replace(alarm, state=state, since_ns=since_ns, owed=owed, version=self._next_sequence)
         event = AlarmEvent(kind, time_ns, self._next_sequence, alarm, before, actor, reason)

@@ -17,30 +17,12 @@ away; where a rule did, what was owed before is owed still: an acknowledgement, 
 """
 
 from collections.abc import Mapping
-from enum import StrEnum
 from types import MappingProxyType
 
-from rotorwatch.records.alarms import AlarmState
-
-
-class Happening(StrEnum):
-    """What can happen to an alarm."""
-
-    CONDITION = "condition"
-    CLEAR = "clear"
-    ESCALATE = "escalate"
-    ACKNOWLEDGE = "acknowledge"
-    RESET = "reset"
-    SHELVE = "shelve"
-    UNSHELVE = "unshelve"
-    SUPPRESS = "suppress"
-    UNSUPPRESS = "unsuppress"
-    REMOVE_FROM_SERVICE = "remove-from-service"
-    RETURN_TO_SERVICE = "return-to-service"
-
+from rotorwatch.records.alarms import AlarmState, EventKind
 
 STAYS = "stays"
-"""The happening is taken note of, and the state stays as it is."""
+"""What happens is taken note of, and the state stays as it is."""
 
 REFUSED = "refused"
 """Nobody may ask for this in this state."""
@@ -49,29 +31,29 @@ OWED = "as owed"
 """Back to where somebody still has to acknowledge or reset; normal if nobody has to."""
 
 Cell = str | tuple[str, AlarmState]
-"""A state, `STAYS`, `REFUSED`, or two states: for *clear* without and with latching, otherwise without and with the
+"""A state, `STAYS`, `REFUSED`, or two states: for *cleared* without and with latching, otherwise without and with the
 condition there."""
 
 _N, _U, _A, _R = AlarmState.NORMAL, AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED, AlarmState.RETURNED
 _LU, _LA = AlarmState.LATCHED_UNACKNOWLEDGED, AlarmState.LATCHED_ACKNOWLEDGED
-_SH, _SU, _OOS = AlarmState.SHELVED, AlarmState.SUPPRESSED, AlarmState.OUT_OF_SERVICE
-_ROWS: Mapping[Happening, tuple[Cell, ...]] = {
-    # from:              normal   unackn.   ackn.     returned  latched-u latched-a shelved  suppressed out of service
-    Happening.CONDITION: (_U,      STAYS,    STAYS,    _U,       _U,       _U,       STAYS,    STAYS,    STAYS),
-    Happening.CLEAR:     (STAYS,   (_R, _LU), (_N, _LA), STAYS,  STAYS,    STAYS,    STAYS,    STAYS,    STAYS),
-    Happening.ESCALATE:  (STAYS,   STAYS,    _U,       STAYS,    STAYS,    STAYS,    STAYS,    STAYS,    STAYS),
-    Happening.ACKNOWLEDGE: (REFUSED, _A,     REFUSED,  _N,       _LA,      REFUSED,  REFUSED,  REFUSED,  REFUSED),
-    Happening.RESET:     (REFUSED, REFUSED,  REFUSED,  REFUSED,  _R,       _N,       REFUSED,  REFUSED,  REFUSED),
-    Happening.SHELVE:    (_SH,     _SH,      _SH,      _SH,      _SH,      _SH,      STAYS,    REFUSED,  REFUSED),
-    Happening.UNSHELVE:  (REFUSED, REFUSED,  REFUSED,  REFUSED,  REFUSED,  REFUSED,  (_N, _U), REFUSED,  REFUSED),
-    Happening.SUPPRESS:  (_SU,     _SU,      _SU,      _SU,      _SU,      _SU,      STAYS,    STAYS,    STAYS),
-    Happening.UNSUPPRESS: (STAYS,  STAYS,    STAYS,    STAYS,    STAYS,    STAYS,    STAYS,    (OWED, _U), STAYS),
-    Happening.REMOVE_FROM_SERVICE: (_OOS, _OOS, _OOS,  _OOS,     _OOS,     _OOS,     _OOS,     _OOS,     REFUSED),
-    Happening.RETURN_TO_SERVICE: (REFUSED, REFUSED, REFUSED, REFUSED, REFUSED, REFUSED, REFUSED, REFUSED, (_N, _U)),
+_SH, _SU, _OOS, _NO = AlarmState.SHELVED, AlarmState.SUPPRESSED, AlarmState.OUT_OF_SERVICE, REFUSED
+_ROWS: Mapping[EventKind, tuple[Cell, ...]] = {
+    # from:                          normal unackn.    ackn.      ret.   latch. l.ack. shelved   suppr.      out
+    EventKind.RAISED:               (_U,    STAYS,     STAYS,     _U,    _U,    _U,    STAYS,    STAYS,      STAYS),
+    EventKind.CLEARED:              (STAYS, (_R, _LU), (_N, _LA), STAYS, STAYS, STAYS, STAYS,    STAYS,      STAYS),
+    EventKind.ESCALATED:            (STAYS, STAYS,     _U,        STAYS, STAYS, STAYS, STAYS,    STAYS,      STAYS),
+    EventKind.ACKNOWLEDGED:         (_NO,   _A,        _NO,       _N,    _LA,   _NO,   _NO,      _NO,        _NO),
+    EventKind.RESET:                (_NO,   _NO,       _NO,       _NO,   _R,    _N,    _NO,      _NO,        _NO),
+    EventKind.SHELVED:              (_SH,   _SH,       _SH,       _SH,   _SH,   _SH,   STAYS,    _NO,        _NO),
+    EventKind.UNSHELVED:            (_NO,   _NO,       _NO,       _NO,   _NO,   _NO,   (_N, _U), _NO,        _NO),
+    EventKind.SUPPRESSED:           (_SU,   _SU,       _SU,       _SU,   _SU,   _SU,   STAYS,    STAYS,      STAYS),
+    EventKind.UNSUPPRESSED:         (STAYS, STAYS,     STAYS,     STAYS, STAYS, STAYS, STAYS,    (OWED, _U), STAYS),
+    EventKind.REMOVED_FROM_SERVICE: (_OOS,  _OOS,      _OOS,      _OOS,  _OOS,  _OOS,  _OOS,     _OOS,       _NO),
+    EventKind.RETURNED_TO_SERVICE:  (_NO,   _NO,       _NO,       _NO,   _NO,   _NO,   _NO,      _NO,        (_N, _U)),
 }  # fmt: skip
 
-TABLE: Mapping[tuple[AlarmState, Happening], Cell] = MappingProxyType(
-    {(state, happening): row[at] for happening, row in _ROWS.items() for at, state in enumerate(AlarmState)}
+TABLE: Mapping[tuple[AlarmState, EventKind], Cell] = MappingProxyType(
+    {(state, kind): row[at] for kind, row in _ROWS.items() for at, state in enumerate(AlarmState)}
 )
 """What becomes of an alarm in a state when something happens."""
 
@@ -85,12 +67,12 @@ def owed_after(state: AlarmState, *, latching: bool) -> AlarmState:
     'returned'
     """
     if state in {AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED}:
-        return follow(state, Happening.CLEAR, present=False, latching=latching) or state
+        return follow(state, EventKind.CLEARED, present=False, latching=latching) or state
     return state
 
 
 def follow(
-    state: AlarmState, happening: Happening, *, present: bool, latching: bool, owed: AlarmState = AlarmState.NORMAL
+    state: AlarmState, kind: EventKind, *, present: bool, latching: bool, owed: AlarmState = AlarmState.NORMAL
 ) -> AlarmState | None:
     """The state an alarm goes to.
 
@@ -110,13 +92,13 @@ def follow(
 
     Examples
     --------
-    >>> follow(AlarmState.UNACKNOWLEDGED, Happening.CLEAR, present=False, latching=False).value
+    >>> follow(AlarmState.UNACKNOWLEDGED, EventKind.CLEARED, present=False, latching=False).value
     'returned'
     """
-    cell = TABLE[state, happening]
+    cell = TABLE[state, kind]
     if isinstance(cell, tuple):
         without, with_ = cell
-        if latching if happening is Happening.CLEAR else present:
+        if latching if kind is EventKind.CLEARED else present:
             return with_
         return owed if without == OWED else AlarmState(without)
     if cell == REFUSED:

@@ -5,17 +5,16 @@ from dataclasses import dataclass
 from models.errors import RotorwatchError
 from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.operations import OperationKind
-from service.monitor.alarms.life_cycle import Happening
 
-HAPPENINGS: dict[OperationKind, tuple[Happening, EventKind]] = {
-    "acknowledge": (Happening.ACKNOWLEDGE, EventKind.ACKNOWLEDGED),
-    "reset": (Happening.RESET, EventKind.RESET),
-    "shelve": (Happening.SHELVE, EventKind.SHELVED),
-    "unshelve": (Happening.UNSHELVE, EventKind.UNSHELVED),
-    "remove-from-service": (Happening.REMOVE_FROM_SERVICE, EventKind.REMOVED_FROM_SERVICE),
-    "return-to-service": (Happening.RETURN_TO_SERVICE, EventKind.RETURNED_TO_SERVICE),
+KIND_OF_EVENT: dict[OperationKind, EventKind] = {
+    "acknowledge": EventKind.ACKNOWLEDGED,
+    "reset": EventKind.RESET,
+    "shelve": EventKind.SHELVED,
+    "unshelve": EventKind.UNSHELVED,
+    "remove-from-service": EventKind.REMOVED_FROM_SERVICE,
+    "return-to-service": EventKind.RETURNED_TO_SERVICE,
 }
-"""What each operation is in the life cycle, and in the log."""
+"""What each operation is in the life cycle and in the log."""
 
 
 class UnknownAlarm(RotorwatchError):  # noqa: N818  # said to an operator, by its name
