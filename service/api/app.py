@@ -28,7 +28,8 @@ from service.api.routes.snapshots import add_snapshot_routes
 from service.api.routes.tokens import add_token_routes
 from service.api.samples import SampleReader
 from service.api.views import PLACE, InPath, ServiceView
-from service.stream.monitored import NoAnswerError
+from service.monitor.conversion import machine_description
+from service.stream.monitored import Monitored, NoAnswerError
 
 _DESCRIPTION = """Health of rotating machines: which parameter changed, by how much, how sure.
 
@@ -117,6 +118,10 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     return app
 
 
+def _description(view: Monitored) -> MachineDescription:
+    return machine_description(view.identity, view.machine, view.health().state)
+
+
 def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
     common: dict[str, Any] = {"tags": ["machines"], "dependencies": [guard.read]}
     lab = {**example(MachineConfiguration), "file": load_machine("lab").model_dump(mode="json")}
@@ -124,12 +129,12 @@ def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
     @app.get("/api/v1/machines", responses=responses(MachineList), **common)
     def machines() -> MachineList:
         """Every monitored machine with its state."""
-        return MachineList(machines=tuple(machine.description() for machine in service.machines()))
+        return MachineList(machines=tuple(_description(machine) for machine in service.machines()))
 
     @app.get(PLACE, responses=responses(MachineDescription, 404, 422), **common)
     def machine(view: InPath) -> MachineDescription:
         """One machine: stream, channels, keys, state."""
-        return view.description()
+        return _description(view)
 
     @app.get(f"{PLACE}/configuration", responses=responses(MachineConfiguration, 404, 422, shown=lab), **common)
     def configuration(view: InPath) -> MachineConfiguration:

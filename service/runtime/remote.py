@@ -8,12 +8,11 @@ from functools import cached_property
 from models.commissioning.commissioned import install
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, HealthState
-from rotorwatch.records.machines import DetectableChanges, MachineDescription
+from rotorwatch.records.machines import DetectableChanges
 from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.machine import MachineSnapshots
 from service.history.records import StoreError
 from service.history.store import Store
-from service.monitor import conversion
 from service.monitor.alarms.operation import (
     NotInTime,
     OperationConflict,
@@ -135,10 +134,6 @@ class RemoteMachine:
     def detectable(self, change: float | None) -> DetectableChanges:
         """Return what would be found on the machine as it runs now."""
         return DetectableChanges.model_validate_json(self._ask(Question(about="detectable", change=change)))
-
-    def description(self) -> MachineDescription:
-        """Identity, stream, keys, and the present state."""
-        return conversion.machine_description(self.identity, self.machine, self.health().state)
 
     def operate(self, operation: OperatorAction) -> tuple[AlarmCloudEvent, ...]:
         """Do what an operator asks for, and say what happened; raises as `MachineWorker.operate`."""

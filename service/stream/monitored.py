@@ -7,7 +7,7 @@ from models.errors import RotorwatchError
 from models.machine import MachineFile
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health
-from rotorwatch.records.machines import DetectableChanges, MachineDescription
+from rotorwatch.records.machines import DetectableChanges
 from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.machine import MachineSnapshots
 from service.history.machine import MachineStore
@@ -67,9 +67,6 @@ class Monitored(Protocol):
 
     def detectable(self, change: float | None) -> DetectableChanges:
         """Return what would be found on the machine as it runs now."""
-
-    def description(self) -> MachineDescription:
-        """Identity, stream, keys, and the present state."""
 
     def operate(self, operation: OperatorAction) -> tuple[AlarmCloudEvent, ...]:
         """Do what an operator asks for, and say what happened; raises as `AlarmBook.operate`, `NotInTime`."""

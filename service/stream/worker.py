@@ -13,7 +13,7 @@ from models.commissioning.commissioned import Installed
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report, StreamStatus
-from rotorwatch.records.machines import DetectableChanges, MachineDescription
+from rotorwatch.records.machines import DetectableChanges
 from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.machine import MachineSnapshots
 from service.history.machine import MachineStore
@@ -250,10 +250,6 @@ class MachineWorker:
     def detectable(self, change: float | None) -> DetectableChanges:
         """Return what would be found on the machine as it runs now."""
         return conversion.detectable_changes(self.identity, self.machine, self._snapshot, change)
-
-    def description(self) -> MachineDescription:
-        """Identity, stream, keys, and the present state."""
-        return conversion.machine_description(self.identity, self.machine, self.health().state)
 
     def operate(self, operation: OperatorAction) -> tuple[AlarmCloudEvent, ...]:
         """Do what an operator asks for, on the machine's thread, and say what happened.

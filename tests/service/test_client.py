@@ -34,6 +34,7 @@ from rotorwatch import (
 )
 from rotorwatch.client import errors
 from service.access.scopes import Scope
+from service.monitor.conversion import machine_description
 from service.runtime.runtime import Runtime, running
 from service.settings.access import AccessSettings, HttpTlsSettings
 from service.settings.service import HistorySettings, HttpSettings, ServiceSettings
@@ -70,7 +71,8 @@ def _token(runtime: Runtime) -> str:
 def test_what_there_is(plant: Client, seen: tuple[Runtime, MachineWorker]) -> None:
     _, worker = seen
     (machine,) = plant.machines()
-    assert machine == plant.machine(PLACE) == worker.description()
+    assert machine == plant.machine(PLACE)
+    assert machine == machine_description(worker.identity, worker.machine, worker.health().state)
     assert plant.configuration(PLACE).machine_hash == worker.identity["machine_hash"]
     assert plant.health(PLACE).report == worker.health().report is not None
     assert plant.detectable(PLACE, -0.05) == worker.detectable(-0.05)
