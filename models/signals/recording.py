@@ -94,7 +94,9 @@ class RecordingWriter:
                 raise RecordingError(f"{existing}: exists already and is not overwritten")
         self._channels: dict[tuple[str, str, str], int] = {}
         self._counts: dict[int, int] = {}
-        self._messages = self._flushed = self._size = 0
+        self.messages = 0  # taken
+        self.flushed = 0  # in complete chunks and with the operating system: they survive the end of the process
+        self.size_bytes = 0  # of the file, without the chunk in progress
         with writing(self.part):
             self._file = self.part.open("wb")
             self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
@@ -106,21 +108,6 @@ class RecordingWriter:
                 self.abandon()
                 self.part.unlink(missing_ok=True)
                 raise
-
-    @property
-    def messages(self) -> int:
-        """Messages taken."""
-        return self._messages
-
-    @property
-    def flushed(self) -> int:
-        """Messages that are in complete chunks and with the operating system: they survive the end of the process."""
-        return self._flushed
-
-    @property
-    def size_bytes(self) -> int:
-        """Size of the file, without the chunk in progress."""
-        return self._size
 
     @property
     def channels(self) -> int:
@@ -138,8 +125,8 @@ class RecordingWriter:
             sequence = self._counts[channel]
             self._counts[channel] = sequence + 1
             self._writer.add_message(channel, message.log_time_ns, data, message.publish_time_ns, sequence & 0xFFFFFFFF)
-            self._messages += 1
-            if self._file.tell() != self._size:  # the library writes when a chunk is complete, and only then
+            self.messages += 1
+            if self._file.tell() != self.size_bytes:  # the library writes when a chunk is complete, and only then
                 self._hand_over()
 
     def flush(self) -> None:
@@ -177,8 +164,8 @@ class RecordingWriter:
 
     def _hand_over(self) -> None:
         self._file.flush()
-        self._size = self._file.tell()
-        self._flushed = self._messages
+        self.size_bytes = self._file.tell()
+        self.flushed = self.messages
 
     def __enter__(self) -> Self:
         return self

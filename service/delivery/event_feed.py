@@ -121,12 +121,7 @@ class EventFeed:
         self._listeners: set[_Listener] = set()
         self._health: dict[str, _Said] = {}  # in the order in which they were said
         self._number = 0
-        self._closed = False
-
-    @property
-    def closed(self) -> bool:
-        """Whether streams have been told to end."""
-        return self._closed
+        self.closed = False  # whether streams have been told to end
 
     def wake(self) -> None:
         """Say that alarm events were committed."""
@@ -146,7 +141,7 @@ class EventFeed:
 
     def close(self) -> None:
         """End every stream once it has told what is committed; whoever reads slowly is waited for only so long."""
-        self._closed = True
+        self.closed = True
         self.wake()
         with self._lock:
             self._lock.wait_for(lambda: not self._listeners, _LAST_S)
@@ -182,7 +177,7 @@ class EventFeed:
             number, told = 0, dict[str, int]()
             asked_s = time.monotonic()
             while True:
-                closes = self._closed
+                closes = self.closed
                 listener.reset()
                 behind = [place for place, log in logs.items() if cursor[place] < log.last_sequence()]
                 for place in behind:

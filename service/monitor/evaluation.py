@@ -127,15 +127,11 @@ class WindowEvaluator(ABC):
     takes_short: bool = False
     """Whether stretches shorter than the window can be evaluated."""
 
-    @property
-    @abstractmethod
-    def by(self) -> str:
-        """Name of the diagnostician that decides."""
+    by: str
+    """Name of the diagnostician that decides."""
 
-    @property
-    @abstractmethod
-    def needs_lags(self) -> bool:
-        """Whether correlations are needed at all lags, or at lag zero alone."""
+    needs_lags: bool
+    """Whether correlations are needed at all lags, or at lag zero alone."""
 
     @abstractmethod
     def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
@@ -216,18 +212,13 @@ class KnownMachineEvaluator(WindowEvaluator):
         identified = None if commissioned is None else commissioned.identified
         self._shared = None if identified is None else identified.matrix()
         self._healthy_misfit = None if commissioned is None else commissioned.misfit
-        self._has_networks = bundle is not None
+        self.needs_lags = bundle is not None  # only the networks look at lags
         self._explained_ns: int | None = None
         others: list[Diagnostician] = []
         if bundle is not None and bundle.amortised is not None:
             others.append(NetworkDiagnostician(machine, bundle.amortised))
         others.append(RelationDiagnostician(machine, () if bundle is None else bundle.networks))
         self._others = tuple(others)
-
-    @property
-    def needs_lags(self) -> bool:
-        """Only the networks look at lags."""
-        return self._has_networks
 
     def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`."""
@@ -328,11 +319,7 @@ class BaselineEvaluator(WindowEvaluator):
         self._length_s = machine.window_data_s
         self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate
         self._baselines = tuple((one.conditions, one.baseline.diagnostician()) for one in commissioned.baselines)
-
-    @property
-    def by(self) -> str:
-        """The baseline, or nothing but the shapes of channels."""
-        return self._baselines[0][1].by if self._baselines else _SHAPE
+        self.by = self._baselines[0][1].by if self._baselines else _SHAPE
 
     def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`; outside the commissioned conditions it is not evaluable."""

@@ -101,7 +101,7 @@ class MachineMonitor:
         self._drops: dict[tuple[int, int], int] = {}
         self._fault = ""
         self._defect: Exception | None = None
-        self._statistics: WindowStatistics | None = None
+        self.window: WindowStatistics | None = None  # that of the latest report, if it was full
         self._newest = NewestBlocks(20_000)
         self._used: SampleBlock | None = None
         self.used = False
@@ -285,11 +285,6 @@ class MachineMonitor:
         return 1 if self._used is None else max(1, -(-self._window.lacking // self._used.samples.shape[0]))
 
     @property
-    def window(self) -> WindowStatistics | None:
-        """The window of the latest report; None if it was not full."""
-        return self._statistics
-
-    @property
     def blocks(self) -> tuple[SampleBlock, ...]:
         """The newest blocks, without a gap, about 20 000 samples at most."""
         return self._newest.blocks
@@ -421,7 +416,7 @@ class MachineMonitor:
         self._data_path.hop(end_ns, skipped=skipped)
         self._data_path.conflict(self._senders.conflict, end_ns)
         self._levels.take(self._window)
-        statistics = self._statistics = self._window.statistics()
+        statistics = self.window = self._window.statistics()
         if statistics is None:
             self._levels.tell(self._alarms, end_ns)
             return Report(**self._window_now(end_ns, end_ns, self._state(HealthState.WARMING)))

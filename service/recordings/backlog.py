@@ -30,32 +30,22 @@ class Backlog:
         self._bytes = 0
         self._changed = threading.Condition()
         self._closed = False
-        self._received = 0
-        self._dropped = 0
-
-    @property
-    def received(self) -> int:
-        """Messages that arrived."""
-        return self._received
-
-    @property
-    def dropped(self) -> int:
-        """Messages thrown away because the disk did not keep up or could not be written."""
-        return self._dropped
+        self.received = 0  # messages that arrived
+        self.dropped = 0  # messages thrown away because the disk did not keep up or could not be written
 
     def put(self, message: RecordedMessage) -> None:
         """Append a message; after `close` it is ignored."""
         with self._changed:
             if self._closed:
                 return
-            self._received += 1
+            self.received += 1
             size = _size(message)
             if self._bytes + size > self._bound:
                 self._keep(deque(waiting for waiting in self._messages if waiting.key != self._stream))
             if self._bytes + size > self._bound:
                 self._keep(deque())
             if size > self._bound:
-                self._dropped += 1
+                self.dropped += 1
                 return
             self._messages.append(message)
             self._bytes += size
@@ -86,7 +76,7 @@ class Backlog:
             self._changed.notify_all()
 
     def _keep(self, messages: deque[RecordedMessage]) -> None:
-        self._dropped += len(self._messages) - len(messages)
+        self.dropped += len(self._messages) - len(messages)
         self._messages = messages
         self._bytes = sum(map(_size, messages))
 

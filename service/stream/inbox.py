@@ -70,17 +70,8 @@ class Inbox:
         self._closed = False
         self._enough = 1
         self._ready = False
-        self._dropped = self._unread = 0
-
-    @property
-    def dropped(self) -> int:
-        """Blocks of the publisher that is followed, thrown away because the queue was full."""
-        return self._dropped
-
-    @property
-    def unread(self) -> int:
-        """Messages that could be no blocks, or came from others, thrown away because too many of them came."""
-        return self._unread
+        self.dropped = 0  # blocks of the publisher that is followed, thrown away because the queue was full
+        self.unread = 0  # messages thrown away that could be no blocks, or came from others, because too many came
 
     @property
     def behind(self) -> int:
@@ -112,7 +103,7 @@ class Inbox:
                 return
             if odd:
                 if len(self._odd) >= _MOST_ODD:
-                    self._unread += 1
+                    self.unread += 1
                     return
                 self._odd.append(block)
             else:
@@ -123,7 +114,7 @@ class Inbox:
                 theirs = self._followed is not None and block.sender != self._followed
                 if self._is_full:
                     if theirs and self._blocks:
-                        self._unread += 1
+                        self.unread += 1
                         return
                     block = self._with_room(block)
                 (self._others if theirs else self._blocks).append(block)
@@ -143,12 +134,12 @@ class Inbox:
     def _with_room(self, block: RawBlock) -> RawBlock:
         """Make room: others go first. The block with what was dropped before it."""
         if self._others:
-            self._unread += len(self._others)
+            self.unread += len(self._others)
             self._others.clear()
             self._bytes = sum(len(one.payload) for one in self._blocks)
             return block
         before = len(self._blocks) + sum(one.dropped_before for one in self._blocks)
-        self._dropped += len(self._blocks)
+        self.dropped += len(self._blocks)
         self._blocks.clear()
         self._bytes = 0
         return replace(block, dropped_before=before)

@@ -102,7 +102,7 @@ class Link:
     """
 
     def __init__(self, settings: LinkSettings, *, fail_fast: bool = False) -> None:
-        self._errors = 0
+        self.errors = 0  # exceptions in callbacks so far
         config = zenoh.Config()
         items = settings.zenoh_items()
         if fail_fast or settings.mode == "client":
@@ -121,11 +121,6 @@ class Link:
         """Whether the session is open."""
         return not self.session.is_closed()
 
-    @property
-    def errors(self) -> int:
-        """Exceptions in callbacks so far."""
-        return self._errors
-
     def guarded(self, callback: Callable[[_T], None]) -> Callable[[_T], None]:
         """Wrap a callback so that its exceptions are logged and counted."""
 
@@ -133,7 +128,7 @@ class Link:
             try:
                 callback(argument)
             except Exception:  # the last frame of ours: Zenoh prints what escapes, and log and count would miss it
-                self._errors += 1
+                self.errors += 1
                 _log.exception("error in a callback")
 
         return call

@@ -55,18 +55,13 @@ class AlarmBook:
     def __init__(self, settings: AlarmSettings) -> None:
         self._settings = settings
         self._alarms: dict[str, Alarm] = {}
-        self._next_sequence = 0
+        self.next_sequence = 0  # number the next event will have
         self._untold: list[AlarmEvent] = []
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
         """Every alarm seen so far, normal ones included."""
         return tuple(self._alarms.values())
-
-    @property
-    def next_sequence(self) -> int:
-        """Number the next event will have."""
-        return self._next_sequence
 
     @property
     def severity(self) -> Severity | None:
@@ -318,7 +313,7 @@ class AlarmBook:
 
     def checkpoint(self) -> str:
         """Everything as JSON."""
-        return _PAGE.dump_json(_Page(self.alarms, self._next_sequence)).decode()
+        return _PAGE.dump_json(_Page(self.alarms, self.next_sequence)).decode()
 
     def restore(self, text: str, next_sequence: int | None = None) -> None:
         """Go on from what `checkpoint` gave.
@@ -342,7 +337,7 @@ class AlarmBook:
             raise CheckpointError(f"alarms cannot be restored: {error}") from error
         # Another version of the program may have known others.
         self._alarms = {alarm.name: alarm for alarm in page.alarms if is_alarm(alarm.name)}
-        self._next_sequence = max(page.next_sequence, next_sequence or 0)
+        self.next_sequence = max(page.next_sequence, next_sequence or 0)
         self._untold = []
 
     # Inside
@@ -438,9 +433,9 @@ class AlarmBook:
         owed = alarm.owed if state is before else AlarmState.NORMAL
         if kind is EventKind.SUPPRESSED:
             owed = owed_after(before, latching=latching)
-        alarm = replace(alarm, state=state, since_ns=since_ns, owed=owed, version=self._next_sequence)
-        event = AlarmEvent(kind, time_ns, self._next_sequence, alarm, before, actor, reason)
-        self._next_sequence += 1
+        alarm = replace(alarm, state=state, since_ns=since_ns, owed=owed, version=self.next_sequence)
+        event = AlarmEvent(kind, time_ns, self.next_sequence, alarm, before, actor, reason)
+        self.next_sequence += 1
         self._alarms[alarm.name] = alarm
         self._untold.append(event)
         return (event,)

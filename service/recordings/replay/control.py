@@ -18,30 +18,15 @@ class Control:
         self._changed = threading.Condition()
         self._paused_since_s: float | None = None
         self._paused_total_s = 0.0
-        self._stopped = False
-        self._reason = ""
+        self.stopped = False  # whether the replay is to end
+        self.reason = ""  # why it is to end, if that needs saying
         self._seek_ns: int | None = None
-        self._position_ns = 0
-
-    @property
-    def stopped(self) -> bool:
-        """Whether the replay is to end."""
-        return self._stopped
-
-    @property
-    def reason(self) -> str:
-        """Why it is to end, if that needs saying."""
-        return self._reason
+        self.position_ns = 0  # where the replay is
 
     @property
     def paused(self) -> bool:
         """Whether the replay is paused."""
         return self._paused_since_s is not None
-
-    @property
-    def position_ns(self) -> int:
-        """Where the replay is."""
-        return self._position_ns
 
     def now_s(self) -> float:
         """Seconds of a clock that stands still while the replay is paused."""
@@ -51,8 +36,8 @@ class Control:
     def stop(self, reason: str = "") -> None:
         """End the replay; the first reason given is kept."""
         with self._changed:
-            self._reason = self._reason or reason
-            self._stopped = True
+            self.reason = self.reason or reason
+            self.stopped = True
             self._changed.notify_all()
 
     def pause(self) -> None:
@@ -79,14 +64,14 @@ class Control:
     def seek_by(self, seconds: float) -> None:
         """Go on that much later, or earlier if negative, counted from where the replay is."""
         with self._changed:
-            base = self._position_ns if self._seek_ns is None else self._seek_ns
+            base = self.position_ns if self._seek_ns is None else self._seek_ns
             self._seek_ns = base + round(seconds * 1e9)
             self._changed.notify_all()
 
     def at(self, position_ns: int) -> None:
         """Take note of where the replay is."""
         with self._changed:
-            self._position_ns = position_ns
+            self.position_ns = position_ns
 
     def wait_until(self, deadline_s: float | None, on_pause: Callable[[], None] | None = None) -> bool:
         """Wait until a moment of `now_s`, or not at all; while paused, wait on.
@@ -102,7 +87,7 @@ class Control:
             False as soon as the replay is to stop or to seek.
         """
         with self._changed:
-            while not (self._stopped or self._seek_ns is not None):
+            while not (self.stopped or self._seek_ns is not None):
                 if self._paused_since_s is not None:
                     if on_pause is not None:
                         on_pause()

@@ -154,7 +154,7 @@ class RunningJob:
         self.results = folder / _RESULTS
         self._lock = threading.Lock()
         self._stop_asked = False
-        self._view = plan.job
+        self.view = plan.job  # what the API says of the job
         bundle = "" if plan.bundle is None else f"@{plan.bundle}"
         self.machine_file = f"{folder / _MACHINE}{bundle}" if plan.machine_file else None
         with (folder / _MESSAGES).open("wb") as messages:
@@ -169,14 +169,9 @@ class RunningJob:
         self._thread.start()
 
     @property
-    def view(self) -> ReplayJob:
-        """What the API says of the job."""
-        return self._view
-
-    @property
     def running(self) -> bool:
         """Whether the process is there."""
-        return self._view.state in ("running", "paused")
+        return self.view.state in ("running", "paused")
 
     def order(self, order: str) -> None:
         """Hand an order to the process, see `service.recordings.replay.console`; one that has ended hears none."""
@@ -188,7 +183,7 @@ class RunningJob:
                 self._process.stdin.flush()
             if order in ("pause", "resume"):
                 state = "paused" if order == "pause" else "running"
-                self._view = self._view.model_copy(update={"state": state})
+                self.view = self.view.model_copy(update={"state": state})
 
     def ask_to_end(self) -> None:
         """Ask the process to end."""
@@ -225,21 +220,21 @@ class RunningJob:
             update: dict[str, object] = {"state": state}
             if state == "failed":
                 update["error"] = self._last_words() or f"the process ended with code {code}"
-            self._view = self._view.model_copy(update=update)
+            self.view = self.view.model_copy(update=update)
             if self._process.stdin is not None:
                 with suppress(OSError):
                     self._process.stdin.close()
-        _log.info("replay ended", id=self._view.id, state=state, why=self._view.error)
+        _log.info("replay ended", id=self.view.id, state=state, why=self.view.error)
 
     def _take(self, text: bytes) -> None:
         try:
             line = ReplayLine.model_validate_json(text)
         except ValidationError:
-            _log.warning("a replay says what is not understood", id=self._view.id, line=text[:200])
+            _log.warning("a replay says what is not understood", id=self.view.id, line=text[:200])
             return
         update = {name: value for name in ("progress", "summary") if (value := getattr(line, name)) is not None}
         with self._lock:
-            self._view = self._view.model_copy(update=update)
+            self.view = self.view.model_copy(update=update)
 
     def _last_words(self) -> str:
         """End of what the process said on standard error; nothing of the inside."""
@@ -248,6 +243,6 @@ class RunningJob:
         except OSError:
             return ""
         if "Traceback (most recent call last)" in text:
-            _log.error("a replay ended with a defect", id=self._view.id, messages=text[-_ERROR_CHARACTERS:])
+            _log.error("a replay ended with a defect", id=self.view.id, messages=text[-_ERROR_CHARACTERS:])
             return "an error inside the replay; the service's log says more"
         return text.strip()[-_ERROR_CHARACTERS:].replace(f"{self.folder}/", "")

@@ -83,16 +83,12 @@ class OfflineReplay:
         self._digest = hashlib.sha256()
         self._windows = self._alarms = self._messages = 0
         self._data_s = 0.0
-        self._differences: tuple[str, ...] = ()
+        # How the recorded channel descriptor differs from the machine file, one sentence per field.
+        self.descriptor_differences: tuple[str, ...] = ()
         self._other_name = (machine.site, machine.name) != (keys.site, keys.machine)
         descriptor = source.descriptor(keys, self._from_ns)
         if descriptor is not None:
             self._describe(descriptor)
-
-    @property
-    def descriptor_differences(self) -> tuple[str, ...]:
-        """How the recorded channel descriptor differs from the machine file, one sentence per field."""
-        return self._differences
 
     def run(
         self, control: Control | None = None, on_progress: Callable[[ReplayProgress], None] | None = None
@@ -126,7 +122,7 @@ class OfflineReplay:
 
     def _describe(self, message: RecordedMessage) -> None:
         found = descriptor_mismatch(message.payload, self._machine)
-        self._differences = tuple(dict.fromkeys((*self._differences, *found)))
+        self.descriptor_differences = tuple(dict.fromkeys((*self.descriptor_differences, *found)))
 
     def _take(self, message: RecordedMessage) -> None:
         for report in self._monitor.step_payload(message.payload, message.attachment, self._encoding(message.encoding)):
@@ -146,7 +142,7 @@ class OfflineReplay:
         The hash covers site and name; with another machine's file the number of channels is checked, and every other
         difference of the descriptors is stated.
         """
-        only_named = all(text.startswith(("site is ", "machine is ")) for text in self._differences)
+        only_named = all(text.startswith(("site is ", "machine is ")) for text in self.descriptor_differences)
         return encoding.partition(";")[0] if self._other_name and only_named else encoding
 
     def _progress(self, at_ns: int) -> ReplayProgress:
@@ -178,7 +174,7 @@ class OfflineReplay:
             data_s=round(self._data_s, 6),
             elapsed_s=round(elapsed_s, 3),
             times_real_time=round(self._data_s / max(elapsed_s, 1e-9), 1),
-            descriptor_differences=self._differences,
+            descriptor_differences=self.descriptor_differences,
             limits={
                 name: ParameterLimits(**self._machine.alarms.for_parameter(name).model_dump()) for name in PARAMETERS
             },
