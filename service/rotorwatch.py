@@ -315,8 +315,10 @@ def _checked(file: Path) -> str:
 
 
 # After the commands of this module, which are the first in the list.
-for group in (installation, size, watching, access, webhook, history, record, replay, interchange, plot):
-    group.register(app)
+for module in (installation, size, watching, access, record, replay, interchange):
+    app.add_typer(module.commands)
+for group in (access.tokens, webhook.commands, history.commands, plot.commands):
+    app.add_typer(group)
 
 
 if __name__ == "__main__":

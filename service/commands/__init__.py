@@ -1,1 +1,1 @@
-"""The commands of ``rotorwatch`` by subject; each module has ``register(app)``."""
+"""The commands of ``rotorwatch`` by subject; each module has them in ``commands``."""

@@ -23,19 +23,14 @@ if TYPE_CHECKING:  # these import sqlalchemy, which --help must not wait for
     from service.history.store import Store
     from service.settings.service import HistorySettings
 
+commands = typer.Typer()
+tokens = typer.Typer(
+    name="token", no_args_is_help=True, help="Tokens for the HTTP API; they work at once, without a restart."
+)
 _PAGE = 500
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    tokens = typer.Typer(no_args_is_help=True, help="Tokens for the HTTP API; they work at once, without a restart.")
-    tokens.command("create")(create)
-    tokens.command("list")(list_)
-    tokens.command("revoke")(revoke)
-    app.add_typer(tokens, name="token")
-    app.command()(audit)
-
-
+@tokens.command()
 def create(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Who will use it, as the audit log shall say.")],
     scope: Annotated[
@@ -96,6 +91,7 @@ def creation_hint(config: Path | None, history: "HistorySettings") -> str:
     return f"{said}: {prefix}{shlex.join(command)}"
 
 
+@tokens.command("list")
 def list_(config: HistoryOption = None) -> None:
     """Show every token there ever was, and which hold.
 
@@ -124,6 +120,7 @@ def list_(config: HistoryOption = None) -> None:
     Console(soft_wrap=True).print(table)
 
 
+@tokens.command()
 def revoke(
     token: Annotated[str, typer.Argument(metavar="ID", help="Public part of the token, from: rotorwatch token list.")],
     config: HistoryOption = None,
@@ -150,6 +147,7 @@ def revoke(
             typer.echo(f"token {record.token_id} of {record.name} was revoked at {_utc(record.revoked_ns)}")
 
 
+@commands.command()
 def audit(
     machine: Annotated[
         str | None, typer.Option("--machine", metavar="SITE/MACHINE", help="Only what was done to this machine.")

@@ -11,16 +11,12 @@ from service.commands.running import HistoryOption
 if TYPE_CHECKING:  # imports sqlalchemy, which --help must not wait for
     from service.history.file import HistoryFile
 
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    history = typer.Typer(no_args_is_help=True, help="The SQLite file of the history: is it whole, copy it, go back.")
-    history.command("check")(check)
-    history.command("backup")(backup)
-    history.command("restore")(restore)
-    app.add_typer(history, name="history")
+commands = typer.Typer(
+    name="history", no_args_is_help=True, help="The SQLite file of the history: is it whole, copy it, go back."
+)
 
 
+@commands.command()
 def check(config: HistoryOption = None) -> None:
     """Look through the whole file, also while a monitor runs; exit code 1 if it is damaged.
 
@@ -39,6 +35,7 @@ def check(config: HistoryOption = None) -> None:
     typer.echo(f"{file}: ok")
 
 
+@commands.command()
 def backup(
     copy: Annotated[Path, typer.Argument(metavar="FILE", help="New file.")], config: HistoryOption = None
 ) -> None:
@@ -55,6 +52,7 @@ def backup(
     typer.echo(f"{file} is copied to {copy}; it holds hashes of the access tokens: keep it where others cannot read it")
 
 
+@commands.command()
 def restore(
     backup_file: Annotated[Path, typer.Argument(metavar="FILE", help="From: rotorwatch history backup.")],
     config: HistoryOption = None,

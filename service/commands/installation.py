@@ -14,18 +14,14 @@ from service.commands.running import ENDPOINT, ConnectOption, ListenOption, prep
 if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from models.machine import MachineFile
 
+commands = typer.Typer()
 _SENSOR = ("name", "quantity", "unit", "location", "direction")
 _ANGLE = "angle_deg"
 _SCHEDULE = ("on_s", "every_s")
 _EXAMPLE = "DE-H acceleration g DE horizontal"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(init)
-    app.command()(doctor)
-
-
+@commands.command()
 def init(
     folder: Annotated[
         Path, typer.Option("--folder", metavar="DIR", help="Where the two files go; made if it is not there.")
@@ -156,6 +152,7 @@ def _machine_text(machine: "MachineFile", speed_rpm: float | None) -> str:
     return "\n".join(lines) + "\n"
 
 
+@commands.command()
 def doctor(
     machine: Annotated[str, typer.Option("--machine", metavar="FILE", help="Machine file: shipped name or path.")],
     connect: ConnectOption = None,

@@ -8,16 +8,12 @@ import typer
 
 from service.commands.running import prepare_numerics
 
+commands = typer.Typer()
 _LISTED = 5
 _TIMES = ["%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%dT%H:%M:%SZ", "%Y-%m-%dT%H:%M:%S.%fZ", "%Y-%m-%d"]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command("import")(import_)
-    app.command("export")(export)
-
-
+@commands.command("import")
 def import_(
     source: Annotated[
         Path,
@@ -55,6 +51,7 @@ def import_(
         typer.echo(line)
 
 
+@commands.command()
 def export(
     recordings: Annotated[
         list[Path], typer.Argument(metavar="RECORDING...", help="Recordings (.mcap); several are joined in time.")

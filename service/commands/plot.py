@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)")
 _SPEEDS = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)")
-_plots = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode="rich")
+commands = typer.Typer(name="plot", cls=Commands, no_args_is_help=True, rich_markup_mode="rich")
 
 _AtOption = Annotated[
     str | None, typer.Option("--at", metavar="TIME", help="The latest data up to then. Else up to the end.")
@@ -50,12 +50,7 @@ _SlowRollOption = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.add_typer(_plots, name="plot")
-
-
-@_plots.callback()
+@commands.callback()
 def _describe() -> None:
     """Draw what is in recordings: PNG or SVG by the end of the name. Needs matplotlib: the extra "plots".
 
@@ -168,7 +163,7 @@ def _kind(paint: Callable[..., "Paint"]) -> None:
     (files, out, *others), (_, *own) = shared.values(), signature(paint).parameters.values()
     options = [one.replace(kind=Parameter.KEYWORD_ONLY) for one in (files, out, *own, *others)]
     command.__signature__ = signature(command).replace(parameters=options)  # type: ignore[attr-defined]  # typer's view
-    _plots.command(paint.__name__.replace("_", "-"), help=paint.__doc__)(command)
+    commands.command(paint.__name__.replace("_", "-"), help=paint.__doc__)(command)
 
 
 @_kind

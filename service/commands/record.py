@@ -23,13 +23,10 @@ if TYPE_CHECKING:  # these import numpy, which --help must not wait for
 
 _STATUS_S = 0.5
 
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(record)
-    app.command()(recover)
+commands = typer.Typer()
 
 
+@commands.command()
 def record(
     machine: Annotated[
         list[str] | None,
@@ -115,6 +112,7 @@ def record(
             raise typer.Exit(1)
 
 
+@commands.command()
 def recover(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="What a crash left, usually NAME.mcap.part.")],
     out: Annotated[

@@ -25,6 +25,7 @@ if TYPE_CHECKING:  # these import pydantic, numpy and pyarrow, which --help must
     from service.stream.replay_link import NetworkPlan
     from service.terminal.stopping import StopRequest
 
+commands = typer.Typer()
 _SLOWEST, _FASTEST = 0.1, 1000.0
 
 NamespaceOption = Annotated[
@@ -47,11 +48,7 @@ def in_namespace(link: "LinkSettings", namespace: str | None) -> "LinkSettings":
     return link.model_copy(update={"namespace": namespace})
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(replay)
-
-
+@commands.command()
 def replay(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap), in any order.")],
     offline: Annotated[

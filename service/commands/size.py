@@ -13,14 +13,11 @@ if TYPE_CHECKING:  # imports numpy and scipy, which --help must not wait for
     from service.history.records import Retention
     from service.runtime.sizing import Costs, Kind, Size
 
+commands = typer.Typer()
 _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(size)
-
-
+@commands.command()
 def size(
     machines: Annotated[int, typer.Option("--machines", min=1, max=1_000_000, help="How many.")],
     channels: Annotated[int, typer.Option("--channels", min=1, max=1000, help="Of each, the shaft angle too.")] = 9,

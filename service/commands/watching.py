@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait fo
     from rotorwatch.records.health import Health
     from service.stream.transport import TopicMessage
 
+commands = typer.Typer()
 _ALARM, _NO_DATA, _NO_ANSWER = 1, 3, 4
 _SUMMARY = {0: "well", _ALARM: "alarm", _NO_DATA: "no-data", _NO_ANSWER: "no-answer"}
 _BAD_STATES = ("alert", "danger", "outside-model", "data-health", "no-data")
@@ -33,12 +34,7 @@ _STYLES = {
 }
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(watch)
-    app.command()(status)
-
-
+@commands.command()
 def watch(
     machine: Annotated[
         str, typer.Option("--machine", metavar="SITE/MACHINE", help="Which machine; * stands for any.")
@@ -83,6 +79,7 @@ def watch(
                 typer.echo("connected again" if there else "connection lost, trying again", err=True)
 
 
+@commands.command()
 def status(
     url: Annotated[str, typer.Option("--url", help="Where the monitor's HTTP API is.")] = "http://127.0.0.1:8080",
     token: Annotated[

@@ -7,15 +7,10 @@ import typer
 
 from models.errors import MachineFileError
 
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    webhooks = typer.Typer(no_args_is_help=True, help="Programs that are told of alarm events.")
-    webhooks.command("secret")(secret)
-    webhooks.command("test")(test)
-    app.add_typer(webhooks, name="webhook")
+commands = typer.Typer(name="webhook", no_args_is_help=True, help="Programs that are told of alarm events.")
 
 
+@commands.command()
 def secret() -> None:
     """Make a secret, with which events are signed; the receiver needs the same.
 
@@ -28,6 +23,7 @@ def secret() -> None:
     typer.echo(new_secret())
 
 
+@commands.command()
 def test(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Which webhook of the settings.")],
     config: Annotated[Path, typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor.")],

@@ -23,7 +23,8 @@ from tests.service.preloaded import ran
 def commands(monkeypatch: pytest.MonkeyPatch) -> typer.Typer:
     monkeypatch.setenv("COLUMNS", "300")
     app = typer.Typer(cls=Commands)
-    access_commands.register(app)
+    app.add_typer(access_commands.commands)
+    app.add_typer(access_commands.tokens)
     return app
 
 

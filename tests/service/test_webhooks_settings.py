@@ -164,7 +164,7 @@ def test_a_monitor_does_not_start_without_its_secrets(tmp_path: Path) -> None:
 @pytest.fixture
 def command() -> typer.Typer:
     app = typer.Typer(cls=Commands)
-    webhook_commands.register(app)
+    app.add_typer(webhook_commands.commands)
     return app
 
 
