@@ -71,8 +71,6 @@ def publish(
         From `simulator.stream.blocks`; not advanced before a subscriber is there, if one is waited for.
     stop : threading.Event, optional
         When set, publishing ends before the next block and the session closes at once.
-    on_block : callable, optional
-        Called with the summary so far after each block.
 
     Raises
     ------

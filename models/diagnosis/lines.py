@@ -61,8 +61,6 @@ def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistic
 
     Parameters
     ----------
-    plan : Plan
-        Of the hops.
     hops : sequence of HopMoments
         At least one.
     window : WindowStatistics

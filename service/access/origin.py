@@ -27,8 +27,6 @@ def check_origin(
 
     Parameters
     ----------
-    listens_on : str
-        Address or name that is listened on.
     hosts : tuple of str
         Other names under which browsers reach the service.
     open_to_all : bool

@@ -22,8 +22,6 @@ class MovingWindow:
     ----------
     amount : int
         Hits that are admitted in a minute.
-    clock : callable
-        Monotonic seconds.
     keys : int
         Keys that are remembered; beyond that, the one used longest ago is forgotten.
 

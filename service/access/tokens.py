@@ -46,8 +46,6 @@ def new_token(name: str, scopes: Iterable[Scope], *, now_ns: int, days: int | No
         Who uses it, as the audit log shall say: at most 64 printable characters.
     scopes : iterable of Scope
         What it is good for, at least one.
-    now_ns : int
-        Time of day, nanoseconds since 1970 UTC.
     days : int, optional
         How long it holds; for ever if left out.
 

@@ -69,13 +69,7 @@ def create(
 
 
 def creation_hint(config: Path | None, history: "HistorySettings") -> str:
-    """Say how a first token is created for a monitor, from any folder and without its environment.
-
-    Parameters
-    ----------
-    config : Path, optional
-        Settings file of the monitor.
-    """
+    """Say how a first token is created for a monitor, from any folder and without its environment."""
     if history.in_memory:
         return "nobody can have a token for it: the history is in memory, where no other program finds tokens"
     command = ["rotorwatch" if shutil.which("rotorwatch") else sys.argv[0], "token", "create", "operator"]

@@ -50,8 +50,6 @@ class Store:
         Time between attempts while the database fails, in seconds.
     waiting_reports : int
         Reports of one machine that wait in memory meanwhile, and steps whose readings do.
-    now_ns : callable
-        The computer's time, nanoseconds since 1970 UTC.
     shared : bool
         Other processes of this monitor write the same database, and one of them looks after it: nothing is made,
         reduced or begun anew here.

@@ -193,8 +193,6 @@ class KnownMachineEvaluator(WindowEvaluator):
 
     Parameters
     ----------
-    machine : Machine
-        With all its parameters.
     bundle : Bundle or None
         Without it the equations are reported as not evaluable.
     commissioned : Commissioned, optional

@@ -40,8 +40,6 @@ class LevelWatch:
     ----------
     plan : Plan
         With levels.
-    installed : Installed
-        What was learned of the healthy machine.
 
     Attributes
     ----------

@@ -72,8 +72,6 @@ class MachineRecorder:
     committed : callable
         Takes a time of this computer and returns the alarm events that the machine's monitor has recorded since then:
         what lies around them is kept longer. Called on the recorder's thread; may raise `RotorwatchError`.
-    clock : callable
-        Monotonic seconds.
     now_ns : callable
         This computer's time, nanoseconds since 1970-01-01 UTC; only for the age of files.
 

@@ -47,8 +47,6 @@ def decide(
     ----------
     recordings : iterable of Recording
         Of one machine; incomplete ones are left alone, and so are those with names of somebody else's making.
-    now_ns : int
-        Present time, nanoseconds since 1970-01-01 UTC.
     """
     own = [one for one in recordings if one.complete and start_of(one.path.name) is not None]
     reasons = {one.id: reason for one in own if (reason := _reason(one, marks, settings) or one.kept_because)}

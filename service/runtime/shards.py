@@ -183,10 +183,6 @@ class Shards:
 
     Parameters
     ----------
-    count : int
-        How many there are.
-    placement : Placement
-        Where they run.
     store : Store
         Opened by whoever has it, between `connect` and `open`.
     """

@@ -170,8 +170,6 @@ def sized(
 
     Parameters
     ----------
-    retention, recording : Retention, RecordingSettings
-        How long things are kept.
     cores : int
         Of a computer.
     busy : float

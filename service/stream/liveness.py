@@ -16,8 +16,6 @@ class Pulse:
     ----------
     call : callable
         Has a function called by the thread; False if it never will be. `service.stream.inbox.Inbox.call` is one.
-    clock : callable
-        Monotonic seconds.
 
     Examples
     --------

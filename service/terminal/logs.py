@@ -57,8 +57,6 @@ class Limiter:
 
     Parameters
     ----------
-    clock : callable
-        Monotonic seconds.
     quiet_s : float
         How long after a line the next one of its kind is let through.
     """

@@ -127,10 +127,6 @@ class SpectralModel:
         ----------
         structural : ndarray, shape (5,)
             Logarithmic ratios of `STRUCTURAL` to nominal.
-        speed_rad_s : float
-            Speed Ω of the gyroscopic terms.
-        w : ndarray, shape (n_frequencies,)
-            Angular frequencies, rad/s.
         """
         change = self._bearing * np.expm1(structural[:4])
         Q = self._Q + self._Q_shaft * np.expm1(structural[4])

@@ -25,8 +25,6 @@ def correlation_snapshot(
 
     Parameters
     ----------
-    prediction : Prediction
-        Theory for the latest window.
     first, second : sequence of str
         Channels by name: the references, and as many responses; without `second` every channel with itself, without
         both a few pairs (`service.analysis.snapshots.channels.chosen_pairs`).

@@ -23,11 +23,6 @@ class MachineSnapshots:
     """Makes snapshots of one machine; any thread may ask.
 
     The theory of a window takes longer than all the rest, and is kept until another window comes.
-
-    Attributes
-    ----------
-    installed : Installed
-        The machine, and what is known of it.
     """
 
     def __init__(self, installed: Installed, identity: Identity) -> None:

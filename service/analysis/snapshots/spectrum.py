@@ -57,8 +57,6 @@ def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
 
     Parameters
     ----------
-    prediction : Prediction
-        Theory for the latest window.
     channels : sequence of str
         By name; without names all displacements, or all of the first quantity that is measured.
     first, second : sequence of str

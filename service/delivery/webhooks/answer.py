@@ -41,8 +41,6 @@ def answer_of(status: int, headers: Mapping[str, str], now_s: float) -> Answer:
     ----------
     headers : mapping
         With ``retry-after``, if the receiver has sent it.
-    now_s : float
-        Time of day, seconds since 1970 UTC.
 
     Examples
     --------

@@ -61,8 +61,6 @@ class Dispatcher:
     cursors : WebhookCursors
         What is remembered is the sequence of the next event, so that a webhook that begins with an empty log (0) can be
         told from a new one (-1).
-    clock : callable
-        Monotonic seconds.
     now_ns : callable
         Time of day, nanoseconds since 1970 UTC; only for the status.
     chance : callable

@@ -84,8 +84,6 @@ def signature(keys: Sequence[bytes], identifier: str, timestamp_s: int, body: by
         ``webhook-id``.
     timestamp_s : int
         ``webhook-timestamp``, seconds since 1970 UTC.
-    body : bytes
-        What is posted.
     """
     signed = f"{identifier}.{timestamp_s}.".encode() + body
     digests = (hmac.new(key, signed, hashlib.sha256).digest() for key in keys)

@@ -99,8 +99,6 @@ class AlarmBook:
             Why nothing can be said of parameters; empty if something can.
         suspect : str
             What explains data outside the model best; empty if nothing does.
-        end_ns : int
-            End of the hop.
         """
         named = {finding.name for finding in verdict.changed}
         probability = {one.name: one.probability for one in verdict.candidates}
@@ -320,8 +318,6 @@ class AlarmBook:
 
         Parameters
         ----------
-        text : str
-            JSON.
         next_sequence : int, optional
             Number of the next event by the log. It may be ahead of what was remembered; it is behind only where
             the log was begun anew.

@@ -80,8 +80,6 @@ def follow(
     ----------
     present : bool
         Whether the condition is there, after what happens.
-    latching : bool
-        Whether the alarm latches.
     owed : AlarmState
         Where it comes back to after a rule, without its condition.
 
