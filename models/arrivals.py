@@ -106,13 +106,7 @@ class Arrivals:
         return gone_on + self._place(arrived)
 
     def withdraw(self, run: int, sequence: int) -> bool:
-        """Take back a block that waits; its place stays open.
-
-        Returns
-        -------
-        bool
-            Whether it waited.
-        """
+        """Take back a block, and say whether it waited; its place stays open."""
         return run == self._run and self._waiting.pop(sequence, None) is not None
 
     def flush(self) -> tuple[Arrived, ...]:

@@ -46,7 +46,7 @@ class RotationLine:
 
 
 def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: float) -> RotationLine | None:
-    """Find the line in one hop.
+    """Find the line in one hop; None if no channel fluctuates or the range holds no frequency.
 
     Parameters
     ----------
@@ -54,11 +54,6 @@ def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: 
         All samples of the hop and what it needs before it.
     speed_rad_s, tolerance : float
         Expected speed and how far it may be off, relative.
-
-    Returns
-    -------
-    RotationLine or None
-        None if no channel fluctuates or the range holds no frequency.
     """
     n_samples = x.shape[1]
     duration_s, expected_hz = n_samples / rate_hz, speed_rad_s / (2 * np.pi)

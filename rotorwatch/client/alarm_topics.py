@@ -60,7 +60,7 @@ class AlarmTopics:
         self._undo.close()
 
     def ask(self, place: str, after: int, limit: int) -> str | None:
-        """Ask a machine's monitor for its alarm log.
+        """Ask a monitor for an alarm log, JSON of an `AlarmLogPage`; None if nobody answers within five seconds.
 
         Parameters
         ----------
@@ -70,11 +70,6 @@ class AlarmTopics:
             Sequence number after which; -1 for the beginning.
         limit : int
             At most so many events, up to 1000.
-
-        Returns
-        -------
-        str or None
-            JSON of an `AlarmLogPage`; None if nobody answers within five seconds.
 
         Raises
         ------

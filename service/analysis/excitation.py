@@ -210,10 +210,6 @@ def sensor_noise(
     frequencies_hz : ndarray, shape (n_groups,)
     high_hz : float
         End of the band.
-
-    Returns
-    -------
-    ndarray, shape (2,)
     """
     shape = np.log1p((frequencies_hz / (2 / 3 * high_hz)) ** 2)
     level = float(np.log(averages @ measured / averages.sum()))

@@ -17,12 +17,7 @@ LOCK = ".lock"
 
 
 def lock(folder: Path) -> int:
-    """Make sure that only one recorder writes into a folder; closing what is returned lets go of it.
-
-    Returns
-    -------
-    int
-        File descriptor.
+    """Make sure that only one recorder writes into a folder; closing the descriptor that is returned lets go.
 
     Raises
     ------
@@ -61,15 +56,10 @@ def leftovers(folder: Path, writing_now: Path | None = None) -> list[Path]:
 
 
 def recover_leftover(part: Path) -> Salvage | None:
-    """Complete what a crash left.
+    """Complete what a crash left; None if there is no room for the copy at present.
 
     ``NAME.mcap`` gets everything that can be read; ``NAME.mcap.part`` goes if no more than its unfinished end was lost,
     and is renamed to ``NAME.mcap.damaged`` otherwise.
-
-    Returns
-    -------
-    Salvage or None
-        None if there is no room for the copy at present.
 
     Raises
     ------

@@ -116,7 +116,7 @@ def commission_machine(
     seed: int,
     processes: int,
 ) -> bool:
-    """Commission a machine and write its bundle.
+    """Commission a machine, write its bundle, and say whether it was commissioned; if not, the report says why.
 
     Parameters
     ----------
@@ -126,11 +126,6 @@ def commission_machine(
         Why the machine is commissioned again; needed where `out` holds a commissioning already.
     networks : bool
         Whether to train networks, too, where the parameters are known.
-
-    Returns
-    -------
-    bool
-        Whether the machine was commissioned; if not, the report says why.
 
     Raises
     ------

@@ -250,17 +250,12 @@ def parameters_of(rows: Sequence[Row] = ROWS) -> tuple[str, ...]:
 
 
 def evaluable_rows(states: Sequence[str], has_phase_reference: bool) -> list[tuple[Row, str]]:
-    """Say of every row whether it can be evaluated with these sensors.
+    """Every row with the reason why it cannot be evaluated with these sensors; empty if it can.
 
     Parameters
     ----------
     has_phase_reference : bool
         Or a speed that the vibration's own line is looked for at.
-
-    Returns
-    -------
-    list of (Row, str)
-        Each row with the reason why it cannot be evaluated; empty if it can.
     """
     found = []
     for row in ROWS:

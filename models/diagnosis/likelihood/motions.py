@@ -192,7 +192,7 @@ class Motions:
         )
 
     def factor(self, w: FloatArray, centre: FloatArray) -> ComplexArray:
-        """What a displacement of one, at frequency w, makes of each motion.
+        """What a displacement of one, at frequency w, makes of each motion, shape (*w.shape, n).
 
         Parameters
         ----------
@@ -200,10 +200,6 @@ class Motions:
             Angular frequencies, rad/s.
         centre : ndarray, broadcast to the shape of w
             Frequency the states are combined for: that of the group w is seen in.
-
-        Returns
-        -------
-        ndarray, shape (*w.shape, n)
         """
         at_centre = self._r(centre)
         pair = (1 + at_centre * self._r(w)) / np.sqrt(1 + at_centre**2)

@@ -203,10 +203,6 @@ class SpectralModel:
             Inverse Cholesky factors of the spectra.
         out : ndarray, shape (size, n_groups, n²), optional
             Where to put them: megabytes, better not allocated at every step.
-
-        Returns
-        -------
-        ndarray, shape (size, n_groups, n²)
         """
         theta = point.theta
         whitened = L_inverse[:, None] @ point.G

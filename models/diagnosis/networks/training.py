@@ -36,17 +36,12 @@ def train_network(
     seed: int,
     progress: Callable[[float], None] = lambda _: None,
 ) -> EquationNetwork:
-    """Fit the network of one equation.
+    """Fit the network of one equation, which is not calibrated yet.
 
     Parameters
     ----------
     windows : sequence of WindowStatistics
         Own parameters nominal, everything else random.
-
-    Returns
-    -------
-    EquationNetwork
-        Not calibrated yet.
 
     Raises
     ------

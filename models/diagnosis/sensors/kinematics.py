@@ -125,17 +125,12 @@ def _turned(w: FloatArray, cross: ComplexArray) -> tuple[float, float]:
 
 
 def read_pair(window: WindowStatistics, pair: MotionPair, bands: Banded | None = None) -> PairReading | None:
-    """Compare two sensors of one motion.
+    """Compare two sensors of one motion; None if one of them shows no fluctuation.
 
     Parameters
     ----------
     bands : Banded, optional
         What `banded` has made of them.
-
-    Returns
-    -------
-    PairReading or None
-        None if one of them shows no fluctuation.
     """
     bands = banded(window, pair) if bands is None else bands
     z, v = bands.spectra[:, 0, 0].real, bands.spectra[:, 1, 1].real

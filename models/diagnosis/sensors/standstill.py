@@ -31,10 +31,6 @@ def runs_down(window: WindowStatistics) -> npt.NDArray[np.bool_]:
     ----------
     window : WindowStatistics
         As its sensors are mounted.
-
-    Returns
-    -------
-    ndarray of bool, shape (n_hops,)
     """
     hops, speeds = window.hop_waveform, np.abs(window.hop_speed_rad_s)
     vibrations = [column for column, state in enumerate(window.sensors) if state != "theta"]

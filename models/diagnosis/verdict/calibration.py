@@ -275,17 +275,12 @@ def detectable_changes(
 
 
 def length_to_find(found: Detectable, change: float) -> float:
-    """Data it takes to find another change of the parameter: standard errors fall as one over the root of the length.
+    """Data, s, to find another change of the parameter: standard errors fall as one over the root of the length.
 
     Parameters
     ----------
     change : float
         Relative change that is to be found instead, not 0 and above -1.
-
-    Returns
-    -------
-    float
-        Length, s.
 
     Raises
     ------

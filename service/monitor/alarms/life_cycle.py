@@ -74,7 +74,7 @@ def owed_after(state: AlarmState, *, latching: bool) -> AlarmState:
 def follow(
     state: AlarmState, kind: EventKind, *, present: bool, latching: bool, owed: AlarmState = AlarmState.NORMAL
 ) -> AlarmState | None:
-    """The state an alarm goes to.
+    """The state an alarm goes to; None if that is refused in this state.
 
     Parameters
     ----------
@@ -82,11 +82,6 @@ def follow(
         Whether the condition is there, after what happens.
     owed : AlarmState
         Where it comes back to after a rule, without its condition.
-
-    Returns
-    -------
-    AlarmState or None
-        None if that is refused in this state.
 
     Examples
     --------

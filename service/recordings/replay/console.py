@@ -80,12 +80,9 @@ def orders(control: Control, *, lines: bool, keyboard: bool) -> Iterator[None]:
 
 
 def obey(control: Control, order: str) -> bool:
-    """Carry out one order: ``pause``, ``resume``, ``stop``, ``seek TIME_NS`` or ``seek +SECONDS`` or ``seek -SECONDS``.
+    """Carry out one order, and say whether it was understood.
 
-    Returns
-    -------
-    bool
-        Whether the order was understood.
+    ``pause``, ``resume``, ``stop``, ``seek TIME_NS``, ``seek +SECONDS`` or ``seek -SECONDS``.
     """
     word, _, argument = order.strip().partition(" ")
     simple = {"pause": control.pause, "resume": control.resume, "stop": control.stop}
