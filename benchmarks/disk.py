@@ -117,7 +117,7 @@ def measure(machines: int, hops: int, seed: int, days: float, *, together: bool)
             one = machine.model_copy(update={"name": f"lab{number}"})
             queue = QueueSettings(when_full="wait")
             workers.append(MachineWorker(install(one, "lab"), queue, store.machine(one.site, one.name), Clocks()))
-            workers[-1].start(_Silent())
+            workers[-1].start(lambda *_: None)
         length_s = (warm + hops + 2) * machine.window.hop_s
         streams = [stream(seed + number, length_s, start_ns) for number in range(machines)]
         feed(workers, streams, warm, together=together)
@@ -141,19 +141,6 @@ def measure(machines: int, hops: int, seed: int, days: float, *, together: bool)
             worker.stop()
         store.close()
         print(f"    an orderly stop: {(written() - before) / machines / 1e6:.2f} MB for each machine", flush=True)
-
-
-class _Silent:
-    """Nobody listens."""
-
-    def publish_report(self, text: str) -> None:
-        """Leave it."""
-
-    def publish_alarm_event(self, text: str) -> None:
-        """Leave it."""
-
-    def publish_alarm_state(self, text: str) -> None:
-        """Leave it."""
 
 
 def main() -> None:

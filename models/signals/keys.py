@@ -26,6 +26,10 @@ PREFIX = "rotorwatch"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
+Topic = Literal["report", "alarm_event", "alarm_state", "health"]
+"""What a monitor publishes, after the fields of `MachineKeys`."""
+
+
 @dataclass(frozen=True, slots=True)
 class MachineKeys:
     """Keys under ``rotorwatch/<site>/<machine>/``.

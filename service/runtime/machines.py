@@ -160,8 +160,8 @@ class LocalMachines:
         undo.callback(machine_link.close)
         # The worker stops first, while its topics are still declared; closing the inbox also frees a waiting callback.
         undo.callback(worker.stop)
-        worker.start(machine_link)
-        machine_link.publish_alarm_state(worker.alarms().model_dump_json())
+        worker.start(machine_link.publish)
+        machine_link.publish("alarm_state", worker.alarms().model_dump_json())
         return machine_link
 
 
@@ -201,7 +201,7 @@ class _Supervisor:
         if before is not None and _news(before) == _news(health):
             return
         self._published[number] = health
-        link.publish_health(health.model_dump_json())
+        link.publish("health", health.model_dump_json())
         self._listener.health(health)
         if before is None or before.state != health.state:
             _log.info("state", machine=f"{health.site}/{health.machine}", state=health.state.value, why=health.reason)

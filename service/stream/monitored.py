@@ -1,10 +1,12 @@
 """A machine that is monitored, as others see it, in this process or from another one; and where it publishes."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
 from models.errors import RotorwatchError
 from models.machine import MachineFile
+from models.signals.keys import Topic
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health
 from rotorwatch.records.machines import DetectableChanges
@@ -72,14 +74,5 @@ class Monitored(Protocol):
         """Do what an operator asks for, and say what happened; raises as `AlarmBook.operate`, `NotInTime`."""
 
 
-class Outlet(Protocol):
-    """Where a worker publishes; `service.stream.transport.MachineLink` is one."""
-
-    def publish_report(self, text: str) -> None:
-        """Publish a window report."""
-
-    def publish_alarm_event(self, text: str) -> None:
-        """Publish an alarm event."""
-
-    def publish_alarm_state(self, text: str) -> None:
-        """Publish the alarms as they are now."""
+Outlet = Callable[[Topic, str], None]
+"""Publishes what a worker says; `service.stream.transport.MachineLink.publish` is one."""

@@ -3,10 +3,10 @@
 ::
 
     stream ------------> on_block          descriptor, publisher_alive ---> on_descriptor, on_publisher
-    report <------------ publish_report            (dropped under congestion)
-    alarm/event <------- publish_alarm_event       (waits under congestion, the latest are kept for late joiners;
+    report <------------ publish                   (dropped under congestion)
+    alarm/event <------- publish                   (waits under congestion, the latest are kept for late joiners;
                                                    the whole log is there by query)
-    alarm/state, health <- publish_...             (latest kept; also answered by query)
+    alarm/state, health <- publish                 (latest kept; also answered by query)
 
 Callbacks run on Zenoh's threads. An exception in one is logged and counted here, because Zenoh would only print it.
 """
@@ -24,7 +24,7 @@ import zenoh
 import zenoh.ext
 
 from models.errors import RotorwatchError
-from models.signals.keys import PREFIX, MachineKeys
+from models.signals.keys import PREFIX, MachineKeys, Topic
 from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage
 from models.signals.wire import REPLAY_MARK
@@ -166,13 +166,15 @@ class MachineLink:
         def keep(declared: Declared) -> None:
             undo.callback(declared.undeclare)
 
-        self._report = session.declare_publisher(
-            keys.report, encoding=_JSON, congestion_control=zenoh.CongestionControl.DROP
-        )
-        self._event = _advanced_publisher(session, keys.alarm_event, _CLOUD_EVENT, _CACHED_EVENTS)
-        self._state = _advanced_publisher(session, keys.alarm_state, _JSON, 1)
-        self._health = _advanced_publisher(session, keys.health, _JSON, 1)
-        for publisher in (self._report, self._event, self._state, self._health):
+        self._publishers: dict[Topic, zenoh.Publisher | zenoh.ext.AdvancedPublisher] = {
+            "report": session.declare_publisher(
+                keys.report, encoding=_JSON, congestion_control=zenoh.CongestionControl.DROP
+            ),
+            "alarm_event": _advanced_publisher(session, keys.alarm_event, _CLOUD_EVENT, _CACHED_EVENTS),
+            "alarm_state": _advanced_publisher(session, keys.alarm_state, _JSON, 1),
+            "health": _advanced_publisher(session, keys.health, _JSON, 1),
+        }
+        for publisher in self._publishers.values():
             keep(publisher)
         for key, answer in ((keys.alarm_state, self._callbacks.alarm_state), (keys.health, self._callbacks.health)):
             keep(session.declare_queryable(key, guarded(answering(key, answer))))
@@ -195,32 +197,17 @@ class MachineLink:
         keep(stream.sample_miss_listener(guarded(self._take_miss)))
         keep(session.liveliness().declare_token(keys.monitor_alive))
 
-    def publish_report(self, text: str) -> None:
-        """Publish a window report."""
-        self._put(self._report, text)
-
-    def publish_alarm_event(self, text: str) -> None:
-        """Publish an alarm event; waits if the network is congested."""
-        self._put(self._event, text)
-
-    def publish_alarm_state(self, text: str) -> None:
-        """Publish the alarms as they are now."""
-        self._put(self._state, text)
-
-    def publish_health(self, text: str) -> None:
-        """Publish the health as it is now."""
-        self._put(self._health, text)
+    def publish(self, topic: Topic, text: str) -> None:
+        """Publish a message; if the network is congested all but reports wait."""
+        with self._lock:
+            if not self._closed:
+                self._publishers[topic].put(text)
 
     def close(self) -> None:
         """Undeclare everything; what is published afterwards is ignored."""
         with self._lock:
             self._closed = True
         self._undeclare.close()
-
-    def _put(self, publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher, text: str) -> None:
-        with self._lock:
-            if not self._closed:
-                publisher.put(text)
 
     def _take_replay(self, sample: zenoh.Sample) -> None:
         self._callbacks.on_replay(sample.kind == zenoh.SampleKind.PUT)

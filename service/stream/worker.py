@@ -153,7 +153,7 @@ class MachineWorker:
         self._begin_s = self._ticked_s = self._clocks.monotonic_s()
         self.tick()  # before any block: what time it is so far
         for event in self._unpublished:
-            outlet.publish_alarm_event(event.text)
+            outlet("alarm_event", event.text)
         self._thread.start()
 
     def stop(self) -> None:
@@ -468,9 +468,9 @@ class MachineWorker:
         if outlet is None:
             return
         for text in reports:
-            outlet.publish_report(text)
+            outlet("report", text)
         for text in events:
-            outlet.publish_alarm_event(text)
+            outlet("alarm_event", text)
         # The latest change of each alarm is in every report; here only what an operator would call news.
         now = tuple(
             (alarm.name, alarm.version, alarm.beyond_ns is None, alarm.small_ns is None)
@@ -478,7 +478,7 @@ class MachineWorker:
         )
         if now != self._published_alarms:
             self._published_alarms = now
-            outlet.publish_alarm_state(self.alarms().model_dump_json())
+            outlet("alarm_state", self.alarms().model_dump_json())
 
     def _explain(self, report: MonitorReport) -> None:
         verdict = report.verdict

@@ -147,7 +147,7 @@ class Monitor:
     def happen(self, *, published: bool = True, text: str = "") -> None:
         self.log.append(event(len(self.log), text, self.place))
         if published:
-            self.link.publish_alarm_event(self.log[-1].model_dump_json())
+            self.link.publish("alarm_event", self.log[-1].model_dump_json())
 
     def state(self) -> str:
         shown = AlarmStates.model_validate(example(AlarmStates))
@@ -246,7 +246,7 @@ def test_missed_events_are_asked_for_at_once_or_when_the_state_tells() -> None:
         machine.happen()
         following.reaches(3)  # long before the next regular question
         machine.happen(published=False)
-        machine.link.publish_alarm_state(machine.state())
+        machine.link.publish("alarm_state", machine.state())
         following.reaches(4)
     assert following.sequences() == list(range(5))
 
@@ -294,7 +294,7 @@ def test_nonsense_on_the_topic_is_left_to_the_log(caplog: pytest.LogCaptureFixtu
     with monitor(address) as (machine,), Following(address) as following:
         machine.happen()
         following.reaches(0)
-        machine.link.publish_alarm_event('{"specversion": "1.0"}')
+        machine.link.publish("alarm_event", '{"specversion": "1.0"}')
         machine.happen(published=False)
         machine.happen()
         following.reaches(2)

@@ -15,6 +15,7 @@ from models.errors import CheckpointError
 from models.ingest import Reason
 from models.machine import AlarmSettings, IngestSettings, Machine
 from models.signals.block import SampleBlock
+from models.signals.keys import Topic
 from models.signals.wire import encode_block
 from rotorwatch.records.alarms import AlarmState
 from rotorwatch.records.example import example
@@ -77,16 +78,11 @@ class Outlet:
         self.events: list[str] = []
         self.is_gone = False
 
-    def publish_report(self, text: str) -> None:
-        pass
-
-    def publish_alarm_event(self, text: str) -> None:
-        if self.is_gone:
-            raise OSError("no route")
-        self.events.append(text)
-
-    def publish_alarm_state(self, text: str) -> None:
-        pass
+    def __call__(self, topic: Topic, text: str) -> None:
+        if topic == "alarm_event":
+            if self.is_gone:
+                raise OSError("no route")
+            self.events.append(text)
 
 
 class Bench:

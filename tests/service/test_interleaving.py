@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from models.commissioning.commissioned import Installed, install
 from models.machine import Machine
 from models.signals.block import SampleBlock
+from models.signals.keys import Topic
 from models.signals.wire import encode_block
 from service.history.records import Retention
 from service.history.store import Store
@@ -89,14 +90,9 @@ class Heard:
 
     events: list[str] = field(default_factory=list)
 
-    def publish_report(self, text: str) -> None:
-        pass
-
-    def publish_alarm_event(self, text: str) -> None:
-        self.events.append(text)
-
-    def publish_alarm_state(self, text: str) -> None:
-        pass
+    def __call__(self, topic: Topic, text: str) -> None:
+        if topic == "alarm_event":
+            self.events.append(text)
 
 
 class Plant:

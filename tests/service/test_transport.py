@@ -236,12 +236,13 @@ def test_nothing_is_delivered_or_published_after_close() -> None:
         feed.put_good()
         until(lambda: len(first) == 1, "first block")
         # Published again until the subscription has arrived, of which there is no other sign.
-        until(repeating(lambda: declared.publish_health('"open"'), lambda: bool(healths)), "health")
+        until(repeating(lambda: declared.publish("health", '"open"'), lambda: bool(healths)), "health")
         declared.close()
-        declared.publish_health('"closed"')
+        declared.publish("health", '"closed"')
         successor = MachineLink(link, KEYS, callbacks, wait_when_full=False)
         until(
-            repeating(lambda: successor.publish_health('"successor"'), lambda: '"successor"' in healths), "later health"
+            repeating(lambda: successor.publish("health", '"successor"'), lambda: '"successor"' in healths),
+            "later health",
         )
         until(repeating(feed.put_good, lambda: bool(second)), "later block")
         successor.close()
@@ -296,10 +297,10 @@ def test_follower_gets_the_latest_state_at_once_and_then_what_happens() -> None:
     address = endpoint()
     messages: list[TopicMessage] = []
     with machine_link(address, ignore) as (opened, declared):
-        declared.publish_health('{"number": 1}')
-        declared.publish_health('{"number": 2}')
-        declared.publish_alarm_state('{"number": 3}')
-        declared.publish_alarm_event('{"number": 0}')
+        declared.publish("health", '{"number": 1}')
+        declared.publish("health", '{"number": 2}')
+        declared.publish("alarm_state", '{"number": 3}')
+        declared.publish("alarm_event", '{"number": 0}')
         link = LinkSettings(mode="client", connect=(address,))
         topics = ("health", "alarm_state", "alarm_event", "report")
         with follow(link, "*/lab", topics, messages.append) as connected:
@@ -310,8 +311,8 @@ def test_follower_gets_the_latest_state_at_once_and_then_what_happens() -> None:
             }
             for key in (KEYS.alarm_event, KEYS.report):
                 until_subscribed(opened.session, key)
-            declared.publish_alarm_event('{"number": 4}')
-            declared.publish_report('{"number": 5}')
+            declared.publish("alarm_event", '{"number": 4}')
+            declared.publish("report", '{"number": 5}')
             until(lambda: len(messages) == 4, "live messages")
             assert {(m.key, m.text) for m in messages[2:]} == {
                 (KEYS.alarm_event, '{"number": 4}'),
@@ -408,7 +409,7 @@ def test_router_joins_what_cannot_reach_each_other() -> None:
         Linked(address) as declared,
         follow(LinkSettings(mode="client", connect=(address,)), "demo/*", ("health",), messages.append),
     ):
-        declared.publish_health(json.dumps({"number": 1}))
+        declared.publish("health", json.dumps({"number": 1}))
         until(lambda: bool(messages), "message through the router")
         assert messages[0] == TopicMessage(KEYS.health, '{"number": 1}')
 
