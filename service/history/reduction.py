@@ -39,7 +39,7 @@ class Reduction:
         self._thread.join(self._database.answer_s)
 
     def run(self, now_ns: int) -> Dropped:
-        """Drop everything that is too old at a time of the computer.
+        """Drop and reduce what is too old at a time of the computer; happens by itself every few minutes.
 
         Raises
         ------

@@ -21,7 +21,7 @@ from rotorwatch.records.monitor import HistorySpan, HistoryStatus
 from service.history.claim import Claim
 from service.history.database import Database
 from service.history.machine import MachineStore
-from service.history.records import Dropped, Retention, StoreError
+from service.history.records import Retention, StoreError
 from service.history.reduction import Reduction
 from service.history.shared import AlarmLog, AuditLog, TokenStore, WebhookCursors
 from service.history.tables import alarm_events, buckets, machines, reports, windows
@@ -84,7 +84,7 @@ class Store:
         self._bucket_ns = retention.bucket_s * 10**9
         self._writer = Writer(self._database, retry_s, waiting_reports, self._bucket_ns, shared=shared)
         self._shared = shared
-        self._reduction = Reduction(self._database, retention, now_ns)
+        self.reduction = Reduction(self._database, retention, now_ns)
         self._now_ns = now_ns
         self._retention = retention
         self.alarms = AlarmLog(self._database)
@@ -134,7 +134,7 @@ class Store:
         self._database.start(set_aside, read_only=self._shared)
         self._writer.start()
         if not self._shared:
-            self._reduction.start()
+            self.reduction.start()
 
     def close(self) -> None:
         """Write what waits, if the database takes it, let go of all machines and disconnect.
@@ -148,7 +148,7 @@ class Store:
             return
         try:
             if not self._shared:
-                self._reduction.stop()
+                self.reduction.stop()
             self._writer.stop()
         finally:
             self._database.stop()
@@ -209,13 +209,3 @@ class Store:
             ),
             **self._retention.model_dump(exclude={"bucket_s"}),
         )
-
-    def retain(self, now_ns: int) -> Dropped:
-        """Drop and reduce what is too old at a time of the computer; happens by itself every few minutes.
-
-        Raises
-        ------
-        StoreError
-            If the database fails.
-        """
-        return self._reduction.run(now_ns)

@@ -168,7 +168,7 @@ class Runtime:
             logs = {f"{one.machine.site}/{one.machine.name}": one.history for one in self._monitored}
             self.webhooks.start(logs, self.store.webhooks)
             self._machines.start(undo)
-            undo.callback(self.replays.close)
+            undo.callback(self.replays.jobs.close)
             self._server = server
             app = create_app(self, guard)
             app.add_middleware(RequestMeter, counts=self._requests)  # around all others, so that refusals count

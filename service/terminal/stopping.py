@@ -5,7 +5,6 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType
 
 _TICK_S = 0.25
 
@@ -42,12 +41,7 @@ class StopRequest:
 def stop_request() -> Iterator[StopRequest]:
     """Turn SIGINT and SIGTERM into a request to stop; the signals' former handlers come back afterwards."""
     stop = StopRequest()
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        _ = number, frame
-        stop.ask()
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, lambda *_: stop.ask()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield stop
     finally:

@@ -135,9 +135,9 @@ def test_downsampled_is_what_numpy_says(store: Store, clock: Clock) -> None:
 def test_reduced_readings_and_those_that_are_still_there_are_one_trend(store: Store, clock: Clock) -> None:
     lab = store.machine("demo", "lab")
     written = write(lab, clock, 1500)
-    assert store.retain(clock.now_ns) == Dropped()
+    assert store.reduction.run(clock.now_ns) == Dropped()
     middle = int(written.ends[737])
-    dropped = store.retain(middle + 90 * DAY)
+    dropped = store.reduction.run(middle + 90 * DAY)
     assert dropped.windows == 720  # in steps of 40; the step of the window at that time is younger
     left = lab.readings(quantity="parameter", name="k_by", limit=5000)
     assert [reading.end_ns for reading in left] == list(written.ends[720:])
@@ -147,8 +147,8 @@ def test_reduced_readings_and_those_that_are_still_there_are_one_trend(store: St
         assert sum(bucket.count for bucket in found) == 1500
         assert_same(found, by_numpy(written, name, written.ends, found[0]))
     # Everything goes, in two more parts that meet within a bucket; what was merged says the same.
-    store.retain(int(written.ends[1111]) + 90 * DAY)
-    store.retain(int(written.ends[-1]) + 90 * DAY + 1)
+    store.reduction.run(int(written.ends[1111]) + 90 * DAY)
+    store.reduction.run(int(written.ends[-1]) + 90 * DAY + 1)
     assert not lab.readings(quantity="parameter", name="k_by")
     for name in ("e", "k_by"):
         found = [bucket for bucket in lab.downsampled(quantity="parameter", points=9) if bucket.name == name]
@@ -187,7 +187,7 @@ def test_what_is_not_finite_is_kept_and_has_no_mean(store: Store) -> None:
     for number, value in enumerate((float("inf"), 1.0, float("-inf"))):
         assert lab.commit(Step(readings=(StoredReading(T0 + number, "misfit", "misfit", value, None),)))
     assert len(lab.readings(quantity="misfit", name="misfit")) == 3
-    store.retain(T0 + 1000 * DAY)
+    store.reduction.run(T0 + 1000 * DAY)
     (bucket,) = lab.downsampled(quantity="misfit")
     assert (bucket.count, bucket.mean) == (1, 1.0)
 
@@ -198,14 +198,14 @@ def test_everything_goes_in_its_time_but_alarms_and_audit(store: Store, clock: C
     store.audit.append(AUDIT)
     write(lab, clock, 1200, per_step=1200 // 8)
     written = T0 + 1200 * HOP + NS
-    assert store.retain(written + 13 * DAY) == Dropped()
-    assert store.retain(written + 14 * DAY) == Dropped(reports=1200)
+    assert store.reduction.run(written + 13 * DAY) == Dropped()
+    assert store.reduction.run(written + 14 * DAY) == Dropped(reports=1200)
     assert lab.reports() == ()
-    assert store.retain(written + 90 * DAY).windows == 1200
+    assert store.reduction.run(written + 90 * DAY).windows == 1200
     n_buckets = len({bucket.start_ns for bucket in lab.downsampled(quantity="parameter", points=5000)})
     assert n_buckets > 0
-    assert store.retain(written + 999 * DAY) == Dropped()
-    assert store.retain(written + 1000 * DAY) == Dropped(buckets=n_buckets)
+    assert store.reduction.run(written + 999 * DAY) == Dropped()
+    assert store.reduction.run(written + 1000 * DAY) == Dropped(buckets=n_buckets)
     assert lab.downsampled(quantity="parameter") == ()
     assert lab.events() == (alarm_event(0),)
     assert len(store.audit.entries()) == 1
@@ -227,7 +227,7 @@ def test_what_is_written_meanwhile_stays(store: Store, clock: Clock) -> None:
 
     with ThreadPoolExecutor(1) as pool:
         feeding = pool.submit(feed)
-        dropped = store.retain(T0 + 91 * DAY)
+        dropped = store.reduction.run(T0 + 91 * DAY)
         stop.set()
         fed = feeding.result()
     assert dropped.windows == 2000

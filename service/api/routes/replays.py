@@ -167,10 +167,6 @@ class ReplayRequests:
                 return Report.model_validate_json(message)
         return None
 
-    def close(self) -> None:
-        """End every replay."""
-        self.jobs.close()
-
     def _machine(self, request: ReplayRequest, recorded: str) -> str | None:
         """FILE or FILE@BUNDLE; None leaves the choice to the recorded name."""
         monitored = self._monitored()
