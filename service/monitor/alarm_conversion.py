@@ -3,13 +3,14 @@
 import json
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime, timedelta
+from typing import Any
 
 from models.alarm_names import alarm_kind
 from models.diagnosis.readings import interval_95
 from rotorwatch import __version__
 from rotorwatch.records.alarms import Alarm as AlarmJson
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, AlarmStates
-from rotorwatch.records.fields import finite
+from rotorwatch.records.fields import Record, finite
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.reports import Identity
 
@@ -40,25 +41,11 @@ def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
     place = f"{identity['site']}/{identity['machine']}"
     data = AlarmEventData(
         **identity,
-        name=alarm.name,
-        text=event.text,
-        kind=event.kind,
-        before=event.before,
-        state=alarm.state,
+        **_shared(AlarmEventData, alarm),
+        **_shared(AlarmEventData, event),
         annunciated=alarm.state.annunciated,
-        severity=alarm.severity,
-        time_ns=event.time_ns,
-        raised_ns=alarm.raised_ns,
-        occurrence=alarm.occurrence,
-        sequence=event.sequence,
         relative_change=alarm.change,
-        standard_error=alarm.standard_error,
         interval_95=_interval(alarm),
-        low_confidence=alarm.low_confidence,
-        note=alarm.note,
-        evidence=alarm.evidence,
-        actor=event.actor,
-        reason=event.reason,
         program_version=__version__,
     )
     return AlarmCloudEvent(
@@ -76,29 +63,18 @@ def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
 
 def _alarm(alarm: Alarm) -> AlarmJson:
     return AlarmJson(
-        name=alarm.name,
+        **_shared(AlarmJson, alarm),
         text=alarm_kind(alarm.name).text,
-        state=alarm.state,
         pending=alarm.beyond_ns is not None,
         clearing=alarm.small_ns is not None,
-        present=alarm.present,
-        raised=alarm.raised,
-        severity=alarm.severity,
-        since_ns=alarm.since_ns,
-        raised_ns=alarm.raised_ns,
-        occurrence=alarm.occurrence,
         relative_change=alarm.change,
-        standard_error=alarm.standard_error,
         interval_95=_interval(alarm),
-        low_confidence=alarm.low_confidence,
-        note=alarm.note,
-        evidence=alarm.evidence,
-        shelf=alarm.shelf,
-        suppressed_by=alarm.suppressed_by,
-        out_of_service_by=alarm.out_of_service_by,
-        out_of_service_reason=alarm.out_of_service_reason,
-        version=alarm.version,
     )
+
+
+def _shared(record: type[Record], known: Alarm | AlarmEvent) -> dict[str, Any]:
+    """Fields of a record that an alarm or event has under the same name."""
+    return {name: getattr(known, name) for name in record.model_fields if hasattr(known, name)}
 
 
 def _interval(alarm: Alarm) -> tuple[float, float] | None:
