@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 
 import zenoh
-from pydantic import ValidationError
 
 from rotorwatch.client.alarm_topics import AlarmMessage, AlarmTopics, LogUnavailable
+from rotorwatch.client.answers import understood
 from rotorwatch.client.errors import ClientError
 from rotorwatch.client.log_order import LogOrder
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage, AlarmStates
@@ -120,12 +120,12 @@ class _Follower:
             return
         try:
             if message.kind == "event":
-                order.hear(AlarmCloudEvent.model_validate_json(message.text))
+                order.hear(understood(AlarmCloudEvent, message.text, message.place))
             else:
-                order.announce(AlarmStates.model_validate_json(message.text).sequence)
-        except ValidationError as error:
+                order.announce(understood(AlarmStates, message.text, message.place).sequence)
+        except ClientError as error:
             # Whoever sent it: what counts is what the log says.
-            _log.warning("%s", _unknown(message.place, error))
+            _log.warning("%s", error)
             self._due_s[message.place] = 0.0
             return
         self._hand_over(order)
@@ -141,10 +141,7 @@ class _Follower:
             page = self._page(topics, order)
             if page is None:
                 return
-            try:
-                order.read(AlarmLogPage.model_validate_json(page))
-            except ValidationError as error:
-                raise _unknown(order.place, error) from error
+            order.read(understood(AlarmLogPage, page, order.place))
             self._hand_over(order)
             if not order.incomplete:
                 return
@@ -170,10 +167,3 @@ class _Follower:
         while not self._stop.is_set() and (event := order.next()) is not None:
             self._on_event(event)
             order.taken()
-
-
-def _unknown(place: str, error: ValidationError) -> ClientError:
-    return ClientError(
-        f"{place}: what was received is not what this version understands; do versions differ? "
-        f"{error.errors()[0]['loc']}: {error.errors()[0]['msg']}"
-    )
