@@ -1,11 +1,10 @@
 """What an import did, in sentences."""
 
-from datetime import UTC, datetime
-
 import numpy as np
 
 from models.signals.block import lowest_valid_hz, settling_s
 from service.interchange.importing import Imported
+from service.monitor.alarm_conversion import rfc3339
 
 _NOTED = 0.01
 """Part of the rows whose loss is pointed out."""
@@ -19,8 +18,8 @@ def summary_lines(done: Imported) -> list[str]:
     lines = [
         f"{done.source}: {several}{read.rows} rows at {done.clock.rate_hz:.9g} Hz, "
         f"{len(machine.sensors)} channels of {machine.site}/{machine.name}",
-        f"{done.recording}: {written.samples} samples in {written.blocks} blocks, {_when(written.start_ns)} to "
-        f"{_when(written.end_ns)}",
+        f"{done.recording}: {written.samples} samples in {written.blocks} blocks, {rfc3339(written.start_ns)} to "
+        f"{rfc3339(written.end_ns)}",
         *_gap_lines(done),
         *_filter_lines(done),
         *_pulse_lines(done),
@@ -47,7 +46,7 @@ def _gap_lines(done: Imported) -> list[str]:
     lines = [f"gaps: {len(gaps)}, {total_s:.6g} s in all, kept as gaps" if gaps else "gaps: none"]
     lines += [
         f"  before row {gap.row + 1}: {(gap.to_ns - gap.from_ns) / 1e9:.6g} s from "
-        f"{_when(done.clock.origin_ns + round(gap.from_ns))}"
+        f"{rfc3339(done.clock.origin_ns + round(gap.from_ns))}"
         for gap in gaps[:_LISTED]
     ]
     if len(gaps) > _LISTED:
@@ -113,8 +112,3 @@ def _pulse_lines(done: Imported) -> list[str]:
             f"note: the machine file says speed_rpm = {operation.speed_rpm:g}; at this speed nothing is evaluated"
         )
     return lines
-
-
-def _when(time_ns: int) -> str:
-    whole = datetime.fromtimestamp(time_ns // 1_000_000_000, UTC)
-    return f"{whole:%Y-%m-%dT%H:%M:%S}.{time_ns % 1_000_000_000 // 1000:06d}Z"
