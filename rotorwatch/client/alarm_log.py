@@ -5,6 +5,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 
 import zenoh
 
@@ -87,7 +88,7 @@ class _Follower:
                 self._order(place)
 
     def run(self, session: zenoh.Session) -> None:
-        with AlarmTopics(session, self._machines, self._hear) as topics:
+        with closing(AlarmTopics(session, self._machines, self._hear)) as topics:
             while not self._stop.is_set():
                 now_s = time.monotonic()
                 due = [place for place, due_s in self._due_s.items() if due_s <= now_s]

@@ -49,12 +49,6 @@ class AlarmTopics:
                 self._subscribe(f"{_PREFIX}/{place}", undo)
             self._undo = undo.pop_all()
 
-    def __enter__(self) -> "AlarmTopics":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def close(self) -> None:
         """End the subscriptions."""
         self._undo.close()

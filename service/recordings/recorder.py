@@ -17,7 +17,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from models.errors import RecordingError, RotorwatchError
@@ -257,9 +257,7 @@ class MachineRecorder:
         """The channel descriptor for the head of a file, logged with the file's first message."""
         known = self._descriptor
         if known is not None:
-            return RecordedMessage(
-                known.key, known.payload, known.attachment, known.encoding, time_ns, known.publish_time_ns
-            )
+            return replace(known, log_time_ns=time_ns)
         text = json.dumps(self.machine.descriptor.model_dump(mode="json"))
         return RecordedMessage(self.machine.keys.descriptor, text.encode(), b"", _ASSUMED, time_ns, time_ns)
 
