@@ -4,7 +4,7 @@ from functools import lru_cache
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.responses import FileResponse
@@ -19,6 +19,7 @@ from service.recordings.catalogue import Catalogue, Recording
 from service.recordings.replay.data_time import DataSpan
 from service.recordings.replay.source import RecordingSource
 
+_PLACE = "/api/v1/recordings"
 _NO_RANGE = {400: "Range: not understood, expected bytes=from-to", 416: "Range: the file is shorter than that"}
 _NONE = "no recordings: the settings name no directory for them ([recording] directory)"
 
@@ -35,13 +36,9 @@ _DataTimes = Annotated[
 
 def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) -> None:
     """Add the routes; without an index they answer with a problem that names the setting."""
+    common: dict[str, Any] = {"tags": ["recordings"], "dependencies": [guard.read]}
 
-    @app.get(
-        "/api/v1/recordings",
-        tags=["recordings"],
-        dependencies=[guard.read],
-        responses=responses(RecordingList, 404, 422),
-    )
+    @app.get(_PLACE, responses=responses(RecordingList, 404, 422), **common)
     def recordings(
         site: _Site = None,
         machine: _Machine = None,
@@ -62,12 +59,7 @@ def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) ->
             chosen = [one for _, group in places for one in list(group)[-latest:]]
         return RecordingList(recordings=tuple(map(_with_data_times, chosen) if data_times else chosen))
 
-    @app.get(
-        "/api/v1/recordings/{site}/{machine}/{name}",
-        tags=["recordings"],
-        dependencies=[guard.read],
-        responses=responses(RecordingDetail, 404, 422),
-    )
+    @app.get(f"{_PLACE}/{{site}}/{{machine}}/{{name}}", responses=responses(RecordingDetail, 404, 422), **common)
     def recording(site: str, machine: str, name: str) -> RecordingDetail:
         """One recording, with the keys in it."""
         found = found_recording(index, f"{site}/{machine}/{name}")
@@ -76,9 +68,8 @@ def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) ->
         return RecordingDetail.model_validate({**dict(_with_data_times(found)), "keys": keys})
 
     @app.get(
-        "/api/v1/recordings/{site}/{machine}/{name}/download",
-        tags=["recordings"],
-        dependencies=[guard.read],
+        f"{_PLACE}/{{site}}/{{machine}}/{{name}}/download",
+        **common,
         response_class=FileResponse,
         responses={
             200: {"content": {"application/octet-stream": {}}},
