@@ -34,6 +34,7 @@ from service.recordings.catalogue import recent_messages, recorded_files
 from service.recordings.recorder import MachineRecorder
 from service.settings.service import ServiceSettings
 from service.stream.evidence import EvidenceCollector
+from service.stream.monitored import with_flow
 from service.stream.transport import Link, MachineCallbacks, MachineLink, MachineTap
 from service.stream.worker import MachineWorker
 from service.terminal.logs import logger
@@ -198,7 +199,8 @@ class _Supervisor:
     def _look(self, number: int, worker: MachineWorker, link: MachineLink) -> None:
         health = worker.health()
         before = self._published.get(number)
-        if before is not None and _news(before) == _news(health):
+        # An alarm that changed and changed back is news, to whoever asked in between: its event's number has changed.
+        if before is not None and with_flow(before, None, 0) == with_flow(health, None, 0):
             return
         self._published[number] = health
         link.publish("health", health.model_dump_json())
@@ -206,16 +208,3 @@ class _Supervisor:
         if before is None or before.state != health.state:
             _log.info("state", machine=f"{health.site}/{health.machine}", state=health.state.value, why=health.reason)
         self._evidence[number].look(health)  # last: nothing waits for it
-
-
-def _news(health: Health) -> Health:
-    """Blank what changes with every block: it is no reason to publish.
-
-    An alarm that changed and changed back is one, to whoever asked in between: the number of its event has changed.
-    """
-    return health.model_copy(
-        update={
-            "stream": health.stream.model_copy(update={"data_age_s": None}),
-            "quality": health.quality.model_copy(update={"accepted_blocks": 0}),
-        }
-    )

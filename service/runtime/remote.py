@@ -23,7 +23,7 @@ from service.monitor.alarms.operation import (
 from service.monitor.reports import Identity
 from service.runtime.standing import EVENTS, Question, Standing, latest_from_bytes
 from service.settings.service import MachineEntry
-from service.stream.monitored import MachineStatus, NoAnswerError
+from service.stream.monitored import MachineStatus, NoAnswerError, with_flow
 from service.stream.shard_link import ask
 from service.stream.transport import Link
 
@@ -111,11 +111,7 @@ class RemoteMachine:
             health, age_s, told_s, accepted = self._health, self._data_age_s, self._told_s, self._accepted
         if age_s is not None:
             age_s = round(age_s + time.monotonic() - told_s, 3)
-        now = {
-            "stream": health.stream.model_copy(update={"data_age_s": age_s}),
-            "quality": health.quality.model_copy(update={"accepted_blocks": accepted}),
-        }
-        health = health.model_copy(update=now)
+        health = with_flow(health, age_s, accepted)
         if not (why := self.not_monitored):
             return health
         state = HealthState.NOT_EVALUABLE if health.state in _CALM else health.state

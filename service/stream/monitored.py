@@ -40,6 +40,13 @@ class MachineStatus:
     recorder: RecorderStatus | None = None  # None if it is not recorded
 
 
+def with_flow(health: Health, data_age_s: float | None, accepted_blocks: int) -> Health:
+    """Health with other values of what changes with every block, which is no reason to publish it."""
+    stream = health.stream.model_copy(update={"data_age_s": data_age_s})
+    quality = health.quality.model_copy(update={"accepted_blocks": accepted_blocks})
+    return health.model_copy(update={"stream": stream, "quality": quality})
+
+
 class Monitored(Protocol):
     """A monitored machine; for any thread. `service.stream.worker.MachineWorker` is one."""
 
