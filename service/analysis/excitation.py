@@ -199,7 +199,7 @@ def noise_density(parameters: FloatArray, frequencies_hz: FloatArray, high_hz: f
 def sensor_noise(
     measured: FloatArray, theory: FloatArray, averages: FloatArray, frequencies_hz: FloatArray, high_hz: float
 ) -> FloatArray:
-    """Find ln d₀ and b of one sensor.
+    """Find ln d₀ and b of one sensor, shape (2,).
 
     Parameters
     ----------

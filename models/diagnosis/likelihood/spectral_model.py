@@ -127,6 +127,8 @@ class SpectralModel:
         ----------
         structural : ndarray, shape (5,)
             Logarithmic ratios of `STRUCTURAL` to nominal.
+        w : ndarray, shape (n_frequencies,)
+            Angular frequencies, rad/s.
         """
         change = self._bearing * np.expm1(structural[:4])
         Q = self._Q + self._Q_shaft * np.expm1(structural[4])
@@ -192,10 +194,10 @@ class SpectralModel:
         return np.asarray(self._share * np.exp(exponent), dtype=np.float64)
 
     def slopes(self, point: ModelPoint, L_inverse: ComplexArray, out: FloatArray | None = None) -> FloatArray:
-        """L⁻¹ (∂S/∂θ_a) L⁻ᴴ of every parameter a, packed; the last 21 are by the elements of C, not of T.
+        """L⁻¹ (∂S/∂θ_a) L⁻ᴴ of every parameter a, packed, shape (size, n_groups, n²).
 
-        With ∂H = -H ∂D H every structural derivative, and every level's, is an outer product of columns of G and of
-        G C Hᴴ plus its conjugate transpose.
+        The last 21 are by the elements of C, not of T. With ∂H = -H ∂D H every structural derivative, and
+        every level's, is an outer product of columns of G and of G C Hᴴ plus its conjugate transpose.
 
         Parameters
         ----------

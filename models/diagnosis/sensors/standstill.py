@@ -23,7 +23,7 @@ _STEADY = 0.15
 
 
 def runs_down(window: WindowStatistics) -> npt.NDArray[np.bool_]:
-    """Which hops have nothing of a running machine but, perhaps, its slow end or beginning, beside others that do.
+    """Which hops have little or nothing of a running machine, shape (n_hops,), beside others that do: a slow end, say.
 
     None where no speed is known: hops may be quiet beside one that a blow or a disturbance has made loud.
 
