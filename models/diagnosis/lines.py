@@ -4,6 +4,11 @@ A line has the same strength in every segment, noise has not: of a steady line t
 coefficient is the square of the mean second power, of noise twice that. And it turns by the same angle from each
 segment to the next, where a resonance has forgotten its phase: their coherence is 1 of a line, and of n segments of
 noise c or more with the probability (1 - c²)ⁿ⁻¹.
+
+Beside a multiple of the speed a line beats with it. Seen from the turning shaft that multiple stands still, and the
+line turns: of what is left without the mean, one rotation holds nearly all, where of n segments of noise it holds a
+part p or more with the probability (1 - p)ⁿ⁻². A change of the multiple itself, a step or a pulsation, turns both ways
+alike.
 """
 
 from collections.abc import Sequence
@@ -41,15 +46,18 @@ class Line:
     state : str
         Where it is strongest.
     share : float
-        Of the power of that channel's random part.
+        Of the power of that channel's part that does not turn with the shaft.
     certain : bool
         Whether no noise is coherent like that.
+    beside : int
+        The multiple of the speed it is next to, within three bins of the spectra; 0 if next to none.
     """
 
     state: str
     frequency_hz: float
     share: float
     certain: bool
+    beside: int = 0
 
     def known(self, speed_rad_s: float) -> KnownLine:
         """What is kept of it."""
@@ -68,7 +76,8 @@ def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistic
     """
     window = window.as_mounted
     states = plan.mounted
-    segments = np.concatenate([hop.segments[:, :, : len(states)] for hop in hops])
+    every = np.concatenate([hop.segments for hop in hops])
+    segments = every[:, :, : len(states)]
     if segments.shape[0] < _FEWEST_SEGMENTS:
         return ()
     power = segments.real**2 + segments.imag**2
@@ -78,7 +87,7 @@ def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistic
     size = max(5, 2 * round(_NEIGHBOURHOOD_HZ / step_hz / 2) + 1)
     floor = scipy.ndimage.median_filter(mean, size=(size, 1), mode="nearest")
     total = np.maximum(np.diag(window.correlation[0]), np.finfo(float).tiny)
-    speed_hz = window.speed_rad_s / (2 * np.pi)
+    speed_hz = abs(window.speed_rad_s) / (2 * np.pi)
     rotation = _near_rotation(frequencies_hz, speed_hz, step_hz)
     found: dict[int, Line] = {}
     for at, column in np.argwhere((mean > _STANDS_OUT * floor) & ~rotation[:, None]):
@@ -91,12 +100,41 @@ def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistic
         if at not in found or share > found[at].share:
             certain = _coherent(segments[:, at, column])
             found[at] = Line(states[column], float(frequencies_hz[at]), min(1.0, share), certain)
-    return tuple(sorted(found.values(), key=lambda line: -line.share))
+    lines = list(found.values())
+    if window.speed_source == "phase reference" and not window.removed_by_hop:
+        turning = every[:, np.abs(frequencies_hz - speed_hz).argmin(), len(states) + 1]
+        turning = turning / np.maximum(np.abs(turning), np.finfo(float).tiny)
+        apart_s = plan.segment // 2 / plan.rate_hz
+        for order in range(1, _HARMONICS + 1):
+            near = np.abs(frequencies_hz - order * speed_hz) <= (_LOBE + 1) * step_hz
+            left = segments[:, near] * (turning.conj() ** order)[:, None, None]
+            left -= left.mean(axis=0)
+            own = (left.real**2 + left.imag**2).mean(axis=0)
+            stands_out = (own > _STANDS_OUT * floor[near]).any(axis=0)
+            shares = np.where(stands_out, 2 * step_hz * own.sum(axis=0) / total, 0.0)
+            if not shares.any():
+                continue
+            column = int(shares.argmax())
+            at = int(own[:, column].argmax())
+            offset_hz, certain = _turning(left[:, at, column], apart_s, frequencies_hz[near][at] - order * speed_hz)
+            share = min(1.0, float(shares[column]))
+            lines.append(Line(states[column], order * speed_hz + offset_hz, share, certain, order))
+    return tuple(sorted(lines, key=lambda line: -line.share))
 
 
-def new_line(lines: Sequence[Line], known: Sequence[KnownLine], speed_rad_s: float) -> Line | None:
-    """The strongest line that the healthy machine did not have, at its frequency or order; None without one."""
+def new_line(
+    lines: Sequence[Line], known: Sequence[KnownLine], speed_rad_s: float, *, beside: bool = True
+) -> Line | None:
+    """The strongest line that the healthy machine did not have, at its frequency or order; None without one.
+
+    Parameters
+    ----------
+    beside : bool
+        Whether the known ones are all, those next to a multiple of the speed too.
+    """
     for line in lines:
+        if line.beside and not beside:
+            continue
         own = line.known(speed_rad_s)
         seen = any(abs(now - then) <= _SAME * then for one in known for now, then in zip(own, one, strict=True))
         if line.certain and line.share > _LOUD and not seen:
@@ -110,6 +148,17 @@ def _coherent(own: npt.NDArray[np.complex128]) -> bool:
     norms = np.linalg.norm(earlier) * np.linalg.norm(later)
     coherence = min(1.0, float(abs(np.vdot(earlier, later)) / norms))
     return bool((1 - coherence**2) ** (earlier.size / 2 - 1) < _CHANCE)
+
+
+def _turning(left: npt.NDArray[np.complex128], apart_s: float, near_hz: float) -> tuple[float, bool]:
+    """How fast most of it turns, of what is possible nearest to a frequency; and whether no noise does like that."""
+    size = 16 * left.size
+    rotations = np.abs(np.fft.fft(left, size)) ** 2
+    most = int(rotations.argmax())
+    part = min(1.0, float(rotations[most]) / (left.size * float((left.real**2 + left.imag**2).sum())))
+    found_hz = most / size / apart_s
+    # Segments that overlap are no evidence, one of two is left.
+    return found_hz + round((near_hz - found_hz) * apart_s) / apart_s, (1 - part) ** (left.size / 2 - 2) < _CHANCE
 
 
 def _near_rotation(frequencies_hz: FloatArray, speed_hz: float, step_hz: float) -> npt.NDArray[np.bool_]:

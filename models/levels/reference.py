@@ -66,6 +66,8 @@ class LevelReference(BaseModel):
     gains: GainReference | None = Field(default=None, exclude_if=lambda found: found is None)
     # Frequency, Hz, and order of each line; None where they were not looked for.
     lines: tuple[tuple[_Level, _Level], ...] | None = Field(default=None, exclude_if=lambda found: found is None)
+    # Whether they were looked for next to multiples of the speed as well.
+    beside: bool = Field(default=False, exclude_if=lambda found: not found)
 
     @model_validator(mode="after")
     def _known(self) -> Self:
@@ -116,7 +118,7 @@ def learn_levels(
         else:
             groups.append([levels])
     states = tuple(_state(channels, group) for group in groups)
-    return LevelReference(source=source, states=states, gains=gains, lines=lines)
+    return LevelReference(source=source, states=states, gains=gains, lines=lines, beside=lines is not None)
 
 
 def _speed(levels: WindowLevels) -> float:

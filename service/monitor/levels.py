@@ -96,14 +96,18 @@ class LevelWatch:
         """What the latest window shows that no change of a parameter makes: a new line, or see `LevelJudge.foreign`."""
         if self._found is None:
             return ""
-        known, speed_rad_s = None if self.reference is None else self.reference.lines, statistics.speed_rad_s
-        if known is not None and math.isfinite(speed_rad_s) and speed_rad_s:
-            line = new_line(steady_lines(window.plan, window.hops, statistics), known, speed_rad_s)
+        healthy, speed_rad_s = self.reference, statistics.speed_rad_s
+        if healthy is not None and healthy.lines is not None and math.isfinite(speed_rad_s) and speed_rad_s:
+            lines = steady_lines(window.plan, window.hops, statistics)
+            line = new_line(lines, healthy.lines, speed_rad_s, beside=healthy.beside)
             if line is not None:
+                order = line.known(speed_rad_s)[1]
+                beat_hz = abs(line.frequency_hz - line.beside * abs(speed_rad_s) / (2 * math.pi))
+                beats = f", beats with the {line.beside}x every {1 / beat_hz:.2g} s" if line.beside else ""
                 text = (
-                    f"a line at {line.frequency_hz:.4g} Hz ({line.known(speed_rad_s)[1]:.2f} times running speed, "
-                    f"{line.share:.0%} of the random vibration of {line.state}) that the healthy machine did not have: "
-                    "a neighbouring machine, whirl or looseness"
+                    f"a line at {line.frequency_hz:.4g} Hz ({order:.4g} times running speed, {line.share:.0%} of the "
+                    f"random vibration of {line.state}{beats}) that the healthy machine did not have: a neighbouring "
+                    "machine, whirl or looseness"
                 )
                 return with_channel_names(text, self._machine.sensors)
         return self._judge.foreign(self._found, self.latest, self.reference, self._contact, named=named)

@@ -27,11 +27,15 @@ def line(hz: float, amplitude: float = 0.5) -> FloatArray:
     return np.asarray(amplitude * np.sin(2 * np.pi * hz * T + 0.3))
 
 
-def recording(of_y1: FloatArray) -> HealthyRecording:
-    """Of noise in every channel, and more in the first; turning at 22 Hz with a strong 1x."""
+def slow(hz: float) -> FloatArray:
+    return np.asarray(np.cos(2 * np.pi * hz * T))
+
+
+def recording(of_y1: FloatArray, turns: int = 1) -> HealthyRecording:
+    """Of noise in every channel, and more in the first; turning at 22 Hz, one way or the other, with a strong 1x."""
     samples = np.column_stack([noise(n) + line(SPEED_HZ, 3.0) for n in range(len(MACHINE.sensors))])
     samples[:, 0] += of_y1
-    samples[:, -1] = np.mod(2 * np.pi * SPEED_HZ * T, 2 * np.pi)
+    samples[:, -1] = np.mod(turns * 2 * np.pi * SPEED_HZ * T, 2 * np.pi)
     size = round(RATE_HZ)
     found = [
         (SampleBlock(1_767_225_600_000_000_000 + n * 10**9, n, 1, RATE_HZ, part.astype(np.float32)), "")
@@ -42,8 +46,8 @@ def recording(of_y1: FloatArray) -> HealthyRecording:
     return made
 
 
-def lines(of_y1: FloatArray) -> tuple[Line, ...]:
-    made = recording(of_y1)
+def lines(of_y1: FloatArray, turns: int = 1) -> tuple[Line, ...]:
+    made = recording(of_y1, turns)
     return steady_lines(made.plan, made.hops, window_statistics(made.plan, made.hops, lagged=False))
 
 
@@ -64,7 +68,7 @@ def test_a_line_is_found_with_its_share_and_kept_by_frequency_and_order() -> Non
 
 
 def test_neither_a_multiple_of_the_speed_nor_a_narrow_resonance_is_one() -> None:
-    assert lines(line(2 * SPEED_HZ)) == ()
+    assert lines(line(2 * SPEED_HZ)) == lines(line(2 * SPEED_HZ), turns=-1) == ()
     root = np.exp(2 * np.pi * (-0.003 + 1j) * 40 / RATE_HZ)  # damped by 0.3 %
     resonance = lfilter([1.0], [1, -2 * root.real, abs(root) ** 2], noise(20))
     assert not any(one.certain for one in lines(resonance / resonance.std()))
@@ -88,3 +92,33 @@ def test_a_line_that_turns_with_the_shaft_is_the_same_at_another_speed() -> None
 
 def test_one_that_is_weak_is_not_told() -> None:
     assert new_line(lines(line(33.0, 0.1)), healthy(), 2 * np.pi * SPEED_HZ) is None
+
+
+@pytest.mark.parametrize(("hz", "beside"), [(21.55, 1), (21.93, 1), (22.08, 1), (44.1, 2), (65.9, 3)])
+def test_a_line_that_beats_with_a_multiple_of_the_speed_is_found_beside_it(hz: float, beside: int) -> None:
+    (found,) = lines(line(hz))
+    (backwards,) = lines(line(hz), turns=-1)
+    assert backwards.beside == beside
+    assert backwards.frequency_hz == pytest.approx(found.frequency_hz)
+    assert (found.state, found.certain, found.beside) == ("y1", True, beside)
+    assert found.frequency_hz == pytest.approx(hz, abs=0.01)
+    assert found.share == pytest.approx(0.125 / 1.125, rel=0.2)
+    speed_rad_s = 2 * np.pi * SPEED_HZ
+    assert new_line([found], healthy(), speed_rad_s) is found
+    assert new_line([found], healthy(), speed_rad_s, beside=False) is None
+    assert new_line([found], [found.known(speed_rad_s)], speed_rad_s) is None
+
+
+@pytest.mark.parametrize("how", ["step", "slope", "pulsation", "resonance"])
+def test_a_multiple_that_changes_has_no_line_beside_it(how: str) -> None:
+    root = np.exp(2 * np.pi * (-0.003 + 1j) * SPEED_HZ / RATE_HZ)
+    resonance = lfilter([1.0], [1, -2 * root.real, abs(root) ** 2], noise(21))
+    more = {
+        "step": line(SPEED_HZ, 3.0) * (T > 33.0),
+        "slope": line(SPEED_HZ, 6.0) * T / T[-1],
+        "pulsation": line(SPEED_HZ, 1.5) * slow(0.11),
+        "resonance": resonance / resonance.std(),
+    }
+    found = lines(more[how])
+    assert found  # there is more than noise, but
+    assert not any(one.certain for one in found)
