@@ -62,7 +62,6 @@ _LONGEST = (
     "test_history_lost",
     "test_training",
     "test_scenarios",
-    "test_restart",
     "test_sequential",
     "test_commissioned",
     "test_overload",
@@ -89,7 +88,6 @@ _LONGEST = (
     "test_survives",
     "test_commission_page",
     "test_interleaving",
-    "test_late_joiner",
     "test_replay_identity",
 )
 """Modules that take long for the number of their tests, longest first."""

@@ -22,8 +22,6 @@ class Row:
         Breaks and mends it.
     prepare : callable
         Sets the plant up before the monitor is started.
-    is_cheap : bool
-        Whether it is part of the small selection.
     """
 
     name: str
@@ -33,7 +31,6 @@ class Row:
     recovery: str
     run: Callable[[Plant], None]
     prepare: Callable[[Plant], None] = lambda plant: None
-    is_cheap: bool = False
 
 
 ROWS = (
@@ -142,7 +139,6 @@ ROWS = (
         "`/readyz` 503: the history cannot be written, what happens waits in memory",
         "`/readyz` 200",
         faults.history_locked,
-        is_cheap=True,
     ),
     Row(
         "The history is locked until the monitor has stopped",
@@ -176,7 +172,6 @@ ROWS = (
         "alarm `monitor-fault`, and in the log that the history goes on in a new file with all it held",
         "the file is there again, `/readyz` 200",
         faults.deleted,
-        is_cheap=True,
     ),
     Row(
         "The history is replaced by another file",
