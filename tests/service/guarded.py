@@ -193,11 +193,6 @@ def basic(token: str, user: str = "x") -> dict[str, str]:
     return {"authorization": "Basic " + base64.b64encode(f"{user}:{token}".encode()).decode()}
 
 
-def send(client: httpx.Client, method: str, path: str) -> httpx.Response:
-    body = None if method in {"GET", "DELETE"} else {"reason": "known"}
-    return client.request(method, path, json=body)
-
-
 def problem(answer: httpx.Response, status: int) -> str:
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"

@@ -146,25 +146,16 @@ def test_the_audit_log_shows_each_action_once(tmp_path: Path, commands: typer.Ty
         assert "GET /health" not in run(commands, "audit", "--actor", "control room", "--config", config).stdout
 
 
-@pytest.mark.parametrize(
-    ("lines", "environment"),
-    [
-        ('[history]\nurl = "sqlite:///own history.sqlite"\n', {}),
-        ('[history]\nurl = "sqlite:///other.sqlite"\n', {"ROTORWATCH_HISTORY__URL": "sqlite:///environment.sqlite"}),
-    ],
-    ids=["file", "environment over file"],
-)
-def test_the_command_that_a_monitor_prints_creates_a_token_that_it_takes(
-    tmp_path: Path, lines: str, environment: dict[str, str]
-) -> None:
+def test_the_command_that_a_monitor_prints_creates_a_token_that_it_takes(tmp_path: Path) -> None:
+    """Where its history is, is said by its environment, over the settings file."""
     folder = tmp_path / "a plant"
     folder.mkdir()
-    (folder / "plant.toml").write_text(lines, encoding="utf-8")
+    (folder / "plant.toml").write_text('[history]\nurl = "sqlite:///other.sqlite"\n', encoding="utf-8")
     arguments = ["--listen", endpoint(), "--http-port", "0", "--config", "plant.toml"]
     plain = {name: value for name, value in os.environ.items() if not name.startswith(("ROTORWATCH_", "XDG_"))}
     plain |= {"PYTHONPATH": str(ROOT), "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     plain |= {"HOME": str(tmp_path)}
-    alone = plain | environment
+    alone = plain | {"ROTORWATCH_HISTORY__URL": "sqlite:///its own.sqlite"}
     with program(tmp_path, "service.rotorwatch", "run", *arguments, cwd=folder, alone=alone) as monitor:
         url = monitor.url()
         monitor.wait_for("token create")

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterable
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -387,12 +386,3 @@ def test_restarts_change_nothing(stories: list[tuple[str, object, object]]) -> N
     other, same = walk(stories, restarts=False)
     assert events == same
     assert sorted(map(repr, book.alarms)) == sorted(map(repr, other.alarms))
-
-
-def test_a_log_that_is_ahead_is_not_numbered_again() -> None:
-    book, now_s = raised()
-    other = AlarmBook(SETTINGS)
-    other.restore(book.checkpoint(), next_sequence=7)
-    (event,) = other.operate(act("acknowledge"), now_s * S)
-    assert event.sequence == 7
-    assert replace(event.alarm, version=0).state is AlarmState.ACKNOWLEDGED

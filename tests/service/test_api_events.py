@@ -462,23 +462,3 @@ def test_a_history_that_fails_is_a_problem(shared: Runtime, monkeypatch: pytest.
     with client(shared) as http:
         found = problem(http.get("/api/v1/machines/demo/lab/alarms/events"), 503)
     assert found.detail == "the history cannot be used: the disk is gone"
-
-
-def test_events_of_a_file_survive_the_service(tmp_path: Path) -> None:
-    """The id of one run of the service leads on in the next."""
-    plan = settings(endpoint())
-    plan = plan.model_copy(
-        update={
-            "access": OPEN,
-            "history": plan.history.model_copy(update={"url": f"sqlite:///{tmp_path / 'h.sqlite'}"}),
-        }
-    )
-    with running(plan) as runtime:
-        happen(runtime.machines()[0], 3)
-        with reading(runtime, "?from=beginning") as reader:
-            reader.next()
-            last = reader.next().id
-    with running(plan) as runtime:
-        happen(runtime.machines()[0])
-        with reading(runtime, **{"last-event-id": last}) as reader:
-            assert [one.data.sequence for one in reader.alarms(2)] == [2, 3]

@@ -13,7 +13,7 @@ from models.machine import load_machine
 from models.signals.block import SampleBlock
 from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
-from models.signals.wire import BLOCK_ENCODING, decode_block, encode_block
+from models.signals.wire import decode_block, encode_block
 from rotorwatch.client.answers import understood
 from rotorwatch.client.log_order import LogOrder
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage, AlarmStates, EventKind
@@ -34,9 +34,9 @@ from tests.service.live import LAB, Feed, endpoint, machine_file, open_session, 
 HASH = LAB.descriptor.schema_hash
 
 
-def with_nan(block: SampleBlock) -> SampleBlock:
+def with_one(block: SampleBlock, value: float) -> SampleBlock:
     samples = block.samples.copy()
-    samples[12, 3] = np.nan
+    samples[12, 3] = value
     return SampleBlock(block.start_ns, block.sequence, block.run, block.rate_hz, samples)
 
 
@@ -68,12 +68,18 @@ BAD: dict[str, tuple[Reason, Callable[[Feed], None], str]] = {
         "has 8 channels, expected 9",
     ),
     "rate": (Reason.RATE, lambda feed: feed.put(feed.block(rate_hz=2048.0)), "has rate_hz 2048, expected 2000"),
+    "a single sample": (Reason.SHAPE, lambda feed: feed.put(feed.block(samples=feed.samples(1))), "1 samples"),
     "too long": (
         Reason.SHAPE,
         lambda feed: feed.put(feed.block(samples=feed.samples(5000))),
         "has 5000 samples (2.5 s)",
     ),
-    "NaN": (Reason.NOT_FINITE, lambda feed: feed.put(with_nan(feed.block())), "channel z1_dot: sample 12 is nan"),
+    "NaN": (
+        Reason.NOT_FINITE,
+        lambda feed: feed.put(with_one(feed.block(), np.nan)),
+        "channel z1_dot: sample 12 is nan",
+    ),
+    "infinity": (Reason.NOT_FINITE, lambda feed: feed.put(with_one(feed.block(), np.inf)), "sample 12 is inf"),
     "repeated": (
         Reason.OVERLAP,
         lambda feed: feed.put(feed.block(sequence=feed.sequence - 1, start_ns=feed.start_ns - 300_000_000)),
@@ -134,20 +140,6 @@ def test_refused_explained_and_carried_on(fed: tuple[Runtime, MachineWorker, Fee
     after = worker.health().quality
     assert after.gaps == before.gaps
     assert after.last_refusal == refused.last_refusal
-    assert worker.errors == 0
-    assert runtime.readiness().ready
-
-
-def test_a_flood_of_rubbish_leaves_the_service_standing(fed: tuple[Runtime, MachineWorker, Feed]) -> None:
-    runtime, worker, feed = fed
-    before = worker.health().quality
-    rng = np.random.default_rng(11)
-    for _ in range(300):
-        feed.put_raw(rng.bytes(int(rng.integers(0, 9000))), rng.bytes(32), f"{BLOCK_ENCODING};{HASH}")
-    feed.put_good()
-    until(lambda: worker.health().quality.accepted_blocks == before.accepted_blocks + 1, "good block after the flood")
-    after = worker.health().quality
-    assert sum(after.refused_blocks.values()) == sum(before.refused_blocks.values()) + 300
     assert worker.errors == 0
     assert runtime.readiness().ready
 

@@ -10,15 +10,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import httpx
 import pytest
 
 from service.commands.demo import FAULTS, Outcome
 from simulator.scenario import load_scenario
-from tests.service.live import ROOT, Program, endpoint, program, until
+from tests.service.live import ROOT, Program, program, until
 from tests.service.preloaded import ran
 
-HEALTHY_S = int(os.environ.get("ROTORWATCH_HEALTHY_S", "75"))
 WHOLE, QUICK = ("service.rotorwatch", "demo"), ("tests.service.quick_demo",)
 
 
@@ -157,32 +155,6 @@ def test_the_demo_breaks_what_the_shipped_scenarios_break() -> None:
     for name, change in FAULTS.items():
         events = load_scenario(name)[0].events
         assert [(event.parameter, event.relative_change) for event in events] == [(name, change)]
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_a_healthy_machine_at_full_speed_raises_nothing_and_loses_nothing(tmp_path: Path) -> None:
-    """Over Zenoh, as fast as the monitor takes it; the publisher waits for the monitor, so no block is lost. An hour::
-
-    ROTORWATCH_HEALTHY_S=3600 python -m pytest tests/service/test_demo.py -k full_speed
-    """
-    where = endpoint()
-    with program(tmp_path, "service.rotorwatch", "run", "--listen", where, "--http-port", "0") as monitor:
-        monitor.url()
-        simulator = ran(
-            "simulator.rotorsim", "publish", "healthy", "--seed", "106", "--duration", str(HEALTHY_S), "--pace", "max",
-            "--connect", where, "--wait-for-subscriber", "60",
-        )  # fmt: skip
-        assert simulator.returncode == 0, simulator.stdout
-        until(lambda: monitor.health().quality.accepted_blocks == 10 * HEALTHY_S, "all blocks")
-        quality = monitor.health().quality
-        assert (quality.refused_blocks, quality.gaps, quality.queue_dropped_blocks) == ({}, 0, 0)
-        base = f"{monitor.url()}/api/v1/machines/demo/lab"
-        reports = httpx.get(f"{base}/reports", params={"limit": 1000}, timeout=180.0).json()["reports"]
-        assert [report["state"] for report in reports].count("healthy") == (HEALTHY_S - 60) // 5
-        events = httpx.get(f"{base}/alarms/events", timeout=180.0).json()["events"]
-        assert [one["data"]["name"] for one in events] in ([], ["stream-lost"])  # the silence after the end
-        assert httpx.get(f"{base}/alarms", params={"all": True}, timeout=180.0).json()["alarms"]
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import identity_of
 from service.runtime.runtime import running
 from service.stream.checkpoints import checkpoint_step, restored
-from service.stream.inbox import Inbox, RawBlock
 from tests.service.live import (
     IN_ORDER,
     LAB,
@@ -215,16 +214,6 @@ def test_a_full_queue_says_so_to_operators(tmp_path: Path) -> None:
         assert "cannot keep up" in worker.health().quality.last_gap
         (event,) = worker.history.events()
         assert event.alarm == OVERLOADED
-
-
-def test_a_queue_counts_what_it_drops_for_the_block_that_comes_next() -> None:
-    inbox = Inbox(2, "drop")
-    for number in range(5):
-        inbox.put(RawBlock(bytes([number]), b"", ""))
-    assert inbox.dropped == 4
-    (left,) = (inbox.get(),)
-    assert isinstance(left, RawBlock)
-    assert (left.payload, left.dropped_before) == (bytes([4]), 4)
 
 
 # What cannot be remembered or put into words

@@ -43,6 +43,8 @@ UNDESCRIBED = {
     ("GET", "/docs/{name}"),
     ("GET", "/page/{version}/{name:path}"),
 }
+#: What there is not: whoever has no token does not even learn that.
+STRAY = {("GET", "/nowhere"), ("PATCH", "/api/v1/machines"), ("POST", "/healthz")}
 VALUES = {
     "site": "demo",
     "version": "0",
@@ -140,7 +142,7 @@ def test_no_route_answers_without_a_valid_token(runtime: Runtime, description: d
     described = {(method.upper(), path) for path, methods in description["paths"].items() for method in methods}
     for text in ("", "rw_000000000000_" + 43 * "0", "secret"):
         with client(runtime, text) as nobody:
-            for method, path in sorted(described | UNDESCRIBED):
+            for method, path in sorted(described | UNDESCRIBED | STRAY):
                 if (method, path) in PUBLIC:
                     assert ask(nobody, method, path).status_code == (404 if "{" in path else 200)
                     continue
@@ -179,6 +181,8 @@ def test_every_route_asks_for_its_scope(runtime: Runtime, http: httpx.Client, de
             declared = [part.get("token") for part in route.get("security", []) if "token" in part]
             public = (method.upper(), path) in PUBLIC
             assert declared == ([] if public else [[needed(method.upper(), path)]]), path
+            in_browsers = any("browser" in part for part in route.get("security", []))
+            assert in_browsers == (declared == [[READ]]), path
     assert http.get("/openapi.json").status_code == 200
 
 

@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 import zenoh
@@ -22,7 +21,6 @@ from tests.service.live import (
     Feed,
     endpoint,
     open_session,
-    program,
     scenario_blocks,
     send,
     service,
@@ -68,8 +66,8 @@ def test_full_inbox_drops_what_waits_and_counts_it() -> None:
         inbox.put(RawBlock(bytes([number]), b"", ""))
     # 0 1 2 | 3 4 5 | 6 7: twice full, twice emptied; what is left continues without a hole.
     assert inbox.dropped == 6
-    taken = [inbox.get(), inbox.get()]
-    assert [block.payload for block in taken if isinstance(block, RawBlock)] == [bytes([6]), bytes([7])]
+    taken = [(block.payload, block.dropped_before) for _ in range(2) if isinstance(block := inbox.get(), RawBlock)]
+    assert taken == [(bytes([6]), 6), (bytes([7]), 0)]  # what was dropped is told with the block that comes next
     assert len(inbox) == 0
 
 
@@ -164,7 +162,7 @@ def test_blocks_of_two_sessions_are_told_apart() -> None:
 
 def test_waiting_slows_the_publisher_down_and_loses_nothing() -> None:
     address = endpoint()
-    stream = scenario_blocks(60.0)
+    stream = scenario_blocks(10.0)
     with service(address, when_full="wait", bound=2) as (_, worker):
         send(address, stream)
         until(lambda: worker.health().quality.accepted_blocks == len(stream), "every block")
@@ -366,24 +364,6 @@ def test_alarm_log_is_answered_while_the_machine_is_busy() -> None:
         assert query(session, KEYS.health) == '{"h": 1}'
         gate.set()
         assert [reply.ok.payload.to_string() for reply in waiting if reply.ok is not None] == ["[]"]
-
-
-def test_killed_monitor_is_seen_to_be_gone(tmp_path: Path) -> None:
-    address = endpoint()
-    changes: list[tuple[str, bool]] = []
-    command = ("service.rotorwatch", "run", "--machine", "lab", "--listen", address, "--http-port", "0")
-    with program(tmp_path, *command) as monitor:
-        monitor.wait_for("HTTP API")
-        with open_session(address) as session:
-            listening = session.liveliness().declare_subscriber(
-                KEYS.monitor_alive,
-                lambda sample: changes.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)),
-                history=True,
-            )
-            until(lambda: changes == [(KEYS.monitor_alive, True)], "monitor's token")
-            monitor.kill()
-            until(lambda: changes[1:] == [(KEYS.monitor_alive, False)], "token gone")
-            listening.undeclare()  # type: ignore[no-untyped-call]
 
 
 def test_publisher_is_seen_to_come_and_go_and_its_descriptor_is_asked_for() -> None:
