@@ -249,7 +249,7 @@ def test_orbits_and_spectra_of_any_window_of_a_replay(browser: Browser, runtime:
             expect(page.locator("window-plots correlation-plot")).to_contain_text("Replay, window 2026-01-01 00:00:")
             assert not violations(page)
             kept(page, "replay-window-all")
-        for kind, phone, dark in (("dark", False, True), ("phone", True, False), ("phone-dark", True, True)):
+        for kind, phone, dark in (("dark", False, True), ("phone", True, False)):
             with looking(browser, url, phone=phone, dark=dark) as page:
                 if kind == "dark":  # no answer; one that refuses would be an error on the console too
                     page.clock.install()

@@ -17,6 +17,8 @@ from tests.service.monitored import PLACE, client, problem
 
 FAULT_S = 40.0
 CHANGED = -0.33
+HOP = 50
+"""Blocks of a hop."""
 
 
 def test_an_alarm_can_be_understood_long_after_its_window_is_gone(tmp_path: Path) -> None:
@@ -31,23 +33,28 @@ def test_an_alarm_can_be_understood_long_after_its_window_is_gone(tmp_path: Path
     blocks = scenario_blocks(100.0, parse_fault(f"k_by={CHANGED}@{FAULT_S:g}"))
     with running(plan) as runtime, open_session(address) as session, client(runtime) as http:
         worker = runtime.machines()[0]
-        feed = Feed(session, LAB)
+        feed, sent = Feed(session, LAB), 0
 
         def kept() -> AlarmEvidence | None:
             text = worker.history.evidence("k_by")
             return None if text is None else AlarmEvidence.model_validate_json(text)
 
+        def feed_on(count: int) -> None:
+            nonlocal sent
+            for block in blocks[sent : sent + count]:
+                feed.put(block)
+            sent += count
+            until(lambda: worker.health().quality.accepted_blocks == sent, f"{sent} blocks")
+            time.sleep(0.3)  # windows are looked at four times a second
+
         def until_settled() -> bool:
-            feed.put(next(coming))
-            time.sleep(0.02)  # windows are looked at four times a second
+            feed_on(HOP)
             found = kept()
             return found is not None and found.settled is not None
 
-        for block in blocks[: round(10 * FAULT_S)]:
-            feed.put(block)
+        feed_on(round(10 * FAULT_S))
         until(lambda: worker.history.evidence("") is not None, "picture of the healthy machine")
         assert problem(http.get(f"{PLACE}/alarms/k_by/evidence"), 404).detail.startswith("nothing was kept of k_by")
-        coming = iter(blocks[round(10 * FAULT_S) :])
         until(until_settled, "evidence of the whole change")
         answer = http.get(f"{PLACE}/alarms/k_by/evidence")
         found = AlarmEvidence.model_validate_json(answer.content)

@@ -9,7 +9,6 @@ import pytest
 from models.alarm_names import PHASE_REFERENCE
 from models.commissioning.commissioned import Installed
 from models.commissioning.healthy import healthy_from_blocks
-from models.diagnosis.networks.bundle import load_bundle
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from models.signals.channels import Quantity
@@ -18,11 +17,11 @@ from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
 from tests.service.live import LAB, scenario_blocks
 
-STOPS_S, STANDS_S, STARTS_S, RUNS_S, END_S = 80.0, 90.0, 170.0, 180.0, 260.0
+STOPS_S, STANDS_S, STARTS_S, RUNS_S, END_S = 40.0, 50.0, 110.0, 120.0, 170.0
 NOISE = 0.01
+KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 20.0})})
 NEW = MachineFile.model_validate(
-    LAB.model_dump(exclude={"rotor", "condition"}, exclude_none=True)
-    | {"levels": {"reference_windows": 2}, "window": LAB.window.model_dump() | {"length_s": 20.0}}
+    KIT.model_dump(exclude={"rotor", "condition"}, exclude_none=True) | {"levels": {"reference_windows": 2}}
 )
 WITHOUT_ANGLE = NEW.model_copy(update={"sensors": NEW.sensors[:-1]})
 
@@ -65,22 +64,22 @@ def watched(monitor: MachineMonitor, stream: list[SampleBlock]) -> tuple[list[Re
 
 
 def monitor_of(machine: MachineFile) -> MachineMonitor:
-    return MachineMonitor(Installed(machine, load_bundle("lab", LAB) if machine is LAB else None))
+    return MachineMonitor(Installed(machine))
 
 
 def test_a_machine_that_stops_and_starts_raises_nothing_and_is_healthy_again_after_a_restart_too() -> None:
-    stream = list(stopping(LAB, "machine"))
-    monitor = monitor_of(LAB)
+    stream = list(stopping(KIT, "machine"))
+    monitor = monitor_of(KIT)
     reports, events = watched(monitor, stream)
     assert events == []
     states = {round((one.end_ns - stream[0].start_ns) / 1e9): one.state for one in reports}
-    assert states[78] is states[258] is HealthState.HEALTHY
+    assert states[38] is states[168] is HealthState.HEALTHY
     standing = [one for one in reports if "the machine stands" in one.reason]
     assert {one.state for one in standing} == {HealthState.NOT_EVALUABLE}
     assert standing[-1].end_ns - standing[0].end_ns >= (STARTS_S - STANDS_S) * 1e9
     assert not any(one.sensors for one in standing)
     half = len(stream) // 2  # while it stands
-    before, after = monitor_of(LAB), monitor_of(LAB)
+    before, after = monitor_of(KIT), monitor_of(KIT)
     seen, _ = watched(before, stream[:half])
     state = before.state(whole=True)
     after.restore(state.state, tuple(data for _, data in state.new_parts))
@@ -89,7 +88,7 @@ def test_a_machine_that_stops_and_starts_raises_nothing_and_is_healthy_again_aft
 
 @pytest.mark.parametrize(("what", "alarm"), [("angle", PHASE_REFERENCE), ("signals", "data-stuck")])
 def test_what_is_lost_while_the_machine_runs_is_told(what: str, alarm: str) -> None:
-    _, events = watched(monitor_of(LAB), list(stopping(LAB, what)))
+    _, events = watched(monitor_of(KIT), list(stopping(KIT, what)))
     assert events == [(EventKind.RAISED, alarm)]
 
 
