@@ -100,17 +100,6 @@ def test_signal_that_another_thread_receives_stops_the_program_too(tmp_path: Pat
         assert started.process.wait(180) == 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [(("run", "--config", "missing.toml"), "missing.toml"), (("check-config", "missing.toml"), "missing.toml")],
-)
-def test_unusable_files_and_arguments_exit_with_2(arguments: tuple[str, ...], named: str) -> None:
-    found = run(*arguments)
-    assert found.returncode == 2
-    assert named in found.stderr
-    assert "Traceback" not in found.stderr
-
-
 def test_watch_and_status_without_a_monitor_say_so() -> None:
     address = endpoint()
     found = run("watch", "--connect", address)

@@ -15,7 +15,6 @@ import pytest
 
 from models.alarm_names import STREAM_LOST
 from models.commissioning.commissioned import install
-from models.errors import BundleError, MachineFileError
 from models.machine import load_machine
 from models.signals.link import LinkSettings
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
@@ -227,21 +226,6 @@ def test_stopped_service_has_no_thread_left() -> None:
             feed.put_good()
         until(lambda: worker.health().quality.accepted_blocks > 0, "blocks")
     assert not worker.status().alive
-
-
-@pytest.mark.parametrize(
-    ("entry", "error", "named"),
-    [
-        (MachineEntry(file="missing.toml"), MachineFileError, "missing.toml: no such machine file"),
-        (MachineEntry(file="lab", bundle="missing"), BundleError, "missing"),
-        (MachineEntry(file="heavy", bundle="lab"), BundleError, "lab"),
-    ],
-)
-def test_files_are_checked_before_anything_runs(
-    entry: MachineEntry, error: type[MachineFileError] | type[BundleError], named: str
-) -> None:
-    with pytest.raises(error, match=named):
-        Runtime(ServiceSettings(machines=(entry,)))
 
 
 def test_log_lines_of_one_kind_are_limited() -> None:

@@ -416,13 +416,3 @@ def test_unusable_endpoint_is_named() -> None:
         Link(settings)
     assert named in str(caught.value)
     assert ".rs" not in str(caught.value)
-
-
-def test_used_and_silent_addresses_are_named() -> None:
-    address = endpoint()
-    with machine_link(address, ignore), pytest.raises(LinkError) as caught:
-        Link(LinkSettings(listen=(address,)))
-    assert f"listen {address}) could not be opened: address already in use" in str(caught.value)
-    with pytest.raises(LinkError) as caught:
-        Link(LinkSettings(mode="client", connect=(address,)), fail_fast=True)
-    assert f"connect {address}) could not be opened: nobody answers there" in str(caught.value)

@@ -6,11 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from models.diagnosis.networks.bundle import load_bundle
 from models.machine import load_machine
-from simulator.rotortrain import app
 from tests.service.live import machine_file
 
 ROOT = Path(__file__).parents[2]
@@ -35,21 +33,6 @@ def test_train_writes_a_bundle_that_fits_the_machine(tmp_path: Path) -> None:
     bundle = load_bundle(out, load_machine(file))
     assert bundle.manifest.training.training_windows == 20
     assert bundle.amortised is not None
-
-
-@pytest.mark.slow
-def test_a_machine_file_that_is_not_there_is_exit_code_2_and_a_sentence(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["train", "--machine", "none.toml", "--out", str(tmp_path / "x")])
-    assert done.exit_code == 2
-    assert "none.toml: no such machine file" in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not (tmp_path / "x").exists()
-
-
-def test_an_option_that_is_missing_is_exit_code_2_and_named() -> None:
-    done = CliRunner().invoke(app, ["train", "--machine", "lab"])
-    assert done.exit_code == 2
-    assert "Missing option '--out'" in done.stderr
 
 
 def test_help_needs_neither_torch_nor_scipy_nor_numpy() -> None:
