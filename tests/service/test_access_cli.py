@@ -86,6 +86,8 @@ def test_a_token_works_at_once_and_not_a_request_longer(tmp_path: Path, commands
         (("create", "x", "--scope", "admin"), "--scope is admin, expected read, operate, configure"),
         (("create", "x", "--scope", "read", "--days", "0"), "days is 0, expected 1 to 3650"),
         (("create", " ", "--scope", "read"), "name is ' '"),
+        (("create", "", "--scope", "read"), "name is ''"),
+        (("create", 65 * "x", "--scope", "read"), "expected 1 to 64 printable characters"),
         (("revoke", "000000000000"), "there is no token '000000000000'"),
     ],
 )

@@ -13,7 +13,7 @@ from models.errors import MachineFileError
 from models.mistakes import in_folder
 from service.access.credentials import network_of
 from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
-from service.access.scopes import ANONYMOUS, Scope
+from service.access.scopes import Scope
 from service.access.tls import server_arguments, tls_context
 from service.access.tokens import masked, new_token, parse_token, token_is_valid
 from service.history.records import TokenRecord
@@ -83,21 +83,6 @@ def test_expiry_and_revocation() -> None:
     assert not token_is_valid(TokenRecord(**{**fields, "revoked_ns": 1}), presented, 1)
     # The right secret under another token's name.
     assert not token_is_valid(TokenRecord(**{**fields, "token_id": "0" * 12}), presented, 1)
-
-
-@pytest.mark.parametrize("name", ["", " x", "x ", "a\nb", "x" * 65, ANONYMOUS, "rw_0123456789AB_x"])
-def test_names_that_mean_nobody_are_refused(name: str) -> None:
-    with pytest.raises(MachineFileError, match="name is"):
-        made(name)
-
-
-def test_scopes_and_days_are_checked() -> None:
-    with pytest.raises(MachineFileError, match="read, operate, configure"):
-        new_token("ops", [], now_ns=0)
-    for days in (0, -1, 3651):
-        with pytest.raises(MachineFileError, match=f"days is {days}"):
-            made(days=days)
-    assert new_token("ops", [Scope.OPERATE, Scope.READ, Scope.READ], now_ns=0)[0].scopes == ("read", "operate")
 
 
 @given(st.text(alphabet=" /?&=é\n"), st.text(alphabet=" /?&=é\n_"), st.integers(1, 43))

@@ -127,22 +127,6 @@ def test_velocity_correlation_is_the_derivative_of_displacement_correlation(
     _assert_agrees(runs_17, theory, np.full(61, np.sqrt(R[i, i] * R[j, j])))
 
 
-def test_the_1x_part_is_the_synchronous_response(machine: Machine, condition: Condition) -> None:
-    samples = Plant(machine, condition, np.random.default_rng(5)).advance(round(60 * RATE_HZ))
-    q1, q2 = synchronous_response(machine.rotor, machine.operation.speed_rad_s)
-    cosine, sine = np.cos(samples.theta_rad), np.sin(samples.theta_rad)
-    blocks = samples.states.reshape(60, -1, 12)  # one second, 22 revolutions, each
-    estimates = np.array([
-        2 * np.stack([c @ x, s @ x]) / len(c)
-        for x, c, s in zip(blocks, cosine.reshape(60, -1), sine.reshape(60, -1), strict=True)
-    ])  # fmt: skip
-    theory = np.stack([q1, q2])
-    error = estimates.std(axis=0, ddof=1) / np.sqrt(60)
-    assert np.all(np.abs(estimates.mean(axis=0) - theory) < 5 * error)
-    disc = STATE_INDEX["y2"]
-    assert error[0, disc] < 0.1 * np.hypot(q1, q2)[disc]
-
-
 def test_the_shaft_angle_is_measured_from_the_phase_reference(machine: Machine) -> None:
     """The heavy spot stands at unbalance_phase_rad when the angle is 0: the same response, later by that angle."""
     phase = 2 * np.pi / 5

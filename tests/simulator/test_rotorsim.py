@@ -20,6 +20,7 @@ from simulator.rotorsim import app
 from simulator.scenario import load_scenario
 from simulator.stream import DEFAULT_START_NS, TruthRecord, blocks
 from tests.loopback import endpoint, session_of
+from tests.service.live import program
 
 ROOT = Path(__file__).parents[2]
 
@@ -129,7 +130,7 @@ def test_a_run_time_failure_exits_1() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_publishing_cleanly(number: signal.Signals) -> None:
+def test_a_signal_ends_publishing_cleanly(tmp_path: Path, number: signal.Signals) -> None:
     address = endpoint()
     three = threading.Event()
     gone = threading.Event()
@@ -146,17 +147,16 @@ def test_a_signal_ends_publishing_cleanly(number: signal.Signals) -> None:
     with session_of(LinkSettings(listen=(address,))) as session:
         session.declare_subscriber("rotorwatch/demo/lab/stream", keep)
         session.liveliness().declare_subscriber("rotorwatch/demo/lab/alive/publisher", watch)
-        command = [sys.executable, "-m", "simulator.rotorsim", "publish", "--connect", address, "--block-s", "0.05"]
-        with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        command = ("simulator.rotorsim", "publish", "--connect", address, "--block-s", "0.05")
+        with program(tmp_path, *command) as publisher:
             assert three.wait(180)
-            process.send_signal(number)
-            out, err = process.communicate(timeout=180)
+            assert publisher.stop(number) == 0
         assert gone.wait(180)
-    assert process.returncode == 0
-    assert [line for line in err.splitlines() if "s of data" not in line] == []  # how far it is, and nothing else
-    assert out.startswith("published ")
-    assert out.endswith("s of data, on rotorwatch/demo/lab/stream\n")
-    assert len(out.splitlines()) == 1
+    # How far it is, and nothing else.
+    assert [line for line in publisher.errors().splitlines() if "s of data" not in line] == []
+    (said,) = publisher.output().splitlines()
+    assert said.startswith("published ")
+    assert said.endswith("s of data, on rotorwatch/demo/lab/stream")
 
 
 @pytest.mark.parametrize("listened", [True, False])
