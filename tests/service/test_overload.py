@@ -25,7 +25,7 @@ from service.monitor.monitor import MachineMonitor
 from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.source import RecordingSource
 from service.runtime.runtime import running
-from service.settings.service import MachineEntry, RecordingSettings
+from service.settings.service import RecordingSettings
 from service.stream import shedding
 from service.stream.inbox import Inbox, RawBlock
 from service.stream.shedding import LoadShedding
@@ -41,6 +41,7 @@ from tests.service.live import (
     open_session,
     scenario_blocks,
     until,
+    worker_of,
 )
 from tests.service.live import settings as plan_for
 from tests.service.monitored import client
@@ -52,10 +53,9 @@ LENGTH_S = 260.0  # long enough for the alarm to clear after what waits has been
 LIMIT = '\n[[levels.limits]]\nchannel = "y1"\nmeasure = "overall"\nalert = 220.0\ndanger = 1000.0\n'
 
 
-def short_machine(folder: Path, name: str = "lab") -> str:
-    """The rotor kit under a name, with windows of 20 s and a limit for what the channel y1 shows."""
-    folder.mkdir(exist_ok=True)
-    file = Path(machine_file(folder, ('name = "lab"', f'name = "{name}"'), PATIENT, *SHORT))
+def short_machine(folder: Path) -> str:
+    """The rotor kit with windows of 20 s and a limit for what the channel y1 shows."""
+    file = Path(machine_file(folder, PATIENT, *SHORT))
     file.write_text(file.read_text(encoding="utf-8") + LIMIT, encoding="utf-8")
     return str(file)
 
@@ -276,75 +276,62 @@ def test_blocks_of_others_and_bursts_for_an_idle_worker_are_no_reason_to_skip() 
 # A running service
 
 
-def hurry(feeds: Sequence[tuple[Feed, MachineWorker, list[SampleBlock]]], done: Callable[[], bool], ahead: int) -> None:
-    """Put blocks so that so many wait at every worker, whatever it does about it, until something is so."""
-    while not done():
-        for feed, worker, stream in feeds:
-            if feed.sequence < len(stream) and len(worker.inbox) < ahead:
-                for block in stream[feed.sequence : feed.sequence + 50]:
-                    feed.put(block)
-                feed.sequence += 50
-        time.sleep(0.002)  # a loop that never rests takes the processor from the workers
-        assert any(feed.sequence < len(stream) for feed, _, stream in feeds), "the stream ended before"
+def hurry(feed: Feed, worker: MachineWorker, stream: list[SampleBlock], until_sent: int, ahead: int) -> None:
+    """Put blocks so that so many wait at the worker, whatever it does about it, until so many are sent."""
+    while feed.sequence < until_sent:
+        if len(worker.inbox) < ahead:
+            for block in stream[feed.sequence : feed.sequence + 50]:
+                feed.put(block)
+            feed.sequence += 50
+        time.sleep(0.002)  # a loop that never rests takes the processor from the worker
 
 
 def test_an_overloaded_service_loses_no_sample_says_so_and_is_replayed_to_the_same_answer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shedding, "_LASTING_S", 0.3)  # data come a hundred times as fast as from a machine
-    address, stream = endpoint(), loud_in_between(LENGTH_S)
-    files = [short_machine(tmp_path / name, name) for name in ("lab", "two")]
-    plan = plan_for(address, bound=1500).model_copy(
-        update={
-            "machines": tuple(MachineEntry(file=file) for file in files),
-            "recording": RecordingSettings(directory=str(tmp_path / "recordings")),
-        }
-    )
+    address, stream, file = endpoint(), loud_in_between(LENGTH_S), short_machine(tmp_path)
+    recording = RecordingSettings(directory=str(tmp_path / "recordings"))
+    plan = plan_for(address, file, bound=1500).model_copy(update={"recording": recording})
     with running(plan) as runtime, open_session(address) as session:
-        workers = [worker for worker in runtime.machines() if isinstance(worker, MachineWorker)]
-        feeds = [(Feed(session, worker.machine), worker, stream) for worker in workers]
-        hurry(feeds, lambda: all(feed.sequence >= 10 * (LOUD_TO_S + 50) for feed, *_ in feeds), 200)
-        for feed, worker, _ in feeds:  # from now on a hop comes when the one before is done
-            for end in (*range(feed.sequence + 25, len(stream), 50), len(stream)):
-                # nothing waits, and nothing but what follows the latest hop is on its way
-                until(
-                    lambda w=worker, f=feed: (  # type: ignore[misc]  # bound now
-                        len(w.inbox) == 0
-                        and w.health().quality.accepted_blocks >= f.sequence - (0 if f.sequence % 50 else 40)
-                    ),
-                    "an idle worker",
-                )
-                for block in stream[feed.sequence : end]:
-                    feed.put(block)
-                feed.sequence = end
-        until(lambda: all(one.health().quality.accepted_blocks == len(stream) for one in workers), "all blocks")
+        worker = worker_of(runtime)
+        feed = Feed(session, worker.machine)
+        hurry(feed, worker, stream, 10 * (LOUD_TO_S + 50), 200)
+        # From now on a hop comes when the one before is done.
+        for end in (*range(feed.sequence + 25, len(stream), 50), len(stream)):
+            # nothing waits, and nothing but what follows the latest hop is on its way
+            known = feed.sequence - (0 if feed.sequence % 50 else 40)
+            until(
+                lambda known=known: len(worker.inbox) == 0 and worker.health().quality.accepted_blocks >= known,  # type: ignore[misc]  # bound now
+                "an idle worker",
+            )
+            for block in stream[feed.sequence : end]:
+                feed.put(block)
+            feed.sequence = end
+        until(lambda: worker.health().quality.accepted_blocks == len(stream), "all blocks")
         with client(runtime) as http:
             metrics = http.get("/metrics").text
-        said = {worker.machine.name: lines_of(worker) for worker in workers}
-        for worker in workers:
-            name, quality = worker.machine.name, worker.health().quality
-            assert (quality.gaps, quality.queue_dropped_blocks, quality.refused_blocks) == (0, 0, {})
-            assert quality.skipped_windows >= 5
-            assert f'windows_skipped_total{{machine="{name}",site="demo"}} {quality.skipped_windows}.0' in metrics
-            windows = [Report.model_validate_json(one.text) for _, one in worker.history.reports(limit=1000)]
-            skipped = {one.end_ns for one in windows if one.skipped}
-            assert len(skipped) == quality.skipped_windows
-            assert len(windows) == math.floor((LENGTH_S - 2.5) / 5)
-            assert worker.tally.windows == len(windows) - len(skipped)
-            events = worker.history.events()
-            told = [f"{one.kind} {one.alarm}" for one in events]
-            assert told.count(f"raised {OVERLOADED}") == told.count(f"cleared {OVERLOADED}") == 1
-            (loud,) = (one for one in events if (one.kind, one.alarm) == ("raised", f"{LEVEL}y1"))
-            assert LOUD_FROM_S < (loud.time_ns - START_NS) / S < LOUD_FROM_S + 20
-            assert loud.time_ns in skipped
-            assert worker.health().state is HealthState.HEALTHY
-    for file in files:
-        machine = load_machine(file)
-        found: list[str] = []
-        source = RecordingSource(sorted((tmp_path / "recordings" / machine.site / machine.name).glob("*.mcap")))
-        OfflineReplay(source, machine.keys, install(machine, None), found.append).run()
-        assert found == said[machine.name]
-        assert sum(json.loads(one)["message"].get("skipped", False) for one in found) >= 5
+        said, quality = lines_of(worker), worker.health().quality
+        assert (quality.gaps, quality.queue_dropped_blocks, quality.refused_blocks) == (0, 0, {})
+        assert quality.skipped_windows >= 5
+        assert f'windows_skipped_total{{machine="lab",site="demo"}} {quality.skipped_windows}.0' in metrics
+        windows = [Report.model_validate_json(one.text) for _, one in worker.history.reports(limit=1000)]
+        skipped = {one.end_ns for one in windows if one.skipped}
+        assert len(skipped) == quality.skipped_windows
+        assert len(windows) == math.floor((LENGTH_S - 2.5) / 5)
+        assert worker.tally.windows == len(windows) - len(skipped)
+        events = worker.history.events()
+        told = [f"{one.kind} {one.alarm}" for one in events]
+        assert told.count(f"raised {OVERLOADED}") == told.count(f"cleared {OVERLOADED}") == 1
+        (loud,) = (one for one in events if (one.kind, one.alarm) == ("raised", f"{LEVEL}y1"))
+        assert LOUD_FROM_S < (loud.time_ns - START_NS) / S < LOUD_FROM_S + 20
+        assert loud.time_ns in skipped
+        assert worker.health().state is HealthState.HEALTHY
+    machine, found = load_machine(file), list[str]()
+    source = RecordingSource(sorted((tmp_path / "recordings" / machine.site / machine.name).glob("*.mcap")))
+    OfflineReplay(source, machine.keys, install(machine, None), found.append).run()
+    assert found == said
+    assert sum(json.loads(one)["message"].get("skipped", False) for one in found) >= 5
 
 
 def test_what_was_recorded_before_damage_is_replayed(tmp_path: Path) -> None:
