@@ -326,29 +326,6 @@ def test_page_for_people_is_kept_by_its_content(http: httpx.Client) -> None:
 
 
 @pytest.mark.parametrize(
-    "route",
-    [
-        "",
-        "/configuration",
-        "/health",
-        "/reports",
-        "/readings",
-        "/alarms",
-        "/alarms/k_by",
-        "/alarms/events",
-        "/detectable",
-        "/correlations",
-        "/spectra",
-        "/orbits",
-    ],
-)
-def test_unknown_machine_is_a_problem_that_names_the_known_ones(http: httpx.Client, route: str) -> None:
-    found = problem(http.get(f"/api/v1/machines/demo/pump{route}"), 404)
-    assert found.title == "Not Found"
-    assert found.detail == "no machine demo/pump; there are: demo/lab"
-
-
-@pytest.mark.parametrize(
     ("path", "near"),
     [
         (f"{PLACE}/heath", f"{PLACE}/health"),

@@ -186,6 +186,15 @@ def test_every_route_asks_for_its_scope(runtime: Runtime, http: httpx.Client, de
     assert http.get("/openapi.json").status_code == 200
 
 
+def test_an_unknown_machine_is_a_problem_that_names_the_known_ones(
+    http: httpx.Client, description: dict[str, Any]
+) -> None:
+    for path, methods in description["paths"].items():
+        for method in methods if path.startswith("/api/v1/machines/{site}") else ():
+            found = problem(ask(http, method.upper(), path.replace("{machine}", "pump")), 404)
+            assert found.detail == "no machine demo/pump; there are: demo/lab", path
+
+
 def test_the_page_of_the_api_loads_nothing_from_elsewhere(http: httpx.Client) -> None:
     page = http.get("/docs")
     assert page.headers["content-type"] == "text/html; charset=utf-8"

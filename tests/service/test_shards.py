@@ -43,6 +43,7 @@ from tests.service.live import (
 )
 from tests.service.monitored import OPEN, answered, client, problem
 from tests.service.preloaded import CONTEXT
+from tests.service.test_demo import children_of
 
 SECONDS = 45.0
 NAMES = ("lab", "pump")
@@ -150,14 +151,8 @@ def test_operators_and_listeners_reach_a_machine_of_another_process(tmp_path: Pa
 
 
 def children(of: int) -> list[int]:
-    """Processes that a program has started, and that run."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        state, parent = stat.read_text(encoding="utf-8").rsplit(")", 1)[1].split()[:2]
-        command = (stat.parent / "cmdline").read_bytes()
-        if int(parent) == of and state != "Z" and b"spawn_main" in command:
-            found.append(int(stat.parent.name))
-    return sorted(found)
+    """Processes that a program has started to share its machines, and that run."""
+    return [one for one in children_of(of) if b"spawn_main" in Path(f"/proc/{one}/cmdline").read_bytes()]
 
 
 def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -> None:

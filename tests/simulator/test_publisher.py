@@ -12,7 +12,7 @@ import zenoh
 import zenoh.ext
 
 from models.errors import MachineFileError
-from models.machine import Machine, load_machine
+from models.machine import Machine
 from models.signals.block import FloatArray
 from models.signals.channels import ChannelDescriptor
 from models.signals.link import LinkSettings
@@ -21,6 +21,7 @@ from simulator.publisher import PublishError, PublishSettings, publish
 from simulator.scenario import ChannelSettings, Event, Scenario, Sensors, load_scenario, parse_fault
 from simulator.stream import DEFAULT_START_NS, RunSummary, TruthRecord, blocks
 from tests.loopback import endpoint, session_of
+from tests.service.live import until
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +40,6 @@ def monitor(endpoint: str) -> Iterator[zenoh.Session]:
     """A session that listens where the publisher connects."""
     with session_of(LinkSettings(listen=(endpoint,))) as session:
         yield session
-
-
-def _until(condition: Callable[[], bool], what: str, timeout_s: float = 30.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, f"no {what} within {timeout_s} s"
-        time.sleep(0.005)
 
 
 class _Received:
@@ -115,9 +109,9 @@ def test_a_late_subscriber_gets_every_block_and_truth_from_the_start(
         stream = _Received(monitor, machine.keys.stream)
         truth = _Received(monitor, machine.keys.truth)
         descriptor = _Received(monitor, machine.keys.descriptor)
-        _until(lambda: len(stream.samples) >= 60, "60 blocks")
-        _until(lambda: len(truth.samples) >= 2, "two truth records")
-        _until(lambda: len(descriptor.samples) >= 1, "descriptor")
+        until(lambda: len(stream.samples) >= 60, "60 blocks")
+        until(lambda: len(truth.samples) >= 2, "two truth records")
+        until(lambda: len(descriptor.samples) >= 1, "descriptor")
         stop.set()
     (summary,) = outcome
     assert isinstance(summary, RunSummary)
@@ -143,13 +137,13 @@ def test_the_descriptor_answers_a_query_and_the_token_shows_who_is_there(
         machine.keys.publisher_alive, lambda s: changes.append(s.kind), history=True
     )
     with _publishing(loaded, endpoint, pace=1.0) as (stop, _):
-        _until(lambda: changes == [zenoh.SampleKind.PUT], "publisher")
+        until(lambda: changes == [zenoh.SampleKind.PUT], "publisher")
         replies = [reply.ok for reply in monitor.get(machine.keys.descriptor, timeout=60)]
         stop.set()
     ok = [reply for reply in replies if reply is not None]
     assert [str(reply.encoding) for reply in ok] == ["application/json"]
     assert ChannelDescriptor.model_validate_json(ok[0].payload.to_bytes()) == machine.descriptor
-    _until(lambda: changes == [zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE], "end of the publisher")
+    until(lambda: changes == [zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE], "end of the publisher")
 
 
 def test_an_unpaced_stream_waits_for_a_slow_subscriber_and_loses_nothing(
@@ -164,8 +158,8 @@ def test_an_unpaced_stream_waits_for_a_slow_subscriber_and_loses_nothing(
             _,
             outcome,
         ):
-            _until(lambda: len(outcome) == 1, "end of the stream", 60.0)
-            _until(lambda: len(stream.samples) >= 1500, "last block", 60.0)
+            until(lambda: len(outcome) == 1, "end of the stream", 60.0)
+            until(lambda: len(stream.samples) >= 1500, "last block", 60.0)
     assert isinstance(outcome[0], RunSummary)
     assert outcome[0].blocks == 1500
     assert stream.sequences == list(range(1500))
@@ -177,7 +171,7 @@ def test_an_arrow_stream_arrives_as_the_same_samples(
     scenario, machine = loaded
     stream = _Received(monitor, machine.keys.stream)
     with _publishing(loaded, endpoint, pace=None, encoding="arrow", wait_for_subscriber_s=30.0):
-        _until(lambda: len(stream.samples) >= 60, "60 blocks")
+        until(lambda: len(stream.samples) >= 60, "60 blocks")
     received = [decode_block(*sample) for sample in stream.samples]
     assert {sample[2] for sample in stream.samples} == {f"{ARROW_ENCODING};{machine.descriptor.schema_hash}"}
     for (one, _), (other, _) in zip(received, blocks(scenario, machine), strict=True):
@@ -200,12 +194,12 @@ def test_nothing_is_sent_before_somebody_listens(
         assert sent.wait(180)
         stop.set()
     assert isinstance(outcome[0], RunSummary)
-    _until(lambda: stream.sequences[:1] == [0], "first block")
+    until(lambda: stream.sequences[:1] == [0], "first block")
 
 
 def test_nobody_in_time_is_an_error(loaded: tuple[Scenario, Machine], endpoint: str) -> None:
     with _publishing(loaded, endpoint, pace=1.0, wait_for_subscriber_s=0.1) as (_, outcome):
-        _until(lambda: len(outcome) == 1, "outcome")
+        until(lambda: len(outcome) == 1, "outcome")
     assert isinstance(outcome[0], PublishError)
     assert "nobody subscribed to rotorwatch/demo/lab/stream within 0.1 s" in str(outcome[0])
 
@@ -222,7 +216,7 @@ def test_pace_follows_the_data_time(loaded: tuple[Scenario, Machine], endpoint: 
     """A block goes out after its last sample: never early, however fast the machine is."""
     summaries: list[RunSummary] = []
     with _publishing(loaded, endpoint, summaries.append, pace=30.0, linger_s=0.0) as (_, outcome):
-        _until(lambda: len(outcome) == 1, "end of the stream")
+        until(lambda: len(outcome) == 1, "end of the stream")
     assert [summary.blocks for summary in summaries] == list(range(1, 61))
     assert all(summary.elapsed_s >= summary.data_s / 30.0 - 1e-3 for summary in summaries)
 
@@ -356,12 +350,3 @@ def test_a_machine_without_the_channel_is_refused(scenario: Scenario, machine: M
         blocks(scenario, short)
     with pytest.raises(ValueError, match="holds no sample"):
         blocks(scenario, machine, 1e-4)
-
-
-def test_both_shipped_machines_run(scenario: Scenario) -> None:
-    for name in ("lab", "heavy"):
-        machine = load_machine(name).model_copy(update={"dtype": "float64"})
-        samples, _ = _all(scenario.model_copy(update={"events": ()}), machine)
-        assert samples.shape == (8469, 9)
-        assert np.all(np.isfinite(samples))
-        assert np.all(samples.std(axis=0) > 0)
