@@ -67,6 +67,7 @@ def test_each_condition_that_a_relation_holds_in_makes_it_surer_elsewhere() -> N
     learned, window = baseline("overhung"), later("overhung", {}, 0)
     half = tuple(replace(one, condition=str(one.window % 2)) for one in learned.consistency)
     found = [BaselineDiagnostician(each).diagnose(window) for each in (learned, replace(learned, consistency=half))]
+    assert found[0].unexplained == ""  # although the force is another one
     for name, floor in (("k_by", 0.005), ("c_by", 0.03)):
         alone, two = (next(each.standard_error for each in one.evaluable if each.name == name) for one in found)
         assert alone is not None

@@ -73,4 +73,3 @@ def test_a_window_of_another_force_that_the_relations_do_not_hold_in_names_nothi
     verdict = isolate_window(diagnosis, 0.01)
     assert verdict.outside
     assert verdict.changed == ()
-    assert BaselineDiagnostician(baseline("overhung", 0)).diagnose(later("overhung", 0, 3)).unexplained == ""
