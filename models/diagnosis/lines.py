@@ -8,7 +8,7 @@ noise c or more with the probability (1 - c²)ⁿ⁻¹.
 Beside a multiple of the speed a line beats with it. Seen from the turning shaft that multiple stands still, and the
 line turns: of what is left without the mean, one rotation holds nearly all, where of n segments of noise it holds a
 part p or more with the probability (1 - p)ⁿ⁻². A change of the multiple itself, a step or a pulsation, turns both ways
-alike.
+alike. What rings from one segment to the next turns one way for a while: a line has to keep its phase besides.
 """
 
 from collections.abc import Sequence
@@ -158,7 +158,9 @@ def _turning(left: npt.NDArray[np.complex128], apart_s: float, near_hz: float) -
     part = min(1.0, float(rotations[most]) / (left.size * float((left.real**2 + left.imag**2).sum())))
     found_hz = most / size / apart_s
     # Segments that overlap are no evidence, one of two is left.
-    return found_hz + round((near_hz - found_hz) * apart_s) / apart_s, (1 - part) ** (left.size / 2 - 2) < _CHANCE
+    one_way = (1 - part) ** (left.size / 2 - 2) < _CHANCE
+    # A resonance that rings from one segment to the next turns one way for a while.
+    return found_hz + round((near_hz - found_hz) * apart_s) / apart_s, one_way and _coherent(left)
 
 
 def _near_rotation(frequencies_hz: FloatArray, speed_hz: float, step_hz: float) -> npt.NDArray[np.bool_]:
