@@ -8,7 +8,8 @@ noise c or more with the probability (1 - c²)ⁿ⁻¹.
 Beside a multiple of the speed a line beats with it. Seen from the turning shaft that multiple stands still, and the
 line turns: of what is left without the mean, one rotation holds nearly all, where of n segments of noise it holds a
 part p or more with the probability (1 - p)ⁿ⁻². A change of the multiple itself, a step or a pulsation, turns both ways
-alike. What rings from one segment to the next turns one way for a while: a line has to keep its phase besides.
+alike, and one that drifts does not get round. What rings from one segment to the next turns one way for a while: a line
+has to keep its phase besides.
 """
 
 from collections.abc import Sequence
@@ -29,6 +30,8 @@ _LOBE = 2  # a Hann window spreads a line over two bins on either side
 _FEWEST_SEGMENTS = 6
 _HARMONICS = 12
 _CHANCE = 1e-9
+_NEARLY_ALL, _OTHER_WAY, _TURNS = 0.8, 0.2, 1.5
+"""Least part that turns one way, most of it that turns the other way, and how often it gets round at least."""
 _LOUD, _SAME = 0.02, 0.02
 """Part of a channel's random power from which on a new line is told, and relative distance of a line from itself."""
 
@@ -105,7 +108,8 @@ def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistic
         turning = every[:, np.abs(frequencies_hz - speed_hz).argmin(), len(states) + 1]
         turning = turning / np.maximum(np.abs(turning), np.finfo(float).tiny)
         apart_s = plan.segment // 2 / plan.rate_hz
-        for order in range(1, _HARMONICS + 1):
+        apart = speed_hz > (2 * _LOBE + 1) * step_hz  # or one multiple is a line beside the next
+        for order in range(1, _HARMONICS + 1 if apart else 1):
             near = np.abs(frequencies_hz - order * speed_hz) <= (_LOBE + 1) * step_hz
             left = segments[:, near] * (turning.conj() ** order)[:, None, None]
             left -= left.mean(axis=0)
@@ -158,7 +162,10 @@ def _turning(left: npt.NDArray[np.complex128], apart_s: float, near_hz: float) -
     part = min(1.0, float(rotations[most]) / (left.size * float((left.real**2 + left.imag**2).sum())))
     found_hz = most / size / apart_s
     # Segments that overlap are no evidence, one of two is left.
-    one_way = (1 - part) ** (left.size / 2 - 2) < _CHANCE
+    one_way = part > _NEARLY_ALL and (1 - part) ** (left.size / 2 - 2) < _CHANCE
+    # A pulsation that one segment shows from its one side and the next from its other is the same either way round.
+    one_way &= bool(rotations[-most] < _OTHER_WAY * rotations[most])
+    one_way &= min(most, size - most) * left.size >= _TURNS * size
     # A resonance that rings from one segment to the next turns one way for a while.
     return found_hz + round((near_hz - found_hz) * apart_s) / apart_s, one_way and _coherent(left)
 

@@ -102,8 +102,11 @@ class LevelWatch:
             line = new_line(lines, healthy.lines, speed_rad_s, beside=healthy.beside)
             if line is not None:
                 order = f"{line.known(speed_rad_s)[1]:.{3 if line.beside else 2}f}"
-                beat_hz = abs(line.frequency_hz - line.beside * abs(speed_rad_s) / (2 * math.pi))
-                beats = f", beats with the {line.beside}x every {1 / beat_hz:.2g} s" if line.beside else ""
+                beats = ""
+                if line.beside:
+                    every_s = 1 / abs(line.frequency_hz - line.beside * abs(speed_rad_s) / (2 * math.pi))
+                    # Two digits, without a power of ten.
+                    beats = f", beats with the {line.beside}x every {float(f'{every_s:.2g}'):g} s"
                 text = (
                     f"a line at {line.frequency_hz:.4g} Hz ({order} times running speed, {line.share:.0%} of the "
                     f"random vibration of {line.state}{beats}) that the healthy machine did not have: a neighbouring "

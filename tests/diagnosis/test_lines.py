@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from models.commissioning.checks import check_lines
 from models.commissioning.healthy import HealthyRecording, healthy_from_blocks, known_lines
 from models.diagnosis.lines import Line, new_line, steady_lines
 from models.diagnosis.window import window_statistics
@@ -31,23 +32,33 @@ def slow(hz: float) -> FloatArray:
     return np.asarray(np.cos(2 * np.pi * hz * T))
 
 
-def recording(of_y1: FloatArray, turns: int = 1) -> HealthyRecording:
-    """Of noise in every channel, and more in the first; turning at 22 Hz, one way or the other, with a strong 1x."""
-    samples = np.column_stack([noise(n) + line(SPEED_HZ, 3.0) for n in range(len(MACHINE.sensors))])
+def recording(
+    of_y1: FloatArray, turns: int = 1, *, machine: MachineFile = MACHINE, speed_hz: float = SPEED_HZ
+) -> HealthyRecording:
+    """Of noise in every channel, and more in the first; turning one way or the other, with a strong 1x."""
+    samples = np.column_stack([noise(n) + line(speed_hz, 3.0) for n in range(len(machine.sensors))])
     samples[:, 0] += of_y1
-    samples[:, -1] = np.mod(turns * 2 * np.pi * SPEED_HZ * T, 2 * np.pi)
+    samples[:, -1] = np.mod(turns * 2 * np.pi * speed_hz * T, 2 * np.pi)
     size = round(RATE_HZ)
     found = [
         (SampleBlock(1_767_225_600_000_000_000 + n * 10**9, n, 1, RATE_HZ, part.astype(np.float32)), "")
         for n, part in enumerate(np.split(samples, N // size))
     ]
-    made = healthy_from_blocks("r", MACHINE, found)
+    made = healthy_from_blocks("r", machine, found)
     assert not made.refused
     return made
 
 
+def with_segments(segment_s: float) -> MachineFile:
+    window = MACHINE.window.model_copy(update={"segment_s": segment_s})
+    return MACHINE.model_copy(update={"window": window})
+
+
 def lines(of_y1: FloatArray, turns: int = 1) -> tuple[Line, ...]:
-    made = recording(of_y1, turns)
+    return lines_of(recording(of_y1, turns))
+
+
+def lines_of(made: HealthyRecording) -> tuple[Line, ...]:
     return steady_lines(made.plan, made.hops, window_statistics(made.plan, made.hops, lagged=False))
 
 
@@ -109,16 +120,31 @@ def test_a_line_that_beats_with_a_multiple_of_the_speed_is_found_beside_it(hz: f
     assert new_line([found], [found.known(speed_rad_s)], speed_rad_s) is None
 
 
-@pytest.mark.parametrize("how", ["step", "slope", "pulsation", "resonance"])
-def test_a_multiple_that_changes_has_no_line_beside_it(how: str) -> None:
+DRIFT = np.cumsum(np.random.default_rng(3).standard_normal((2, N)), axis=1) / np.sqrt(N)
+
+
+@pytest.mark.parametrize("segment_s", [5.0, 2.0])  # few segments in a window, and many
+@pytest.mark.parametrize("how", ["step", "slope", "drift", "pulsation", "fast pulsation", "resonance"])
+def test_a_multiple_that_changes_has_no_line_beside_it(how: str, segment_s: float) -> None:
     root = np.exp(2 * np.pi * (-0.003 + 1j) * SPEED_HZ / RATE_HZ)
     resonance = lfilter([1.0], [1, -2 * root.real, abs(root) ** 2], noise(21))
     more = {
         "step": line(SPEED_HZ, 3.0) * (T > 33.0),
         "slope": line(SPEED_HZ, 6.0) * T / T[-1],
+        "drift": 4 * np.real((DRIFT[0] + 1j * DRIFT[1]) * np.exp(2j * np.pi * SPEED_HZ * T)),
         "pulsation": line(SPEED_HZ, 1.5) * slow(0.11),
+        "fast pulsation": line(SPEED_HZ, 1.5) * slow(0.2),  # every second of the segments of 5 s shows it from one side
         "resonance": resonance / resonance.std(),
     }
-    found = lines(more[how])
+    made = recording(more[how], machine=with_segments(segment_s))
+    found = lines_of(made)
     assert found  # there is more than noise, but
     assert not any(one.certain for one in found)
+    assert check_lines(MACHINE, [made]).verdict == "passed"
+
+
+@pytest.mark.parametrize(("speed_hz", "segment_s"), [(2.2, 5.0), (3.3, 1.0)])
+def test_multiples_of_a_slow_machine_are_no_lines_beside_each_other(speed_hz: float, segment_s: float) -> None:
+    orders = np.asarray(sum(line(order * speed_hz, order + 2.0) for order in range(2, 9)))
+    made = recording(orders, machine=with_segments(segment_s), speed_hz=speed_hz)
+    assert not any(one.certain for one in lines_of(made))
