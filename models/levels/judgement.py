@@ -180,7 +180,8 @@ class LevelJudge:
             now, lasting = (
                 departure(hops[:, at], healthy, BEYOND_RANGE, _ERRORS_OF_CONTACT) for hops in (window, several)
             )
-            if window[:, at].mean() - healthy.mean > _STILL * lasting:
+            # Of no more than the window, it is what that shows, and may be one knock.
+            if len(several) > len(window) and window[:, at].mean() - healthy.mean > _STILL * lasting:
                 now = max(now, lasting)
             looked.append((now, healthy.mean, pair))
         most, mean, pair = max(looked, default=(0.0, 0.0, (0, 0)))

@@ -94,7 +94,7 @@ PAIR = [channel("displacement", way) for way in "yz"]
 HEALTHY = HopReference(mean=0.0, scatter=1.0, hops=144, range=0.5)
 
 
-def heard(hops: FloatArray, *, faster: int | None = None, stop: int | None = None) -> list[int]:
+def heard(hops: FloatArray, *, faster: int | None = None, stop: int | None = None, window: int = WINDOW) -> list[int]:
     """After how many hops, each of the two numbers of a pair, a contact is told; shape (n_hops, 2).
 
     Parameters
@@ -103,6 +103,8 @@ def heard(hops: FloatArray, *, faster: int | None = None, stop: int | None = Non
         After how many the machine runs at another of its speeds.
     stop : int, optional
         After how many another monitor goes on.
+    window : int, optional
+        How many a window has.
     """
     contacts = {one.name: HEALTHY for one in PAIR}
     slow, fast = (
@@ -112,9 +114,9 @@ def heard(hops: FloatArray, *, faster: int | None = None, stop: int | None = Non
     reference = LevelReference(source="commissioned", states=(slow, fast))
     judge, latest = LevelJudge(level_plan(PAIR, 2000.0, (10.0, 1000.0)), PAIR, LevelSettings()), LatestContact(LATEST)
     found = []
-    for end in range(WINDOW, len(hops) + 1):
+    for end in range(window, len(hops) + 1):
         speed_rad_s = 100.0 if faster is None or end <= faster else 200.0
-        levels = WindowLevels({}, {}, None, speed_rad_s, WINDOW, contact=hops[end - WINDOW : end])
+        levels = WindowLevels({}, {}, None, speed_rad_s, window, contact=hops[end - window : end])
         if end == stop:
             arrays, latest = latest.checkpoint(), LatestContact(LATEST)
             latest.restore(arrays)
@@ -139,6 +141,9 @@ def test_one_hop_is_no_contact_and_one_that_is_over_is_told_no_more() -> None:
     once = hops_of(20261211, 120, 0)
     once[60] += 100.0
     assert not heard(once)
+    first = np.full((6, 2), 0.75)
+    first[3] = 8.0  # the newest of the first window, and all that is known of several
+    assert not heard(first, window=4)
     over = heard(hops_of(20261212, 24, 24, 96, size=10.0))
     assert over
     assert max(over) < 24 + 24 + WINDOW
