@@ -120,7 +120,7 @@ def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistic
                 continue
             column = int(shares.argmax())
             at = int(own[:, column].argmax())
-            offset_hz, certain = _turning(left[:, at, column], apart_s, frequencies_hz[near][at] - order * speed_hz)
+            offset_hz, certain = _turning(left[:, :, column], at, apart_s, frequencies_hz[near][at] - order * speed_hz)
             share = min(1.0, float(shares[column]))
             lines.append(Line(states[column], order * speed_hz + offset_hz, share, certain, order))
     return tuple(sorted(lines, key=lambda line: -line.share))
@@ -154,20 +154,22 @@ def _coherent(own: npt.NDArray[np.complex128]) -> bool:
     return bool((1 - coherence**2) ** (earlier.size / 2 - 1) < _CHANCE)
 
 
-def _turning(left: npt.NDArray[np.complex128], apart_s: float, near_hz: float) -> tuple[float, bool]:
-    """How fast most of it turns, of what is possible nearest to a frequency; and whether no noise does like that."""
-    size = 16 * left.size
-    rotations = np.abs(np.fft.fft(left, size)) ** 2
-    most = int(rotations.argmax())
-    part = min(1.0, float(rotations[most]) / (left.size * float((left.real**2 + left.imag**2).sum())))
+def _turning(left: npt.NDArray[np.complex128], at: int, apart_s: float, near_hz: float) -> tuple[float, bool]:
+    """How fast most of a bin turns, of what is possible nearest to a frequency; and whether only a line does that."""
+    n_segments = left.shape[0]
+    size = 16 * n_segments
+    rotations = np.abs(np.fft.fft(left, size, axis=0)) ** 2
+    most = int(rotations[:, at].argmax())
+    own = left[:, at]
+    part = min(1.0, float(rotations[most, at]) / (n_segments * float((own.real**2 + own.imag**2).sum())))
     found_hz = most / size / apart_s
     # Segments that overlap are no evidence, one of two is left.
-    one_way = part > _NEARLY_ALL and (1 - part) ** (left.size / 2 - 2) < _CHANCE
-    # A pulsation that one segment shows from its one side and the next from its other is the same either way round.
-    one_way &= bool(rotations[-most] < _OTHER_WAY * rotations[most])
-    one_way &= min(most, size - most) * left.size >= _TURNS * size
+    one_way = part > _NEARLY_ALL and (1 - part) ** (n_segments / 2 - 2) < _CHANCE
+    # The two sides of a pulsation may be in different bins, or look alike from one segment to the next.
+    there, back = rotations[[most, -most]].sum(axis=1)
+    one_way &= bool(back < _OTHER_WAY * there) and min(most, size - most) * n_segments >= _TURNS * size
     # A resonance that rings from one segment to the next turns one way for a while.
-    return found_hz + round((near_hz - found_hz) * apart_s) / apart_s, one_way and _coherent(left)
+    return found_hz + round((near_hz - found_hz) * apart_s) / apart_s, one_way and _coherent(own)
 
 
 def _near_rotation(frequencies_hz: FloatArray, speed_hz: float, step_hz: float) -> npt.NDArray[np.bool_]:

@@ -133,7 +133,7 @@ def test_a_multiple_that_changes_has_no_line_beside_it(how: str, segment_s: floa
         "slope": line(SPEED_HZ, 6.0) * T / T[-1],
         "drift": 4 * np.real((DRIFT[0] + 1j * DRIFT[1]) * np.exp(2j * np.pi * SPEED_HZ * T)),
         "pulsation": line(SPEED_HZ, 1.5) * slow(0.11),
-        "fast pulsation": line(SPEED_HZ, 1.5) * slow(0.2),  # every second of the segments of 5 s shows it from one side
+        "fast pulsation": line(SPEED_HZ, 1.5) * slow(0.2),  # segments of 5 s show one side of it and the other in turn
         "resonance": resonance / resonance.std(),
     }
     made = recording(more[how], machine=with_segments(segment_s))
@@ -141,6 +141,12 @@ def test_a_multiple_that_changes_has_no_line_beside_it(how: str, segment_s: floa
     assert found  # there is more than noise, but
     assert not any(one.certain for one in found)
     assert check_lines(MACHINE, [made]).verdict == "passed"
+
+
+def test_the_two_sides_of_a_pulsation_in_bins_of_their_own_are_no_lines() -> None:
+    found = lines(line(SPEED_HZ, 1.5) * slow(0.48))
+    assert found
+    assert not any(one.certain for one in found)
 
 
 @pytest.mark.parametrize(("speed_hz", "segment_s"), [(2.2, 5.0), (3.3, 1.0)])
