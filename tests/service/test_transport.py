@@ -416,3 +416,10 @@ def test_unusable_endpoint_is_named() -> None:
         Link(settings)
     assert named in str(caught.value)
     assert ".rs" not in str(caught.value)
+
+
+def test_an_address_that_is_in_use_is_named() -> None:
+    address = endpoint()
+    with machine_link(address, ignore), pytest.raises(LinkError) as caught:
+        Link(LinkSettings(listen=(address,)))
+    assert f"listen {address}) could not be opened: address already in use" in str(caught.value)
