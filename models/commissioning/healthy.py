@@ -153,12 +153,12 @@ def _blocks(path: Path, machine: MachineFile) -> Iterator[tuple[SampleBlock, str
 
 
 def foreign_lines(recording: HealthyRecording) -> tuple[Line, ...]:
-    """Lines that are neither noise nor a multiple of the speed, or a change of one, strongest first."""
+    """Lines that are neither noise nor a multiple of the speed, strongest first."""
     hops = recording.hops
     if not hops:
         return ()
     window = window_statistics(recording.plan, hops, lagged=False)
-    return tuple(line for line in steady_lines(recording.plan, hops, window) if line.certain or not line.beside)
+    return steady_lines(recording.plan, hops, window)
 
 
 def known_lines(recordings: Iterable[HealthyRecording]) -> tuple[KnownLine, ...] | None:

@@ -121,8 +121,10 @@ def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistic
             column = int(shares.argmax())
             at = int(own[:, column].argmax())
             offset_hz, certain = _turning(left[:, :, column], at, apart_s, frequencies_hz[near][at] - order * speed_hz)
-            share = min(1.0, float(shares[column]))
-            lines.append(Line(states[column], order * speed_hz + offset_hz, share, certain, order))
+            # Or the multiple may have changed: no reason to refuse a recording, and nothing that hides a line.
+            if certain:
+                share = min(1.0, float(shares[column]))
+                lines.append(Line(states[column], order * speed_hz + offset_hz, share, certain, order))
     return tuple(sorted(lines, key=lambda line: -line.share))
 
 

@@ -120,6 +120,15 @@ def test_a_line_that_beats_with_a_multiple_of_the_speed_is_found_beside_it(hz: f
     assert new_line([found], [found.known(speed_rad_s)], speed_rad_s) is None
 
 
+def test_a_beat_of_the_healthy_machine_is_not_new_and_a_1x_that_drifted_then_hides_none() -> None:
+    beats, drifts = line(22.08), line(SPEED_HZ, 6.0) * T / T[-1]
+    found, speed_rad_s = lines(beats), 2 * np.pi * SPEED_HZ
+    for healthy_y1, new in ((beats, False), (drifts, True)):
+        known = known_lines([recording(healthy_y1)])
+        assert known is not None
+        assert (new_line(found, known, speed_rad_s) is not None) is new
+
+
 DRIFT = np.cumsum(np.random.default_rng(3).standard_normal((2, N)), axis=1) / np.sqrt(N)
 
 
@@ -137,16 +146,12 @@ def test_a_multiple_that_changes_has_no_line_beside_it(how: str, segment_s: floa
         "resonance": resonance / resonance.std(),
     }
     made = recording(more[how], machine=with_segments(segment_s))
-    found = lines_of(made)
-    assert found  # there is more than noise, but
-    assert not any(one.certain for one in found)
+    assert not any(one.beside or one.certain for one in lines_of(made))
     assert check_lines(MACHINE, [made]).verdict == "passed"
 
 
 def test_the_two_sides_of_a_pulsation_in_bins_of_their_own_are_no_lines() -> None:
-    found = lines(line(SPEED_HZ, 1.5) * slow(0.48))
-    assert found
-    assert not any(one.certain for one in found)
+    assert not lines(line(SPEED_HZ, 1.5) * slow(0.48))
 
 
 @pytest.mark.parametrize(("speed_hz", "segment_s"), [(2.2, 5.0), (3.3, 1.0)])
