@@ -1,5 +1,6 @@
 """Errors that belong to other conditions, and the lag from which a relation holds."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -113,3 +114,16 @@ def test_where_a_relation_does_not_fit_longer_lags_are_used(monkeypatch: pytest.
     again = BaselineRecord.model_validate_json(BaselineRecord.of(longer).model_dump_json()).baseline()
     lags = [None if one is None else one.lag_from_s for one in longer.relations]
     assert [None if one is None else one.lag_from_s for one in again.relations] == lags
+
+
+def test_a_guess_of_the_memory_that_is_too_short_is_no_misfit(monkeypatch: pytest.MonkeyPatch) -> None:
+    remembers = replace(COMMISSIONED, cutoff_hz=(25.0, 25.0))
+    run = drawn_condition(ROTOR, SourceLayout.ONE_SOURCE, remembers, {}, np.random.default_rng(1))
+    judge = BaselineDiagnostician(learned_baseline(windows(run, 4, 1), ["one"] * 4))
+    (window,) = windows(run, 1, 2)
+    monkeypatch.setattr(relation, "lag_beyond_memory", lambda *_: 0.014)  # the shortest there is
+    found = judge.diagnose(window)
+    assert found.evaluable
+    assert found.misfit_z is not None
+    assert found.misfit_z < 3
+    assert not found.suspect

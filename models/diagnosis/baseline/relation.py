@@ -202,7 +202,11 @@ class Fit:
     @property
     def fits(self) -> bool:
         """Whether what is left is within what scatter explains."""
-        return bool(self.chi2 <= self.degrees_of_freedom + _FITS * np.sqrt(2 * self.degrees_of_freedom))
+        return _by_chance(self.chi2, self.degrees_of_freedom)
+
+
+def _by_chance(chi2: float, freedom: int) -> bool:
+    return bool(chi2 <= freedom + _FITS * np.sqrt(2 * freedom))
 
 
 def prior_of(row: Row, start: FloatArray, *, minimal: bool) -> FloatArray:
@@ -384,15 +388,19 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
     Moments are weighted by all that is uncertain, the relation included: where the healthy recording did not determine
     the relation, a window is not asked.
 
+    A guess of the force's memory that is too short leaves more than chance does. Where so much is left, and not beyond
+    the longer lag of the first reading, that one is believed, as it was when the relation was learned.
+
     Raises
     ------
     EstimationError
         If the window does not determine them.
     """
     first = change_of(row, relation, window.beyond(max(LAG_FROM_S, relation.lag_from_s)))
-    return change_of(
-        row, relation, window.beyond(max(relation.lag_from_s, lag_beyond_memory(window, first.combination)))
-    )
+    lag_s = max(relation.lag_from_s, lag_beyond_memory(window, first.combination))
+    change = change_of(row, relation, window.beyond(lag_s))
+    guessed = _by_chance(change.chi2, change.degrees_of_freedom) or lag_s > LAG_FROM_S
+    return change if guessed or not _by_chance(first.chi2, first.degrees_of_freedom) else first
 
 
 def change_of(row: Row, relation: Relation, moments: LagMoments) -> RowChange:
@@ -438,7 +446,7 @@ def change_of(row: Row, relation: Relation, moments: LagMoments) -> RowChange:
 
     chi2, freedom = float(left @ W @ left), max(1, rank - d.size)
     # What is left beyond chance was not expected by any of these errors: it is in the change as well.
-    beyond = chi2 / freedom if chi2 > freedom + _FITS * np.sqrt(2 * freedom) else 1.0
+    beyond = 1.0 if _by_chance(chi2, freedom) else chi2 / freedom
     return RowChange(
         change=d,
         projection=np.sqrt(beyond) * stretching(criterion, d, covariance) @ projection,
