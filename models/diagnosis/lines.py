@@ -12,14 +12,14 @@ alike, and one that drifts does not get round. What rings from one segment to th
 has to keep its phase besides.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
 
-from models.diagnosis.moments import HopMoments, Plan
+from models.diagnosis.moments import ComplexArray, HopMoments, Plan
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
@@ -103,29 +103,46 @@ def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistic
         if at not in found or share > found[at].share:
             certain = _coherent(segments[:, at, column])
             found[at] = Line(states[column], float(frequencies_hz[at]), min(1.0, share), certain)
-    lines = list(found.values())
-    if window.speed_source == "phase reference" and not window.removed_by_hop:
-        turning = every[:, np.abs(frequencies_hz - speed_hz).argmin(), len(states) + 1]
-        turning = turning / np.maximum(np.abs(turning), np.finfo(float).tiny)
-        apart_s = plan.segment // 2 / plan.rate_hz
-        apart = speed_hz > (2 * _LOBE + 1) * step_hz  # or one multiple is a line beside the next
-        for order in range(1, _HARMONICS + 1 if apart else 1):
-            near = np.abs(frequencies_hz - order * speed_hz) <= (_LOBE + 1) * step_hz
-            left = segments[:, near] * (turning.conj() ** order)[:, None, None]
-            left -= left.mean(axis=0)
-            own = (left.real**2 + left.imag**2).mean(axis=0)
-            stands_out = (own > _STANDS_OUT * floor[near]).any(axis=0)
-            shares = np.where(stands_out, 2 * step_hz * own.sum(axis=0) / total, 0.0)
-            if not shares.any():
-                continue
-            column = int(shares.argmax())
-            at = int(own[:, column].argmax())
-            offset_hz, certain = _turning(left[:, :, column], at, apart_s, frequencies_hz[near][at] - order * speed_hz)
-            # Or the multiple may have changed: no reason to refuse a recording, and nothing that hides a line.
-            if certain:
-                share = min(1.0, float(shares[column]))
-                lines.append(Line(states[column], order * speed_hz + offset_hz, share, certain, order))
+    lines = [*found.values(), *_beside_multiples(plan, window, every, floor, total)]
     return tuple(sorted(lines, key=lambda line: -line.share))
+
+
+def _beside_multiples(
+    plan: Plan, window: WindowStatistics, every: ComplexArray, floor: FloatArray, total: FloatArray
+) -> Iterator[Line]:
+    """The strongest line that is certain beside each multiple of the speed, where this is steady.
+
+    Parameters
+    ----------
+    every : ndarray of complex, shape (n_segments, n_bins, n_states + n_regressors)
+    floor : ndarray, shape (n_bins, n_states)
+        Power of what surrounds a bin.
+    total : ndarray, shape (n_states,)
+    """
+    if window.speed_source != "phase reference" or window.removed_by_hop:
+        return
+    frequencies_hz, states = plan.frequencies_hz, plan.mounted
+    step_hz, speed_hz = float(frequencies_hz[1] - frequencies_hz[0]), abs(window.speed_rad_s) / (2 * np.pi)
+    if speed_hz <= (2 * _LOBE + 1) * step_hz:  # one multiple would be a line beside the next
+        return
+    turning = every[:, np.abs(frequencies_hz - speed_hz).argmin(), len(states) + 1]
+    turning = turning / np.maximum(np.abs(turning), np.finfo(float).tiny)
+    for order in range(1, _HARMONICS + 1):
+        near = np.abs(frequencies_hz - order * speed_hz) <= (_LOBE + 1) * step_hz
+        left = every[:, near, : len(states)] * (turning.conj() ** order)[:, None, None]
+        left -= left.mean(axis=0)
+        own = (left.real**2 + left.imag**2).mean(axis=0)
+        stands_out = (own > _STANDS_OUT * floor[near]).any(axis=0)
+        shares = np.where(stands_out, 2 * step_hz * own.sum(axis=0) / total, 0.0)
+        if not shares.any():
+            continue
+        column = int(shares.argmax())
+        at, multiple_hz = int(own[:, column].argmax()), order * speed_hz
+        every_s = plan.segment // 2 / plan.rate_hz
+        offset_hz, certain = _turning(left[:, :, column], at, every_s, frequencies_hz[near][at] - multiple_hz)
+        # Or the multiple may have changed: no reason to refuse a recording, and nothing that hides a line.
+        if certain:
+            yield Line(states[column], multiple_hz + offset_hz, min(1.0, float(shares[column])), certain, order)
 
 
 def new_line(
@@ -148,7 +165,7 @@ def new_line(
     return None
 
 
-def _coherent(own: npt.NDArray[np.complex128]) -> bool:
+def _coherent(own: ComplexArray) -> bool:
     """Whether segments keep their phase as no noise does; those that overlap are no evidence, one of two is left."""
     earlier, later = own[:-2], own[2:]
     norms = np.linalg.norm(earlier) * np.linalg.norm(later)
@@ -156,7 +173,7 @@ def _coherent(own: npt.NDArray[np.complex128]) -> bool:
     return bool((1 - coherence**2) ** (earlier.size / 2 - 1) < _CHANCE)
 
 
-def _turning(left: npt.NDArray[np.complex128], at: int, apart_s: float, near_hz: float) -> tuple[float, bool]:
+def _turning(left: ComplexArray, at: int, every_s: float, near_hz: float) -> tuple[float, bool]:
     """How fast most of a bin turns, of what is possible nearest to a frequency; and whether only a line does that."""
     n_segments = left.shape[0]
     size = 16 * n_segments
@@ -164,14 +181,14 @@ def _turning(left: npt.NDArray[np.complex128], at: int, apart_s: float, near_hz:
     most = int(rotations[:, at].argmax())
     own = left[:, at]
     part = min(1.0, float(rotations[most, at]) / (n_segments * float((own.real**2 + own.imag**2).sum())))
-    found_hz = most / size / apart_s
+    found_hz = most / size / every_s
     # Segments that overlap are no evidence, one of two is left.
     one_way = part > _NEARLY_ALL and (1 - part) ** (n_segments / 2 - 2) < _CHANCE
     # The two sides of a pulsation may be in different bins, or look alike from one segment to the next.
     there, back = rotations[[most, -most]].sum(axis=1)
     one_way &= bool(back < _OTHER_WAY * there) and min(most, size - most) * n_segments >= _TURNS * size
     # A resonance that rings from one segment to the next turns one way for a while.
-    return found_hz + round((near_hz - found_hz) * apart_s) / apart_s, one_way and _coherent(own)
+    return found_hz + round((near_hz - found_hz) * every_s) / every_s, one_way and _coherent(own)
 
 
 def _near_rotation(frequencies_hz: FloatArray, speed_hz: float, step_hz: float) -> npt.NDArray[np.bool_]:

@@ -399,8 +399,8 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
     first = change_of(row, relation, window.beyond(max(LAG_FROM_S, relation.lag_from_s)))
     lag_s = max(relation.lag_from_s, lag_beyond_memory(window, first.combination))
     change = change_of(row, relation, window.beyond(lag_s))
-    guessed = _by_chance(change.chi2, change.degrees_of_freedom) or lag_s > LAG_FROM_S
-    return change if guessed or not _by_chance(first.chi2, first.degrees_of_freedom) else first
+    fits, first_fits = (_by_chance(one.chi2, one.degrees_of_freedom) for one in (change, first))
+    return first if first_fits and not fits and lag_s < LAG_FROM_S else change
 
 
 def change_of(row: Row, relation: Relation, moments: LagMoments) -> RowChange:
