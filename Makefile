@@ -13,7 +13,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN := $(VENV)/.run
 READY := $(VENV)/.ready
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
+# Modules are compiled when first imported; of most of what is installed, nothing ever is.
+INSTALL := $(BIN)/python -m pip install --no-compile --quiet --disable-pip-version-check --constraint constraints.txt --editable
 MODELS_AND_MONITOR := tests/test_doctests.py tests/physics tests/signals tests/diagnosis tests/commissioning $(wildcard tests/service/test_monitor*.py)
 # Three times the cores of a small computer: many tests wait more than they compute.
 WORKERS ?= 6
@@ -34,18 +35,20 @@ BROWSERS := chromium chromium-browser google-chrome google-chrome-stable chrome
 
 setup: $(READY)
 
-# What runs needs no torch; training and the checks do.
-$(RUN): pyproject.toml constraints.txt
+$(BIN)/python:
 	@command -v $(PYTHON) >/dev/null || { echo "rotorwatch needs Python 3.11, 3.12 or 3.13 (none found; say make PYTHON=...)"; exit 1; }
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(PYTHON) -m venv $(VENV)
+
+# What runs needs no torch; training and the checks do.
+$(RUN): pyproject.toml constraints.txt | $(BIN)/python
 	@echo "installing what rotorwatch needs (a minute the first time) ..."
 	@$(INSTALL) .
 	@touch $@
 
-$(READY): $(RUN)
-	@echo "installing what training and the checks need ..."
+$(READY): pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing what rotorwatch, training and the checks need (two minutes the first time) ..."
 	@$(INSTALL) '.[train,dev,io,postgres,fleet]'
-	@touch $@
+	@touch $(RUN) $@
 
 demo: $(RUN)
 	@$(BIN)/rotorwatch demo --fault $(FAULT) --seed $(SEED) --pace $(PACE) $(if $(ONCE),--once)
