@@ -49,8 +49,8 @@ def main() -> None:
     scenario, machine = load_scenario("healthy")
     scenario = scenario.overridden(seed=1, duration_s=DATA_S)
     stream = [block for block, _ in blocks(scenario, machine)]
-    bundle, plan = load_bundle("lab", machine), plan_for(machine, levels=True, contact=False)
-    window, touching = SlidingWindow(plan), replace(plan, contact=True)
+    bundle, plan = load_bundle("lab", machine), plan_for(machine, levels=True, thorough=False)
+    window, touching = SlidingWindow(plan), replace(plan, thorough=True)
     windows: list[WindowStatistics] = []
     measures: list[WindowLevels] = []
     samples = np.concatenate([plan.to_si(block.samples) for block in stream])

@@ -120,7 +120,9 @@ class Drawing:
             for number in range(gain.size):
                 sums = np.ones((10, bands.shape[2]))
                 sums[0], sums[4:6], sums[7] = 0.0, np.nan, self.in_band @ bands[number]
-                hops.append(HopLevels(self.n_samples, sums, vectors[number], bands[number, :-1]))
+                hops.append(
+                    HopLevels(self.n_samples, sums, vectors[number], bands[number, :-1], np.empty((0, bands.shape[2])))
+                )
             yield from _windows(self.plan, hops, self.speed_rad_s)
 
 

@@ -319,10 +319,10 @@ class Installed:
         return self.commissioned is None and self.known is None
 
     @property
-    def knows_contact(self) -> bool:
-        """Whether a contact can be told, see `models.levels.contact`: what the healthy machine has of it is known."""
+    def thorough(self) -> bool:
+        """Whether what the healthy machine has of a contact, or of lines, is known: one can be told then."""
         levels = None if self.commissioned is None else self.commissioned.levels
-        return levels is not None and any(state.contact for state in levels.states)
+        return levels is not None and any(state.contact or state.lines for state in levels.states)
 
     @property
     def identity(self) -> str | None:

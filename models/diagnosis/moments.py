@@ -67,7 +67,7 @@ class Plan:
     speed_tolerance: float = 0.0  # how far the speed may be off, relative
     others: tuple[str, ...] = ()  # channels at other places, of which only levels are taken
     levels: LevelPlan | None = None  # of all `columns`; None where no levels are wanted
-    contact: bool = True  # whether it is looked for, where levels are
+    thorough: bool = True  # whether with levels all is looked for that is compared with a healthy machine alone
     # Where sensors are at an angle: what each column of `states` is as mounted (``bearing@45``), and the matrix that
     # turns those, shape (n, n), states = turn @ mounted.
     angled: tuple[str, ...] = ()
@@ -136,7 +136,7 @@ def states_of(machine: MachineFile) -> tuple[str, ...]:
     return tuple(name for name in (*STATE_INDEX, *ACCELERATIONS) if name in measured and machine.holds_band)
 
 
-def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False, contact: bool = True) -> Plan:
+def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False, thorough: bool = True) -> Plan:
     """Derive the plan of a machine.
 
     Parameters
@@ -145,8 +145,9 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False,
         Whether correlations are wanted at all lags, as the networks need them, or at lag zero alone.
     levels : bool
         Whether levels are wanted.
-    contact : bool
-        Whether with levels `models.levels.contact` is wanted too, a fifth of the time that a hop's moments take.
+    thorough : bool
+        Whether with levels `models.levels.contact` and the lines of `models.levels.bands` are wanted too, a fifth of
+        the time that a hop's moments take.
     """
     window, rate_hz = machine.window, machine.rate_hz
     order = {name: column for column, name in enumerate(machine.descriptor.states)}
@@ -183,8 +184,10 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False,
         speed_rad_s=None if machine.operation is None else machine.operation.speed_rad_s,
         speed_tolerance=0.0 if machine.operation is None else machine.operation.speed_tolerance,
         others=others,
-        levels=level_plan(channels, rate_hz, machine.levels.band(speed_rpm), runout) if levels else None,
-        contact=contact,
+        levels=level_plan(channels, rate_hz, machine.levels.band(speed_rpm), runout, lines=thorough)
+        if levels
+        else None,
+        thorough=thorough,
         angled=tuple(state_name(one) for one in channels[: len(states)]),
         turn=None if np.array_equal(seen, np.eye(len(states))) else np.linalg.inv(seen),
         runout=runout[: len(states)] if np.any(runout[: len(states)]) else None,
@@ -295,7 +298,7 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
             spectrum = spectra[:n_states, -1]  # the last segment is the hop itself
             spectrum[:, :2] -= (waveform.mean[:n_states] - level)[:, None] * spectra[n_states, -1, :2]
         levels = hop_levels(plan.levels, waveform, deviations, turned, spectrum)
-        if plan.contact and turned is not None and plan.states:
+        if plan.thorough and turned is not None and plan.states:
             speed_rad_s = turned_rad * plan.rate_hz / plan.hop if line is None else line.speed_rad_s
             for pair, skew in zip(map(list, plan.levels.pairs), plan.levels.skew, strict=True):
                 turning, turns = a[-2:, -plan.fresh :], speed_rad_s * plan.fresh / plan.rate_hz / (2 * np.pi)

@@ -26,6 +26,7 @@ from models.levels.limits import (
     unit_of,
     unit_size,
 )
+from models.levels.lines import new_line
 from models.levels.measures import LevelPlan, WindowLevels
 from models.levels.reference import LevelReference, OperatingState
 from models.levels.settings import LevelSettings
@@ -123,8 +124,8 @@ class LevelJudge:
     ) -> str:
         """What the levels of a window show that no change of a parameter makes; empty if nothing.
 
-        A shaft that is pushed back where it is far out, a wrong gain of all sensors of a place, a 2x that has grown, or
-        a random part that is not Gaussian as it was on the healthy machine.
+        A shaft that is pushed back where it is far out, a new line, a wrong gain of all sensors of a place, a 2x that
+        has grown, or a random part that is not Gaussian as it was on the healthy machine.
 
         Parameters
         ----------
@@ -138,7 +139,9 @@ class LevelJudge:
         if reference is None:
             return ""
         state, seen = reference.at(levels.speed_rad_s)
-        found = self._contact(levels, state, latest, reference.states.index(state)) if seen else ""
+        found = ""
+        if seen:
+            found = self._contact(levels, state, latest, reference.states.index(state)) or self._line(levels, state)
         if not found and reference.gains is not None and levels.bands is not None:
             wrong = wrong_gain(levels.bands, [place_of(one) for one in self._channels], reference.gains)
             if wrong is not None:
@@ -191,6 +194,28 @@ class LevelJudge:
         return (
             f"a shaft at {y.name} and {z.name} ({y.location}) that is pushed back where it is far out, as by a rub or "
             f"a stop: {mean + most:.1f} standard errors in a mean hop, {mean:.1f} on the healthy machine"
+        )
+
+    def _line(self, levels: WindowLevels, state: OperatingState) -> str:
+        """The loudest line that the healthy machine did not have; empty if there is none."""
+        if levels.lines is None or levels.bands is None or not state.lines:
+            return ""
+        unknown = [math.nan] * len(levels.lines)
+        healthy = np.array([state.lines.get(one.name, unknown) for one in self._channels]).T
+        if healthy.shape != levels.lines.shape:
+            return ""
+        found = new_line(levels.bands, levels.lines, healthy, levels.values["not_x1"] ** 2)
+        if found is None:
+            return ""
+        column, (low_hz, high_hz), share = found
+        times = ""
+        if levels.speed_rad_s:
+            low, high = (2 * math.pi * edge / abs(levels.speed_rad_s) for edge in (low_hz, high_hz))
+            times = f"{low:.3g} to {high:.3g} times running speed, "
+        return (
+            f"a line within {_plain(low_hz)} to {_plain(high_hz)} Hz ({times}{share:.0%} of the vibration of "
+            f"{self._channels[column].name} without its 1x) that the healthy machine did not have: gears, blades, a "
+            "bearing or a neighbouring machine"
         )
 
     def _departure(self, levels: WindowLevels, column: int, state: OperatingState, n_errors: float) -> float:

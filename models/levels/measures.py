@@ -27,6 +27,7 @@ All in SI units here. A level of random vibration scatters: over a time T with b
 standard error of 1/(2√(BT)) (J. S. Bendat, A. G. Piersol, "Random Data", 4th ed., chapter 8).
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -91,6 +92,8 @@ class LevelPlan:
         Cosine of the angle between their axes: 0 at right angles, as nearly all are.
     runout : ndarray of complex, shape (n,), or None
         What is taken out of 1x: q of x = Re{q e^{jθ}} at slow roll, for an angle that grows.
+    lines : bool
+        Whether the strongest line of every narrow band is wanted.
     """
 
     rate_hz: float
@@ -99,6 +102,7 @@ class LevelPlan:
     pairs: tuple[tuple[int, int], ...]
     skew: tuple[float, ...]
     runout: _ComplexArray | None = None
+    lines: bool = False
 
     @property
     def high_hz(self) -> tuple[float, float] | None:
@@ -128,7 +132,12 @@ class LevelPlan:
 
 
 def level_plan(
-    channels: Sequence[Channel], rate_hz: float, band_hz: tuple[float, float], runout: _ComplexArray | None = None
+    channels: Sequence[Channel],
+    rate_hz: float,
+    band_hz: tuple[float, float],
+    runout: _ComplexArray | None = None,
+    *,
+    lines: bool = False,
 ) -> LevelPlan:
     """Plan the levels of a machine.
 
@@ -139,6 +148,8 @@ def level_plan(
     band_hz : tuple of float
         Of velocities; cut off where the sampling rate ends it.
     runout : ndarray of complex, optional
+        See `LevelPlan`.
+    lines : bool
         See `LevelPlan`.
     """
     shaft = [(n, one) for n, one in enumerate(channels) if one.quantity is Quantity.DISPLACEMENT]
@@ -156,6 +167,7 @@ def level_plan(
         tuple(pairs),
         tuple(_skew(channels[first], channels[second]) for first, second in pairs),
         runout if runout is not None and np.any(runout) else None,
+        lines,
     )
 
 
@@ -182,12 +194,15 @@ class HopLevels:
         means nothing: the shaft angle is known to a whole turn.
     bands : ndarray, shape (n_bands, n)
         Mean squares in the bands of `models.levels.bands`.
+    lines : ndarray, shape (n_bands, n)
+        Of the strongest bin of each; without rows where lines are not wanted.
     """
 
     n_samples: int
     sums: FloatArray
     orders: _ComplexArray
     bands: FloatArray
+    lines: FloatArray
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything as named arrays."""
@@ -196,6 +211,7 @@ class HopLevels:
             "sums": self.sums,
             "orders": self.orders,
             "bands": self.bands,
+            "lines": self.lines,
         }
 
     @classmethod
@@ -213,6 +229,7 @@ class HopLevels:
             sums,
             checked(arrays, "orders", np.complex128, (len(ORDERS), sums.shape[1])),
             checked(arrays, "bands", np.float64, (None, sums.shape[1])),
+            checked(arrays, "lines", np.float64, (None, sums.shape[1])),
         )
 
 
@@ -273,7 +290,11 @@ def hop_levels(
             distance -= 2 * skew * x[y] * x[z]
         sums[4, y] = np.sqrt(distance.max() / (1 - skew**2))
     orders = unit * order_vectors(x, unit, spectrum, amplitude, angle_rad)
-    return HopLevels(n_samples, sums, orders, np.ascontiguousarray(bands.T))
+    lines = np.empty((n, 0))
+    if plan.lines:
+        bins = parts[:, : 2 * cuts[-1] : 2] + parts[:, 1 : 2 * cuts[-1] : 2]
+        lines = power * np.maximum.reduceat(bins[:, : cuts[edges[-1]]], cuts[edges[:-1]], axis=1)
+    return HopLevels(n_samples, sums, orders, np.ascontiguousarray(bands.T), np.ascontiguousarray(lines.T))
 
 
 @lru_cache(maxsize=8)
@@ -328,6 +349,10 @@ class WindowLevels:
     speed_rad_s : float or None
         Mean speed; None where it is not known.
     bands : BandLevels or None
+    lines : ndarray, shape (n_bands, n), or None
+        Part of each band's power that the strongest bin of a hop has, where lines are looked for.
+    unsteady : float
+        From the slowest hop to the fastest, relative to the speed; infinite where that is not known.
     moments : tuple of ndarray, or None
         Of each hop, what `random_kurtosis` is made of, and the mean squares in the bands.
     contact : ndarray, shape (n_hops, n), or None
@@ -340,6 +365,8 @@ class WindowLevels:
     speed_rad_s: float | None = None
     hops: int = 1
     bands: BandLevels | None = None
+    lines: FloatArray | None = None
+    unsteady: float = math.inf
     moments: tuple[FloatArray, FloatArray, _ComplexArray, FloatArray] | None = None
     contact: FloatArray | None = None
 
@@ -411,8 +438,12 @@ def window_levels(
         np.sqrt(in_bands).std(axis=0) / np.sqrt(max(1, count - 1)) if errors else None,
         freedom,
     )
+    lines = None
+    if plan.lines:
+        lines = _mean(np.stack([hop.lines for hop in hops])) / np.maximum(_mean(in_bands), np.finfo(float).tiny)
     moments = sums[:, 6], sums[:, 3], every_order[:, 1:], in_bands
-    return WindowLevels(values, scatter, vectors, speed_rad_s, count, bands, moments, sums[:, CONTACT])
+    unsteady = float(np.ptp(speeds_rad_s)) / abs(speed_rad_s) if speed_rad_s and turning.all() else math.inf
+    return WindowLevels(values, scatter, vectors, speed_rad_s, count, bands, lines, unsteady, moments, sums[:, CONTACT])
 
 
 def _mean(values: npt.NDArray[_Number]) -> npt.NDArray[_Number]:

@@ -13,6 +13,7 @@ from models.errors import CheckpointError
 from models.levels.bands import BandLevels, BandReference, learn_bands
 from models.levels.gains import GainReference
 from models.levels.kurtosis import HopReference, learn_hops
+from models.levels.lines import learn_lines
 from models.levels.measures import COMPARED, WindowLevels
 from models.signals.block import FloatArray
 
@@ -51,6 +52,8 @@ class OperatingState(BaseModel):
     hops: float = Field(ge=1)  # mean number of hops in a window
     # By channel.
     bands: dict[str, BandReference] = {}
+    # Largest part of each band's power that the strongest bin of a hop had, see `models.levels.lines`.
+    lines: dict[str, tuple[_Level, ...]] = Field(default={}, exclude_if=lambda found: not found)
     kurtosis: dict[str, HopReference] = Field(default={}, exclude_if=lambda found: not found)
     contact: dict[str, HopReference] = Field(default={}, exclude_if=lambda found: not found)
 
@@ -128,6 +131,9 @@ def _speed(levels: WindowLevels) -> float:
 def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingState:
     speeds = [one.speed_rad_s for one in group if one.speed_rad_s is not None]
     bands = [one.bands for one in group if one.bands is not None]
+    looked, lines = [one.lines for one in group if one.lines is not None], np.empty((0, 0))
+    if bands and len(looked) == len(group):
+        lines = learn_lines(looked, bands[0], group[0].hops, max(one.unsteady for one in group))
     kurtosis, contact = [one.random_kurtosis for one in group], [one.contact for one in group]
     return OperatingState(
         windows=len(group),
@@ -140,6 +146,7 @@ def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingS
         bands={
             channel: learn_bands(bands, column) for column, channel in enumerate(channels) if len(bands) == len(group)
         },
+        lines=dict(zip(channels, map(tuple, lines.T.round(3).tolist()), strict=False)),
         kurtosis=_hops(channels, kurtosis),
         contact={
             # As theory says; and no push outwards, which is made by something else, hides one inwards.

@@ -78,7 +78,7 @@ class MachineMonitor:
         self._evaluator = judge = evaluator_for(installed)
         self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
         self._standstill = Standstill(self._sensors)
-        self._plan = plan = plan_for(machine, lagged=judge.needs_lags, levels=True, contact=installed.knows_contact)
+        self._plan = plan = plan_for(machine, lagged=judge.needs_lags, levels=True, thorough=installed.thorough)
         self._watching = installed.watching or not plan.states
         self._levels = LevelWatch(plan, machine, installed)
         self._senders = Senders()

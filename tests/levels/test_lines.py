@@ -1,0 +1,95 @@
+"""A line that the healthy machine did not have is told, however loud the healthy machine was in another condition."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from models.levels.contact import LatestContact
+from models.levels.judgement import LevelJudge
+from models.levels.measures import WindowLevels, hop_levels, level_plan, window_levels
+from models.levels.reference import learn_levels
+from models.levels.settings import LevelSettings
+from models.signals.channels import Channel
+from models.signals.waveform import waveform_of
+
+RATE_HZ, HOP, HOPS, SPEED_HZ = 2000.0, 10_000, 12, 22.0
+CHANNELS = [
+    Channel.model_validate({"name": name, "quantity": "velocity", "location": "DE", "direction": way, "unit": "m/s"})
+    for name, way in (("V", "y"), ("H", "z"))
+]
+NAMES = [channel.name for channel in CHANNELS]
+PLAN = level_plan(CHANNELS, RATE_HZ, (10.0, 1000.0), lines=True)
+TIME_S = np.arange(HOP * HOPS) / RATE_HZ
+
+
+def window(
+    seed: int, *, loud: float = 1.0, mesh: float = 0.0, damping: float = 0.02, wander: float = 0.0
+) -> WindowLevels:
+    """A resonance at 480 Hz that noise excites, 1x, and a mesh of 22 teeth in the first channel.
+
+    Parameters
+    ----------
+    loud : float
+        Of the noise, whose rms is 1 otherwise.
+    wander : float
+        Of the speed, up and down within a hop, relative.
+    """
+    rng = np.random.default_rng([20261240, seed])
+    pole = np.exp(2 * np.pi * 480.0 / RATE_HZ * (-damping + 1j))
+    noise = lfilter([1.0], [1.0, -2 * pole.real, abs(pole) ** 2], rng.standard_normal((2, TIME_S.size)))
+    noise = loud * (noise / noise.std() + 0.3 * rng.standard_normal(noise.shape))
+    angle = 2 * np.pi * SPEED_HZ * (TIME_S + wander / (2 * np.pi * 0.33) * np.sin(2 * np.pi * 0.33 * TIME_S))
+    samples = noise + 0.5 * np.cos(angle)
+    samples[0] += mesh * np.cos(22 * angle + rng.uniform(0, 2 * np.pi))
+    hops = []
+    for part, turning in zip(np.split(samples, HOPS, axis=1), np.split(angle, HOPS), strict=True):
+        waveform, deviations = waveform_of(part.T)
+        hops.append((hop_levels(PLAN, waveform, deviations, turning), (turning[-1] - turning[0]) / (HOP / RATE_HZ)))
+    speeds = np.array([speed for _, speed in hops])
+    return window_levels(PLAN, [levels for levels, _ in hops], speeds, phase_reference=True)
+
+
+def told(levels: WindowLevels, healthy: list[WindowLevels]) -> str:
+    judge = LevelJudge(PLAN, CHANNELS, LevelSettings())
+    reference = learn_levels("commissioned", NAMES, healthy)
+    reference = type(reference).model_validate_json(reference.model_dump_json())
+    return judge.foreign(levels, judge.judge(levels, reference), reference, LatestContact(4), named=False)
+
+
+@pytest.fixture(scope="module")
+def healthy() -> list[WindowLevels]:
+    """In three conditions, in one of which it is ten times as loud as in another."""
+    return [window(number, loud=loud) for number, loud in enumerate([0.3, 0.3, 1.0, 1.0, 3.0, 3.0])]
+
+
+def test_a_new_line_is_told_where_no_level_has_grown(healthy: list[WindowLevels]) -> None:
+    levels = window(100, loud=0.3, mesh=0.4)
+    text = told(levels, healthy)
+    assert "a line within 460 to 487 Hz (20.9 to 22.1 times running speed" in text
+    assert "of the vibration of V without its 1x) that the healthy machine did not have" in text
+    judged = LevelJudge(PLAN, CHANNELS, LevelSettings()).judge(levels, learn_levels("commissioned", NAMES, healthy))
+    assert all(limit.state == "normal" for one in judged for limit in one.limits)
+
+
+@pytest.mark.parametrize("loud", [0.1, 0.3, 1.0, 3.0])
+def test_noise_is_no_line_whatever_its_level_or_resonance(healthy: list[WindowLevels], loud: float) -> None:
+    for seed in range(200, 205):
+        assert told(window(seed, loud=loud), healthy) == ""
+        assert "a line" not in told(window(seed, loud=loud, damping=0.008), healthy)
+
+
+def test_a_line_that_is_little_of_the_vibration_is_not_told(healthy: list[WindowLevels]) -> None:
+    assert told(window(300, loud=3.0, mesh=0.3), healthy) == ""
+
+
+@pytest.mark.parametrize("wander", [0.0, 0.01])
+def test_a_line_of_the_healthy_machine_is_none_steadier_or_not(wander: float) -> None:
+    geared = [window(400 + number, mesh=0.4, loud=0.3, wander=wander) for number in range(6)]
+    for change in (0.0, 0.005):
+        assert "a line" not in told(window(500, mesh=0.5, loud=0.3, wander=change), geared)
+
+
+def test_commissionings_and_plans_without_lines_have_none_to_tell(healthy: list[WindowLevels]) -> None:
+    assert level_plan(CHANNELS, RATE_HZ, (10.0, 1000.0)).lines is False
+    without = [type(one)(one.values, one.errors, one.vectors, one.speed_rad_s, one.hops, one.bands) for one in healthy]
+    assert told(window(600, loud=0.3, mesh=0.4), without) == ""
