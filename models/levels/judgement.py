@@ -198,13 +198,14 @@ class LevelJudge:
 
     def _line(self, levels: WindowLevels, state: OperatingState) -> str:
         """The loudest line that the healthy machine did not have; empty if there is none."""
-        if levels.lines is None or levels.bands is None or not state.lines:
+        parts = levels.line_parts
+        if parts is None or levels.bands is None or not state.lines:
             return ""
-        unknown = [math.nan] * len(levels.lines)
+        unknown = [math.nan] * len(parts)
         healthy = np.array([state.lines.get(one.name, unknown) for one in self._channels]).T
-        if healthy.shape != levels.lines.shape:
+        if healthy.shape != parts.shape:
             return ""
-        found = new_line(levels.bands, levels.lines, healthy, levels.values["not_x1"] ** 2)
+        found = new_line(levels.bands, parts, healthy, levels.values["not_x1"] ** 2)
         if found is None:
             return ""
         column, (low_hz, high_hz), share = found
@@ -230,7 +231,9 @@ class LevelJudge:
         found = departure(hops, healthy, BEYOND_RANGE, n_errors)
         if found < 0:
             orders, in_bands = levels.moments[2][:, :, column], levels.moments[3][:, :, column]
-            lines = fallen_by_lines(levels.bands, in_bands, orders, levels.speed_rad_s or 0.0, state.bands.get(name))
+            strongest = None if levels.lines is None else levels.lines[:, :, column]
+            before, speed_rad_s = (state.bands.get(name), state.lines.get(name, ())), levels.speed_rad_s or 0.0
+            lines = fallen_by_lines(levels.bands, in_bands, orders, speed_rad_s, *before, strongest)
             return found if departure(hops + lines, healthy, BEYOND_RANGE, n_errors) < 0 else 0.0
         if found and healthy.mean < GAUSSIAN:
             random = without_lines(healthy)

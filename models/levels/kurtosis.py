@@ -14,6 +14,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from models.levels.bands import BandLevels, BandReference
+from models.levels.lines import LINE, OF_BIN
 from models.signals.block import FloatArray
 
 
@@ -71,6 +72,8 @@ def fallen_by_lines(
     orders: npt.NDArray[np.complex128],
     speed_rad_s: float,
     healthy: BandReference | None,
+    healthy_parts: Sequence[float] = (),
+    strongest: FloatArray | None = None,
 ) -> FloatArray:
     """What lines, such as a gear mesh, have taken from a channel's kurtosis since it was healthy; of each hop.
 
@@ -82,6 +85,10 @@ def fallen_by_lines(
         Mean squares.
     orders : ndarray of complex, shape (n_hops, n_orders)
         Amplitudes of the first multiples of running speed, which have been taken out.
+    healthy_parts : sequence of float
+        Largest part of each band's power that the strongest bin had on the healthy machine.
+    strongest : ndarray, shape (n_hops, n_bands), optional
+        Mean squares of the strongest bins: a line in a band of noise is known better by these.
     """
     total = np.maximum(in_bands.sum(axis=1), np.finfo(float).tiny)
     freedom = bands.freedom / len(in_bands)
@@ -92,8 +99,14 @@ def fallen_by_lines(
     if healthy is not None and len(healthy.mean) == before.size:
         before = np.square(healthy.mean)
         before /= max(float(before.sum()), np.finfo(float).tiny)
-    lines = ~near.any(axis=0) & _steady(in_bands, freedom)
-    fallen = np.maximum((in_bands[:, lines] / total[:, None]) ** 2 - before[lines] ** 2, 0.0).sum(axis=1)
+    of_lines, freedom_of_lines = in_bands, freedom
+    if strongest is not None and strongest.size and len(healthy_parts) == before.size:
+        alone = strongest.sum(axis=0) > LINE * in_bands.sum(axis=0)
+        of_lines = np.where(alone, np.minimum(in_bands, OF_BIN * strongest), in_bands)
+        before = np.where(alone, before * np.minimum(1.0, OF_BIN * np.array(healthy_parts)), before)
+        freedom_of_lines = np.where(alone, 2.0, freedom)
+    lines = ~near.any(axis=0) & _steady(of_lines, freedom_of_lines)
+    fallen = np.maximum((of_lines[:, lines] / total[:, None]) ** 2 - before[lines] ** 2, 0.0).sum(axis=1)
     beside = np.maximum(in_bands @ near.T - np.abs(orders) ** 2 / 2, 0.0)
     fallen += ((beside / total[:, None]) ** 2)[:, _steady(beside, near @ freedom)].sum(axis=1)
     return np.asarray(1.5 * fallen, dtype=np.float64)

@@ -12,8 +12,10 @@ import numpy as np
 from models.levels.bands import BandLevels
 from models.signals.block import FloatArray
 
-_LINE, _OVER_HEALTHY = 0.2, 2.0
+LINE, _OVER_HEALTHY = 0.2, 2.0
 """Least part of its band that a line has, and times the largest of the healthy machine."""
+OF_BIN = 1.5
+"""Power of a line over that of its strongest bin, where it is in the middle of it."""
 _HAD_ONE = 0.25
 """Part from which on the healthy machine is taken to have a line there; a narrow resonance has less."""
 _NOISE, _STEADY = 2.0, 1e-3
@@ -66,7 +68,7 @@ def new_line(
     """
     padded = np.pad(healthy, ((1, 1), (0, 0)), mode="edge")  # a line moves to the next band when the speed does
     before = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
-    new = (before < _HAD_ONE) & (parts > np.maximum(_LINE, _OVER_HEALTHY * before))  # not where it is not known
+    new = (before < _HAD_ONE) & (parts > np.maximum(LINE, _OVER_HEALTHY * before))  # not where it is not known
     share = np.where(new, parts * levels.rms**2 / power, 0.0)
     band, column = divmod(int(share.argmax()), share.shape[1])
     if share[band, column] < _LOUD:

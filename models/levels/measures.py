@@ -349,8 +349,8 @@ class WindowLevels:
     speed_rad_s : float or None
         Mean speed; None where it is not known.
     bands : BandLevels or None
-    lines : ndarray, shape (n_bands, n), or None
-        Part of each band's power that the strongest bin of a hop has, where lines are looked for.
+    lines : ndarray, shape (n_hops, n_bands, n), or None
+        Mean squares of the strongest bin of each band, where lines are looked for.
     unsteady : float
         From the slowest hop to the fastest, relative to the speed; infinite where that is not known.
     moments : tuple of ndarray, or None
@@ -369,6 +369,13 @@ class WindowLevels:
     unsteady: float = math.inf
     moments: tuple[FloatArray, FloatArray, _ComplexArray, FloatArray] | None = None
     contact: FloatArray | None = None
+
+    @property
+    def line_parts(self) -> FloatArray | None:
+        """Part of each band's power that the strongest bin of a hop has; shape (n_bands, n)."""
+        if self.lines is None or self.moments is None:
+            return None
+        return np.asarray(_mean(self.lines) / np.maximum(_mean(self.moments[3]), np.finfo(float).tiny))
 
     @property
     def random_kurtosis(self) -> FloatArray | None:
@@ -438,9 +445,7 @@ def window_levels(
         np.sqrt(in_bands).std(axis=0) / np.sqrt(max(1, count - 1)) if errors else None,
         freedom,
     )
-    lines = None
-    if plan.lines:
-        lines = _mean(np.stack([hop.lines for hop in hops])) / np.maximum(_mean(in_bands), np.finfo(float).tiny)
+    lines = np.stack([hop.lines for hop in hops]) if plan.lines else None
     moments = sums[:, 6], sums[:, 3], every_order[:, 1:], in_bands
     unsteady = float(np.ptp(speeds_rad_s)) / abs(speed_rad_s) if speed_rad_s and turning.all() else math.inf
     return WindowLevels(values, scatter, vectors, speed_rad_s, count, bands, lines, unsteady, moments, sums[:, CONTACT])

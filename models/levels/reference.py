@@ -131,7 +131,7 @@ def _speed(levels: WindowLevels) -> float:
 def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingState:
     speeds = [one.speed_rad_s for one in group if one.speed_rad_s is not None]
     bands = [one.bands for one in group if one.bands is not None]
-    looked, lines = [one.lines for one in group if one.lines is not None], np.empty((0, 0))
+    looked, lines = [parts for one in group if (parts := one.line_parts) is not None], np.empty((0, 0))
     if bands and len(looked) == len(group):
         lines = learn_lines(looked, bands[0], group[0].hops, max(one.unsteady for one in group))
     kurtosis, contact = [one.random_kurtosis for one in group], [one.contact for one in group]
