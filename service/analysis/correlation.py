@@ -40,26 +40,12 @@ class Curve:
 class Panel:
     """One equation."""
 
-    # Number and subject of the equation, and name of its target correlation.
-    number: str
-    title: str
-    target: str
+    target: str  # name of its target correlation
     over: str  # ``lag`` or ``angle``: what `x` is
     x: FloatArray  # (n_points,), lags, s; or shaft angles, rad
     curves: tuple[Curve, ...]  # empty if it cannot be evaluated
     # What the monitor reports of it: mean squared deviation, that of healthy windows, parameters, or the reason.
     reading: EquationReading
-
-
-@dataclass(frozen=True, slots=True)
-class Correlations:
-    """All equations of one window."""
-
-    # Oldest and newest data in the window.
-    start_ns: int
-    end_ns: int
-    speed_rad_s: float  # mean speed; nan without a shaft angle
-    panels: tuple[Panel, ...]
 
 
 def latest_window(data: Recorded, machine: MachineFile) -> WindowStatistics:
@@ -93,11 +79,10 @@ def latest_window(data: Recorded, machine: MachineFile) -> WindowStatistics:
     return latest
 
 
-def correlations_of(window: WindowStatistics, machine: Machine, bundle: Bundle) -> Correlations:
+def correlations_of(window: WindowStatistics, machine: Machine, bundle: Bundle) -> tuple[Panel, ...]:
     """Every equation in a window: the figures of the monitor's report, and the curves they come from."""
     trained = {network.equation.number: network for network in bundle.networks}
-    panels = tuple(_panel(equation, trained.get(equation.number), window, machine) for equation in EQUATIONS)
-    return Correlations(window.start_ns, window.end_ns, window.speed_rad_s, panels)
+    return tuple(_panel(equation, trained.get(equation.number), window, machine) for equation in EQUATIONS)
 
 
 def _panel(
@@ -116,7 +101,7 @@ def _panel(
     else:
         reading = read_equation(trained, window, machine)
     if trained is None or reading.reason:
-        return Panel(equation.number, equation.title, target, over, np.empty(0), (), reading)
+        return Panel(target, over, np.empty(0), (), reading)
     view = window_view(window, machine)
     rows = equation.rows(view, machine)
     measured = rows.target / rows.norm
@@ -132,7 +117,7 @@ def _panel(
         columns = (measured.reshape(n_points, -1).T, predicted.reshape(n_points, -1).T)
         labels = list(equation.channels[: 2 * columns[0].shape[0] : 2])
     curves = tuple(Curve(label, one, other) for label, one, other in zip(labels, *columns, strict=True))
-    return Panel(equation.number, equation.title, target, over, x, curves, reading)
+    return Panel(target, over, x, curves, reading)
 
 
 def _blocks(data: Recorded, machine: MachineFile) -> Iterator[tuple[SampleBlock, str]]:

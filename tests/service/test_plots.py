@@ -245,10 +245,11 @@ def test_correlation_panels_carry_the_figures_of_the_report(
     report = [one for one in reports_of(lines) if one.equations][nth]
     source = RecordingSource([faulty])
     window = latest_window(Recorded(source, LAB.keys, source.span().start_ns, report.end_ns + S), LAB)
-    found = correlations_of(window, LAB, load_bundle("lab", LAB))
-    assert (found.start_ns, found.end_ns) == (report.start_ns, report.end_ns)
-    assert [panel.number for panel in found.panels] == [equation.equation for equation in report.equations]
-    for panel, said in zip(found.panels, report.equations, strict=True):
+    panels = correlations_of(window, LAB, load_bundle("lab", LAB))
+    assert (window.start_ns, window.end_ns) == (report.start_ns, report.end_ns)
+    by_number = {panel.reading.equation: panel for panel in panels}
+    assert list(by_number) == [equation.equation for equation in report.equations]
+    for panel, said in zip(panels, report.equations, strict=True):
         if not said.evaluable:
             assert (panel.curves, panel.reading.reason) == ((), said.reason)
             continue
@@ -257,7 +258,6 @@ def test_correlation_panels_carry_the_figures_of_the_report(
         assert (panel.reading.msd, panel.reading.msd_healthy) == (said.msd, said.msd_healthy)
         measured = np.concatenate([curve.measured for curve in panel.curves])
         assert np.sqrt(np.mean(measured**2)) == pytest.approx(1.0)  # over the target's rms
-    by_number = {panel.number: panel for panel in found.panels}
     assert by_number["30"].reading.reason.startswith("not measured: psi_dot")
     assert [curve.label for curve in by_number["28"].curves] == ["y1", "y2", "z1", "z2"]
     assert by_number["28"].x[[0, -1]] == pytest.approx([0.010, 0.125])
@@ -268,7 +268,7 @@ def test_curves_are_labelled_with_their_references(faulty: Path) -> None:
     """Each curve against the window's own correlation of that reference with the target."""
     source = RecordingSource([faulty])
     window = latest_window(Recorded(source, LAB.keys, source.span().start_ns, source.span().end_ns + 1), LAB)
-    panel = correlations_of(window, LAB, load_bundle("lab", LAB)).panels[0]
+    panel = correlations_of(window, LAB, load_bundle("lab", LAB))[0]
     lags = window.lags_s >= 0.0099
     for curve in panel.curves:
         i, j = window.states.index(f"{curve.label}_dot"), window.states.index("y1_dot")

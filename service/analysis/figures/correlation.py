@@ -7,8 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from models.diagnosis.window import WindowStatistics
 from models.errors import MachineFileError
-from service.analysis.correlation import Correlations, Panel, correlations_of, latest_window
+from service.analysis.correlation import Panel, correlations_of, latest_window
 from service.analysis.figures.style import COLOURS, GREY, INK, Look, Paint, heading, rpm
 from service.analysis.recorded import Recorded
 from service.recordings.replay.machine import choose_machine
@@ -23,20 +24,20 @@ def correlation(data: Recorded, choice: str | None) -> Paint:
             "correlations are compared with what trained networks predict: name a bundle that has networks, as "
             "--machine FILE@BUNDLE (one that was commissioned without the rotor's parameters has none)"
         )
-    found = correlations_of(latest_window(data, machine), machine, bundle)
-    return partial(_paint, found, data.name, bundle.identity)
+    window = latest_window(data, machine)
+    return partial(_paint, window, correlations_of(window, machine, bundle), data.name, bundle.identity)
 
 
-def _paint(found: Correlations, name: str, networks: str, look: Look) -> Figure:
+def _paint(window: WindowStatistics, panels: tuple[Panel, ...], name: str, networks: str, look: Look) -> Figure:
     """Two panels for each equation."""
     figure = Figure(figsize=look.size_in or (11.0, 8.4))
     figure.set_layout_engine("constrained", h_pad=0.03, hspace=0.0)
-    rows = (len(found.panels) + 1) // 2
+    rows = (len(panels) + 1) // 2
     grid = figure.add_gridspec(3 * rows - 1, 2, height_ratios=([2.2, 1.0, 0.1] * rows)[:-1])
-    for number, panel in enumerate(found.panels):
+    for number, panel in enumerate(panels):
         row, column = 3 * (number // 2), number % 2
         upper = figure.add_subplot(grid[row, column])
-        upper.set_title(f"({panel.number})  {panel.title}", fontweight="bold")
+        upper.set_title(f"({panel.reading.equation})  {panel.reading.title}", fontweight="bold")
         if panel.curves:
             _curves(upper, figure.add_subplot(grid[row + 1, column], sharex=upper), panel)
         else:
@@ -49,8 +50,8 @@ def _paint(found: Correlations, name: str, networks: str, look: Look) -> Figure:
         loc="outside lower center",
         ncols=2,
     )
-    title, span = f"{name}: correlations against the networks' prediction", (found.start_ns, found.end_ns)
-    heading(figure, look, title, span, rpm(found.speed_rad_s), f"networks {networks}")
+    title, span = f"{name}: correlations against the networks' prediction", (window.start_ns, window.end_ns)
+    heading(figure, look, title, span, rpm(window.speed_rad_s), f"networks {networks}")
     return figure
 
 

@@ -72,7 +72,9 @@ def _paint(trend: TrendSeries, look: Look) -> Figure:
     for axes in panels[1:]:
         alarm_lines(axes, trend.alarms)
     for name, axes in zip((MODEL, *(one.name for one in trend.parameters)), panels, strict=False):
-        _name_alarms(axes, [alarm for alarm in trend.alarms if _panel_of(alarm) == name])
+        # A parameter's alarm belongs to its panel, any other to the one of the states.
+        own = [one for one in trend.alarms if (one.name if one.name in PARAMETER_TEXT else MODEL) == name]
+        _name_alarms(axes, own)
     panels[-1].set_xlim(*as_dates(np.array([trend.end_ns[0], trend.end_ns[-1] + step_ns])))
     time_axis(panels[-1])
     figure.legend(handles=_legend(trend), loc="outside lower center", ncols=5, fontsize=8)
@@ -151,11 +153,6 @@ def _parameter(axes: Axes, parameter: ParameterTrend, trend: TrendSeries, step_n
     # One window with an endless interval must not hide the others.
     top = max(_LEAST_PERCENT, 1.15 * limit, min(1.15 * ends, 2.5 * max(far + wide, limit)))
     axes.set_ylim(-top, top)
-
-
-def _panel_of(alarm: AlarmEventData) -> str:
-    """A parameter's alarm belongs to its panel, any other to the one of the states."""
-    return alarm.name if alarm.name in PARAMETER_TEXT else MODEL
 
 
 def _danger_near(parameter: ParameterTrend, alarms: AlarmSettings) -> bool:

@@ -10,7 +10,7 @@ from service.analysis.past import Past
 from service.analysis.recorded import Sampled
 from service.analysis.runup import past_run_up, read_run_up
 from service.analysis.snapshots.channels import figures
-from service.analysis.snapshots.samples import source_of, whose
+from service.analysis.snapshots.samples import whose
 from service.analysis.spectrum import steady
 
 _MOST_VECTORS = 1000
@@ -33,7 +33,7 @@ def vector_series(
         found = read_run_up(data, channels, order, revolutions, slow_roll_rpm)
     every = -(-found.time_ns.size // _MOST_VECTORS)
     return VectorSeries(
-        **whose(data, "history" if isinstance(data, Past) else source_of(data)),
+        **whose(data),
         order=order,
         revolutions=found.revolutions,
         slow_roll_rpm=found.slow_roll_rpm,
@@ -63,7 +63,7 @@ def centreline_series(data: Sampled | Past) -> CentrelineSeries:
     pairs = recorded_pairs(data)
     found = past_centreline(data, pairs) if isinstance(data, Past) else read_centreline(data, pairs, _CENTRELINE_S)
     return CentrelineSeries(
-        **whose(data, "history" if isinstance(data, Past) else source_of(data)),
+        **whose(data),
         times_ns=tuple(found.time_ns.tolist()),
         speeds_rad_s=figures(np.asarray(found.speed_rad_s, dtype=np.float64)),
         places=tuple(

@@ -16,7 +16,8 @@ from rotorwatch.records.plots import (
     WaveformSnapshot,
 )
 from service.analysis.orbit import recorded_pairs
-from service.analysis.recorded import Described, Recorded, Sampled
+from service.analysis.past import Past
+from service.analysis.recorded import Recorded, Sampled
 from service.analysis.revolutions import Excerpt, newest_revolutions
 from service.analysis.snapshots.channels import figures, known_figures
 from service.analysis.spectrum import lowest_hz, read_full_spectrum, read_waterfall, shown_as, steady, unit_shown
@@ -28,13 +29,6 @@ _FULL_S, _FULL_HZ = 10.0, 1.0
 _MOST_ROWS, _MOST_LINES = 60, 400
 _ROW_S = 0.5
 _UM = "µm p-p"
-
-Source = Literal["newest samples", "history", "recordings"]
-
-
-def source_of(data: Sampled) -> Source:
-    """What values made of some samples come from."""
-    return "recordings" if isinstance(data, Recorded) else "newest samples"
 
 
 def waveform_snapshot(
@@ -52,7 +46,7 @@ def waveform_snapshot(
     shown = found.excerpt or _newest(excerpt)
     speed = figures([shown.speed_rad_s if np.isfinite(shown.speed_rad_s) else speed_rad_s or np.nan])[0]
     return WaveformSnapshot(
-        **whose(data, source_of(data)),
+        **whose(data),
         start_ns=shown.start_ns,
         end_ns=shown.end_ns,
         speed_rad_s=speed,
@@ -87,7 +81,7 @@ def full_spectrum_snapshot(data: Sampled) -> FullSpectrumSnapshot:
     values = np.where(clear, found.values_um, np.nan)[:, lines]
     group = -(-values.shape[1] // (2 * _MOST_LINES))
     return FullSpectrumSnapshot(
-        **whose(data, source_of(data)),
+        **whose(data),
         start_ns=found.start_ns,
         end_ns=found.end_ns,
         speed_rad_s=figures([found.speed_rad_s])[0],
@@ -131,7 +125,7 @@ def waterfall_snapshot(data: Sampled, channel: Channel, over: Literal["time", "s
     lines = (found.frequencies_hz >= lowest_hz(found.resolution_hz)) & (found.frequencies_hz <= found.useful_hz)
     group = -(-int(lines.sum()) // _MOST_LINES) or 1
     return WaterfallSnapshot(
-        **whose(data, source_of(data)),
+        **whose(data),
         start_ns=int(found.start_ns[0]),
         end_ns=int(found.end_ns[-1]),
         channel=channel.name,
@@ -157,13 +151,14 @@ class Whose(TypedDict):
 
     site: str
     machine: str
-    source: Source
+    source: Literal["newest samples", "history", "recordings"]
 
 
-def whose(data: Described, source: Source) -> Whose:
+def whose(data: Sampled | Past) -> Whose:
     """Whose values they are, and what they come from."""
     site, machine = data.name.split("/")
-    return {"site": site, "machine": machine, "source": source}
+    recorded: Literal["newest samples", "recordings"] = "recordings" if isinstance(data, Recorded) else "newest samples"
+    return {"site": site, "machine": machine, "source": "history" if isinstance(data, Past) else recorded}
 
 
 def _newest(excerpt: Excerpt) -> Excerpt:
