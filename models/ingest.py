@@ -105,7 +105,7 @@ class Gate:
     """Judges the blocks of one machine in the order of their arrival."""
 
     def __init__(self, machine: MachineFile) -> None:
-        self._name = f"{machine.site}/{machine.name}"
+        self._name = machine.title
         self._settings = machine.ingest
         self._rate_hz = machine.rate_hz
         self._n_channels = len(machine.sensors)

@@ -422,6 +422,11 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
         return (self.window.band_hz[1] - self.window.band_hz[0]) * self.window.segment_s >= _BINS
 
     @property
+    def title(self) -> str:
+        """``site/name``."""
+        return f"{self.site}/{self.name}"
+
+    @property
     def keys(self) -> MachineKeys:
         """The machine's Zenoh keys."""
         return MachineKeys(self.site, self.name)

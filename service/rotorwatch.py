@@ -137,7 +137,7 @@ def _serve(settings: "ServiceSettings", config: Path | None, ray_address: str | 
         keep_loaded()
         for worker in service.machines():
             networks = worker.identity["bundle"] or "none: the equations are not evaluated"
-            typer.echo(f"machine {worker.machine.site}/{worker.machine.name}, bundle {networks}")
+            typer.echo(f"machine {worker.machine.title}, bundle {networks}")
         if settings.link.namespace:
             typer.echo(f"Zenoh namespace {settings.link.namespace}: nothing from outside it is heard")
         for what, ends in (("listening on", settings.link.listen), ("connecting to", settings.link.connect)):
@@ -303,13 +303,13 @@ def _checked(file: Path) -> str:
 
     if {"site", "rotor", "sensors"} & set(read_toml(file)):
         machine = load_machine_file(file)
-        return f"machine {machine.site}/{machine.name}, {len(machine.sensors)} channels at {machine.rate_hz:g} Hz"
+        return f"machine {machine.title}, {len(machine.sensors)} channels at {machine.rate_hz:g} Hz"
     settings = load_settings(file)
     names = []
     for entry in settings.machines:
         machine = entry.load()
         install(machine, entry.bundle)
-        names.append(f"{machine.site}/{machine.name}")
+        names.append(machine.title)
     Store(settings.history.database, settings.history.retention)  # knows which addresses it can use
     return f"settings for {', '.join(names)}"
 

@@ -280,14 +280,12 @@ def load_commissioned(directory: Path, machine: MachineFile, *, same_description
         told = "; ".join(text for _, text in mistakes(error, Commissioned))
         raise BundleError(f"{path}: damaged, or of another version: {told}") from error
     if (found.site, found.machine) != (machine.site, machine.name):
-        raise BundleError(
-            f"{path}: commissioned for {found.site}/{found.machine}, not for {machine.site}/{machine.name}"
-        )
+        raise BundleError(f"{path}: commissioned for {found.site}/{found.machine}, not for {machine.title}")
     now = described(machine)
     different = [name for name in sorted(now) if now[name] != found.described.get(name)]
     if same_description and different:
         raise BundleError(
-            f"{path}: {', '.join(different)} in the machine file of {machine.site}/{machine.name} differ from what was "
+            f"{path}: {', '.join(different)} in the machine file of {machine.title} differ from what was "
             "commissioned: commission the machine again"
         )
     return found
@@ -356,7 +354,7 @@ def install(machine: MachineFile, bundle: str | Path | None) -> Installed:
         return Installed(machine)
     if not isinstance(machine, Machine):
         raise BundleError(
-            f"{machine.site}/{machine.name}: {directory} is not a commissioned bundle, and its machine file does not "
+            f"{machine.title}: {directory} is not a commissioned bundle, and its machine file does not "
             "give all parameters of the rotor, which a trained one needs; commission it from healthy recordings "
             "(rotortrain commission), or name no bundle: then its vibration levels are watched"
         )

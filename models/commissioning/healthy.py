@@ -138,7 +138,7 @@ def read_healthy(path: Path, machine: MachineFile, until_s: float | None = None)
     if not found.hops and not found.refused:
         streams = [key for key in summarize_recording(path).messages if key.endswith("/stream")]
         raise RecordingError(
-            f"{path}: no hop of {machine.hop_data_s:g} s of {machine.site}/{machine.name} in it; it holds "
+            f"{path}: no hop of {machine.hop_data_s:g} s of {machine.title} in it; it holds "
             f"{', '.join(streams) or 'no stream'}"
         )
     return found

@@ -72,7 +72,7 @@ def identify(
             break
     else:
         raise EstimationError(
-            f"{machine.site}/{machine.name}: the rotor cannot be identified: after {_ROUNDS} rounds "
+            f"{machine.title}: the rotor cannot be identified: after {_ROUNDS} rounds "
             f"{max(moves, key=lambda name: abs(moves[name]))} still moves; masses or shaft of [rotor] may be wrong, or "
             "the machine is not a bearing with an overhung disc"
         )
@@ -122,11 +122,11 @@ def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics]) -> M
     """Every parameter from somewhere: the file, the sum of forces on bearing and disc, or the lowest peak."""
     known = machine.rotor
     if known is None or known.m2_kg is None or known.m1_kg is None:
-        raise MachineFileError(f"{machine.site}/{machine.name}: [rotor] gives no masses")
+        raise MachineFileError(f"{machine.title}: [rotor] gives no masses")
     speeds = [window.speed_rad_s for window in windows if np.isfinite(window.speed_rad_s)]
     if machine.operation is None and not speeds:
         raise MachineFileError(
-            f"{machine.site}/{machine.name}: the recordings have no phase reference: give speed_rpm in [operation]"
+            f"{machine.title}: the recordings have no phase reference: give speed_rpm in [operation]"
         )
     speed = machine.operation.speed_rad_s if machine.operation is not None else float(np.median(speeds))
     spread = max((abs(one / speed - 1) for one in speeds), default=0.0)

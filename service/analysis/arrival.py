@@ -40,7 +40,7 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
     messages : sequence of RecordedMessage
         In the order of their arrival.
     """
-    place, keys = f"{machine.site}/{machine.name}", machine.keys
+    place, keys = machine.title, machine.keys
     troubles: list[str] = []
     announced = [one.payload for one in messages if one.key == keys.descriptor]
     if not announced:

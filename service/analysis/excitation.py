@@ -107,15 +107,14 @@ def excitation_of(machine: Machine, window: WindowStatistics) -> Excitation:
         If a channel does not move, or no excitation is the best one.
     """
     window = integrated(window)
-    place = f"{machine.site}/{machine.name}"
-    speed = window_speed(machine, window)
+    speed = float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else machine.operation.speed_rad_s
     frequencies_hz = window.frequencies_hz
     spacing_hz = float(frequencies_hz[1] - frequencies_hz[0])
     excluded = np.abs(frequencies_hz - abs(speed) / (2 * np.pi)) <= LEFT_OUT_BINS * spacing_hz
     power = np.einsum("fii->i", window.spectrum[~excluded]).real / np.count_nonzero(~excluded)
     still = [state for state, one in zip(window.states, power, strict=True) if not one > 0]
     if still:
-        raise EstimationError(f"{place}: no fluctuation in {', '.join(still)}: nothing to compare with theory")
+        raise EstimationError(f"{machine.title}: no fluctuation in {', '.join(still)}: nothing to compare with theory")
     motions = Motions(window.states, np.sqrt(power))
     low_hz, high_hz = machine.window.band_hz
     groups = group_bins(frequencies_hz, machine, np.asarray(excluded, dtype=np.bool_), (high_hz - low_hz) / _GROUPS)
@@ -131,18 +130,15 @@ def excitation_of(machine: Machine, window: WindowStatistics) -> Excitation:
             start = starting_point(model, observed, search.centre, speed)
             theta = search.maximise(start, _STEPS, _NEAR, _GAIN).theta
     except np.linalg.LinAlgError as error:
-        raise EstimationError(f"{place}: no excitation explains this window with these parameters: {error}") from error
+        raise EstimationError(
+            f"{machine.title}: no excitation explains this window with these parameters: {error}"
+        ) from error
     if not np.all(np.isfinite(theta)):
-        raise EstimationError(f"{place}: no excitation explains this window with these parameters")
+        raise EstimationError(f"{machine.title}: no excitation explains this window with these parameters")
     theta = theta.copy()
     theta[: model.cutoff_at] = 0.0
     noise = _noise_of(machine, model, theta, window, speed)
     return Excitation(machine, motions, theta, force_scale, speed, noise)
-
-
-def window_speed(machine: Machine, window: WindowStatistics) -> float:
-    """Speed in the window; the nominal one where it is not known, rad/s."""
-    return float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else machine.operation.speed_rad_s
 
 
 def _noise_of(

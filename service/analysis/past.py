@@ -52,7 +52,7 @@ class Past(Described):
             If there are no reports.
         """
         reports = _parsed(log.texts(since_ns or 0, _LATEST_NS if until_ns is None else until_ns, most))
-        name = f"{machine.site}/{machine.name}"
+        name = machine.title
         if not reports:
             raise RotorwatchError(f"{name}: no reports in this stretch of time")
         return cls(machine, name, "the history", reports, ())
@@ -76,7 +76,7 @@ class Past(Described):
             If the history cannot be read, or has no reports there.
         """
         chosen = load_settings(settings)
-        there = {f"{one.site}/{one.name}": one for one in (entry.load() for entry in chosen.machines)}
+        there = {one.title: one for one in (entry.load() for entry in chosen.machines)}
         name = key or next(iter(there))
         if name not in there or (key is None and len(there) > 1):
             raise MachineFileError(f"{settings}: machines: {', '.join(there)}; name one, as --key SITE/MACHINE")

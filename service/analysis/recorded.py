@@ -266,7 +266,7 @@ class Held(Sampled):
     def __init__(self, machine: MachineFile, blocks: Sequence[SampleBlock]) -> None:
         self._descriptor = machine.descriptor
         self._excerpt = Excerpt.of_blocks(blocks, machine.rate_hz, None)
-        self.name, self.place = f"{machine.site}/{machine.name}", "the newest samples"
+        self.name, self.place = machine.title, "the newest samples"
         self.from_ns, self.to_ns = self._excerpt.start_ns, self._excerpt.end_ns
 
     @property

@@ -98,7 +98,7 @@ def _check(found: ChannelDescriptor, machine: MachineFile, place: str) -> None:
     expected = machine.descriptor
     if found.channels != expected.channels or found.rate_hz != expected.rate_hz:
         raise RotorwatchError(
-            f"{machine.site}/{machine.name}: {place} was recorded with {', '.join(one.name for one in found.channels)} "
+            f"{machine.title}: {place} was recorded with {', '.join(one.name for one in found.channels)} "
             f"at {found.rate_hz:g} Hz, or other units; expected those of the machine file, "
             f"{', '.join(one.name for one in expected.channels)} at {expected.rate_hz:g} Hz"
         )

@@ -132,7 +132,7 @@ class SampleReader:
         with _taking_turns():
             source = _source(found)
             _check_size(source, since_ns, until_ns)
-            keys = source.machine(_place(view))
+            keys = source.machine(view.machine.title)
             yield Recorded(source, keys, *source.between(_moment(since_ns), _moment(until_ns), keys))
 
     def window(self, view: Monitored, chosen: Chosen) -> tuple[MachineSnapshots, LatestData]:
@@ -146,7 +146,7 @@ class SampleReader:
         if not chosen.recorded:
             return view.snapshots, view.latest
         job = None if chosen.replay is None else self._job(view, chosen.replay)
-        asked = (_place(view), chosen, None if job is None else job.state)
+        asked = (view.machine.title, chosen, None if job is None else job.state)
         found = self._files(view, chosen)
         with _taking_turns():
             kept = self._windows.pop(asked, None) or self._read(view, chosen, job, found)
@@ -167,13 +167,13 @@ class SampleReader:
             if until_ns is not None:
                 _check_size(source, until_ns - round(installed.machine.window.length_s * 1e9), until_ns)
             lagged = evaluator_for(installed).needs_lags
-            data = recorded_window(source, installed.machine, _place(view), until_ns, report, lagged=lagged)
+            data = recorded_window(source, installed.machine, view.machine.title, until_ns, report, lagged=lagged)
         except RotorwatchError as error:
             data = LatestData(lacking=str(error))
         return MachineSnapshots(installed, identity_of(installed)), data
 
     def _files(self, view: Monitored, chosen: Chosen) -> _Files:
-        ids = [f"{_place(view)}/{name}" for name in chosen.recordings]
+        ids = [f"{view.machine.title}/{name}" for name in chosen.recordings]
         if chosen.replay is not None:
             ids = list(self._job(view, chosen.replay).recordings)
         found = [found_recording(self._service.catalogue, one) for one in dict.fromkeys(ids)]
@@ -182,8 +182,8 @@ class SampleReader:
     def _job(self, view: Monitored, replay_id: str) -> ReplayJob:
         job = self._service.replays.job(replay_id)
         machine = job.recordings[0].rpartition("/")[0]
-        if machine != _place(view):
-            raise HTTPException(422, f"replay: {replay_id} is of {machine}, expected one of {_place(view)}")
+        if machine != view.machine.title:
+            raise HTTPException(422, f"replay: {replay_id} is of {machine}, expected one of {view.machine.title}")
         return job
 
 
@@ -208,10 +208,6 @@ def _check_size(source: RecordingSource, since_ns: int | None, until_ns: int | N
     if size > _MOST_BYTES:
         most = f"expected at most {_MOST_BYTES / 1e6:.0f} MB at once"
         raise HTTPException(422, f"recording: {size / 1e6:.0f} MB, {most}")
-
-
-def _place(view: Monitored) -> str:
-    return f"{view.machine.site}/{view.machine.name}"
 
 
 def _moment(time_ns: int | None) -> str | None:

@@ -71,7 +71,7 @@ def found_machine(service: ServiceView, site: str, name: str) -> Monitored:
     """
     machine = service.machine(site, name)
     if machine is None:
-        known = ", ".join(f"{one.machine.site}/{one.machine.name}" for one in service.machines())
+        known = ", ".join(one.machine.title for one in service.machines())
         raise HTTPException(404, f"no machine {site[:64]}/{name[:64]}; there are: {known}")
     return machine
 

@@ -191,7 +191,7 @@ class _Show:
         zenoh_port, http_port = (_port(None if free else usual) for usual in _PORTS)
         self._endpoint = f"tcp/127.0.0.1:{zenoh_port}"
         self._url = f"http://127.0.0.1:{options.http_port or http_port}"
-        self._base = f"{self._url}/api/v1/machines/{self._machine.site}/{self._machine.name}"
+        self._base = f"{self._url}/api/v1/machines/{self._machine.title}"
         names = list(FAULTS)
         first = names.index(options.fault) if options.fault in FAULTS else 0
         self._faults = islice(cycle(names[first:] + names[:first]), _ROUNDS)
@@ -214,8 +214,7 @@ class _Show:
         _wait_until_ready(self._url, monitor)
         link = LinkSettings(mode="client", connect=(self._endpoint,))
         inbox: queue.SimpleQueue[TopicMessage] = queue.SimpleQueue()
-        place = f"{self._machine.site}/{self._machine.name}"
-        stack.enter_context(follow(link, place, ("report", "alarm_event", "truth"), inbox.put))
+        stack.enter_context(follow(link, self._machine.title, ("report", "alarm_event", "truth"), inbox.put))
         self._introduce()
         simulator = stack.enter_context(
             _program(

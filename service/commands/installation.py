@@ -95,7 +95,7 @@ def init(
         f'[history]\nurl = "sqlite:///history.sqlite"\n\n[[machines]]\nfile = "{machine_path.name}"\n',
         encoding="utf-8",
     )
-    typer.echo(f"{machine_path}: {machine.site}/{machine.name}, {len(machine.sensors)} channels at {rate:g} Hz")
+    typer.echo(f"{machine_path}: {machine.title}, {len(machine.sensors)} channels at {rate:g} Hz")
     typer.echo(f"{settings_path}: listens on {ENDPOINT}, records into {folder / 'recordings'}")
     typer.echo(f"samples are expected under {machine.keys.stream}; the wire format is in docs/wire.md")
     typer.echo(f"see what arrives: rotorwatch doctor --machine {machine_path}")

@@ -17,7 +17,7 @@ def summary_lines(done: Imported) -> list[str]:
     several = f"{read.files} files, " if read.files > 1 else ""
     lines = [
         f"{done.source}: {several}{read.rows} rows at {done.clock.rate_hz:.9g} Hz, "
-        f"{len(machine.sensors)} channels of {machine.site}/{machine.name}",
+        f"{len(machine.sensors)} channels of {machine.title}",
         f"{done.recording}: {written.samples} samples in {written.blocks} blocks, {rfc3339(written.start_ns)} to "
         f"{rfc3339(written.end_ns)}",
         *_gap_lines(done),

@@ -205,7 +205,6 @@ class KnownMachineEvaluator(WindowEvaluator):
 
     def __init__(self, machine: Machine, bundle: Bundle | None, commissioned: Commissioned | None = None) -> None:
         self._machine = machine
-        self._place = f"{machine.site}/{machine.name}"
         self._likelihood = LengthFits(machine)
         identified = None if commissioned is None else commissioned.identified
         self._shared = None if identified is None else identified.matrix()
@@ -271,16 +270,16 @@ class KnownMachineEvaluator(WindowEvaluator):
         if off > operation.speed_tolerance:
             text, limit = beyond(100 * off, 100 * operation.speed_tolerance)
             raise EstimationError(
-                f"{self._place}: speed is {speed * 30 / np.pi:.0f} rpm, off {operation.speed_rpm:g} rpm by {text} %, "
-                f"evaluated is at most {limit} %"
+                f"{self._machine.title}: speed is {speed * 30 / np.pi:.0f} rpm, off {operation.speed_rpm:g} rpm by "
+                f"{text} %, evaluated is at most {limit} %"
             )
         slowest, fastest = window.speed_range
         varied = (fastest - slowest) / operation.speed_rad_s
         if varied > _STEADY:
             text, limit = beyond(100 * varied, 100 * _STEADY)
             raise EstimationError(
-                f"{self._place}: speed went from {slowest * 30 / np.pi:.0f} to {fastest * 30 / np.pi:.0f} rpm within "
-                f"the window, by {text} % of nominal, evaluated is at most {limit} %"
+                f"{self._machine.title}: speed went from {slowest * 30 / np.pi:.0f} to {fastest * 30 / np.pi:.0f} rpm "
+                f"within the window, by {text} % of nominal, evaluated is at most {limit} %"
             )
         return speed
 
@@ -289,7 +288,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         try:
             diagnosis = diagnose(window)
         except np.linalg.LinAlgError as error:
-            raise EstimationError(f"{self._place}: {error} in this window") from error
+            raise EstimationError(f"{self._machine.title}: {error} in this window") from error
         stated = determined(diagnosis, window, self._machine.window_data_s)
         if self._healthy_misfit is not None and stated.goodness is not None:
             left = self._healthy_misfit.beyond(stated.goodness, window.duration_s / self._machine.window_data_s)
@@ -309,7 +308,7 @@ class BaselineEvaluator(WindowEvaluator):
     needs_lags = True  # relations hold between correlation functions
 
     def __init__(self, machine: MachineFile, commissioned: Commissioned) -> None:
-        self._place = f"{machine.site}/{machine.name}"
+        self._place = machine.title
         self._conditions = commissioned.conditions
         self._naming = Naming(machine.sensors)
         self._diagnosed = states_of(machine) != ()

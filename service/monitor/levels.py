@@ -49,7 +49,7 @@ class LevelWatch:
 
     def __init__(self, plan: Plan, machine: MachineFile, installed: Installed) -> None:
         if plan.levels is None:
-            raise ValueError(f"{machine.site}/{machine.name}: no levels are planned")
+            raise ValueError(f"{machine.title}: no levels are planned")
         channels = [machine.sensors[column] for column in plan.columns]
         self._judge = LevelJudge(plan.levels, channels, machine.levels)
         of = machine.levels.reference or ("first windows" if installed.watching else "commissioned")

@@ -72,7 +72,6 @@ class MachineMonitor:
         self, installed: Installed, skips: Callable[[int], bool] = lambda _: False, *, remembered: bool = True
     ) -> None:
         self.machine = machine = installed.machine
-        self._name = f"{machine.site}/{machine.name}"
         self.identity = identity_of(installed)
         self._skips = skips
         self._evaluator = judge = evaluator_for(installed)
@@ -130,7 +129,7 @@ class MachineMonitor:
         try:
             block, schema_hash = decode_block(payload, attachment, encoding)
         except WireError as error:
-            return (MonitorReport(self._count(Admission(Reason.MALFORMED, f"{self._name}: {error}"))),)
+            return (MonitorReport(self._count(Admission(Reason.MALFORMED, f"{self.machine.title}: {error}"))),)
         if (misshapen := self._gate.form(block, schema_hash)) is not None:  # before its run and number are used
             return (MonitorReport(self._count(misshapen)),)
         if self._window.lacks:
@@ -141,7 +140,7 @@ class MachineMonitor:
             return self._released()
         if self._disputed(block):
             text = f"block {block.sequence} of run {block.run} came in two versions; neither is used"
-            verdict = Admission(Reason.CONFLICT, f"{self._name}: {text}")
+            verdict = Admission(Reason.CONFLICT, f"{self.machine.title}: {text}")
             return (MonitorReport(self._count(verdict), events=self._alarms.take()),)
         if self._dropped:
             self._drops[block.run, block.sequence], self._dropped = self._dropped, 0
@@ -378,7 +377,7 @@ class MachineMonitor:
         anew = not self._gate.courses
         verdict = self._gate.judge(block, schema_hash)
         if anew and verdict.accepted and self.end_ns is not None:
-            name, ingest = self._name, self.machine.ingest
+            name, ingest = self.machine.title, self.machine.ingest
             late_s = (block.start_ns - self.end_ns) / 1e9
             if abs(late_s) > ingest.max_jump_s:
                 text = f"{name}: the stream's clock is {late_s:.6g} s from where it was before the restart"
@@ -388,7 +387,7 @@ class MachineMonitor:
                 verdict = Admission(text=text, gap_s=late_s)
         if dropped and verdict.gap_s > 0:
             text = f"{dropped} blocks ({verdict.gap_s:.6g} s of data) were not evaluated: the monitor cannot keep up"
-            verdict = replace(verdict, text=f"{self._name}: {text}")
+            verdict = replace(verdict, text=f"{self.machine.title}: {text}")
         return self._count(verdict)
 
     def _count(self, verdict: Admission) -> Admission:

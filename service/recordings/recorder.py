@@ -98,7 +98,7 @@ class MachineRecorder:
         self._committed = committed
         self._clock = clock
         self._now_ns = now_ns
-        self._log = logger(part="recorder", machine=f"{machine.site}/{machine.name}")
+        self._log = logger(part="recorder", machine=machine.title)
         self._limiter = Limiter(clock)
         self._backlog = Backlog(round(settings.queue_mb * 1e6), machine.keys.stream)
         self._catalogue = Catalogue(self.directory)

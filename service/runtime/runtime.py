@@ -165,7 +165,7 @@ class Runtime:
             self._monitored = self._machines.open(undo)
             for one in self._monitored:
                 self.metrics.watch(one)
-            logs = {f"{one.machine.site}/{one.machine.name}": one.history for one in self._monitored}
+            logs = {one.machine.title: one.history for one in self._monitored}
             self.webhooks.start(logs, self.store.webhooks)
             self._machines.start(undo)
             undo.callback(self.replays.jobs.close)

@@ -92,7 +92,7 @@ class MachineWorker:
         self._on_events = on_events
         self._recorded = recorded
         self._recorded_since_ns: int | None = None
-        self._log = logger(machine=f"{machine.site}/{machine.name}")
+        self._log = logger(machine=machine.title)
         self._limiter = Limiter(clocks.monotonic_s)
         self.steps = StepWriter(history, self.identity)
         self._unpublished: tuple[StoredEvent, ...] = ()
@@ -113,7 +113,7 @@ class MachineWorker:
         self._dropped_logged = 0
         self._ticking = False
         self._pulse = Pulse(self.inbox.call)
-        self._thread = threading.Thread(target=self._run, name=f"monitor {machine.site}/{machine.name}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"monitor {machine.title}", daemon=True)
 
     def _restored(self, installed: Installed) -> tuple[MachineMonitor, str]:
         """A monitor that goes on from the history, if there is anything to go on from."""
@@ -275,14 +275,14 @@ class MachineWorker:
                 done.set_exception(error)
 
         if not self.inbox.call(work):
-            raise NotInTime(f"{self._place}: the monitor is being stopped")
+            raise NotInTime(f"{self.machine.title}: the monitor is being stopped")
         try:
             return done.result(_OPERATION_S)
         except TimeoutError as error:
             if done.cancel():
-                raise NotInTime(f"{self._place}: busy for {_OPERATION_S:g} s; nothing was done") from error
+                raise NotInTime(f"{self.machine.title}: busy for {_OPERATION_S:g} s; nothing was done") from error
             raise NotInTime(
-                f"{self._place}: busy for {_OPERATION_S:g} s; look at the alarm before trying again"
+                f"{self.machine.title}: busy for {_OPERATION_S:g} s; look at the alarm before trying again"
             ) from error
 
     def tick(self) -> None:
@@ -291,10 +291,6 @@ class MachineWorker:
         if not self._ticking:
             self._ticking = True
             self.inbox.call(self._tick)
-
-    @property
-    def _place(self) -> str:
-        return f"{self.machine.site}/{self.machine.name}"
 
     @property
     def _silent(self) -> bool:

@@ -233,9 +233,7 @@ def load_bundle(name_or_path: str | Path, machine: Machine) -> Bundle:
         raise BundleError(f"{directory}: an equation occurs twice: {', '.join(numbers)}")
     differences = list(_differences(manifest.physics, _physics(machine)))
     if differences:
-        raise BundleError(
-            f"{directory}: trained for another machine than {machine.site}/{machine.name}: {'; '.join(differences)}"
-        )
+        raise BundleError(f"{directory}: trained for another machine than {machine.title}: {'; '.join(differences)}")
     try:
         arrays = {name: _shared.setdefault((digest, name), array) for name, array in load(weights).items()}
     except SafetensorError as error:

@@ -36,15 +36,13 @@ def chosen_channels(machine: MachineFile, names: Sequence[str], field: str = "ch
     """
     there = {channel.name: channel for channel in machine.sensors if state_name(channel) != "theta"}
     if len(names) > _MOST_CHANNELS:
-        raise SnapshotError(
-            f"{machine.site}/{machine.name}: {len(names)} values of {field}, expected at most {_MOST_CHANNELS}"
-        )
+        raise SnapshotError(f"{machine.title}: {len(names)} values of {field}, expected at most {_MOST_CHANNELS}")
     for name in names:
         if name not in there:
             known = {channel.name for channel in machine.sensors}
             what = "is the shaft angle" if name in known else "is not a channel of it"
             raise SnapshotError(
-                f"{machine.site}/{machine.name}: {field} is {name!r}, which {what}; expected one of {', '.join(there)}"
+                f"{machine.title}: {field} is {name!r}, which {what}; expected one of {', '.join(there)}"
             )
     if names:
         return tuple(there[name] for name in dict.fromkeys(names))
@@ -70,7 +68,7 @@ def chosen_pairs(
     if first or second:
         if second and len(second) != len(first):
             raise SnapshotError(
-                f"{machine.site}/{machine.name}: {len(first)} values of first and {len(second)} of second, expected as "
+                f"{machine.title}: {len(first)} values of first and {len(second)} of second, expected as "
                 "many of one as of the other, or none of second"
             )
         by_name = {
@@ -104,7 +102,7 @@ def check_held(machine: MachineFile, channels: Sequence[Channel], states: Sequen
     without = [channel.name for channel in channels if state_name(channel) not in states]
     if without:
         raise SnapshotError(
-            f"{machine.site}/{machine.name}: of {', '.join(without)} only levels are watched, and no spectra are held"
+            f"{machine.title}: of {', '.join(without)} only levels are watched, and no spectra are held"
         )
 
 

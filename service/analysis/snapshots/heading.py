@@ -66,11 +66,8 @@ def no_window(machine: MachineFile, data: LatestData) -> str:
     if data.lacking:
         return data.lacking
     if data.window is not None:
-        return f"{machine.site}/{machine.name}: only levels are watched at the places of its channels"
-    return (
-        f"{machine.site}/{machine.name}: no window of {machine.window.length_s:g} s is full yet, "
-        f"{data.filled:.0%} of one is there"
-    )
+        return f"{machine.title}: only levels are watched at the places of its channels"
+    return f"{machine.title}: no window of {machine.window.length_s:g} s is full yet, {data.filled:.0%} of one is there"
 
 
 def theory(changes: Mapping[str, float], nominal_reason: str, estimated_reason: str) -> Theory:

@@ -56,7 +56,7 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
     estimated_reason = lacking or ("" if changes else data.why_not or NOTHING_READ)
     vectors = None if window is None else _vectors(window)
     if not places:
-        reason = f"{machine.site}/{machine.name}: {no_pair(machine.sensors)}"
+        reason = f"{machine.title}: {no_pair(machine.sensors)}"
     elif window is None:
         reason = no_window(machine, data)
     else:
@@ -177,8 +177,7 @@ def _newest_path(
     machine: MachineFile, blocks: tuple[SampleBlock, ...], revolutions: int, speed_rad_s: float | None
 ) -> Revolutions:
     if not 0 <= revolutions <= MOST_REVOLUTIONS:
-        place = f"{machine.site}/{machine.name}"
-        raise SnapshotError(f"{place}: revolutions is {revolutions}, expected 0 to {MOST_REVOLUTIONS}")
+        raise SnapshotError(f"{machine.title}: revolutions is {revolutions}, expected 0 to {MOST_REVOLUTIONS}")
     if not revolutions:
         return no_revolutions("none were asked for")
     if not blocks:

@@ -148,7 +148,7 @@ def _checked(machine: MachineFile, band_hz: tuple[float, float] | None) -> tuple
     low_hz, high_hz = max(band_hz[0], there[0]), min(band_hz[1], there[1])
     if not high_hz - low_hz >= 2 / machine.window.segment_s:
         raise SnapshotError(
-            f"{machine.site}/{machine.name}: band is {band_hz[0]:g} to {band_hz[1]:g} Hz, expected at least "
+            f"{machine.title}: band is {band_hz[0]:g} to {band_hz[1]:g} Hz, expected at least "
             f"{2 / machine.window.segment_s:g} Hz within {there[0]:g} to {there[1]:g} Hz"
         )
     return low_hz, high_hz

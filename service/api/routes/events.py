@@ -108,7 +108,7 @@ def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
 
 
 def _logs(service: ServiceView, wanted: list[str]) -> Mapping[str, MachineStore]:
-    there = {f"{one.machine.site}/{one.machine.name}": one.history for one in service.machines()}
+    there = {one.machine.title: one.history for one in service.machines()}
     unknown = next((place for place in wanted if place not in there), None)
     if unknown is not None:
         raise HTTPException(404, f"no machine {unknown[:129]}; there are: {', '.join(there)}")

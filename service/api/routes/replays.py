@@ -209,7 +209,7 @@ class ReplayRequests:
     def _monitored(self) -> dict[str, MachineEntry]:
         if self._entries is None:
             loaded = ((entry.load(), entry) for entry in self._settings.machines)
-            self._entries = {f"{machine.site}/{machine.name}": entry for machine, entry in loaded}
+            self._entries = {machine.title: entry for machine, entry in loaded}
         return self._entries
 
 

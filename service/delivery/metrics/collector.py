@@ -72,7 +72,7 @@ class Metrics:
 
     def watch(self, machine: Monitored) -> None:
         """Count the alarm events of a machine from now on."""
-        self._events[f"{machine.machine.site}/{machine.machine.name}"] = _EventCounts(machine)
+        self._events[machine.machine.title] = _EventCounts(machine)
 
     def text(self) -> bytes:
         """Everything in the text format of Prometheus; for any thread."""
@@ -84,7 +84,7 @@ class Metrics:
         readiness = self._service.readiness()
         observed = []
         for one in self._service.machines():
-            events = self._events.get(f"{one.machine.site}/{one.machine.name}")
+            events = self._events.get(one.machine.title)
             counts = Counter() if events is None else events.read()
             observed.append(Observed(one, one.health(), one.status(), counts))
         yield from machine_families(observed)

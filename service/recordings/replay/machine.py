@@ -63,8 +63,8 @@ def check_sent(text: str, changes: str, recorded: str) -> None:
                 f"{place}: line {number} has {len(line)} characters, at most {_LONGEST_LINE} are read"
             )
     machine = checked(MachineFile, changed(parse_toml(text, place), changes), place)
-    if f"{machine.site}/{machine.name}" != recorded:
-        raise MachineFileError(f"{place}: of {machine.site}/{machine.name}, the recordings are of {recorded}")
+    if machine.title != recorded:
+        raise MachineFileError(f"{place}: of {machine.title}, the recordings are of {recorded}")
 
 
 def is_shipped_machine(name: str) -> bool:
