@@ -69,6 +69,11 @@ def responses(
     return {status_code: answer, **problem_responses(*problems, guarded=guarded)}
 
 
+def written(model: type[BaseModel], *problems: int) -> dict[str, Any]:
+    """Arguments of a route whose answer is written already when FastAPI sees it, for OpenAPI to tell of it."""
+    return {"responses": responses(model, *problems), "response_model": model}
+
+
 def problem_responses(*problems: int, guarded: bool = True) -> dict[int | str, dict[str, Any]]:
     """OpenAPI entries of the problems a request may meet, those that any request may meet included."""
     statuses = sorted({*problems, *_ANYWHERE, *(_GUARDED if guarded else ())})

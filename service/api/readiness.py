@@ -1,6 +1,6 @@
 """Whether the service can do its work, and if not, why."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 from rotorwatch.records.monitor import MachineReadiness, Readiness
 from service.stream.liveness import STUCK_S
@@ -30,38 +30,29 @@ def readiness_of(
     failing_webhooks : sequence of str
         Name, and what is wrong.
     """
-    reasons = tuple(_reasons(session_open, machines, history_open, history_trouble, history_lost))
+    reasons = []
+    if not session_open:
+        reasons.append("the Zenoh session is closed: nothing arrives and nothing is published")
+    if not history_open:
+        reasons.append("the history is not open, or its tables are not up to date")
+    if history_trouble:
+        reasons.append(f"the history cannot be written, what happens waits in memory: {history_trouble}")
+    if history_lost:
+        reasons.append(f"{history_lost}; see docs/history.md, and start the monitor again when it is seen to")
+    for machine in machines:
+        place = f"{machine.site}/{machine.machine}"
+        if not machine.worker_alive:
+            reasons.append(f"{place}: the thread that evaluates its blocks has stopped")
+        elif machine.worker_busy_s > STUCK_S:
+            reasons.append(f"{place}: one block has been in the monitor for {machine.worker_busy_s:.0f} s")
+        if machine.trouble:
+            reasons.append(f"{place}: {machine.trouble}")
     return Readiness(
         ready=not reasons,
-        reasons=reasons,
+        reasons=tuple(reasons),
         session_open=session_open,
         history_open=history_open,
         history_trouble=history_trouble,
         failing_webhooks=tuple(failing_webhooks),
         machines=tuple(machines),
     )
-
-
-def _reasons(
-    session_open: bool,
-    machines: Sequence[MachineReadiness],
-    history_open: bool,
-    history_trouble: str,
-    history_lost: str,
-) -> Iterator[str]:
-    if not session_open:
-        yield "the Zenoh session is closed: nothing arrives and nothing is published"
-    if not history_open:
-        yield "the history is not open, or its tables are not up to date"
-    if history_trouble:
-        yield f"the history cannot be written, what happens waits in memory: {history_trouble}"
-    if history_lost:
-        yield f"{history_lost}; see docs/history.md, and start the monitor again when it is seen to"
-    for machine in machines:
-        place = f"{machine.site}/{machine.machine}"
-        if not machine.worker_alive:
-            yield f"{place}: the thread that evaluates its blocks has stopped"
-        elif machine.worker_busy_s > STUCK_S:
-            yield f"{place}: one block has been in the monitor for {machine.worker_busy_s:.0f} s"
-        if machine.trouble:
-            yield f"{place}: {machine.trouble}"

@@ -195,8 +195,9 @@ class EventFeed:
                     return
                 if changed:
                     await asyncio.sleep(_PAUSE_S)  # the machines of a plant change one after the other
-                quiet = not await _woken(listener.news, _AGAIN_S if waits else _KEEP_ALIVE_S)
-                if quiet:
+                try:
+                    await asyncio.wait_for(listener.news.wait(), _AGAIN_S if waits else _KEEP_ALIVE_S)
+                except TimeoutError:
                     # No empty line: some readers take that for the end of an event without data.
                     yield ": still there\n"
                 if time.monotonic() - asked_s >= _KEEP_ALIVE_S:
@@ -246,11 +247,3 @@ def _told(health: Health, *, in_full: bool) -> str:
     if in_full:
         return f"event: health\ndata: {health.model_dump_json()}\n\n"
     return f"event: overview\ndata: {overview(health).model_dump_json()}\n\n"
-
-
-async def _woken(news: asyncio.Event, timeout_s: float) -> bool:
-    try:
-        await asyncio.wait_for(news.wait(), timeout_s)
-    except TimeoutError:
-        return False
-    return True

@@ -24,7 +24,7 @@ from rotorwatch.records.history import (
 )
 from rotorwatch.records.monitor import HistoryStatus
 from service.access.guard import Guard
-from service.access.problems import responses
+from service.access.problems import responses, written
 from service.api.views import (
     PLACE,
     AlarmName,
@@ -81,9 +81,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
     """Add the routes."""
     common: dict[str, Any] = {"tags": ["history"], "dependencies": [guard.read]}
 
-    @app.get(
-        f"{PLACE}/alarms/events", responses=responses(AlarmEventList, 404, 422), response_model=AlarmEventList, **common
-    )
+    @app.get(f"{PLACE}/alarms/events", **written(AlarmEventList, 404, 422), **common)
     def alarm_events(
         view: InPath,
         after: _After = None,
@@ -116,12 +114,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
             next_after=None if after is None else last,
         )
 
-    @app.get(
-        f"{PLACE}/alarms/{{name}}/evidence",
-        responses=responses(AlarmEvidence, 404, 422),
-        response_model=AlarmEvidence,
-        **common,
-    )
+    @app.get(f"{PLACE}/alarms/{{name}}/evidence", **written(AlarmEvidence, 404, 422), **common)
     def evidence(
         site: SiteName,
         machine: MachineName,
@@ -137,7 +130,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
             raise HTTPException(404, f"nothing was kept of {which}{name}: it was not raised on a window, or long ago")
         return Response(text, media_type="application/json")
 
-    @app.get(f"{PLACE}/reports", responses=responses(ReportList, 404, 422), response_model=ReportList, **common)
+    @app.get(f"{PLACE}/reports", **written(ReportList, 404, 422), **common)
     def reports(
         view: InPath, before: _Before = None, since_ns: SinceNs = None, until_ns: UntilNs = None, limit: Limit = 100
     ) -> Response:
@@ -147,7 +140,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
             "reports", [one.text for _, one in found], next_before=found[-1][0] if len(found) == limit else None
         )
 
-    @app.get(f"{PLACE}/readings", responses=responses(ReadingList, 404, 422), response_model=ReadingList, **common)
+    @app.get(f"{PLACE}/readings", **written(ReadingList, 404, 422), **common)
     def readings(
         view: InPath,
         quantity: _Quantity = "parameter",

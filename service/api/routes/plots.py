@@ -47,46 +47,41 @@ _SlowRoll = Annotated[
 _Values = TypeVar("_Values", WaveformSnapshot, FullSpectrumSnapshot, WaterfallSnapshot, VectorSeries, CentrelineSeries)
 
 
-class _Data:
-    """What values are made of: the newest samples, recordings, or the history of a machine."""
+def _of_samples(
+    reader: SampleReader,
+    view: Monitored,
+    chosen: Chosen,
+    kind: type[_Values],
+    make: Callable[[Sampled], _Values],
+    reach_s: float | None = None,
+    **asked: Any,
+) -> _Values:
+    """What is made of samples; where there is nothing to make it of, why, beside what was asked for."""
+    try:
+        with reader.samples(view, chosen, reach_s) as data:
+            return make(data)
+    except SnapshotError:
+        raise
+    except RotorwatchError as error:
+        return _without(view, kind, "recordings" if chosen.recorded else "newest samples", error, asked)
 
-    def __init__(self, reader: SampleReader) -> None:
-        self._reader = reader
 
-    def of_samples(
-        self,
-        view: Monitored,
-        chosen: Chosen,
-        kind: type[_Values],
-        make: Callable[[Sampled], _Values],
-        reach_s: float | None = None,
-        **asked: Any,
-    ) -> _Values:
-        """What is made of samples; where there is nothing to make it of, why, beside what was asked for."""
-        try:
-            with self._reader.samples(view, chosen, reach_s) as data:
-                return make(data)
-        except SnapshotError:
-            raise
-        except RotorwatchError as error:
-            return _without(view, kind, "recordings" if chosen.recorded else "newest samples", error, asked)
-
-    def of_past(
-        self,
-        view: Monitored,
-        names: list[str],
-        between: tuple[int | None, int | None],
-        kind: type[_Values],
-        make: Callable[[Sampled | Past], _Values],
-        **asked: Any,
-    ) -> _Values:
-        """What is made of recordings, or without names of the history, every so many windows of a long time."""
-        if names:
-            return self.of_samples(view, Chosen(tuple(names), None, *between), kind, make, **asked)
-        try:
-            return make(Past.of(view.machine, view.history.report_log, *between, _MOST_REPORTS))
-        except RotorwatchError as error:
-            return _without(view, kind, "history", error, asked)
+def _of_past(
+    reader: SampleReader,
+    view: Monitored,
+    names: list[str],
+    between: tuple[int | None, int | None],
+    kind: type[_Values],
+    make: Callable[[Sampled | Past], _Values],
+    **asked: Any,
+) -> _Values:
+    """What is made of recordings, or without names of the history, every so many windows of a long time."""
+    if names:
+        return _of_samples(reader, view, Chosen(tuple(names), None, *between), kind, make, **asked)
+    try:
+        return make(Past.of(view.machine, view.history.report_log, *between, _MOST_REPORTS))
+    except RotorwatchError as error:
+        return _without(view, kind, "history", error, asked)
 
 
 def _without(view: Monitored, kind: type[_Values], source: str, error: RotorwatchError, asked: Any) -> _Values:
@@ -96,7 +91,6 @@ def _without(view: Monitored, kind: type[_Values], source: str, error: Rotorwatc
 
 def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
     """Add the routes."""
-    data = _Data(reader)
     common: dict[str, Any] = {"tags": ["snapshots"], "dependencies": [guard.read]}
 
     @app.get(f"{PLACE}/waveforms", responses=responses(WaveformSnapshot, 404, 422), **common)
@@ -114,12 +108,12 @@ def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
         def made(found: Sampled) -> WaveformSnapshot:
             return waveform_snapshot(found, found.channels(names), revolutions, speed)
 
-        return data.of_samples(view, chosen, WaveformSnapshot, made, _SOON_S)
+        return _of_samples(reader, view, chosen, WaveformSnapshot, made, _SOON_S)
 
     @app.get(f"{PLACE}/full-spectra", responses=responses(FullSpectrumSnapshot, 404, 422), **common)
     def full_spectra(view: InPath, chosen: ChosenWindow) -> FullSpectrumSnapshot:
         """Full spectra of the newest seconds: forward precession and reverse, at each place with two displacements."""
-        return data.of_samples(view, chosen, FullSpectrumSnapshot, full_spectrum_snapshot, _SOON_S)
+        return _of_samples(reader, view, chosen, FullSpectrumSnapshot, full_spectrum_snapshot, _SOON_S)
 
     @app.get(f"{PLACE}/waterfalls", responses=responses(WaterfallSnapshot, 404, 422), **common)
     def waterfalls(
@@ -138,7 +132,7 @@ def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
                 raise RotorwatchError("no channel measures a vibration")
             return waterfall_snapshot(found, found.channels([shown[0].name])[0], over)
 
-        return data.of_samples(view, chosen, WaterfallSnapshot, made, over=over)
+        return _of_samples(reader, view, chosen, WaterfallSnapshot, made, over=over)
 
     @app.get(f"{PLACE}/vectors", responses=responses(VectorSeries, 404, 422), **common)
     def vectors(
@@ -161,11 +155,11 @@ def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
 
         if slow_roll_rpm is not None and not recording:
             raise HTTPException(422, "slow_roll_rpm: needs samples, so name a recording")
-        return data.of_past(view, recording, (since_ns, until_ns), VectorSeries, made, order=order)
+        return _of_past(reader, view, recording, (since_ns, until_ns), VectorSeries, made, order=order)
 
     @app.get(f"{PLACE}/centrelines", responses=responses(CentrelineSeries, 404, 422), **common)
     def centrelines(
         view: InPath, since_ns: SinceNs = None, until_ns: UntilNs = None, recording: Recordings = _NONE
     ) -> CentrelineSeries:
         """Where the shaft was on average, over time and speed, from the history or recordings."""
-        return data.of_past(view, recording, (since_ns, until_ns), CentrelineSeries, centreline_series)
+        return _of_past(reader, view, recording, (since_ns, until_ns), CentrelineSeries, centreline_series)

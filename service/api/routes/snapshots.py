@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
 from service.access.guard import Guard
-from service.access.problems import problem_answer, responses
+from service.access.problems import problem_answer, written
 from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
@@ -96,12 +96,7 @@ def add_snapshot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> Non
     common: dict[str, Any] = {"tags": ["snapshots"], "dependencies": [guard.read]}
     answers = WindowAnswers()
 
-    @app.get(
-        f"{PLACE}/correlations",
-        responses=responses(CorrelationSnapshot, 404, 422),
-        response_model=CorrelationSnapshot,
-        **common,
-    )
+    @app.get(f"{PLACE}/correlations", **written(CorrelationSnapshot, 404, 422), **common)
     def correlations(
         view: InPath, chosen: ChosenWindow, first: _First = _NONE, second: _Second = _NONE, units: _Units = "channel"
     ) -> Response:
@@ -110,9 +105,7 @@ def add_snapshot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> Non
         asked = ("correlations", view, chosen, tuple(first), tuple(second), units)
         return answers.of(asked, data, lambda: shown.correlations(data, first, second, units))
 
-    @app.get(
-        f"{PLACE}/spectra", responses=responses(SpectrumSnapshot, 404, 422), response_model=SpectrumSnapshot, **common
-    )
+    @app.get(f"{PLACE}/spectra", **written(SpectrumSnapshot, 404, 422), **common)
     def spectra(
         view: InPath,
         chosen: ChosenWindow,
@@ -131,7 +124,7 @@ def add_snapshot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> Non
         asked = ("spectra", view, chosen, tuple(channel), tuple(first), tuple(second), band, units)
         return answers.of(asked, data, lambda: shown.spectra(data, channel, first, second, band, units))
 
-    @app.get(f"{PLACE}/orbits", responses=responses(OrbitSnapshot, 404, 422), response_model=OrbitSnapshot, **common)
+    @app.get(f"{PLACE}/orbits", **written(OrbitSnapshot, 404, 422), **common)
     def orbits(
         view: InPath, chosen: ChosenWindow, revolutions: _Revolutions = 0, units: _Units = "channel"
     ) -> Response:

@@ -8,7 +8,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 NO_ROUTE = "-"
 """Route of a request that was refused before one was looked for, or whose path is none."""
 
-REASONS = ("token", "scope", "origin", "rate")
 _METHODS = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"))
 
 
@@ -17,18 +16,10 @@ class RequestCounts:
 
     def __init__(self) -> None:
         self._answered: Counter[tuple[str, str, str]] = Counter()
-        self._refused: Counter[str] = Counter()
 
     def count(self, method: str, route: str, status: int) -> None:
         """Count a request."""
         self._answered[method if method in _METHODS else "other", route, str(status)] += 1
-        if status == 401:
-            self._refused["token"] += 1
-        elif status == 429:
-            self._refused["rate"] += 1
-        elif status == 403:
-            # Scopes are looked at when the route is known, where a request comes from before that.
-            self._refused["origin" if route == NO_ROUTE else "scope"] += 1
 
     def answered(self) -> Mapping[tuple[str, str, str], int]:
         """Requests by method, route and status."""
@@ -36,7 +27,13 @@ class RequestCounts:
 
     def refused(self) -> Mapping[str, int]:
         """Requests that were refused: without a valid token, without the scope, for their origin, or too many."""
-        return {reason: self._refused[reason] for reason in REASONS}
+        refused = dict.fromkeys(("token", "scope", "origin", "rate"), 0)
+        for (_, route, status), count in self.answered().items():
+            # Scopes are looked at when the route is known, where a request comes from before that.
+            reasons = {"401": "token", "403": "origin" if route == NO_ROUTE else "scope", "429": "rate"}
+            if status in reasons:
+                refused[reasons[status]] += count
+        return refused
 
 
 class RequestMeter:
