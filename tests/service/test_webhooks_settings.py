@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from models.errors import MachineFileError
 from service.commands import webhook as webhook_commands
 from service.commands.running import Commands
-from service.delivery.webhooks.answer import Answer, Meaning, answer_of, no_answer, pause_s
+from service.delivery.webhooks.answer import Answer, Meaning, answer_of, pause_s
 from service.delivery.webhooks.receiver import Receiver
 from service.delivery.webhooks.signature import new_secret, parse_secret, signing_keys
 from service.runtime.runtime import Runtime
@@ -213,9 +213,9 @@ def test_a_receiver_may_say_when_to_come_back(text: str, wished_s: float) -> Non
 
 def test_pauses_differ_by_chance_and_are_bounded() -> None:
     refused = Answer(Meaning.REFUSED, "404 Not Found")
-    assert pause_s(no_answer(""), 3, 300.0, 0.0) == 2.0
-    assert pause_s(no_answer(""), 3, 300.0, 0.5) == 3.0
-    assert pause_s(no_answer(""), 10_000, 300.0, 1.0) == 300.0
+    assert pause_s(Answer(Meaning.TROUBLE), 3, 300.0, 0.0) == 2.0
+    assert pause_s(Answer(Meaning.TROUBLE), 3, 300.0, 0.5) == 3.0
+    assert pause_s(Answer(Meaning.TROUBLE), 10_000, 300.0, 1.0) == 300.0
     assert pause_s(refused, 1, 300.0, 1.0) == 60.0
     assert pause_s(refused, 4, 300.0, 1.0) == 300.0
     assert pause_s(refused, 1, 5.0, 1.0) == 5.0

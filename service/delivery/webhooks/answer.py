@@ -59,11 +59,6 @@ def answer_of(status: int, headers: Mapping[str, str], now_s: float) -> Answer:
     return Answer(Meaning.REFUSED, text)
 
 
-def no_answer(why: str) -> Answer:
-    """The meaning of no answer at all."""
-    return Answer(Meaning.TROUBLE, why)
-
-
 def pause_s(answer: Answer, failures: int, longest_s: float, chance: float) -> float:
     """How long to wait after a failed attempt.
 
@@ -78,7 +73,7 @@ def pause_s(answer: Answer, failures: int, longest_s: float, chance: float) -> f
 
     Examples
     --------
-    >>> [pause_s(no_answer("no connection"), failures, 10.0, 1.0) for failures in (1, 2, 3, 4, 5)]
+    >>> [pause_s(Answer(Meaning.TROUBLE), failures, 10.0, 1.0) for failures in (1, 2, 3, 4, 5)]
     [1.0, 2.0, 4.0, 8.0, 10.0]
     """
     first_s = _FIRST_S["refused" if answer.meaning is Meaning.REFUSED else "trouble"]

@@ -9,7 +9,7 @@ import httpx
 
 from models.errors import MachineFileError
 from rotorwatch import __version__
-from service.delivery.webhooks.answer import Answer, answer_of, no_answer
+from service.delivery.webhooks.answer import Answer, Meaning, answer_of
 from service.delivery.webhooks.signature import signature, signing_keys
 from service.settings.webhooks import WebhookSettings
 
@@ -80,13 +80,13 @@ class Receiver:
 
     async def _interruptible(self, identifier: str, body: bytes) -> Answer:
         if self._interrupted:
-            return no_answer("interrupted")
+            return Answer(Meaning.TROUBLE, "interrupted")
         self._task = asyncio.create_task(self._attempt(identifier, body))
         try:
             return await self._task
         except asyncio.CancelledError:
             if self._interrupted:
-                return no_answer("interrupted")
+                return Answer(Meaning.TROUBLE, "interrupted")
             raise
         finally:
             self._task = None
@@ -112,7 +112,7 @@ class Receiver:
             if self._client is not None:
                 self._client.cookies.clear()
         # What matters is the status: whoever has answered has the event, however the rest of the answer fares.
-        return no_answer(why) if answer is None else answer
+        return Answer(Meaning.TROUBLE, why) if answer is None else answer
 
     def _opened(self) -> httpx.AsyncClient:
         if self._client is None:
