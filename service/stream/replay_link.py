@@ -77,20 +77,6 @@ class _PatientLink(LinkSettings):
         return items
 
 
-@dataclass(frozen=True, slots=True)
-class ReplayTarget:
-    """Where a replay goes."""
-
-    # Machines whose messages are replayed, each with its recorded channel descriptor.
-    machines: Sequence[tuple[MachineKeys, bytes | None]]
-    prefix: str  # what goes before every key; empty is the original keys
-    wait: bool  # subscribers slow the replay down instead of missing messages
-
-    def key(self, key: str) -> str:
-        """Key under the prefix."""
-        return f"{self.prefix}/{key}" if self.prefix else key
-
-
 class ReplayLink:
     """A Zenoh session that publishes one pass of a replay after the other; a context manager.
 
@@ -110,7 +96,8 @@ class ReplayLink:
     def __init__(self, settings: LinkSettings, on_live: Callable[[str], None]) -> None:
         self._link = Link(_PatientLink.model_validate(settings.model_dump()), fail_fast=bool(settings.connect))
         self._on_live = on_live
-        self._target: ReplayTarget | None = None
+        self._machines: tuple[MachineKeys, ...] = ()
+        self._prefix, self._wait = "", False
         self._publishers: dict[str, _Publisher] = {}
         self._lock = threading.Lock()
         self._live = ""
@@ -123,8 +110,17 @@ class ReplayLink:
         self.end_pass()
         self._link.close()
 
-    def begin_pass(self, target: ReplayTarget) -> None:
+    def begin_pass(self, machines: dict[MachineKeys, bytes | None], prefix: str, *, wait: bool) -> None:
         """Declare what one pass needs, as a live publisher would.
+
+        Parameters
+        ----------
+        machines : dict of MachineKeys to bytes or None
+            Those whose messages are replayed, each with its recorded channel descriptor.
+        prefix : str
+            What goes before every key; empty is the original keys.
+        wait : bool
+            Subscribers slow the replay down instead of missing messages.
 
         Raises
         ------
@@ -132,21 +128,21 @@ class ReplayLink:
             If the original keys are asked for and a live publisher or monitor of a machine is there.
         """
         session = self._link.session
-        self._target = target
-        if not target.prefix:
-            for keys, _ in target.machines:
+        self._machines, self._prefix, self._wait = tuple(machines), prefix, wait
+        if not prefix:
+            for keys in machines:
                 self._keep(session.liveliness().declare_token(keys.replay_alive))
-            self._watch_for_live(target)
-        for keys, descriptor in target.machines:
+            self._watch_for_live()
+        for keys, descriptor in machines.items():
             self._publisher(keys.stream)
             self._publisher(keys.descriptor)
             if descriptor is not None:
-                key = target.key(keys.descriptor)
+                key = self._key(keys.descriptor)
                 reply = answering(key, partial(bytes, descriptor))
                 self._keep(session.declare_queryable(key, self._link.guarded(reply)))
-            if target.prefix:
+            if prefix:
                 # On the original keys there is no token: it would say that a live machine is there, and hide one.
-                self._keep(session.liveliness().declare_token(target.key(keys.publisher_alive)))
+                self._keep(session.liveliness().declare_token(self._key(keys.publisher_alive)))
 
     def end_pass(self) -> None:
         """Undeclare it all."""
@@ -163,25 +159,23 @@ class ReplayLink:
         with self._lock:
             if self._live:
                 return
-        marked = not self._present().prefix and message.key.endswith("/stream")
+        marked = not self._prefix and message.key.endswith("/stream")
         encoding = message.encoding + REPLAY_MARK if marked else message.encoding
         self._publisher(message.key).put(message.payload, attachment=message.attachment or None, encoding=encoding)
 
-    def wait_for_subscribers(self, timeout_s: float, stopped: Callable[[], bool]) -> bool:
-        """Wait until somebody subscribes to every machine's stream; say whether that came true."""
-        target = self._present()
+    def wait_for_subscribers(self, timeout_s: float, stopped: Callable[[], bool]) -> None:
+        """Wait until somebody subscribes to every machine's stream, or the time is over."""
         deadline_s = time.monotonic() + timeout_s
-        for keys, _ in target.machines:
+        for keys in self._machines:
             # The advanced publisher does not say whether it has subscribers; a plain one on the same key does.
-            probe = self._link.session.declare_publisher(target.key(keys.stream))
+            probe = self._link.session.declare_publisher(self._key(keys.stream))
             try:
                 while not probe.matching_status.matching:  # type: ignore[attr-defined]  # the stub says bool
                     if stopped() or time.monotonic() > deadline_s:
-                        return False
+                        return
                     time.sleep(_POLL_S)
             finally:
                 probe.undeclare()  # type: ignore[no-untyped-call]
-        return True
 
     def drain(self, timeout_s: float) -> None:
         """Wait until monitors have received everything; without a monitor there is nothing to wait for.
@@ -189,17 +183,14 @@ class ReplayLink:
         A query of lower priority leaves after all messages, and a link is handled in order: its answer says that they
         have arrived.
         """
-        target = self._present()
-        for keys, _ in target.machines:
+        for keys in self._machines:
             for _ in self._link.session.get(
-                target.key(keys.health), priority=zenoh.Priority.BACKGROUND, timeout=timeout_s
+                self._key(keys.health), priority=zenoh.Priority.BACKGROUND, timeout=timeout_s
             ):
                 pass
 
-    def _present(self) -> ReplayTarget:
-        if self._target is None:
-            raise RuntimeError("no pass was begun")
-        return self._target
+    def _key(self, key: str) -> str:
+        return f"{self._prefix}/{key}" if self._prefix else key
 
     def _keep(self, declared: Declared) -> None:
         self._undo.callback(declared.undeclare)
@@ -208,13 +199,13 @@ class ReplayLink:
         known = self._publishers.get(key)
         if known is not None:
             return known
-        target, session = self._present(), self._link.session
-        congestion = zenoh.CongestionControl.BLOCK if target.wait else zenoh.CongestionControl.DROP
+        session = self._link.session
+        congestion = zenoh.CongestionControl.BLOCK if self._wait else zenoh.CongestionControl.DROP
         publisher: _Publisher
-        if target.prefix:
+        if self._prefix:
             publisher = zenoh.ext.declare_advanced_publisher(
                 session,
-                target.key(key),
+                self._key(key),
                 encoding=_JSON,
                 congestion_control=congestion,
                 priority=zenoh.Priority.DATA_LOW,  # what is live goes first
@@ -231,9 +222,9 @@ class ReplayLink:
         self._publishers[key] = publisher
         return publisher
 
-    def _watch_for_live(self, target: ReplayTarget) -> None:
+    def _watch_for_live(self) -> None:
         session = self._link.session
-        for keys, _ in target.machines:
+        for keys in self._machines:
             for key, who in ((keys.publisher_alive, "publisher"), (keys.monitor_alive, "monitor")):
                 text = f"a live {who} of {keys.site}/{keys.machine} is there ({key})"
                 if any(reply.ok is not None for reply in session.liveliness().get(key, timeout=_LIVENESS_TIMEOUT_S)):
@@ -275,16 +266,12 @@ def replay_to_network(
     with ReplayLink(plan.link, control.stop) as link:
         while not control.stopped and (plan.passes is None or number < plan.passes):
             number += 1
-            described = [(keys, source.descriptor(keys, plan.from_ns)) for keys in plan.machines]
-            target = ReplayTarget(
-                machines=[(keys, None if found is None else found.payload) for keys, found in described],
-                prefix=plan.prefix_of(number),
-                wait=plan.pace is None,
-            )
-            link.begin_pass(target)
+            described = {keys: source.descriptor(keys, plan.from_ns) for keys in plan.machines}
+            announced = {keys: None if found is None else found.payload for keys, found in described.items()}
+            link.begin_pass(announced, plan.prefix_of(number), wait=plan.pace is None)
             if plan.wait_for_subscriber_s:
                 link.wait_for_subscribers(plan.wait_for_subscriber_s, lambda: control.stopped)
-            for keys, found in described:
+            for keys, found in described.items():
                 if found is not None and source.span(keys).start_ns < plan.from_ns:  # else it comes in its place
                     link.put(found)
             wanted = None if plan.everything else _sent_by(plan.machines)
