@@ -1,5 +1,6 @@
 """Orbits of the latest window at running speed, and the newest revolutions as measured."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,7 +10,7 @@ from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine, MachineFile
 from models.physics.response import synchronous_response
-from models.physics.rotor import STATE_INDEX, RotorParameters, changed
+from models.physics.rotor import STATES, RotorParameters, changed
 from models.signals.block import SampleBlock
 from models.signals.channels import Channel
 from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector, Units
@@ -61,16 +62,16 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
         reason = no_window(machine, data)
     else:
         reason = _NO_SPEED if vectors is None else ""
-    rotors = (
-        None if known is None else known.rotor,
-        None if known is None or estimated_reason else changed(known.rotor, changes),
-    )
+    predicted: list[ComplexArray | None] = [None, None]
+    if known is not None and window is not None and vectors is not None:
+        predicted[0] = _predicted(known, known.rotor, window)
+        predicted[1] = None if estimated_reason else _predicted(known, changed(known.rotor, changes), window)
     head = heading(subject, data)
     return OrbitSnapshot(
         **head,
         speed_source="unknown" if window is None else window.speed_source,
         orbits=tuple(
-            _place(pair, window, vectors, known, rotors, _path(machine, path, pair, units), units) for pair in places
+            _place(pair, window, vectors, predicted, _path(machine, path, pair, units), units) for pair in places
         ),
         revolutions=path.count,
         path_start_ns=None if path.excerpt is None else path.excerpt.start_ns,
@@ -94,21 +95,18 @@ def _place(
     pair: tuple[Channel, Channel],
     window: WindowStatistics | None,
     vectors: _Vectors | None,
-    known: Machine | None,
-    rotors: tuple[RotorParameters | None, RotorParameters | None],
+    predicted: Sequence[ComplexArray | None],
     path: PathSamples | None,
     units: Units,
 ) -> PlaceOrbit:
     factor, planes = 1.0 if units == "SI" else 1 / pair[0].to_si, planes_of(pair)
     y = z = ellipse = nominal = estimated = None
     if window is not None and vectors is not None:
-        at = [window.states.index(state) for state in _planes_at(pair[0].location)]
+        states = ("y1", "z1") if pair[0].location == "bearing" else ("y2", "z2")
+        at, rows = ([every.index(state) for state in states] for every in (window.states, STATES))
         y, z = (_vector(name, column, vectors, factor) for name, column in zip(planes.names, at, strict=True))
-        ellipse = _ellipse(factor * vectors.mean[at], vectors.direction, absolute=vectors.absolute)
-        nominal, estimated = (
-            None if known is None or rotor is None else _predicted(known, rotor, pair, window, vectors, factor)
-            for rotor in rotors
-        )
+        ellipse = _ellipse(factor * vectors.mean[at], vectors)
+        nominal, estimated = (None if q is None else _ellipse(factor * q[rows], vectors) for q in predicted)
     return PlaceOrbit(
         location=pair[0].location,
         unit="m" if units == "SI" else pair[0].unit,
@@ -139,37 +137,23 @@ def _vector(name: str, column: int, vectors: _Vectors, factor: float) -> Running
     )
 
 
-def _predicted(
-    known: Machine,
-    rotor: RotorParameters,
-    pair: tuple[Channel, Channel],
-    window: WindowStatistics,
-    vectors: _Vectors,
-    factor: float,
-) -> OrbitEllipse:
-    """Orbit that the unbalance makes at the window's speed."""
+def _predicted(known: Machine, rotor: RotorParameters, window: WindowStatistics) -> ComplexArray:
+    """Vectors that the unbalance makes at the window's speed, of all states."""
     q1, q2 = synchronous_response(rotor, window.speed_rad_s)
-    rows = [STATE_INDEX[state] for state in _planes_at(pair[0].location)]
-    q = (q1 - 1j * q2)[rows] * np.exp(1j * known.operation.unbalance_phase_rad)
-    return _ellipse(factor * q, vectors.direction, absolute=vectors.absolute)
+    return np.asarray((q1 - 1j * q2) * np.exp(1j * known.operation.unbalance_phase_rad), dtype=np.complex128)
 
 
-def _planes_at(location: str) -> tuple[str, str]:
-    """States of the displacements at a place."""
-    return ("y1", "z1") if location == "bearing" else ("y2", "z2")
-
-
-def _ellipse(vectors: ComplexArray, direction: int, *, absolute: bool) -> OrbitEllipse:
-    found = Ellipse(complex(vectors[0]), complex(vectors[1]))
+def _ellipse(q: ComplexArray, vectors: _Vectors) -> OrbitEllipse:
+    found = Ellipse(complex(q[0]), complex(q[1]))
     with_shaft = found.precession == "forward"
-    sense: Literal["y to z", "z to y"] = "y to z" if with_shaft == (direction > 0) else "z to y"
+    sense: Literal["y to z", "z to y"] = "y to z" if with_shaft == (vectors.direction > 0) else "z to y"
     precession: Literal["forward", "backward"] = "forward" if with_shaft else "backward"
     return OrbitEllipse(
         semi_major=_rounded(found.semi_major),
         semi_minor=_rounded(found.semi_minor),
         tilt_deg=_rounded(found.tilt_deg),
         sense=sense,
-        precession=precession if absolute else None,
+        precession=precession if vectors.absolute else None,
     )
 
 
