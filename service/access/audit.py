@@ -12,7 +12,7 @@ first; if it is missing, the outcome is not known.
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from models.errors import RotorwatchError
 from service.access.rates import MovingWindow
@@ -112,20 +112,9 @@ class AuditTrail:
         return withheld
 
     def _write(self, visit: Visit, status: int, note: AuditNote) -> None:
-        entry = AuditEntry(
-            number=0,
-            at_ns=visit.at_ns,
-            actor=visit.actor,
-            address=visit.address,
-            method=_short(visit.method),
-            path=_short(visit.path),
-            status=status,
-            action=_short(note.action),
-            machine=_short(note.machine),
-            alarm=_short(note.alarm),
-            reason=_short(note.reason),
-        )
-        self._journal.append(entry)
+        said = {name: _short(text) for name, text in asdict(note).items()}
+        method, path = _short(visit.method), _short(visit.path)
+        self._journal.append(AuditEntry(0, visit.at_ns, visit.actor, visit.address, method, path, status, **said))
 
 
 def _short(text: str) -> str:

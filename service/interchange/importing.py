@@ -66,7 +66,8 @@ def import_file(
         columns = [signal.reference for signal in signals]
         keyphasor = mapping.keyphasor
         if keyphasor is not None and keyphasor.column is not None:
-            columns = [*columns, *_sampled(keyphasor.column, keyphasor.index, columns)]
+            pulses_in = Reference(keyphasor.column, keyphasor.index)
+            columns += [] if pulses_in in columns else [pulses_in]
         clock = clock_for(source, columns, mapping.time, machine, files[0].start_ns)
         pulses = None
         if keyphasor is not None:
@@ -99,12 +100,6 @@ def import_file(
             raise
     cut_rows = sum(overlap.cut_rows for overlap in overlaps)
     return Imported(path, recording, machine, mapping, clock, read, maker.written, pulses, cut_rows, angle.unknown)
-
-
-def _sampled(column: str, index: int | None, columns: list[Reference]) -> list[Reference]:
-    """The keyphasor's own signal, if it is not one of the others."""
-    reference = Reference(column, index)
-    return [] if reference in columns else [reference]
 
 
 def _nothing(path: Path, machine: MachineFile, read: Read, cut_rows: int) -> str:

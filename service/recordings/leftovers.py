@@ -3,8 +3,6 @@
 import fcntl
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from models.errors import RecordingError
@@ -51,8 +49,10 @@ def is_locked(folder: Path) -> bool:
 
 def leftovers(folder: Path, writing_now: Path | None = None) -> list[Path]:
     """Incomplete files of a folder, oldest first, without the one that is being written."""
-    with _listing(folder):
+    try:
         return sorted(path for path in folder.glob(f"*{SUFFIX}{PART}") if path != writing_now and path.is_file())
+    except OSError as error:
+        raise RecordingError(f"{folder}: cannot be listed ({error.strerror or error})") from error
 
 
 def recover_leftover(part: Path) -> Salvage | None:
@@ -105,11 +105,3 @@ def loss_text(salvage: Salvage) -> str:
 def _set_aside(part: Path) -> None:
     with writing(part):
         part.replace(part.with_name(part.name.removesuffix(PART) + DAMAGED))
-
-
-@contextmanager
-def _listing(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise RecordingError(f"{folder}: cannot be listed ({error.strerror or error})") from error

@@ -145,7 +145,8 @@ class _Shard:
                         one.follow(known_by)
                     self._listener.wake()  # events that were committed and not told any more
                 except Exception as error:  # whatever it is, the machines must not stay without anybody
-                    self._log.error("a shard could not be started again", exc_info=_unknown(error), why=str(error))
+                    trace = None if isinstance(error, RotorwatchError) else error  # those say by themselves what it is
+                    self._log.error("a shard could not be started again", exc_info=trace, why=str(error))
                     self._say(f"{why}, which failed: {error}")
                     self._stopping.wait(wait_s)
                     wait_s = min(2 * wait_s, _LONGEST_AGAIN_S)
@@ -171,11 +172,6 @@ class _Shard:
     def _tell(self) -> None:
         for one in self.machines:
             self._listener.health(one.health())
-
-
-def _unknown(error: Exception) -> Exception | None:
-    """An error, unless it says by itself what is wrong."""
-    return None if isinstance(error, RotorwatchError) else error
 
 
 class Shards:

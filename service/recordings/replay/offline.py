@@ -110,7 +110,10 @@ class OfflineReplay:
             if message.key == self._keys.descriptor:
                 self._describe(message)
                 continue
-            self._take(message)
+            for report in self._monitor.step_payload(
+                message.payload, message.attachment, self._encoding(message.encoding)
+            ):
+                self._note(report)
             if on_progress is not None:
                 on_progress(self._progress(time_ns))
         if not control.stopped:
@@ -123,10 +126,6 @@ class OfflineReplay:
     def _describe(self, message: RecordedMessage) -> None:
         found = descriptor_mismatch(message.payload, self._machine)
         self.descriptor_differences = tuple(dict.fromkeys((*self.descriptor_differences, *found)))
-
-    def _take(self, message: RecordedMessage) -> None:
-        for report in self._monitor.step_payload(message.payload, message.attachment, self._encoding(message.encoding)):
-            self._note(report)
 
     def _note(self, report: MonitorReport) -> None:
         self._data_s += report.data_s
