@@ -180,7 +180,7 @@ class SampleReader:
         return tuple((one.path, one.size_bytes) for one in found)
 
     def _job(self, view: Monitored, replay_id: str) -> ReplayJob:
-        job = self._service.replays.job(replay_id)
+        job = self._service.replays.found(replay_id).view
         machine = job.recordings[0].rpartition("/")[0]
         if machine != view.machine.title:
             raise HTTPException(422, f"replay: {replay_id} is of {machine}, expected one of {view.machine.title}")

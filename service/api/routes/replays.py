@@ -2,6 +2,7 @@
 
 import asyncio
 import re
+import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
@@ -100,7 +101,7 @@ class ReplayRequests:
         bundle = self._beside_sent(request, machines[0])
         _check_changes(request, machine)
         job = ReplayJob(
-            id=(job_id := ReplayJobs.new_id()),
+            id=(job_id := secrets.token_hex(6)),
             state="running",
             mode=request.mode,
             recordings=request.recordings,
@@ -133,15 +134,12 @@ class ReplayRequests:
         except ReplayJobError as error:
             raise HTTPException(503, str(error)) from error
 
-    def job(self, replay_id: str) -> ReplayJob:
-        """One replay.
-
-        Raises
-        ------
-        HTTPException
-            404 if there is none.
-        """
-        return _found(self, replay_id).view
+    def found(self, replay_id: str) -> RunningJob:
+        """One replay; raises HTTPException 404 if there is none."""
+        found = self.jobs.find(replay_id)
+        if found is None:
+            raise HTTPException(404, f"no replay {replay_id}; they are forgotten when the service stops")
+        return found
 
     def installed(self, job: ReplayJob) -> Installed:
         """What an offline replay is evaluated with.
@@ -251,7 +249,7 @@ def _add_reading_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> Non
     @app.get(_JOB, responses=responses(ReplayJob, 404, 422), **common)
     def replay(replay_id: str) -> ReplayJob:
         """How far a replay is, and in the end what it found."""
-        return desk.job(replay_id)
+        return desk.found(replay_id).view
 
     @app.get(f"{_JOB}/reports", responses=responses(ReplayReportList, 404, 422), **common)
     def replay_reports(replay_id: str, offset: _Offset = 0, limit: _Limit = 100, every: _Every = 1) -> ReplayReportList:
@@ -275,9 +273,9 @@ def _add_reading_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> Non
     )
     def replay_events(replay_id: str) -> StreamingResponse:
         """Progress as server-sent events until the end: `progress`, then `end`, each with the replay as data."""
-        desk.job(replay_id)
+        desk.found(replay_id)
         return StreamingResponse(
-            _events(lambda: desk.job(replay_id)),
+            _events(lambda: desk.found(replay_id).view),
             media_type="text/event-stream",
             headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
         )
@@ -297,7 +295,7 @@ def _add_changing_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> No
     @app.delete(_JOB, responses=responses(ReplayJob, 404, 422), **common)
     def stop_replay(replay_id: str) -> ReplayJob:
         """Stop a replay; what it found so far stays."""
-        found = _found(desk, replay_id)
+        found = desk.found(replay_id)
         found.end()
         return found.view
 
@@ -335,15 +333,8 @@ def _switch(desk: ReplayRequests) -> Callable[[], None]:
     return check
 
 
-def _found(desk: ReplayRequests, replay_id: str) -> RunningJob:
-    found = desk.jobs.find(replay_id)
-    if found is None:
-        raise HTTPException(404, f"no replay {replay_id}; they are forgotten when the service stops")
-    return found
-
-
 def _order(desk: ReplayRequests, replay_id: str, order: str) -> ReplayJob:
-    found = _found(desk, replay_id)
+    found = desk.found(replay_id)
     if found.view.mode != "paced":
         raise HTTPException(409, "an offline replay has no pace: only paced replays can be paused or moved")
     if not found.running:
@@ -356,7 +347,7 @@ def _results(
     desk: ReplayRequests, replay_id: str, topic: str, offset: int, limit: int, every: int = 1
 ) -> tuple[list[str], int | None]:
     """Messages of one topic, and where those that follow begin."""
-    job = _found(desk, replay_id)
+    job = desk.found(replay_id)
     if job.view.mode != "offline":
         raise HTTPException(404, "a paced replay only publishes: ask the monitor in its namespace what it found")
     found: list[str] = []

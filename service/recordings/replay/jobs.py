@@ -5,7 +5,6 @@ however it ends, the input ends, and so does the replay. Results go to a folder 
 """
 
 import re
-import secrets
 import shutil
 import subprocess
 import sys
@@ -72,11 +71,6 @@ class ReplayJobs:
         self._lock = threading.Lock()
         self._jobs: dict[str, RunningJob] = {}
         self._closed = False
-
-    @staticmethod
-    def new_id() -> str:
-        """Return a name for a job."""
-        return secrets.token_hex(6)
 
     def start(self, plan: JobPlan) -> ReplayJob:
         """Start a job.
