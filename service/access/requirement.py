@@ -29,7 +29,9 @@ class Requirement:
         HTTPException
             401 without a caller, 403 if the scope is missing.
         """
-        caller = caller_of(request)
+        caller = getattr(request.state, CALLER, None)
+        if not isinstance(caller, Caller):  # it came past the middleware
+            raise HTTPException(401, NEEDED, {"WWW-Authenticate": BEARER})
         if self.scope not in caller.scopes:
             granted = ", ".join(scope for scope in Scope if scope in caller.scopes)
             text = f"this needs the scope {self.scope}; {caller.name} has {granted or 'none'}"
@@ -79,17 +81,3 @@ def requires(scope: Scope, *, in_browsers: bool = False) -> Any:
         return caller
 
     return Depends(with_token_or_password if in_browsers else with_token)
-
-
-def caller_of(request: Request) -> Caller:
-    """Who sent a request that the middleware has let in.
-
-    Raises
-    ------
-    HTTPException
-        401 if it came past the middleware.
-    """
-    caller = getattr(request.state, CALLER, None)
-    if not isinstance(caller, Caller):
-        raise HTTPException(401, NEEDED, {"WWW-Authenticate": BEARER})
-    return caller
