@@ -1,6 +1,6 @@
 """What the history of a monitor holds of one machine: reports, each with the levels of its window."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,7 +51,8 @@ class Past(Described):
         RotorwatchError
             If there are no reports.
         """
-        reports = _parsed(log.texts(since_ns or 0, _LATEST_NS if until_ns is None else until_ns, most))
+        texts = log.texts(since_ns or 0, _LATEST_NS if until_ns is None else until_ns, most)
+        reports = tuple(parsed_reports(texts))
         name = machine.title
         if not reports:
             raise RotorwatchError(f"{name}: no reports in this stretch of time")
@@ -94,7 +95,7 @@ class Past(Described):
                 for text, other, option in zip(between, (first, last + 1), ("--from", "--to"), strict=True)
             )
             alarms = AlarmLog(database).since(machine.site, machine.name, 0)
-            reports = _parsed(log.texts(since, until, _MOST))
+            reports = tuple(parsed_reports(log.texts(since, until, _MOST)))
         finally:
             database.stop()
         if not reports:
@@ -104,9 +105,8 @@ class Past(Described):
         )
 
 
-def _parsed(texts: Iterable[str]) -> tuple[Report, ...]:
-    found = []
+def parsed_reports(texts: Iterable[str | bytes]) -> Iterator[Report]:
+    """Reports as they were published, in their order; those that cannot be read are left out."""
     for text in texts:
         with suppress(ValidationError):  # of another version of the program
-            found.append(Report.model_validate_json(text))
-    return tuple(found)
+            yield Report.model_validate_json(text)

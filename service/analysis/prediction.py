@@ -123,47 +123,46 @@ class Prediction:
         lags_s: FloatArray,
         within_hz: tuple[float, float] | None,
     ) -> FloatArray | None:
-        if rotor is None or self.excitation is None:
+        if rotor is None or self.excitation is None or self.machine is None:
             return None
-        low_hz, high_hz = within_hz or (0.0, self._highest_hz(states))
-        frequencies_hz, weights = self._nodes(rotor, low_hz, high_hz, float(lags_s[-1]))
+        low_hz, high_hz = within_hz or (0.0, _highest_hz(self.machine, states))
+        frequencies_hz, weights = _nodes(self.excitation, rotor, low_hz, high_hz, float(lags_s[-1]))
         spectra = self.excitation.spectra(rotor, states, frequencies_hz)
         of_pairs = np.stack([spectra[:, i, j] for i, j in pairs], axis=1) * weights[:, None]
         phase = 2 * np.pi * np.outer(lags_s, frequencies_hz)
         return np.asarray(2 * (np.cos(phase) @ of_pairs.real + np.sin(phase) @ of_pairs.imag), dtype=np.float64)
 
-    def _highest_hz(self, states: tuple[str, ...]) -> float:
-        """Where what is measured ends, or what is left is next to nothing."""
-        assert self.machine is not None  # noqa: S101  # asked by those who have it
-        nyquist_hz = self.machine.rate_hz / 2
-        if any(state.endswith("_ddot") for state in states):
-            return nyquist_hz
-        poles = np.linalg.eigvals(system_A(self.machine.rotor, self.machine.operation.speed_rad_s))
-        fastest_hz = float(np.abs(poles).max()) / (2 * np.pi)
-        return min(nyquist_hz, max(_OVER_BAND * self.machine.window.band_hz[1], 1.5 * fastest_hz))
 
-    def _nodes(
-        self, rotor: RotorParameters, low_hz: float, high_hz: float, longest_s: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Frequencies and weights of the quadrature."""
-        assert self.excitation is not None  # noqa: S101  # asked by those who have it
-        assert self.machine is not None  # noqa: S101
-        poles = np.linalg.eigvals(system_A(rotor, self.excitation.speed_rad_s))
-        poles = poles[poles.imag > 0]
-        modes_hz, half_hz = poles.imag / (2 * np.pi), np.maximum(-poles.real / (2 * np.pi), 1e-9)
-        around = (modes_hz[:, None] + half_hz[:, None] * np.concatenate([-_HALF_WIDTHS[:0:-1], _HALF_WIDTHS])).ravel()
-        widest_hz = _CYCLES / max(longest_s, 1 / self.machine.window.band_hz[1])
-        even, at = [low_hz], low_hz
-        beyond_hz = _OVER_BAND * self.machine.window.band_hz[1]
-        while at < high_hz:
-            at += widest_hz if at < beyond_hz else max(widest_hz, _GROWTH * at)
-            even.append(min(at, high_hz))
-        edges = np.unique(np.concatenate([even, around[(around > low_hz) & (around < high_hz)]]))
-        middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
-        return (
-            np.asarray((middle[:, None] + half[:, None] * _POINTS).ravel()),
-            np.asarray((half[:, None] * _WEIGHTS).ravel()),
-        )
+def _highest_hz(machine: Machine, states: tuple[str, ...]) -> float:
+    """Where what is measured ends, or what is left is next to nothing."""
+    nyquist_hz = machine.rate_hz / 2
+    if any(state.endswith("_ddot") for state in states):
+        return nyquist_hz
+    poles = np.linalg.eigvals(system_A(machine.rotor, machine.operation.speed_rad_s))
+    fastest_hz = float(np.abs(poles).max()) / (2 * np.pi)
+    return min(nyquist_hz, max(_OVER_BAND * machine.window.band_hz[1], 1.5 * fastest_hz))
+
+
+def _nodes(
+    excitation: Excitation, rotor: RotorParameters, low_hz: float, high_hz: float, longest_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Frequencies and weights of the quadrature."""
+    poles = np.linalg.eigvals(system_A(rotor, excitation.speed_rad_s))
+    poles = poles[poles.imag > 0]
+    modes_hz, half_hz = poles.imag / (2 * np.pi), np.maximum(-poles.real / (2 * np.pi), 1e-9)
+    around = (modes_hz[:, None] + half_hz[:, None] * np.concatenate([-_HALF_WIDTHS[:0:-1], _HALF_WIDTHS])).ravel()
+    widest_hz = _CYCLES / max(longest_s, 1 / excitation.machine.window.band_hz[1])
+    even, at = [low_hz], low_hz
+    beyond_hz = _OVER_BAND * excitation.machine.window.band_hz[1]
+    while at < high_hz:
+        at += widest_hz if at < beyond_hz else max(widest_hz, _GROWTH * at)
+        even.append(min(at, high_hz))
+    edges = np.unique(np.concatenate([even, around[(around > low_hz) & (around < high_hz)]]))
+    middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
+    return (
+        np.asarray((middle[:, None] + half[:, None] * _POINTS).ravel()),
+        np.asarray((half[:, None] * _WEIGHTS).ravel()),
+    )
 
 
 def predict(

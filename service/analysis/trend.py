@@ -16,7 +16,7 @@ from models.signals.block import FloatArray
 from models.signals.keys import MachineKeys
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, EventKind
 from rotorwatch.records.health import MEASURES, HealthState, Report
-from service.analysis.past import Past
+from service.analysis.past import Past, parsed_reports
 from service.analysis.recorded import Recorded
 from service.monitor.reports import machine_hash
 from service.recordings.replay.machine import choose_machine
@@ -92,7 +92,8 @@ def read_trend(data: Recorded, machine: str | None = None, *, levels: bool = Fal
     RotorwatchError
         If there are no reports and none can be computed, or nothing was read in any.
     """
-    if machine is None and (reports := list(recorded_reports(data))):
+    recorded = parsed_reports(message.payload for message in data.messages(data.keys.report))
+    if machine is None and (reports := [_slim(one) for one in recorded]):
         limits = _limits(data.keys, reports[-1])
         return trend_of(reports, recorded_alarms(data), limits, "as recorded", levels=levels)
     if data.keys.stream not in data.source.keys:
@@ -189,16 +190,6 @@ def _level_trends(reports: Sequence[Report]) -> Iterator[LevelTrend]:
             np.array([None if one is None else one.alert for one in limits], dtype=np.float64),
             np.array([None if one is None else one.danger for one in limits], dtype=np.float64),
         )
-
-
-def recorded_reports(data: Recorded) -> Iterator[Report]:
-    """Reports that were recorded, in the order of recording; unreadable ones are left out."""
-    for message in data.messages(data.keys.report):
-        try:
-            report = Report.model_validate_json(message.payload)
-        except ValidationError:
-            continue  # of another version of the program
-        yield _slim(report)
 
 
 def _slim(report: Report) -> Report:

@@ -79,7 +79,9 @@ Paint = Callable[[Look], Figure]
 
 
 def draw(path: Path, look: Look, paint: Paint) -> None:
-    """Draw in the house style, whatever the settings of the person who draws, and write it.
+    """Draw in the house style, whatever the settings of the person who draws, and write it as PNG or SVG by its suffix.
+
+    Time and program are not in it.
 
     Raises
     ------
@@ -87,17 +89,10 @@ def draw(path: Path, look: Look, paint: Paint) -> None:
         If the file cannot be written.
     """
     with style.context(["default", _STYLE]):
-        write_figure(paint(look), path, look.dpi)
+        _write(paint(look), path, look.dpi)
 
 
-def write_figure(figure: Figure, path: Path, dpi: float) -> None:
-    """Write a figure as PNG or SVG by its suffix, without time and program in it.
-
-    Raises
-    ------
-    RotorwatchError
-        If the file cannot be written.
-    """
+def _write(figure: Figure, path: Path, dpi: float) -> None:
     kind = path.suffix.lower().removeprefix(".")
     engine = figure.get_layout_engine()
     if engine is not None:  # otherwise the figure would be drawn twice, first to find the layout
