@@ -2,11 +2,14 @@
 
 Each window has context before and after the rows whose result is kept. The beginning and the end of a stretch have
 none; there the result is not valid and is left out.
+
+A filter says at multiples of how many rows of a stretch windows begin (`multiple`), and how many rows of context there
+are before and after (`context`). It takes times and samples of a window with its contexts, and the first row of the
+stretch, and returns times and samples of the rows between the contexts.
 """
 
 from collections.abc import Iterator
 from fractions import Fraction
-from typing import Protocol
 
 import numpy as np
 from scipy.signal import resample_poly
@@ -17,31 +20,10 @@ from service.interchange.samples import Piece, Signal
 _CORE_ROWS = 65536
 
 
-class WindowFilter(Protocol):
-    """What is computed in a window."""
-
-    multiple: int
-    """Windows begin at multiples of this many rows of a stretch."""
-    context: int
-    """Rows of context, before and after."""
-
-    def __call__(self, time_ns: FloatArray, samples: FloatArray, level: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Times and samples of the rows between the contexts.
-
-        Parameters
-        ----------
-        time_ns : ndarray, shape (context + n + context,)
-        samples : ndarray, shape (context + n + context, n_columns)
-        level : ndarray, shape (n_columns,)
-            The first row of the stretch.
-        """
-        ...
-
-
 class Overlap:
     """Runs a filter over pieces; remembers what the next window needs."""
 
-    def __init__(self, window_filter: WindowFilter) -> None:
+    def __init__(self, window_filter: "Integration | Resampling") -> None:
         self._filter = window_filter
         self._context = window_filter.context
         self._core = -(-max(_CORE_ROWS, self._context) // window_filter.multiple) * window_filter.multiple
@@ -94,7 +76,7 @@ class Integration:
         self.context = int(np.ceil(settling_s(high_pass_hz) * rate_hz))
 
     def __call__(self, time_ns: FloatArray, samples: FloatArray, level: FloatArray) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002
-        """See `WindowFilter`."""
+        """Filter a window."""
         inner = slice(self.context, time_ns.size - self.context)
         result = samples[inner].copy()
         for number, signal in enumerate(self._signals):
@@ -126,7 +108,7 @@ class Resampling:
         self.context = -(-reach // self._down) * self._down
 
     def __call__(self, time_ns: FloatArray, samples: FloatArray, level: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """See `WindowFilter`."""
+        """Filter a window."""
         up, down = self._up, self._down
         plain = samples - level
         circles = [part(samples[:, self._angles]) for part in (np.cos, np.sin)]
