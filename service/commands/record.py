@@ -99,15 +99,15 @@ def record(
                 running.callback(MachineTap(link, recorder.machine.keys, recorder.put).close)
                 if not as_json:
                     typer.echo(f"recording {recorder.machine.keys.root} into {recorder.folder}/; Ctrl-C ends")
-            show = _Statuses(recorders) if as_json else None
+            told: dict[Path, str] = {}
             sys.stdout.flush()
             while True:
-                if show is not None:
-                    show()
+                if as_json:
+                    _tell_changes(recorders, told)
                 if stop.wait(_STATUS_S):
                     break
-        if show is not None:
-            show()
+        if as_json:
+            _tell_changes(recorders, told)
         elif not _summed_up(recorders):
             raise typer.Exit(1)
 
@@ -146,20 +146,14 @@ def recover(
         raise typer.Exit(1)
 
 
-class _Statuses:
-    """Writes a JSON line for every recorder whose status has changed."""
-
-    def __init__(self, recorders: "list[MachineRecorder]") -> None:
-        self._shown: dict[str, str] = {}
-        self._recorders = recorders
-
-    def __call__(self) -> None:
-        for recorder in self._recorders:
-            line = json.dumps(asdict(recorder.status()))
-            if self._shown.get(recorder.folder.as_posix()) != line:
-                self._shown[recorder.folder.as_posix()] = line
-                typer.echo(line)
-        sys.stdout.flush()
+def _tell_changes(recorders: "list[MachineRecorder]", told: dict[Path, str]) -> None:
+    """Write a JSON line for every recorder whose status is another than was told."""
+    for recorder in recorders:
+        line = json.dumps(asdict(recorder.status()))
+        if told.get(recorder.folder) != line:
+            told[recorder.folder] = line
+            typer.echo(line)
+    sys.stdout.flush()
 
 
 def _settings(

@@ -70,7 +70,7 @@ def watch(
     base = LinkSettings(mode="client", connect=(ENDPOINT,)) if link is None else load_link(link)
     ends = {"connect": tuple(connect)} if connect else {}
     settings = in_namespace(base.model_copy(update=ends), namespace)
-    show = _JsonLines() if as_json else _Lines()
+    show = _show_json if as_json else _Lines()
     with stop_request() as stop, follow(settings, machine, topics, show) as connected:
         there = True
         while not stop.wait(0.5):
@@ -198,12 +198,9 @@ class _Lines:
         sys.stdout.flush()
 
 
-class _JsonLines:
-    """Writes messages as JSON lines."""
-
-    def __call__(self, message: "TopicMessage") -> None:
-        sys.stdout.write(f'{{"topic": {json.dumps(message.key)}, "message": {message.text}}}\n')
-        sys.stdout.flush()
+def _show_json(message: "TopicMessage") -> None:
+    sys.stdout.write(f'{{"topic": {json.dumps(message.key)}, "message": {message.text}}}\n')
+    sys.stdout.flush()
 
 
 def _fetch_healths(url: str, token: str | None, ca: Path | None) -> "list[Health]":
