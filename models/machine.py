@@ -461,12 +461,7 @@ class Machine(MachineFile):
 
 
 def load_machine(name_or_path: str | Path) -> Machine:
-    """Load the file of a machine whose parameters are known, by path, or a shipped one by its name.
-
-    Parameters
-    ----------
-    name_or_path : str or Path
-        Name of a shipped machine ("lab", "heavy", "light"), or the path of a TOML file.
+    """Load the file of a machine whose parameters are known, by path, or a shipped one by its name, such as ``lab``.
 
     Raises
     ------
