@@ -32,7 +32,7 @@ class Centreline:
     z_um: FloatArray
 
 
-def past_centreline(data: Past, pairs: Sequence[tuple[Channel, Channel]]) -> Centreline:
+def _past_centreline(data: Past, pairs: Sequence[tuple[Channel, Channel]]) -> Centreline:
     """Mean positions in the windows of the history, as the monitor reported them.
 
     Raises
@@ -60,14 +60,16 @@ def past_centreline(data: Past, pairs: Sequence[tuple[Channel, Channel]]) -> Cen
     )
 
 
-def read_centreline(data: Sampled, pairs: Sequence[tuple[Channel, Channel]], each_s: float) -> Centreline:
-    """Means over every so many seconds; in long recordings over longer ones.
+def read_centreline(data: Sampled | Past, pairs: Sequence[tuple[Channel, Channel]], each_s: float) -> Centreline:
+    """Means over every so many seconds, in long recordings over longer ones; of a history those of its windows.
 
     Raises
     ------
     RotorwatchError
         If there are not two such stretches.
     """
+    if isinstance(data, Past):
+        return _past_centreline(data, pairs)
     each_s = max(each_s, (data.to_ns - data.from_ns) / 1e9 / _MOST_POINTS)
     rows: list[tuple[int, float, FloatArray]] = []
     for stretch in data.stretches([channel for pair in pairs for channel in pair], each_s):

@@ -42,7 +42,7 @@ class RunUp:
             raise RotorwatchError(f"a Bode plot needs a run-up or coast-down: {text}")
 
 
-def past_run_up(data: Past, channels: tuple[Channel, ...], order: int) -> RunUp:
+def _past_run_up(data: Past, channels: tuple[Channel, ...], order: int) -> RunUp:
     """Vectors of the windows of the history, as the monitor reported them.
 
     Raises
@@ -80,14 +80,14 @@ def past_run_up(data: Past, channels: tuple[Channel, ...], order: int) -> RunUp:
 
 
 def read_run_up(
-    data: Sampled,
+    data: Sampled | Past,
     channels: tuple[Channel, ...],
     order: int,
     revolutions: int,
     slow_roll_rpm: float | None = None,
     between_rpm: tuple[float, float] | None = None,
 ) -> RunUp:
-    """Vectors of everything that was recorded.
+    """Vectors of everything that was recorded, or of the windows of the history, whatever their length.
 
     Parameters
     ----------
@@ -103,10 +103,15 @@ def read_run_up(
     Raises
     ------
     MachineFileError
-        If the shaft angle is not measured, and no speeds are named; or it is, and they are.
+        If the shaft angle is not measured, and no speeds are named; or it is, and they are; or a history has no samples
+        for what is asked.
     RotorwatchError
         If the shaft does not turn, or never as slowly as that.
     """
+    if isinstance(data, Past):
+        if slow_roll_rpm is not None or between_rpm is not None:
+            raise MachineFileError("--slow-roll and --speeds need samples: name recordings instead of --history")
+        return _past_run_up(data, channels, order)
     if between_rpm is not None and data.has_angle:
         raise MachineFileError(f"--speeds: {data.name} measures the shaft angle, so its speed is known")
     if between_rpm is not None and slow_roll_rpm is not None:

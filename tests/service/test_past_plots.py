@@ -10,10 +10,10 @@ from models.errors import RotorwatchError
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Report
 from rotorwatch.records.levels import ChannelLevels
-from service.analysis.centreline import past_centreline
+from service.analysis.centreline import read_centreline
 from service.analysis.orbit import recorded_pairs
 from service.analysis.past import Past
-from service.analysis.runup import past_run_up
+from service.analysis.runup import read_run_up
 from service.analysis.trend import past_trend
 from service.history.records import Retention, Step, StoredReport
 from service.history.store import Store
@@ -63,12 +63,12 @@ def test_vectors_and_gaps_of_the_history_are_those_of_the_reports(settings: Path
     data = Past.find(settings, None, (None, None))
     assert (data.name, len(data.reports)) == ("demo/lab", COUNT)
     number = np.arange(COUNT)
-    found = past_run_up(data, data.channels(["z1", "y2"]), 1)
+    found = read_run_up(data, data.channels(["z1", "y2"]), 1, 8)
     assert found.speed_rad_s * 30 / np.pi == pytest.approx(-(1000 + 10 * number))
     assert (found.direction, found.units) == (-1, ("µm p-p", "µm p-p"))
     assert found.amplitude == pytest.approx(np.stack([20.0 + number] * 2, axis=1))
     assert found.lag_deg == pytest.approx(np.stack([90 + 2.0 * number, 180 + 2.0 * number], axis=1))
-    line = past_centreline(data, recorded_pairs(data))
+    line = read_centreline(data, recorded_pairs(data), 1.0)
     assert line.y_um == pytest.approx(np.stack([0.0 + number, 200.0 + number], axis=1))
     assert line.z_um == pytest.approx(np.stack([100.0 + number, 300.0 + number], axis=1))
     assert line.time_ns.tolist() == [START_NS + (30 + 5 * one) * S for one in range(COUNT)]
@@ -79,7 +79,7 @@ def test_a_stretch_of_the_history_and_what_it_lacks(settings: Path, monkeypatch:
     some = Past.find(settings, "demo/lab", ("20", "51"))
     assert [one.end_ns for one in some.reports] == [START_NS + (80 + 5 * one) * S for one in range(7)]
     with pytest.raises(RotorwatchError, match="no report of demo/lab has amplitude and phase of 3x of y1"):
-        past_run_up(some, some.channels(["y1"]), 3)
+        read_run_up(some, some.channels(["y1"]), 3, 8)
     with pytest.raises(RotorwatchError, match="no reports of demo/lab in this stretch of time"):
         Past.find(settings, None, ("5000", None))
     monkeypatch.setattr("service.analysis.past._MOST", 10)

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 
-from models.errors import MachineFileError
 from models.signals.block import FloatArray
 from service.analysis.figures.style import (
     COLOURS,
@@ -32,7 +31,7 @@ from service.analysis.figures.style import (
 )
 from service.analysis.past import Past
 from service.analysis.recorded import Recorded
-from service.analysis.runup import RunUp, past_run_up, read_run_up
+from service.analysis.runup import RunUp, read_run_up
 
 _APART = 0.16
 """Distance of marks, of the longest vector."""
@@ -47,7 +46,7 @@ def bode(  # what may be asked for
     between_rpm: tuple[float, float] | None = None,
 ) -> Paint:
     """Amplitude and phase lag at an order over the speed."""
-    found = _read(data, channels, order, revolutions, slow_roll_rpm, between_rpm)
+    found = read_run_up(data, data.chosen(channels), order, revolutions, slow_roll_rpm, between_rpm)
     found.check_speeds()
     return partial(_paint_bode, found, data.name)
 
@@ -56,23 +55,8 @@ def polar(
     data: Recorded | Past, channels: Sequence[str], order: int, revolutions: int, slow_roll_rpm: float | None
 ) -> Paint:
     """The same as vectors in their plane, with speeds or times written at points."""
-    return partial(_paint_polar, _read(data, channels, order, revolutions, slow_roll_rpm), data.name)
-
-
-def _read(  # what may be asked for
-    data: Recorded | Past,
-    channels: Sequence[str],
-    order: int,
-    revolutions: int,
-    slow_roll_rpm: float | None,
-    between_rpm: tuple[float, float] | None = None,
-) -> RunUp:
-    chosen = data.chosen(channels)
-    if isinstance(data, Recorded):
-        return read_run_up(data, chosen, order, revolutions, slow_roll_rpm, between_rpm)
-    if slow_roll_rpm is not None or between_rpm is not None:
-        raise MachineFileError("--slow-roll and --speeds need samples: name recordings instead of --history")
-    return past_run_up(data, chosen, order)
+    found = read_run_up(data, data.chosen(channels), order, revolutions, slow_roll_rpm)
+    return partial(_paint_polar, found, data.name)
 
 
 def _paint_bode(found: RunUp, name: str, look: Look) -> Figure:

@@ -9,7 +9,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from service.analysis.centreline import Centreline, past_centreline, read_centreline
+from service.analysis.centreline import Centreline, read_centreline
 from service.analysis.figures.style import (
     COLOURS,
     GREY,
@@ -32,8 +32,7 @@ from service.analysis.recorded import Recorded
 def centreline(data: Recorded | Past, place: str | None, each_s: float, clearance_um: float | None) -> Paint:
     """Mean positions of pairs of probes, from the first one on."""
     pairs = recorded_pairs(data, place)
-    found = read_centreline(data, pairs, each_s) if isinstance(data, Recorded) else past_centreline(data, pairs)
-    return partial(_paint, found, data.name, clearance_um)
+    return partial(_paint, read_centreline(data, pairs, each_s), data.name, clearance_um)
 
 
 def _paint(found: Centreline, name: str, clearance_um: float | None, look: Look) -> Figure:

@@ -4,11 +4,11 @@ import numpy as np
 
 from models.signals.channels import Channel
 from rotorwatch.records.plots import CentrelineSeries, ChannelVectors, PlaceCentreline, VectorSeries
-from service.analysis.centreline import past_centreline, read_centreline
+from service.analysis.centreline import read_centreline
 from service.analysis.orbit import recorded_pairs
 from service.analysis.past import Past
 from service.analysis.recorded import Sampled
-from service.analysis.runup import past_run_up, read_run_up
+from service.analysis.runup import read_run_up
 from service.analysis.snapshots.channels import figures
 from service.analysis.snapshots.samples import whose
 from service.analysis.spectrum import steady
@@ -27,10 +27,7 @@ def vector_series(
     RotorwatchError
         If there are none: without a shaft angle, or if the shaft does not turn.
     """
-    if isinstance(data, Past):
-        found = past_run_up(data, channels, order)
-    else:
-        found = read_run_up(data, channels, order, revolutions, slow_roll_rpm)
+    found = read_run_up(data, channels, order, revolutions, slow_roll_rpm)
     every = -(-found.time_ns.size // _MOST_VECTORS)
     return VectorSeries(
         **whose(data),
@@ -61,7 +58,7 @@ def centreline_series(data: Sampled | Past) -> CentrelineSeries:
         If there is no such place, or there are not two positions.
     """
     pairs = recorded_pairs(data)
-    found = past_centreline(data, pairs) if isinstance(data, Past) else read_centreline(data, pairs, _CENTRELINE_S)
+    found = read_centreline(data, pairs, _CENTRELINE_S)
     return CentrelineSeries(
         **whose(data),
         times_ns=tuple(found.time_ns.tolist()),
