@@ -85,9 +85,31 @@ def run(
     [cyan]rotorwatch run --when-full wait[/cyan]
     """
     _prepare()
-    from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
+    from models.signals.link import load_link  # noqa: PLC0415  # keeps --help quick
+    from service.settings.service import MachineEntry, check_distinct, load_settings  # noqa: PLC0415
 
-    settings = _overridden(load_settings(config), machine, link, listen, connect, http_port, when_full, namespace)
+    settings = load_settings(config)
+    update: dict[str, Any] = {}
+    if machine:
+        pairs = [text.partition("@") for text in machine]
+        update["machines"] = tuple(MachineEntry(file=file, bundle=bundle or None) for file, _, bundle in pairs)
+    # Endpoints and role replace those of the settings altogether.
+    ends = settings.link if link is None else load_link(link)
+    if listen or connect:
+        # A router joins clients; between peers, which it takes to know each other, it passes nothing on.
+        mode = "peer" if listen else "client"
+        ends = ends.model_copy(update={"mode": mode, "listen": tuple(listen or ()), "connect": tuple(connect or ())})
+    if namespace is not None:
+        # What is replayed must not end up among the recordings and in the history of the live machine.
+        update["recording"] = settings.recording.model_copy(update={"directory": None})
+        update["history"] = settings.history.model_copy(update={"url": "sqlite:///:memory:"})
+    if http_port is not None:
+        update["http"] = settings.http.model_copy(update={"port": http_port})
+    if when_full is not None:
+        update["queue"] = settings.queue.model_copy(update={"when_full": when_full})
+    settings = settings.model_copy(update=update | {"link": in_namespace(ends, namespace)})
+    check_distinct(Path("command line"), settings)
+    settings.link.check_reach("command line")
     _serve(settings, config)
 
 
@@ -250,47 +272,6 @@ def demo(
 
     code = run_demo(DemoOptions(fault=fault, seed=seed, pace=pace, once=once, http_port=http_port))
     raise typer.Exit(code)
-
-
-def _overridden(
-    settings: "ServiceSettings",
-    machines: list[str] | None,
-    link: Path | None,
-    listen: list[str] | None,
-    connect: list[str] | None,
-    http_port: int | None,
-    when_full: Literal["drop", "wait"] | None,
-    namespace: str | None,
-) -> "ServiceSettings":
-    """Put the command line over the settings; endpoints and role replace those of the settings altogether."""
-    from service.settings.service import MachineEntry, check_distinct  # noqa: PLC0415  # keeps --help quick
-
-    update: dict[str, Any] = {}
-    if machines:
-        pairs = [text.partition("@") for text in machines]
-        update["machines"] = tuple(MachineEntry(file=file, bundle=bundle or None) for file, _, bundle in pairs)
-    if link is not None:
-        from models.signals.link import load_link  # noqa: PLC0415  # keeps --help quick
-
-        update["link"] = load_link(link)
-    if listen or connect:
-        # A router joins clients; between peers, which it takes to know each other, it passes nothing on.
-        mode = "peer" if listen else "client"
-        ends = {"mode": mode, "listen": tuple(listen or ()), "connect": tuple(connect or ())}
-        update["link"] = update.get("link", settings.link).model_copy(update=ends)
-    if namespace is not None:
-        update["link"] = in_namespace(update.get("link", settings.link), namespace)
-        # What is replayed must not end up among the recordings and in the history of the live machine.
-        update["recording"] = settings.recording.model_copy(update={"directory": None})
-        update["history"] = settings.history.model_copy(update={"url": "sqlite:///:memory:"})
-    if http_port is not None:
-        update["http"] = settings.http.model_copy(update={"port": http_port})
-    if when_full is not None:
-        update["queue"] = settings.queue.model_copy(update={"when_full": when_full})
-    overridden = settings.model_copy(update=update)
-    check_distinct(Path("command line"), overridden)
-    overridden.link.check_reach("command line")
-    return overridden
 
 
 def _checked(file: Path) -> str:
