@@ -88,10 +88,6 @@ runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 """
 
 
-class DemoError(RotorwatchError):
-    """A program of the demo did not start or died; the message holds the end of its output."""
-
-
 class Truth(BaseModel, extra="ignore", frozen=True):
     """The part of the simulator's truth record that the demo looks at."""
 
@@ -164,7 +160,7 @@ def run_demo(options: DemoOptions) -> int:
 
     Raises
     ------
-    DemoError
+    RotorwatchError
         If a program does not start or dies.
     """
     console = Console(highlight=False)
@@ -237,7 +233,7 @@ class _Show:
                 with suppress(subprocess.TimeoutExpired):
                     monitor.process.wait(_STOP_S)
                 monitor.must_run()
-                raise DemoError(f"the monitor does not answer at {self._base}: {error}") from error
+                raise RotorwatchError(f"the monitor does not answer at {self._base}: {error}") from error
             if ended and (reason := self._end_of_round()) is not None:
                 return not reason
         self._console.print(f"{_ROUNDS} faults were shown: stopping")
@@ -348,7 +344,7 @@ class _Program:
             how = f"was killed ({signal.Signals(-code).name})" if code < 0 else f"ended with exit code {code}"
             self.output.seek(0)
             tail = self.output.read().decode(errors="replace").splitlines()[-15:]
-            raise DemoError("\n".join([f"the {self.name} {how}", *tail]))
+            raise RotorwatchError("\n".join([f"the {self.name} {how}", *tail]))
 
 
 @contextmanager
@@ -389,7 +385,7 @@ def _wait_until_ready(url: str, monitor: _Program) -> None:
             except httpx.TransportError:
                 pass
             time.sleep(0.1)
-    raise DemoError(f"the monitor was not ready after {_START_S:g} s")
+    raise RotorwatchError(f"the monitor was not ready after {_START_S:g} s")
 
 
 @contextmanager

@@ -9,10 +9,6 @@ _DEFAULT_EVENTS = 100
 _LIMITS = {"after": (-1, 2**53), "limit": (1, MOST_EVENTS)}
 
 
-class QueryError(RotorwatchError):
-    """What was asked makes no sense; the message says which parameter."""
-
-
 def read_log_query(parameters: str) -> tuple[int, int]:
     """Read the parameters of a query: after which sequence number, and at most how many events.
 
@@ -28,7 +24,7 @@ def read_log_query(parameters: str) -> tuple[int, int]:
 
     Raises
     ------
-    QueryError
+    RotorwatchError
         Naming what was found and what was expected.
 
     Examples
@@ -42,9 +38,9 @@ def read_log_query(parameters: str) -> tuple[int, int]:
         if name.startswith("_"):
             continue
         if name not in found:
-            raise QueryError(f"no parameter {name}, expected after or limit")
+            raise RotorwatchError(f"no parameter {name}, expected after or limit")
         least, most = _LIMITS[name]
         if not re.fullmatch(r"-?[0-9]{1,18}", value) or not least <= int(value) <= most:
-            raise QueryError(f"{name} is {value!r}, expected a whole number from {least} to {most}")
+            raise RotorwatchError(f"{name} is {value!r}, expected a whole number from {least} to {most}")
         found[name] = int(value)
     return found["after"], found["limit"]

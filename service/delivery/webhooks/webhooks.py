@@ -16,10 +16,6 @@ from service.monitor.alarm_conversion import rfc3339
 from service.settings.webhooks import WebhookSettings
 
 
-class NotDeliveredError(RotorwatchError):
-    """A test event was not taken; the message says why."""
-
-
 class Webhooks:
     """Starts and stops webhooks and says how they stand.
 
@@ -77,7 +73,7 @@ def send_test(settings: WebhookSettings) -> float:
     ------
     MachineFileError
         If the secret or certificate cannot be used.
-    NotDeliveredError
+    RotorwatchError
         If the receiver did not take it.
     """
     now_ns = time.time_ns()
@@ -94,5 +90,5 @@ def send_test(settings: WebhookSettings) -> float:
     with closing(Receiver(settings)) as receiver:
         answer = receiver.post(f"test/{now_ns}", json.dumps(event).encode())
     if answer.meaning is not Meaning.DELIVERED:
-        raise NotDeliveredError(f"{settings.name}: {settings.target} did not take the test event: {answer.text}")
+        raise RotorwatchError(f"{settings.name}: {settings.target} did not take the test event: {answer.text}")
     return time.monotonic() - begin_s
