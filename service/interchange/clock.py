@@ -64,7 +64,9 @@ def clock_for(
         If the file and the mapping do not tell, contradict each other, or the rate is not the machine's.
     """
     path, timing = source.path, source.timing(columns)
-    column, unit_ns = _time_column(base, timing)
+    column, unit_ns = timing.time, 1e9
+    if base.column is not None:
+        column, unit_ns = Reference(base.column, base.index), 1.0 if base.is_datetime else time_unit_ns(base.unit)
     declared = _declared_rate(source, base, timing)
     if column is None:
         if declared is None:
@@ -88,12 +90,6 @@ def clock_for(
     rate_hz = declared if declared is not None else measured
     ratio = _ratio(path, rate_hz, tolerance, base, machine)
     return Clock(path, column, unit_ns, origin_ns, first, rate_hz, ratio)
-
-
-def _time_column(base: TimeBase, timing: Timing) -> tuple[Reference | None, float]:
-    if base.column is not None:
-        return Reference(base.column, base.index), 1.0 if base.is_datetime else time_unit_ns(base.unit)
-    return timing.time, 1e9
 
 
 def _declared_rate(source: Source, base: TimeBase, timing: Timing) -> float | None:

@@ -5,6 +5,7 @@ A table is a schema, whose fields carry ``unit`` and ``description`` in their me
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -240,30 +241,26 @@ def _message_table(
     """Rows from JSON messages; a message that does not follow its schema is left out and said."""
     key = f"{selection.root()}/{topic}"
     table = Table(pa.schema(fields, metadata={"key": key}), iter(()))
-    table.batches = _message_batches(selection, key, row, time, table)
+
+    def rows() -> Iterator[_Row]:
+        for path, message in _messages(selection, key):
+            try:
+                found = row(message.payload)
+            except ValidationError as error:
+                table.skipped.append(f"{path}: a message on {key} cannot be read: {error}")
+                continue
+            when = found[time]
+            if isinstance(when, int) and selection.wants(when):
+                yield {name: found.get(name) for name in table.schema.names}
+
+    def batches() -> Iterator[pa.RecordBatch]:
+        wanted = rows()
+        while some := list(islice(wanted, _MESSAGES)):
+            yield pa.RecordBatch.from_pylist(some, schema=table.schema)
+            table.rows += len(some)
+
+    table.batches = batches()
     return table
-
-
-def _message_batches(
-    selection: Selection, key: str, row: Callable[[bytes], _Row], time: str, table: Table
-) -> Iterator[pa.RecordBatch]:
-    pending: list[_Row] = []
-    for path, message in _messages(selection, key):
-        try:
-            found = row(message.payload)
-        except ValidationError as error:
-            table.skipped.append(f"{path}: a message on {key} cannot be read: {error}")
-            continue
-        when = found[time]
-        if isinstance(when, int) and selection.wants(when):
-            pending.append({name: found.get(name) for name in table.schema.names})
-        if len(pending) >= _MESSAGES:
-            yield pa.RecordBatch.from_pylist(pending, schema=table.schema)
-            table.rows += len(pending)
-            pending = []
-    if pending:
-        yield pa.RecordBatch.from_pylist(pending, schema=table.schema)
-        table.rows += len(pending)
 
 
 def _report_row(payload: bytes) -> _Row:

@@ -54,7 +54,9 @@ def export(
     with _completed(out) as part:
         match kind:
             case "parquet":
-                _write_parquet(table, part)
+                with pa.parquet.ParquetWriter(part, table.schema, compression="zstd") as writer:
+                    for batch in table.batches:
+                        writer.write_batch(batch)
             case "csv":
                 _write_csv(table, part)
             case "mat":
@@ -77,12 +79,6 @@ def _completed(out: Path) -> Iterator[Path]:
         raise RecordingError(f"{out}: cannot be written ({error.strerror or error})") from error
     finally:
         part.unlink(missing_ok=True)
-
-
-def _write_parquet(table: Table, part: Path) -> None:
-    with pa.parquet.ParquetWriter(part, table.schema, compression="zstd") as writer:
-        for batch in table.batches:
-            writer.write_batch(batch)
 
 
 def _write_csv(table: Table, part: Path) -> None:
