@@ -18,7 +18,7 @@ from models.mistakes import in_folder, mistakes, read_toml
 from models.signals.link import LinkSettings, TlsSettings, endpoint_fault
 from service.history.records import Retention
 from service.settings.access import AccessSettings, check_access
-from service.settings.webhooks import WebhookSettings, repeated_name
+from service.settings.webhooks import WebhookSettings
 
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 
@@ -227,8 +227,9 @@ class ServiceSettings(BaseSettings):
     def _reachable(self) -> Self:
         if not self.link.listen and not self.link.connect:
             raise ValueError("link has neither listen nor connect: no stream could reach the monitor")
-        if (name := repeated_name(self.webhooks)) is not None:
-            raise ValueError(f"webhooks: two are called {name}, expected different names")
+        names = [hook.name for hook in self.webhooks]
+        if repeated := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"webhooks: two are called {repeated[0]}, expected different names")
         return self
 
     @classmethod
@@ -309,13 +310,11 @@ def _culprit(at: tuple[int | str, ...], place: Path) -> str:
 
 
 def _resolved(entry: MachineEntry, folder: Path) -> MachineEntry:
-    def beside(name: str) -> str:
-        path = folder / name
-        return str(path) if path.exists() else name
-
     # A machine file is known by its suffix; a bundle is a folder, so a name that is no folder is a shipped one.
-    file = str(folder / entry.file) if entry.file.endswith(".toml") else entry.file
-    return MachineEntry(file=file, bundle=None if entry.bundle is None else beside(entry.bundle))
+    file, bundle = entry.file, entry.bundle
+    file = str(folder / file) if file.endswith(".toml") else file
+    bundle = str(folder / bundle) if bundle is not None and (folder / bundle).exists() else bundle
+    return MachineEntry(file=file, bundle=bundle)
 
 
 def check_distinct(place: Path, settings: ServiceSettings) -> None:

@@ -111,16 +111,3 @@ class WebhookSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_erro
     def on_this_computer(self) -> bool:
         """Whether the receiver runs on this computer."""
         return is_loopback(self._parts.hostname or "")
-
-
-def repeated_name(webhooks: tuple[WebhookSettings, ...]) -> str | None:
-    """A name that two webhooks have; None if there is none.
-
-    Examples
-    --------
-    >>> hook = WebhookSettings(name="pager", url="https://pager.example/", secret_variable="S")
-    >>> repeated_name((hook,)), repeated_name((hook, hook))
-    (None, 'pager')
-    """
-    names = [hook.name for hook in webhooks]
-    return next((name for name in names if names.count(name) > 1), None)

@@ -7,7 +7,7 @@ appears.
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -274,8 +274,8 @@ def replay_to_network(
             for keys, found in described.items():
                 if found is not None and source.span(keys).start_ns < plan.from_ns:  # else it comes in its place
                     link.put(found)
-            wanted = None if plan.everything else _sent_by(plan.machines)
-            stretch = PlayPlan(wanted, plan.pace, plan.from_ns, plan.to_ns, number)
+            sent = frozenset(key for keys in plan.machines for key in (keys.stream, keys.descriptor, keys.truth))
+            stretch = PlayPlan(None if plan.everything else sent, plan.pace, plan.from_ns, plan.to_ns, number)
             count += play(source, link.put, stretch, control, on_progress)
             if not control.stopped:
                 if plan.pace is None:
@@ -285,7 +285,3 @@ def replay_to_network(
     if control.reason:
         raise LiveMachineError(control.reason)
     return count
-
-
-def _sent_by(machines: Sequence[MachineKeys]) -> frozenset[str]:
-    return frozenset(key for keys in machines for key in (keys.stream, keys.descriptor, keys.truth))

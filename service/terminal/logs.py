@@ -36,8 +36,11 @@ def configure_logging(settings: LogSettings) -> None:
     # The chatter of libraries is of interest only when something is wrong.
     for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "asyncio", "httpx", "alembic"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    # It warns of every request that is no HTTP, which anybody can send.
-    logging.getLogger("uvicorn.error").filters[:] = [_OnceAMinute()]
+    # It warns of every request that is no HTTP, which anybody can send: once a minute will do.
+    minute = Limiter(quiet_s=60.0)
+    logging.getLogger("uvicorn.error").filters[:] = [
+        lambda record: record.levelno >= logging.ERROR or minute.admit(str(record.msg)) is not None
+    ]
     structlog.configure(
         processors=[*shared, structlog.stdlib.ProcessorFormatter.wrap_for_formatter],
         logger_factory=structlog.stdlib.LoggerFactory(),
@@ -80,14 +83,3 @@ class Limiter:
         """Write a line of a kind, with how many were withheld before it, unless it is to be withheld as well."""
         if (withheld := self.admit(kind)) is not None:
             write(text, **details, **({"withheld": withheld} if withheld else {}))
-
-
-class _OnceAMinute(logging.Filter):
-    """Lets a warning through once a minute, and every error."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._limiter = Limiter(quiet_s=60.0)
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        return record.levelno >= logging.ERROR or self._limiter.admit(str(record.msg)) is not None
