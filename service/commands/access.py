@@ -19,7 +19,7 @@ from models.errors import MachineFileError
 from service.commands.running import HistoryOption
 
 if TYPE_CHECKING:  # these import sqlalchemy, which --help must not wait for
-    from service.history.records import AuditEntry, TokenRecord
+    from service.history.records import AuditEntry
     from service.history.store import Store
     from service.settings.service import HistorySettings
 
@@ -97,19 +97,22 @@ def list_(config: HistoryOption = None) -> None:
     from rich.table import Column, Table  # noqa: PLC0415
     from rich.text import Text  # noqa: PLC0415
 
+    from service.access.tokens import token_state  # noqa: PLC0415
+
     with _opened(config) as store:
         records = store.tokens.all()
     now_ns = time.time_ns()
     table = Table(Column("token", no_wrap=True), "name", "scopes", "created", "expires", "state")
     for record in sorted(records, key=lambda one: one.created_ns):
-        state = _state(record, now_ns)
+        state = token_state(record, now_ns)
+        since = "" if record.revoked_ns is None else f" {_utc(record.revoked_ns)}"
         table.add_row(
             record.token_id,
             Text(record.name),
             ", ".join(record.scopes),
             _utc(record.created_ns),
             "-" if record.expires_ns is None else _utc(record.expires_ns),
-            Text(state, style="green" if state == "valid" else "red"),
+            Text(state + since, style="green" if state == "valid" else "red"),
         )
     Console(soft_wrap=True).print(table)
 
@@ -232,13 +235,6 @@ def _write(store: "Store", action: str, reason: str) -> None:
         user = f"user {os.getuid()}"
     said = {"action": action, "reason": reason}
     store.audit.append(AuditEntry(0, time.time_ns(), user, "", "command", "rotorwatch token", status=200, **said))
-
-
-def _state(record: "TokenRecord", now_ns: int) -> str:
-    from service.access.tokens import token_state  # noqa: PLC0415  # keeps --help quick
-
-    state = token_state(record, now_ns)
-    return state if record.revoked_ns is None else f"{state} {_utc(record.revoked_ns)}"
 
 
 def _utc(time_ns: int) -> str:

@@ -171,7 +171,10 @@ def _check(machine: str, of: str, record: StoredReport | StoredReading | StoredE
     for each in fields(record):
         value = getattr(record, each.name)
         if isinstance(value, int | float):
-            _check_number(machine, of, each.name, value)
+            if isinstance(value, int) and not 0 <= value < _LARGEST:
+                raise StoreError(f"{machine}: {of}: {each.name} is {value}, expected 0 or more and less than 2^63")
+            if math.isnan(value):
+                raise StoreError(f"{machine}: {of}: {each.name} is nan, expected a number")
         elif isinstance(value, str):
             try:
                 value.encode()
@@ -179,10 +182,3 @@ def _check(machine: str, of: str, record: StoredReport | StoredReading | StoredE
                 raise StoreError(f"{machine}: {of}: {value!r} is no valid text: {error.reason}") from error
             if "\0" in value:
                 raise StoreError(f"{machine}: {of}: {value!r} holds a NUL character, which no text may")
-
-
-def _check_number(machine: str, of: str, name: str, value: float) -> None:
-    if isinstance(value, int) and not 0 <= value < _LARGEST:
-        raise StoreError(f"{machine}: {of}: {name} is {value}, expected 0 or more and less than 2^63")
-    if math.isnan(value):
-        raise StoreError(f"{machine}: {of}: {name} is nan, expected a number")

@@ -117,7 +117,10 @@ def paint_waterfall(
     else:
         time_axis(axes, vertical=True)
         alarm_lines(axes, alarms, vertical=True)
-    _waterfall_heading(figure, look, found, name)
+    title = f"{name}: spectra of {found.channel.name}, {place_text(found.channel)}"
+    text = f"{found.values.shape[0]} spectra, {found.resolution_hz:.3g} Hz, Hann"
+    span = int(found.start_ns[0]), int(found.end_ns[-1])
+    heading(figure, look, title, span, speeds_text(found.speed_rad_s), text)
     return figure
 
 
@@ -178,13 +181,6 @@ def _cascade(axes: Axes, found: Waterfall, shown: npt.NDArray[np.bool_], *, over
     )
     full += ", 3 decades" if log else ""
     axes.text(right * 0.975, base[-1] + scale / 2, full, ha="right", va="center", fontsize=8, zorder=400, bbox=PLATE)
-
-
-def _waterfall_heading(figure: Figure, look: Look, found: Waterfall, name: str) -> None:
-    title = f"{name}: spectra of {found.channel.name}, {place_text(found.channel)}"
-    span = int(found.start_ns[0]), int(found.end_ns[-1])
-    text = f"{found.values.shape[0]} spectra, {found.resolution_hz:.3g} Hz, Hann"
-    heading(figure, look, title, span, speeds_text(found.speed_rad_s), text)
 
 
 def _rows_in_time(found: Waterfall, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
