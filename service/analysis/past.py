@@ -13,7 +13,7 @@ from models.signals.channels import ChannelDescriptor
 from rotorwatch.records.health import Report
 from service.analysis.recorded import Described
 from service.history.database import Database
-from service.history.shared import AlarmLog, ReportLog
+from service.history.shared import ReportLog, alarms_since
 from service.recordings.replay.source import parse_moment
 from service.settings.service import load_settings
 
@@ -94,7 +94,7 @@ class Past(Described):
                 other if text is None else parse_moment(text, first, option)
                 for text, other, option in zip(between, (first, last + 1), ("--from", "--to"), strict=True)
             )
-            alarms = AlarmLog(database).since(machine.site, machine.name, 0)
+            alarms = alarms_since(database, machine.site, machine.name, 0)
             reports = tuple(parsed_reports(log.texts(since, until, _MOST)))
         finally:
             database.stop()

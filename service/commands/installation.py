@@ -184,20 +184,20 @@ def doctor(
     from models.signals.link import LinkSettings  # noqa: PLC0415
     from models.signals.recording import RecordedMessage  # noqa: PLC0415
     from service.analysis.arrival import examined  # noqa: PLC0415
-    from service.stream.transport import Link, MachineTap  # noqa: PLC0415
+    from service.stream.transport import Link, tap  # noqa: PLC0415
 
     known = load_machine_file(machine)
     ends = LinkSettings(mode="client", connect=tuple(connect)) if connect else None
     link = Link(ends or LinkSettings(listen=tuple(listen or (ENDPOINT,))))
     heard: list[RecordedMessage] = []
     try:
-        tap = MachineTap(link, known.keys, heard.append)
+        close = tap(link, known.keys, heard.append)
         schedule = known.schedule
         seconds = seconds or (10.0 if schedule is None else 10.0 + schedule.every_s + schedule.on_s)
         typer.echo(f"listening for {seconds:g} s to {known.keys.root} ...")
         sys.stdout.flush()
         time.sleep(seconds)
-        tap.close()
+        close()
     finally:
         link.close()
     found = examined(known, heard)

@@ -78,7 +78,7 @@ def record(
         from service.history.shared import committed_events  # noqa: PLC0415  # keeps --help quick
         from service.recordings.recorder import MachineRecorder  # noqa: PLC0415
         from service.settings.service import LogSettings  # noqa: PLC0415
-        from service.stream.transport import Link, MachineTap  # noqa: PLC0415
+        from service.stream.transport import Link, tap  # noqa: PLC0415
         from service.terminal.logs import configure_logging  # noqa: PLC0415
         from service.terminal.stopping import stop_request  # noqa: PLC0415
 
@@ -96,7 +96,7 @@ def record(
             for recorder in recorders:
                 running.callback(recorder.stop)
                 recorder.start()
-                running.callback(MachineTap(link, recorder.machine.keys, recorder.put).close)
+                running.callback(tap(link, recorder.machine.keys, recorder.put))
                 if not as_json:
                     typer.echo(f"recording {recorder.machine.keys.root} into {recorder.folder}/; Ctrl-C ends")
             told: dict[Path, str] = {}

@@ -14,34 +14,28 @@ _MOST = 10_000
 _TIMEOUT_S = 5.0
 
 
-class AlarmLog:
-    """What monitors committed to their logs of alarms; for any thread."""
+def alarms_since(database: Database, site: str, name: str, recorded_ns: int) -> tuple[StoredEvent, ...]:
+    """The latest events that a monitor committed to a machine's log, at most 10 000, in the order of their sequence.
 
-    def __init__(self, database: Database) -> None:
-        self._database = database
+    Parameters
+    ----------
+    site, name : str
+        The machine; of one that has no history there are none.
 
-    def since(self, site: str, name: str, recorded_ns: int) -> tuple[StoredEvent, ...]:
-        """The latest events of a machine, at most 10 000, in the order of their sequence.
-
-        Parameters
-        ----------
-        site, name : str
-            The machine; of one that has no history there are none.
-
-        Raises
-        ------
-        StoreError
-            If the database fails.
-        """
-        log = alarm_events.c
-        query = select(*EVENT).join(machines, machines.c.machine_id == log.machine_id)
-        query = query.where(machines.c.site == site, machines.c.name == name, log.recorded_ns >= recorded_ns)
-        newest_first = self._database.rows(query.order_by(log.sequence.desc()).limit(_MOST))
-        return tuple(StoredEvent(*row) for row in reversed(newest_first))
+    Raises
+    ------
+    StoreError
+        If the database fails.
+    """
+    log = alarm_events.c
+    query = select(*EVENT).join(machines, machines.c.machine_id == log.machine_id)
+    query = query.where(machines.c.site == site, machines.c.name == name, log.recorded_ns >= recorded_ns)
+    newest_first = database.rows(query.order_by(log.sequence.desc()).limit(_MOST))
+    return tuple(StoredEvent(*row) for row in reversed(newest_first))
 
 
 def committed_events(url: str, site: str, name: str, recorded_ns: int) -> tuple[StoredEvent, ...]:
-    """`AlarmLog.since` of a history that another program writes, which is opened for the moment and left as it is.
+    """`alarms_since` of a history that another program writes, which is opened for the moment and left as it is.
 
     Raises
     ------
@@ -51,7 +45,7 @@ def committed_events(url: str, site: str, name: str, recorded_ns: int) -> tuple[
     database = Database(url, _TIMEOUT_S)
     database.start(read_only=True)
     try:
-        return AlarmLog(database).since(site, name, recorded_ns)
+        return alarms_since(database, site, name, recorded_ns)
     finally:
         database.stop()
 

@@ -14,6 +14,7 @@ whoever waits is told.
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 from sqlalchemy import Column, Table, func, select, text
 
@@ -23,7 +24,7 @@ from service.history.database import Database
 from service.history.machine import MachineStore
 from service.history.records import Retention, StoreError
 from service.history.reduction import Reduction
-from service.history.shared import AlarmLog, AuditLog, TokenStore, WebhookCursors
+from service.history.shared import AuditLog, TokenStore, WebhookCursors, alarms_since
 from service.history.tables import alarm_events, buckets, machines, reports, windows
 from service.history.writer import Writer
 
@@ -87,7 +88,7 @@ class Store:
         self.reduction = Reduction(self._database, retention, now_ns)
         self._now_ns = now_ns
         self._retention = retention
-        self.alarms = AlarmLog(self._database)
+        self.alarms_since = partial(alarms_since, self._database)
         self.tokens = TokenStore(self._database)
         self.audit = AuditLog(self._database)
         self.webhooks = WebhookCursors(self._database)

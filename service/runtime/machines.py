@@ -35,7 +35,7 @@ from service.recordings.recorder import MachineRecorder
 from service.settings.service import ServiceSettings
 from service.stream.evidence import EvidenceCollector
 from service.stream.monitored import with_flow
-from service.stream.transport import Link, MachineCallbacks, MachineLink, MachineTap
+from service.stream.transport import Link, MachineCallbacks, MachineLink, tap
 from service.stream.worker import MachineWorker
 from service.terminal.logs import logger
 
@@ -137,12 +137,12 @@ class LocalMachines:
         if self._settings.link.namespace:
             _log.warning("not recorded: what is heard in a namespace is a replay", machine=machine.name)
             return
-        committed = partial(self._store.alarms.since, machine.site, machine.name)
+        committed = partial(self._store.alarms_since, machine.site, machine.name)
         recorder = MachineRecorder(machine, self._settings.recording, committed)
         undo.callback(recorder.stop)
         recorder.start()
         # Before anything is published for the machine, and undeclared after everything is.
-        undo.callback(MachineTap(link, machine.keys, recorder.put).close)
+        undo.callback(tap(link, machine.keys, recorder.put))
         worker.recorder = recorder
 
     def _connect(self, worker: MachineWorker, link: Link, undo: ExitStack) -> MachineLink:

@@ -24,7 +24,7 @@ from rotorwatch.records.replays import ReplayProgress
 from service.recordings.replay.control import Control
 from service.recordings.replay.player import PlayPlan, play
 from service.recordings.replay.source import RecordingSource
-from service.stream.transport import Declared, Link, answering
+from service.stream.transport import Link, answering
 
 _JSON = "application/json"
 _CACHE_STREAM = 300
@@ -131,7 +131,7 @@ class ReplayLink:
         self._machines, self._prefix, self._wait = tuple(machines), prefix, wait
         if not prefix:
             for keys in machines:
-                self._keep(session.liveliness().declare_token(keys.replay_alive))
+                self._undo.callback(session.liveliness().declare_token(keys.replay_alive).undeclare)
             self._watch_for_live()
         for keys, descriptor in machines.items():
             self._publisher(keys.stream)
@@ -139,10 +139,10 @@ class ReplayLink:
             if descriptor is not None:
                 key = self._key(keys.descriptor)
                 reply = answering(key, partial(bytes, descriptor))
-                self._keep(session.declare_queryable(key, self._link.guarded(reply)))
+                self._undo.callback(session.declare_queryable(key, self._link.guarded(reply)).undeclare)
             if prefix:
                 # On the original keys there is no token: it would say that a live machine is there, and hide one.
-                self._keep(session.liveliness().declare_token(self._key(keys.publisher_alive)))
+                self._undo.callback(session.liveliness().declare_token(self._key(keys.publisher_alive)).undeclare)
 
     def end_pass(self) -> None:
         """Undeclare it all."""
@@ -192,9 +192,6 @@ class ReplayLink:
     def _key(self, key: str) -> str:
         return f"{self._prefix}/{key}" if self._prefix else key
 
-    def _keep(self, declared: Declared) -> None:
-        self._undo.callback(declared.undeclare)
-
     def _publisher(self, key: str) -> _Publisher:
         known = self._publishers.get(key)
         if known is not None:
@@ -218,7 +215,7 @@ class ReplayLink:
             publisher = session.declare_publisher(
                 key, encoding=_JSON, congestion_control=congestion, priority=zenoh.Priority.DATA_LOW
             )
-        self._keep(publisher)
+        self._undo.callback(publisher.undeclare)
         self._publishers[key] = publisher
         return publisher
 
@@ -233,7 +230,7 @@ class ReplayLink:
                     key, self._link.guarded(self._appeared(f"{text}: the replay on the original keys was stopped")),
                     history=True,
                 )  # fmt: skip
-                self._keep(watch)
+                self._undo.callback(watch.undeclare)
 
     def _appeared(self, text: str) -> Callable[[zenoh.Sample], None]:
         def take(sample: zenoh.Sample) -> None:

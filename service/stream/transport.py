@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import zenoh
 import zenoh.ext
@@ -49,13 +49,6 @@ _log = logger(part="transport")
 
 class LinkError(RotorwatchError):
     """No Zenoh session with these endpoints; the message names them."""
-
-
-class Declared(Protocol):
-    """What Zenoh gives for a declaration."""
-
-    def undeclare(self) -> object:
-        """Take it back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,11 +154,7 @@ class MachineLink:
             self._undeclare = undo.pop_all()
 
     def _declare(self, session: zenoh.Session, undo: ExitStack, wait_when_full: bool) -> None:
-        keys, guarded = self._keys, self._link.guarded
-
-        def keep(declared: Declared) -> None:
-            undo.callback(declared.undeclare)
-
+        keys, guarded, keep = self._keys, self._link.guarded, undo.callback
         self._publishers: dict[Topic, zenoh.Publisher | zenoh.ext.AdvancedPublisher] = {
             "report": session.declare_publisher(
                 keys.report, encoding=_JSON, congestion_control=zenoh.CongestionControl.DROP
@@ -175,13 +164,15 @@ class MachineLink:
             "health": _advanced_publisher(session, keys.health, _JSON, 1),
         }
         for publisher in self._publishers.values():
-            keep(publisher)
+            keep(publisher.undeclare)
         for key, answer in ((keys.alarm_state, self._callbacks.alarm_state), (keys.health, self._callbacks.health)):
-            keep(session.declare_queryable(key, guarded(answering(key, answer))))
+            keep(session.declare_queryable(key, guarded(answering(key, answer))).undeclare)
         log = _answering_from_log(keys.alarm_event, self._callbacks.alarm_events)
         # A thread of its own, because it waits for the database: the others, and Zenoh, go on.
-        keep(session.declare_queryable(keys.alarm_event, zenoh.handlers.Callback(guarded(log), indirect=True)))
-        keep(session.liveliness().declare_subscriber(keys.replay_alive, guarded(self._take_replay), history=True))
+        events = zenoh.handlers.Callback(guarded(log), indirect=True)
+        keep(session.declare_queryable(keys.alarm_event, events).undeclare)
+        alive = session.liveliness()
+        keep(alive.declare_subscriber(keys.replay_alive, guarded(self._take_replay), history=True).undeclare)
         # Descriptor and liveliness before the stream: they say what the stream should look like.
         keep(
             zenoh.ext.declare_advanced_subscriber(
@@ -189,13 +180,13 @@ class MachineLink:
                 keys.descriptor,
                 guarded(self._take_descriptor),
                 history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
-            )
+            ).undeclare
         )
-        keep(session.liveliness().declare_subscriber(keys.publisher_alive, guarded(self._take_alive), history=True))
+        keep(alive.declare_subscriber(keys.publisher_alive, guarded(self._take_alive), history=True).undeclare)
         stream = _stream_subscriber(session, keys.stream, guarded(self._take_block), wait=wait_when_full)
-        keep(stream)
-        keep(stream.sample_miss_listener(guarded(self._take_miss)))
-        keep(session.liveliness().declare_token(keys.monitor_alive))
+        keep(stream.undeclare)
+        keep(stream.sample_miss_listener(guarded(self._take_miss)).undeclare)
+        keep(alive.declare_token(keys.monitor_alive).undeclare)
 
     def publish(self, topic: Topic, text: str) -> None:
         """Publish a message; if the network is congested all but reports wait."""
@@ -232,50 +223,46 @@ class MachineLink:
             _ask(self._link, self._keys.descriptor, self._take_descriptor)  # without a cache they answer only queries
 
 
-class MachineTap:
-    """Hands on every message under a machine's keys as it is, whoever published it, this program included.
+def tap(link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], None]) -> Callable[[], None]:
+    """Hand on every message under a machine's keys as it is, whoever published it, this program included.
 
     Parameters
     ----------
     link : Link
-        Open session; must outlive this object.
+        Open session; must outlive this.
     on_message : callable
         Takes each message on a thread of Zenoh's: be short. Descriptors also come as answers to a query, at the start
         and whenever a publisher appears, so that one announced earlier is known.
+
+    Returns
+    -------
+    callable
+        Ends it.
     """
 
-    def __init__(self, link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], None]) -> None:
-        self._link = link
-        self._keys = keys
-        self._on_message = on_message
-        session, guarded = link.session, link.guarded
-        with ExitStack() as undo:
-            undo.callback(session.declare_subscriber(f"{keys.root}/**", guarded(self._take)).undeclare)
-            # The stream as the monitor takes it: blocks that were lost on the way are fetched again.
-            stream = _stream_subscriber(session, keys.stream, guarded(self._take_block), wait=False)
-            undo.callback(stream.undeclare)
-            alive = session.liveliness().declare_subscriber(
-                keys.publisher_alive, guarded(self._take_alive), history=True
-            )
-            undo.callback(alive.undeclare)
-            self._undeclare = undo.pop_all()
-        _ask(self._link, self._keys.descriptor, self._take)
+    def take(sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT and str(sample.key_expr) != keys.stream:
+            on_message(_verbatim(sample))
 
-    def close(self) -> None:
-        """Undeclare the subscriptions."""
-        self._undeclare.close()
-
-    def _take(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT and str(sample.key_expr) != self._keys.stream:
-            self._on_message(_verbatim(sample))
-
-    def _take_block(self, sample: zenoh.Sample) -> None:
+    def take_block(sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
-            self._on_message(_verbatim(sample))
+            on_message(_verbatim(sample))
 
-    def _take_alive(self, sample: zenoh.Sample) -> None:
+    def take_alive(sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
-            _ask(self._link, self._keys.descriptor, self._take)
+            _ask(link, keys.descriptor, take)
+
+    session = link.session
+    with ExitStack() as undo:
+        undo.callback(session.declare_subscriber(f"{keys.root}/**", link.guarded(take)).undeclare)
+        # The stream as the monitor takes it: blocks that were lost on the way are fetched again.
+        undo.callback(_stream_subscriber(session, keys.stream, link.guarded(take_block), wait=False).undeclare)
+        liveliness = session.liveliness()
+        alive = liveliness.declare_subscriber(keys.publisher_alive, link.guarded(take_alive), history=True)
+        undo.callback(alive.undeclare)
+        close = undo.pop_all().close
+    _ask(link, keys.descriptor, take)
+    return close
 
 
 @contextmanager

@@ -407,7 +407,7 @@ def test_who_may_not_write_reads_what_was_committed(kind: str, tmp_path: Path) -
     events = tuple(alarm_event(number) for number in range(4))
     lab.commit(Step(events=events))
     pump.commit(Step(events=events[:1]))
-    for read in (store.alarms.since, partial(committed_events, url)):
+    for read in (store.alarms_since, partial(committed_events, url)):
         assert read("demo", "lab", events[1].recorded_ns) == events[1:]
         assert read("demo", "pump", 0) == events[:1]
         assert read("demo", "fan", 0) == ()
