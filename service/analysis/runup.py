@@ -11,7 +11,7 @@ from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from service.analysis.past import Past
 from service.analysis.recorded import Sampled
-from service.analysis.spectrum import shown_as, steady, unit_shown
+from service.analysis.spectrum import shown_as, unit_shown
 from service.analysis.vectors import estimated_vectors, read_vectors
 
 
@@ -35,11 +35,6 @@ class RunUp:
     def direction(self) -> int:
         """1 if the shaft turns from y to z, -1 if from z to y."""
         return 1 if np.median(self.speed_rad_s) >= 0 else -1
-
-    def check_speeds(self) -> None:
-        """Refuse speeds that are all the same. Raises RotorwatchError, which names them."""
-        if text := steady(self.speed_rad_s):
-            raise RotorwatchError(f"a Bode plot needs a run-up or coast-down: {text}")
 
 
 def _past_run_up(data: Past, channels: tuple[Channel, ...], order: int) -> RunUp:

@@ -5,7 +5,7 @@ import json
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, TypeAdapter
+from pydantic import BaseModel, TypeAdapter
 
 from models.checkpoint import from_bytes, to_bytes
 from models.diagnosis.window import WindowStatistics
@@ -23,10 +23,8 @@ _PARTS: dict[str, Any] = {kind.__name__: kind for kind in (LatestData, WindowSta
 EVENTS = TypeAdapter(tuple[AlarmCloudEvent, ...])
 
 
-class Standing(BaseModel):
+class Standing(BaseModel, frozen=True, arbitrary_types_allowed=True):
     """What has changed of a machine; what is None has not."""
-
-    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
 
     process: str
     place: str
@@ -39,10 +37,8 @@ class Standing(BaseModel):
     health: Health | None = None
 
 
-class Question(BaseModel):
+class Question(BaseModel, frozen=True):
     """What is asked of the process that monitors a machine."""
-
-    model_config = ConfigDict(frozen=True)
 
     about: str  # ``standing``, ``alarms``, ``detectable``, ``operate``, ``latest``
     change: float | None = None

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 
+from models.errors import RotorwatchError
 from models.signals.block import FloatArray
 from service.analysis.figures.style import (
     COLOURS,
@@ -32,6 +33,7 @@ from service.analysis.figures.style import (
 from service.analysis.past import Past
 from service.analysis.recorded import Recorded
 from service.analysis.runup import RunUp, read_run_up
+from service.analysis.spectrum import steady
 
 _APART = 0.16
 """Distance of marks, of the longest vector."""
@@ -47,7 +49,8 @@ def bode(  # what may be asked for
 ) -> Paint:
     """Amplitude and phase lag at an order over the speed."""
     found = read_run_up(data, data.chosen(channels), order, revolutions, slow_roll_rpm, between_rpm)
-    found.check_speeds()
+    if text := steady(found.speed_rad_s):
+        raise RotorwatchError(f"a Bode plot needs a run-up or coast-down: {text}")
     return partial(_paint_bode, found, data.name)
 
 
