@@ -34,8 +34,15 @@ from service.access.credentials import address_of, kept_text, key_of, network_of
 from service.access.middleware import VISIT, AccessMiddleware
 from service.access.origin import SAFE_METHODS, check_body_type, check_origin
 from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
-from service.access.requirement import Requirement, requires
-from service.access.routes import PAGE_FILES, PROBE_PATHS, PUBLIC_PATHS, declared_scopes, unguarded_routes
+from service.access.requirement import (
+    PAGE_FILES,
+    PROBE_PATHS,
+    PUBLIC_PATHS,
+    Requirement,
+    declared_scopes,
+    requires,
+    unguarded_routes,
+)
 from service.access.scopes import ANONYMOUS, NOBODY, Caller, Scope
 from service.access.tokens import PresentedToken, parse_token, token_is_valid, token_state
 from service.history.records import TokenRecord

@@ -15,7 +15,7 @@ from fastapi import Path as InPath
 from fastapi.responses import FileResponse, HTMLResponse
 
 from service.access.guard import Guard
-from service.access.routes import PAGE_FILES
+from service.access.requirement import PAGE_FILES
 
 _FOLDER = Path(str(files("service"))) / "api" / "page"
 _INDEX = "index.html"
