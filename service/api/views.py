@@ -47,9 +47,6 @@ class ServiceView(Protocol):
     def machines(self) -> Sequence[Monitored]:
         """Every monitored machine."""
 
-    def machine(self, site: str, name: str) -> Monitored | None:
-        """One machine, or None if it is not monitored."""
-
     def readiness(self) -> Readiness:
         """Whether the service can do its work."""
 
@@ -69,10 +66,10 @@ def found_machine(service: ServiceView, site: str, name: str) -> Monitored:
     HTTPException
         404, with the machines there are.
     """
-    machine = service.machine(site, name)
+    machines = {one.machine.title: one for one in service.machines()}
+    machine = machines.get(f"{site}/{name}")
     if machine is None:
-        known = ", ".join(one.machine.title for one in service.machines())
-        raise HTTPException(404, f"no machine {site[:64]}/{name[:64]}; there are: {known}")
+        raise HTTPException(404, f"no machine {site[:64]}/{name[:64]}; there are: {', '.join(machines)}")
     return machine
 
 

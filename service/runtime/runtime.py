@@ -17,7 +17,6 @@ from rotorwatch.records.health import Health
 from rotorwatch.records.monitor import MachineReadiness, Readiness
 from service.access.guard import Guard
 from service.api.app import create_app
-from service.api.readiness import readiness_of
 from service.api.routes.replays import ReplayRequests
 from service.api.server import HttpError, HttpServer
 from service.delivery.event_feed import EventFeed
@@ -31,6 +30,7 @@ from service.runtime.machines import LocalMachines
 from service.runtime.processes import OneComputer
 from service.runtime.shards import Shards, shard_count
 from service.settings.service import ServiceSettings
+from service.stream.liveness import STUCK_S
 from service.stream.monitored import Monitored
 from service.terminal.logs import logger
 
@@ -90,13 +90,6 @@ class Runtime:
     def machines(self) -> Sequence[Monitored]:
         """Every monitored machine."""
         return self._monitored
-
-    def machine(self, site: str, name: str) -> Monitored | None:
-        """One machine, or None if it is not monitored."""
-        for one in self._monitored:
-            if (one.machine.site, one.machine.name) == (site, name):
-                return one
-        return None
 
     def health(self, health: Health) -> None:
         """Hear that a machine's health has changed."""
@@ -192,6 +185,58 @@ class Runtime:
             _log.error("stopped; not everything is in the history", why=str(error))
             raise
         _log.info("stopped")
+
+
+def readiness_of(
+    *,
+    session_open: bool,
+    machines: Sequence[MachineReadiness],
+    history_open: bool,
+    history_trouble: str,
+    history_lost: str,
+    failing_webhooks: Sequence[str],
+) -> Readiness:
+    """Judge.
+
+    Recordings and webhooks are stated and no reason: machines are monitored, and alarms kept, all the same.
+
+    Parameters
+    ----------
+    history_open : bool
+        The database is connected and its tables are up to date.
+    history_trouble : str
+        Why it cannot be written; empty if it can.
+    history_lost : str
+        Why something of it is gone; empty if nothing is.
+    failing_webhooks : sequence of str
+        Name, and what is wrong.
+    """
+    reasons = []
+    if not session_open:
+        reasons.append("the Zenoh session is closed: nothing arrives and nothing is published")
+    if not history_open:
+        reasons.append("the history is not open, or its tables are not up to date")
+    if history_trouble:
+        reasons.append(f"the history cannot be written, what happens waits in memory: {history_trouble}")
+    if history_lost:
+        reasons.append(f"{history_lost}; see docs/history.md, and start the monitor again when it is seen to")
+    for machine in machines:
+        place = f"{machine.site}/{machine.machine}"
+        if not machine.worker_alive:
+            reasons.append(f"{place}: the thread that evaluates its blocks has stopped")
+        elif machine.worker_busy_s > STUCK_S:
+            reasons.append(f"{place}: one block has been in the monitor for {machine.worker_busy_s:.0f} s")
+        if machine.trouble:
+            reasons.append(f"{place}: {machine.trouble}")
+    return Readiness(
+        ready=not reasons,
+        reasons=tuple(reasons),
+        session_open=session_open,
+        history_open=history_open,
+        history_trouble=history_trouble,
+        failing_webhooks=tuple(failing_webhooks),
+        machines=tuple(machines),
+    )
 
 
 @contextmanager

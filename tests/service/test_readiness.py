@@ -10,9 +10,8 @@ import pytest
 
 from rotorwatch.records.health import HealthState
 from rotorwatch.records.monitor import MachineReadiness, Readiness
-from service.api.readiness import readiness_of
 from service.history.store import Store
-from service.runtime.runtime import Runtime, running
+from service.runtime.runtime import Runtime, readiness_of, running
 from service.settings.service import HistorySettings, ServiceSettings
 from service.stream.liveness import Pulse
 from tests.service.hooked import hook, settings_for
@@ -73,7 +72,7 @@ def test_a_history_that_cannot_be_written_is_a_reason_until_it_can(
 
 
 def test_a_stuck_worker_is_a_reason_until_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.api.readiness.STUCK_S", 0.5)
+    monkeypatch.setattr("service.runtime.runtime.STUCK_S", 0.5)
     release = threading.Event()
     with service(endpoint()) as (runtime, worker):
         until(lambda: worker.status().alive, "the thread")

