@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 from urllib.parse import urlsplit
@@ -164,33 +165,25 @@ def audit(
     [cyan]rotorwatch audit --machine plant/pump-7 --limit 20[/cyan]
     """
     with _opened(config) as store:
-        entries = list(_with_outcomes(store, machine, actor, limit))
+        entries = list(islice(_with_outcomes(store, machine, actor), limit))
     who = max((len(entry.actor) for entry in entries), default=0)
     origin = max((len(entry.address) for entry in entries), default=0)
     for entry in entries:
         typer.echo(_audit_line(entry, who, origin))
 
 
-def _with_outcomes(store: "Store", machine: str | None, actor: str | None, limit: int) -> "Iterator[AuditEntry]":
+def _with_outcomes(store: "Store", machine: str | None, actor: str | None) -> "Iterator[AuditEntry]":
     """Entries, newest first, without the beginnings whose outcome is there too."""
     from service.access.audit import STARTED  # noqa: PLC0415  # keeps --help quick
 
     outcomes: set[tuple[int, str, str]] = set()
     before: int | None = None
-    shown = 0
-    while True:
-        page = store.audit.entries(before=before, limit=_PAGE, machine=machine, actor=actor)
+    while page := store.audit.entries(before=before, limit=_PAGE, machine=machine, actor=actor):
         for entry in page:
             key = (entry.at_ns, entry.method, entry.path)
-            if entry.status == 0 and entry.action == STARTED and key in outcomes:
-                continue
-            outcomes.add(key)
-            yield entry
-            shown += 1
-            if shown == limit:
-                return
-        if len(page) < _PAGE:
-            return
+            if entry.status != 0 or entry.action != STARTED or key not in outcomes:
+                outcomes.add(key)
+                yield entry
         before = page[-1].number
 
 
