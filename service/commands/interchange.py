@@ -41,9 +41,8 @@ def import_(
     """
     prepare_numerics()
     from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
-    from service.interchange.importing import import_file  # noqa: PLC0415
+    from service.interchange.importing import import_file, summary_lines  # noqa: PLC0415
     from service.interchange.mapping import load_mapping  # noqa: PLC0415
-    from service.interchange.summary import summary_lines  # noqa: PLC0415
 
     described = load_machine_file(machine)
     done = import_file(source, load_mapping(mapping, described), described, out, overwrite=overwrite)

@@ -1,4 +1,4 @@
-"""Import: a file from another program becomes a recording.
+"""Import: a file from another program becomes a recording, and what was done to it is said in sentences.
 
 ::
 
@@ -11,7 +11,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from models.machine import MachineFile
+from models.signals.block import lowest_valid_hz, settling_s
 from models.signals.keyphasor import PulseTrain
 from models.signals.recording import RecordingWriter
 from service.interchange.angle import AngleColumn, pulse_times, read_pulses
@@ -23,6 +26,11 @@ from service.interchange.mapping import Mapping
 from service.interchange.overlap import Integration, Overlap, Resampling
 from service.interchange.samples import Piece, Read, pieces, signals_of
 from service.interchange.source import Reference, SourceError
+from service.monitor.alarm_conversion import rfc3339
+
+_NOTED = 0.01
+"""Part of the rows whose loss is pointed out."""
+_LISTED = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,3 +116,106 @@ def _nothing(path: Path, machine: MachineFile, read: Read, cut_rows: int) -> str
         f"{path}: {read.rows} rows, {len(read.gaps)} gaps: no stretch is long enough{ends}; expected at least "
         f"{machine.ingest.block_from_s:g} s of the machine's samples"
     )
+
+
+def summary_lines(done: Imported) -> list[str]:
+    """Describe an import; every gap, filled row, cut end and limit of validity is stated."""
+    machine, read, written = done.machine, done.read, done.written
+    several = f"{read.files} files, " if read.files > 1 else ""
+    lines = [
+        f"{done.source}: {several}{read.rows} rows at {done.clock.rate_hz:.9g} Hz, "
+        f"{len(machine.sensors)} channels of {machine.title}",
+        f"{done.recording}: {written.samples} samples in {written.blocks} blocks, {rfc3339(written.start_ns)} to "
+        f"{rfc3339(written.end_ns)}",
+        *_gap_lines(done),
+        *_filter_lines(done),
+        *_pulse_lines(done),
+    ]
+    if read.left_out:
+        lines.append(f"rows left out for an empty cell, NaN or infinity: {read.left_out}")
+    if written.too_short:
+        lines.append(f"samples left out in stretches shorter than a block: {written.too_short}")
+    length_s = written.samples / machine.rate_hz
+    if length_s < machine.window_data_s:
+        lines.append(
+            f"note: {length_s:.6g} s of data do not fill one window of {machine.window.length_s:g} s; reports will be "
+            "few or none"
+        )
+    return lines
+
+
+def _gap_lines(done: Imported) -> list[str]:
+    schedule = done.machine.schedule
+    gaps = done.read.gaps
+    if schedule is not None:
+        gaps = [gap for gap in gaps if not schedule.is_silence((gap.to_ns - gap.from_ns) / 1e9)]
+    total_s = sum(gap.to_ns - gap.from_ns for gap in gaps) / 1e9
+    lines = [f"gaps: {len(gaps)}, {total_s:.6g} s in all, kept as gaps" if gaps else "gaps: none"]
+    lines += [
+        f"  before row {gap.row + 1}: {(gap.to_ns - gap.from_ns) / 1e9:.6g} s from "
+        f"{rfc3339(done.clock.origin_ns + round(gap.from_ns))}"
+        for gap in gaps[:_LISTED]
+    ]
+    if len(gaps) > _LISTED:
+        lines.append(f"  and {len(gaps) - _LISTED} more")
+    if done.read.filled:
+        lines.append(
+            f"rows put into gaps of up to {done.mapping.time.fill_gaps_up_to_s:g} s by straight lines: "
+            f"{done.read.filled}"
+        )
+    return lines
+
+
+def _filter_lines(done: Imported) -> list[str]:
+    lines = []
+    acceleration, machine = done.mapping.acceleration, done.machine
+    if acceleration is not None:
+        corner_hz = acceleration.high_pass_hz
+        lowest_hz = lowest_valid_hz(corner_hz)
+        lines.append(
+            f"integrated from acceleration: {', '.join(acceleration.channels)}; high-pass at {corner_hz:g} Hz, valid "
+            f"from {lowest_hz:g} Hz, not below; the first and last {settling_s(corner_hz):.6g} s of each stretch are "
+            "left out"
+        )
+        if lowest_hz > machine.window.band_hz[0]:
+            lines.append(
+                f"note: the machine file evaluates from window.band_hz = {machine.window.band_hz[0]:g} Hz on, which is "
+                f"below {lowest_hz:g} Hz"
+            )
+    if done.clock.ratio != 1:
+        ratio = done.clock.ratio
+        lowest_rate_hz = min(machine.rate_hz, done.clock.rate_hz)
+        lines.append(
+            f"resampled from {done.clock.rate_hz:.9g} to {machine.rate_hz:.9g} Hz by {ratio.numerator}/"
+            f"{ratio.denominator} (polyphase); flat up to {0.42 * lowest_rate_hz:.4g} Hz"
+        )
+    if done.cut_rows:
+        lines.append(f"rows left out at the ends of stretches, where filters settle: {done.cut_rows}")
+    return lines
+
+
+def _pulse_lines(done: Imported) -> list[str]:
+    train = done.pulses
+    if train is None:
+        return []
+    passed_ns = float(np.diff(train.times)[train.known].sum())
+    turns = float(np.diff(train.counts)[train.known].sum()) / train.pulses_per_turn
+    speed_rpm = turns / passed_ns * 60e9 if turns else float("nan")
+    lines = [
+        f"keyphasor: {train.times.size} pulses, {speed_rpm:.6g} rpm on average, {train.missing} missing ones bridged, "
+        f"{train.extra} extra ones left out, {train.interruptions} interruptions"
+    ]
+    if done.unknown_angle:
+        lines.append(f"rows left out because the shaft angle is not known: {done.unknown_angle}")
+        share = done.unknown_angle / max(1, done.read.rows)
+        if share > _NOTED:
+            lines.append(
+                f"note: that is {share:.0%} of the file, in which the keyphasor gives no pulses or uneven ones; look "
+                "at its signal and threshold, or leave the shaft angle out of the machine file"
+            )
+    operation = done.machine.operation
+    if operation is not None and abs(speed_rpm / operation.speed_rpm - 1) > operation.speed_tolerance:
+        lines.append(
+            f"note: the machine file says speed_rpm = {operation.speed_rpm:g}; at this speed nothing is evaluated"
+        )
+    return lines

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.interchange.importing import summary_lines
 from service.interchange.source import SourceError
-from service.interchange.summary import summary_lines
 from tests.interchange.material import CHANNELS, RATE_HZ, START_NS, imported, machine, signals, stretches
 
 ON_S, EVERY_S, FILES = 2.0, 20.0, 12

@@ -12,8 +12,8 @@ from models.errors import MachineFileError
 from models.machine import load_machine_file
 from models.signals.block import integrated, lowest_valid_hz, settling_s
 from models.signals.channels import unit_factor
+from service.interchange.importing import summary_lines
 from service.interchange.mapping import Acceleration, Column, CsvFormat, Keyphasor, Mapping, TimeBase
-from service.interchange.summary import summary_lines
 from tests.interchange.material import CHANNELS, START, START_NS, imported, signals, stretches
 from tests.service.preloaded import rotorwatch as run
 

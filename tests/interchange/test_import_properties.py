@@ -14,8 +14,8 @@ from models.machine import Machine
 from models.signals.block import FloatArray
 from models.signals.channels import unit_factor
 from models.signals.keyphasor import EdgeDetector, pulse_train, shaft_angle
+from service.interchange.importing import summary_lines
 from service.interchange.source import SourceError
-from service.interchange.summary import summary_lines
 from tests.interchange.material import (
     CHANNELS,
     RATE_HZ,
