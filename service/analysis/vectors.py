@@ -122,30 +122,27 @@ def estimated_vectors(data: Sampled, channels: Sequence[Channel], between_rad_s:
     return found
 
 
-def _estimated(stretch: Excerpt, channels: Sequence[Channel], speed_rad_s: float, tolerance: float) -> Vectors:
+def _estimated(stretch: Excerpt, channels: Sequence[Channel], speed_rad_s: float, tolerance: float) -> Vectors | None:
     si = stretch.samples * np.array([channel.to_si for channel in channels])
     line = rotation_line(si.T, stretch.rate_hz, speed_rad_s, tolerance)
-    there = line is not None and line.strength > _STANDS_OUT
-    orders, speeds = [], []
-    if line is not None and there:
-        t_s = np.asarray((np.arange(len(si)) - (len(si) - 1) / 2) / stretch.rate_hz, dtype=np.float64)
-        plan = level_plan(channels, stretch.rate_hz, (0.0, stretch.rate_hz))
-        levels = hop_levels(plan, *waveform_of(si), line.angle(t_s))
-        orders, speeds = [levels.orders], [line.speed_rad_s]
+    if line is None or line.strength <= _STANDS_OUT:
+        return None
+    t_s = np.asarray((np.arange(len(si)) - (len(si) - 1) / 2) / stretch.rate_hz, dtype=np.float64)
+    plan = level_plan(channels, stretch.rate_hz, (0.0, stretch.rate_hz))
     return Vectors(
-        np.array([(stretch.start_ns + stretch.end_ns) // 2] * len(speeds), dtype=np.int64),
-        np.array(speeds, dtype=np.float64),
-        np.array([round(stretch.length_s * speed / (2 * np.pi)) for speed in speeds], dtype=np.int64),
-        np.array(orders, dtype=np.complex128).reshape(-1, len(ORDERS), len(channels)),
+        np.array([(stretch.start_ns + stretch.end_ns) // 2], dtype=np.int64),
+        np.array([line.speed_rad_s], dtype=np.float64),
+        np.array([round(stretch.length_s * line.speed_rad_s / (2 * np.pi))], dtype=np.int64),
+        np.array([hop_levels(plan, *waveform_of(si), line.angle(t_s)).orders], dtype=np.complex128),
     )
 
 
-def _one_after_the_other(pieces: Iterable[tuple[Excerpt, Vectors]]) -> Vectors | None:
+def _one_after_the_other(pieces: Iterable[tuple[Excerpt, Vectors | None]]) -> Vectors | None:
     found: list[Vectors] = []
     for stretch, vectors in pieces:
         while found and begins_again(int(found[-1].time_ns[-1]), stretch.start_ns):
             found.pop()  # of several runs at the same time the one that was recorded last is shown
-        if vectors.time_ns.size:
+        if vectors is not None and vectors.time_ns.size:
             found.append(vectors)
     if not found:
         return None

@@ -46,8 +46,20 @@ def play(
     begin_ns: int | None = plan.from_ns
 
     def tell(at_ns: int) -> None:
-        if on_progress is not None:
-            on_progress(_progress(plan, control, at_ns, count))
+        if on_progress is None:
+            return
+        done = (at_ns - plan.from_ns) / max(1, plan.to_ns - 1 - plan.from_ns)
+        on_progress(
+            ReplayProgress(
+                fraction=min(1.0, max(0.0, done)),
+                position_ns=at_ns,
+                messages=count,
+                windows=0,
+                alarms=0,
+                pass_number=plan.pass_number,
+                paused=control.paused,
+            )
+        )
 
     control.at(plan.from_ns)
     while begin_ns is not None:
@@ -96,16 +108,3 @@ class _Timetable:
         if ahead_ns > 0 or self._behind > _BELIEVED:
             self._front_ns = time_ns
         return self._due_s
-
-
-def _progress(plan: PlayPlan, control: Control, at_ns: int, count: int) -> ReplayProgress:
-    done = (at_ns - plan.from_ns) / max(1, plan.to_ns - 1 - plan.from_ns)
-    return ReplayProgress(
-        fraction=min(1.0, max(0.0, done)),
-        position_ns=at_ns,
-        messages=count,
-        windows=0,
-        alarms=0,
-        pass_number=plan.pass_number,
-        paused=control.paused,
-    )

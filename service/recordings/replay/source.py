@@ -96,10 +96,8 @@ class RecordingSource:
         found = self._machines("report", "stream") if reports else self.machines
         there = {f"{keys.site}/{keys.machine}": keys for keys in found}
         listed = ", ".join(there) or "none"
-        place, what = (
-            ", ".join(path.name for path in self.paths),
-            "reports or sample blocks" if reports else "sample blocks",
-        )
+        what = "reports or sample blocks" if reports else "sample blocks"
+        place = ", ".join(path.name for path in self.paths)
         if wanted is None:
             if len(there) != 1:
                 raise MachineFileError(f"{place}: machines with {what}: {listed}; name one, as --key SITE/MACHINE")
