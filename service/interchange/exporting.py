@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import chain, count
 from pathlib import Path
 from typing import Literal
 
@@ -127,9 +128,6 @@ def _matlab_name(name: str, taken: set[str]) -> str:
     """A field name that MATLAB accepts: letters, digits and _, beginning with a letter, at most 63."""
     plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
     plain = (plain if plain[:1].isalpha() else f"x{plain}")[:60]
-    unique, number = plain, 1
-    while unique in taken:
-        number += 1
-        unique = f"{plain}_{number}"
+    unique = next(one for one in chain([plain], (f"{plain}_{number}" for number in count(2))) if one not in taken)
     taken.add(unique)
     return unique

@@ -12,9 +12,9 @@ _SOURCES: dict[Format, tuple[str, tuple[str, ...]]] = {
     "npz": ("arrays.NumpySource", (".npz",)),
     "mat": ("arrays.MatlabSource", (".mat",)),
     "wav": ("arrays.WavSource", (".wav",)),
-    "uff": ("universal.UniversalSource", (".uff", ".unv")),
-    "tdms": ("tdms.TdmsSource", (".tdms",)),
-    "mf4": ("mdf.MdfSource", (".mf4", ".mdf")),
+    "uff": ("acquisition.UniversalSource", (".uff", ".unv")),
+    "tdms": ("acquisition.TdmsSource", (".tdms",)),
+    "mf4": ("acquisition.MdfSource", (".mf4", ".mdf")),
 }
 """Class in this package, imported when it is needed with the library that only it needs, and how files are named."""
 

@@ -1,0 +1,209 @@
+"""Sources of measuring systems, each read by a library of its own.
+
+TDMS files of LabVIEW and DIAdem; ASAM MDF version 4 (MF4), the format of vehicle and test bench recorders; and of the
+Universal File Format data set 58 (functions at nodal degrees of freedom), time responses.
+"""
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.interchange.source import CHUNK_ROWS, Array, Reference, Source, SourceError, Timing, equally_long, readable
+
+_SAME_TIME_S = 1e-9
+_TIME_RESPONSE = 1
+_EVEN = 1e-6
+
+
+class TdmsSource(Source):
+    """A TDMS file, read piece by piece. Channels are named ``group/channel``, or ``channel`` where that is unique."""
+
+    kind, package, entry = "TDMS", "npTDMS", "channel"
+
+    def __init__(self, path: Path) -> None:
+        with readable(path, self.kind, self.package):
+            from nptdms import TdmsFile  # noqa: PLC0415  # an extra
+
+            self._file = path.open("rb")  # ours, because the library leaves a file open that it cannot read
+            try:
+                self._tdms = TdmsFile.open(self._file)
+                channels = [channel for group in self._tdms.groups() for channel in group.channels()]
+            except BaseException:
+                self._file.close()
+                raise
+        short = [channel.name for channel in channels]
+        full = {f"{channel.group_name}/{channel.name}": channel for channel in channels}
+        unique = {channel.name: channel for channel in channels if short.count(channel.name) == 1}
+        super().__init__(path, full | {name: channel for name, channel in unique.items() if name not in full})
+
+    def timing(self, columns: Sequence[Reference]) -> Timing:
+        """Rate and start of the waveforms (``wf_increment``, ``wf_start_time``, ``wf_start_offset``)."""
+        found: Timing | None = None
+        for reference in columns:
+            properties = self._column(reference).properties
+            increment_s = float(properties.get("wf_increment") or 0.0)
+            timing = Timing(1 / increment_s if increment_s > 0 else None, _tdms_start_ns(properties))
+            if found is not None and timing != found:
+                raise SourceError(
+                    f"{self.path}: channel {reference} starts or is sampled otherwise than {columns[0]}: {timing} "
+                    f"and {found}"
+                )
+            found = timing
+        return found or Timing()
+
+    def unit(self, column: Reference) -> str:
+        """Property ``unit_string``, or what NI-DAQ calls it."""
+        properties = self._column(column).properties
+        return str(properties.get("unit_string") or properties.get("NI_UnitDescription") or "")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._tdms.close()
+        self._file.close()
+
+    def _rows(self, reference: Reference) -> tuple[int, Callable[[slice], Any]]:
+        channel = self._column(reference)
+        return len(channel), lambda rows: channel.read_data(rows.start, rows.stop - rows.start)
+
+
+def _tdms_start_ns(properties: Any) -> int | None:
+    start = properties.get("wf_start_time")
+    if start is None:
+        return None
+    offset_ns = round(float(properties.get("wf_start_offset") or 0.0) * 1e9)
+    return int(np.datetime64(start, "ns").astype(np.int64)) + offset_ns
+
+
+class MdfSource(Source):
+    """An MF4 file, read piece by piece.
+
+    A channel is named by its own name where that is unique, and always ``number of its group/name``. ``time`` is the
+    time column of the first channel that is asked for together with it.
+    """
+
+    kind, package, entry = "MF4", "asammdf", "channel"
+
+    def __init__(self, path: Path) -> None:
+        places: dict[str, tuple[int, int]] = {}
+        with readable(path, self.kind, self.package):
+            from asammdf import MDF  # noqa: PLC0415  # an extra
+            from asammdf.blocks.mdf_v4 import MDF4  # noqa: PLC0415
+
+            # What it has half read of a damaged file it cannot close, and says so with a traceback beside ours.
+            MDF4.__del__ = lambda _: None  # type: ignore[method-assign]
+            logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # its errors come as exceptions as well
+            if not path.is_file():
+                raise SourceError(f"{path}: no such file")
+            self._file: Any = MDF(path)
+            for name, found in self._file.channels_db.items():
+                for group, index in found:
+                    if index != self._file.masters_db.get(group):
+                        places[f"{group}/{name}"] = (group, index)
+                        if len(found) == 1:
+                            places[name] = (group, index)
+        super().__init__(path, {"time": None} | places)
+
+    def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002
+        """Start of the measurement; every row has its own time."""
+        return Timing(start_ns=self._start_ns(), time=Reference("time"))
+
+    def unit(self, column: Reference) -> str:
+        """Unit of the channel."""
+        if column.column == "time":
+            return "s"
+        group, index = self._column(column)
+        return str(self._file.groups[group].channels[index].unit or "")
+
+    def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
+        """Rows, `CHUNK_ROWS` at a time; channels of several groups must have the same times."""
+        places = [self._column(reference) for reference in columns]
+        asked = [reference for reference, place in zip(columns, places, strict=True) if place is not None]
+        groups = [place[0] for place in places if place is not None]
+        if not groups:
+            raise SourceError(f"{self.path}: time alone is no measurement, expected a channel as well")
+        counts = [int(self._file.groups[group].channel_group.cycles_nr) for group in groups]
+        count = equally_long(self.path, asked, counts)
+        with readable(self.path, self.kind, self.package):
+            for first in range(0, count, CHUNK_ROWS):
+                signals = [None if place is None else self._read(place, first) for place in places]
+                present = [signal for signal in signals if signal is not None]
+                for reference, signal in zip(asked, present, strict=True):
+                    if np.abs(signal.timestamps - present[0].timestamps).max(initial=0.0) > _SAME_TIME_S:
+                        raise SourceError(f"{self.path}: channels {asked[0]} and {reference} have different times")
+                yield tuple(
+                    present[0].timestamps if signal is None else np.asarray(signal.samples) for signal in signals
+                )
+
+    def values(self, column: str) -> Array:
+        """Read a channel whole."""
+        group, index = self._column(Reference(column))
+        with readable(self.path, self.kind, self.package):
+            return np.asarray(self._file.get(group=group, index=index).samples)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _read(self, place: tuple[int, int], first: int) -> Any:
+        return self._file.get(group=place[0], index=place[1], record_offset=first, record_count=CHUNK_ROWS)
+
+    def _start_ns(self) -> int:
+        start = np.datetime64(self._file.header.start_time.replace(tzinfo=None), "ns")
+        offset = self._file.header.start_time.utcoffset()
+        return int(start.astype(np.int64)) - (0 if offset is None else round(offset.total_seconds() * 1e9))
+
+
+class UniversalSource(Source):
+    """A UFF file, read whole. A data set is named by its first line where that is unique, and by number: ``set 1``."""
+
+    kind, package, entry = "UFF", "pyuff", "data set"
+
+    def __init__(self, path: Path) -> None:
+        with readable(path, self.kind, self.package):
+            import pyuff  # noqa: PLC0415  # an extra
+
+            if not path.is_file():
+                raise SourceError(f"{path}: no such file")
+            file = pyuff.UFF(str(path))
+            numbers = [number for number, kind in enumerate(file.get_set_types()) if kind == 58]
+            read = file.read_sets(numbers) if numbers else []
+        sets: list[dict[str, Any]] = [read] if isinstance(read, dict) else list(read)
+        sets = [found for found in sets if found["func_type"] == _TIME_RESPONSE]
+        if not sets:
+            raise SourceError(f"{path}: holds no time response (data set 58 with function type 1)")
+        titles = [str(found["id1"]).strip() for found in sets]
+        self._sets = {f"set {number + 1}": found for number, found in enumerate(sets)}
+        for title, found in zip(titles, sets, strict=True):
+            if title not in ("", "NONE") and titles.count(title) == 1:
+                self._sets.setdefault(title, found)
+        super().__init__(path, {name: np.asarray(found["data"]) for name, found in self._sets.items()})
+
+    def timing(self, columns: Sequence[Reference]) -> Timing:
+        """Rate from the abscissa's increment, or from its values where the file gives no increment."""
+        rates = [self._rate_hz(reference) for reference in columns]
+        for reference, rate_hz in zip(columns, rates, strict=True):
+            if abs(rate_hz / rates[0] - 1) > _EVEN:
+                raise SourceError(
+                    f"{self.path}: {reference} has {rate_hz:g} samples per second, {columns[0]} has {rates[0]:g}; "
+                    "expected the same"
+                )
+        return Timing(rate_hz=rates[0] if rates else None)
+
+    def unit(self, column: Reference) -> str:
+        """Label of the ordinate's unit."""
+        label = str(self._sets[column.column]["ordinate_axis_units_lab"]).strip()
+        return "" if label == "NONE" else label
+
+    def _rate_hz(self, reference: Reference) -> float:
+        self._column(reference)  # refuses what is not there
+        found = self._sets[reference.column]
+        step_s = float(found["abscissa_inc"])
+        if found["abscissa_spacing"] == 1 and step_s > 0:
+            return 1 / step_s
+        steps = np.diff(np.asarray(found["x"], dtype=np.float64))
+        if steps.size == 0 or steps.min() <= 0 or np.ptp(steps) > _EVEN * steps.mean() + 1e-9:
+            raise SourceError(f"{self.path}: {reference} is not sampled evenly, expected one time step throughout")
+        return float(1 / steps.mean())
