@@ -85,6 +85,7 @@ class Sampled(Described):
 
     from_ns: int
     to_ns: int
+    end_ns: int  # of the newest data before `to_ns`
 
     @abstractmethod
     def stretches(
@@ -98,9 +99,14 @@ class Sampled(Described):
             Length of a stretch, s; without it only gaps cut.
         """
 
-    @abstractmethod
     def latest(self, channels: Sequence[Channel], length_s: float) -> list[Excerpt]:
         """The newest `length_s` of data, in pieces if there are gaps."""
+        found: list[Excerpt] = []
+        for stretch in self.stretches(channels, from_ns=max(self.from_ns, self.end_ns - round(length_s * 1e9))):
+            if found and begins_again(found[-1].end_ns, stretch.start_ns):
+                found.clear()
+            found.append(stretch)
+        return found
 
 
 class Recorded(Sampled):
@@ -117,6 +123,8 @@ class Recorded(Sampled):
         self.from_ns, self.to_ns = from_ns, to_ns
         self.name = f"{keys.site}/{keys.machine}"
         self.place = ", ".join(path.name for path in source.paths)
+        span = source.span(keys)
+        self.end_ns = to_ns if to_ns <= span.end_ns else span.newest_ns
 
     @classmethod
     def find(
@@ -211,17 +219,6 @@ class Recorded(Sampled):
         if count:
             yield self._stretch(start_ns, np.concatenate(pending), angle is not None)
 
-    def latest(self, channels: Sequence[Channel], length_s: float) -> list[Excerpt]:
-        """The newest `length_s` of data before `to_ns`, in pieces if there are gaps."""
-        span = self.source.span(self.keys)
-        end_ns = self.to_ns if self.to_ns <= span.end_ns else span.newest_ns
-        found: list[Excerpt] = []
-        for stretch in self.stretches(channels, from_ns=max(self.from_ns, end_ns - round(length_s * 1e9))):
-            if found and begins_again(found[-1].end_ns, stretch.start_ns):
-                found.clear()
-            found.append(stretch)
-        return found
-
     def _stretch(self, start_ns: int, rows: FloatArray, with_angle: bool) -> Excerpt:
         rate_hz = self.descriptor.rate_hz
         if with_angle:
@@ -267,7 +264,8 @@ class Held(Sampled):
         self._descriptor = machine.descriptor
         self._excerpt = Excerpt.of_blocks(blocks, machine.rate_hz, None)
         self.name, self.place = machine.title, "the newest samples"
-        self.from_ns, self.to_ns = self._excerpt.start_ns, self._excerpt.end_ns
+        self.from_ns = self._excerpt.start_ns
+        self.to_ns = self.end_ns = self._excerpt.end_ns
 
     @property
     def descriptor(self) -> ChannelDescriptor:
@@ -287,7 +285,3 @@ class Held(Sampled):
         size = len(rows) if longest_s is None else max(1, round(longest_s * whole.rate_hz))
         for first in range(begin, len(rows), size):
             yield whole.part(first, first + size)
-
-    def latest(self, channels: Sequence[Channel], length_s: float) -> list[Excerpt]:
-        """The newest `length_s`."""
-        return list(self.stretches(channels, from_ns=self.to_ns - round(length_s * 1e9)))

@@ -295,7 +295,7 @@ def full_spectrum(
     ] = "hz",
 ) -> "Paint":
     """Forward and reverse precession of the shaft at a place, from its displacements in y and z."""
-    from service.analysis.figures.full_spectrum import full_spectrum as read  # noqa: PLC0415
+    from service.analysis.figures.spectrum import full_spectrum as read  # noqa: PLC0415
 
     lines = _lines(window, resolution, to_hz, density=False, log=scale == "log")
     return read(picture.recorded(at), place, lines, orders=axis == "orders")
@@ -312,7 +312,7 @@ def centreline(
     ] = None,
 ) -> "Paint":
     """Mean position of the shaft across the bearing, from gaps in y and z, over speed or time."""
-    from service.analysis.figures.centreline import centreline as read  # noqa: PLC0415
+    from service.analysis.figures.run_up import centreline as read  # noqa: PLC0415
 
     _positive("--window", window)
     _positive("--clearance", clearance)
@@ -334,7 +334,7 @@ def bode(
     ] = None,
 ) -> "Paint":
     """Amplitude and phase lag of 1x over the speed, from a run-up or coast-down."""
-    from service.analysis.figures.bode import bode as read  # noqa: PLC0415
+    from service.analysis.figures.run_up import bode as read  # noqa: PLC0415
 
     return read(picture.known(), channel or (), order, revolutions, slow_roll, _speeds(speeds))
 
@@ -348,7 +348,7 @@ def polar(
     slow_roll: _SlowRollOption = None,
 ) -> "Paint":
     """The same as vectors in their plane, with speeds at points; the lag goes against the rotation."""
-    from service.analysis.figures.bode import polar as read  # noqa: PLC0415
+    from service.analysis.figures.run_up import polar as read  # noqa: PLC0415
 
     return read(picture.known(), channel or (), order, revolutions, slow_roll)
 

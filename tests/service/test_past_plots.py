@@ -10,10 +10,9 @@ from models.errors import RotorwatchError
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Report
 from rotorwatch.records.levels import ChannelLevels
-from service.analysis.centreline import read_centreline
 from service.analysis.orbit import recorded_pairs
 from service.analysis.past import Past
-from service.analysis.runup import read_run_up
+from service.analysis.runup import read_centreline, read_run_up
 from service.analysis.trend import past_trend
 from service.history.records import Retention, Step, StoredReport
 from service.history.store import Store

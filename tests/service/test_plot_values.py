@@ -18,8 +18,13 @@ from rotorwatch.records.plots import (
 from rotorwatch.records.recordings import RecordingList
 from service.analysis.past import Past
 from service.analysis.recorded import Held, Sampled
-from service.analysis.snapshots.run_up import centreline_series, vector_series
-from service.analysis.snapshots.samples import full_spectrum_snapshot, waterfall_snapshot, waveform_snapshot
+from service.analysis.snapshots.plots import (
+    centreline_series,
+    full_spectrum_snapshot,
+    vector_series,
+    waterfall_snapshot,
+    waveform_snapshot,
+)
 from service.api import samples
 from service.runtime.runtime import Runtime
 from tests.service.live import LAB, START_NS

@@ -14,13 +14,11 @@ from scipy.signal import cont2discrete, lfilter
 from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
-from service.analysis.centreline import read_centreline
-from service.analysis.figures.bode import bode, polar
-from service.analysis.figures.centreline import centreline
+from service.analysis.figures.run_up import bode, centreline, polar
 from service.analysis.figures.style import Look
 from service.analysis.figures.waveform import waveform
 from service.analysis.orbit import in_planes, orbit_pairs, recorded_pairs
-from service.analysis.runup import read_run_up
+from service.analysis.runup import read_centreline, read_run_up
 from service.analysis.spectrum import read_full_spectrum
 from simulator.recorder import record
 from tests.service.live import LAB, START_NS

@@ -19,8 +19,13 @@ from service.analysis.past import Past
 from service.analysis.recorded import Sampled
 from service.analysis.snapshots.channels import SnapshotError, chosen_channels
 from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
-from service.analysis.snapshots.run_up import centreline_series, vector_series
-from service.analysis.snapshots.samples import full_spectrum_snapshot, waterfall_snapshot, waveform_snapshot
+from service.analysis.snapshots.plots import (
+    centreline_series,
+    full_spectrum_snapshot,
+    vector_series,
+    waterfall_snapshot,
+    waveform_snapshot,
+)
 from service.api.samples import Chosen, ChosenSamples, ChosenWindow, Recordings, SampleReader
 from service.api.views import PLACE, InPath, SinceNs, UntilNs
 from service.stream.monitored import Monitored

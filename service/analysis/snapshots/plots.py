@@ -1,6 +1,6 @@
-"""Values of the plots of samples: waveforms, full spectra, and spectra over time or speed."""
+"""Values of plots: waveforms, full spectra, spectra over time or speed, vectors and centreline over speed."""
 
-from typing import Literal, TypedDict
+from typing import Any, Literal
 
 import numpy as np
 
@@ -8,9 +8,13 @@ from models.errors import RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from rotorwatch.records.plots import (
+    CentrelineSeries,
+    ChannelVectors,
     ChannelWaveform,
     FullSpectrumSnapshot,
+    PlaceCentreline,
     PlaceSpectrum,
+    VectorSeries,
     WaterfallRow,
     WaterfallSnapshot,
     WaveformSnapshot,
@@ -19,6 +23,7 @@ from service.analysis.orbit import recorded_pairs
 from service.analysis.past import Past
 from service.analysis.recorded import Recorded, Sampled
 from service.analysis.revolutions import Excerpt, newest_revolutions
+from service.analysis.runup import read_centreline, read_run_up
 from service.analysis.snapshots.channels import figures, known_figures
 from service.analysis.spectrum import lowest_hz, read_full_spectrum, read_waterfall, shown_as, steady, unit_shown
 
@@ -29,6 +34,8 @@ _FULL_S, _FULL_HZ = 10.0, 1.0
 _MOST_ROWS, _MOST_LINES = 60, 400
 _ROW_S = 0.5
 _UM = "µm p-p"
+_MOST_VECTORS = 1000
+_CENTRELINE_S = 1.0
 
 
 def waveform_snapshot(
@@ -46,7 +53,7 @@ def waveform_snapshot(
     shown = found.excerpt or _newest(excerpt)
     speed = figures([shown.speed_rad_s if np.isfinite(shown.speed_rad_s) else speed_rad_s or np.nan])[0]
     return WaveformSnapshot(
-        **whose(data),
+        **_whose(data),
         start_ns=shown.start_ns,
         end_ns=shown.end_ns,
         speed_rad_s=speed,
@@ -81,7 +88,7 @@ def full_spectrum_snapshot(data: Sampled) -> FullSpectrumSnapshot:
     values = np.where(clear, found.values_um, np.nan)[:, lines]
     group = -(-values.shape[1] // (2 * _MOST_LINES))
     return FullSpectrumSnapshot(
-        **whose(data),
+        **_whose(data),
         start_ns=found.start_ns,
         end_ns=found.end_ns,
         speed_rad_s=figures([found.speed_rad_s])[0],
@@ -125,7 +132,7 @@ def waterfall_snapshot(data: Sampled, channel: Channel, over: Literal["time", "s
     lines = (found.frequencies_hz >= lowest_hz(found.resolution_hz)) & (found.frequencies_hz <= found.useful_hz)
     group = -(-int(lines.sum()) // _MOST_LINES) or 1
     return WaterfallSnapshot(
-        **whose(data),
+        **_whose(data),
         start_ns=int(found.start_ns[0]),
         end_ns=int(found.end_ns[-1]),
         channel=channel.name,
@@ -146,19 +153,66 @@ def waterfall_snapshot(data: Sampled, channel: Channel, over: Literal["time", "s
     )
 
 
-class Whose(TypedDict):
-    """First fields of values of a plot."""
+def vector_series(
+    data: Sampled | Past, channels: tuple[Channel, ...], order: int, revolutions: int, slow_roll_rpm: float | None
+) -> VectorSeries:
+    """Vectors of some channels: of the windows of the history, or of every so many revolutions of samples.
 
-    site: str
-    machine: str
-    source: Literal["newest samples", "history", "recordings"]
+    Raises
+    ------
+    RotorwatchError
+        If there are none: without a shaft angle, or if the shaft does not turn.
+    """
+    found = read_run_up(data, channels, order, revolutions, slow_roll_rpm)
+    every = -(-found.time_ns.size // _MOST_VECTORS)
+    return VectorSeries(
+        **_whose(data),
+        order=order,
+        revolutions=found.revolutions,
+        slow_roll_rpm=found.slow_roll_rpm,
+        times_ns=tuple(found.time_ns[::every].tolist()),
+        speeds_rad_s=figures(found.speed_rad_s[::every]),
+        channels=tuple(
+            ChannelVectors(
+                channel=channel.name,
+                unit=unit,
+                amplitude=figures(found.amplitude[::every, number]),
+                phase_lag_deg=figures(found.lag_deg[::every, number]),
+            )
+            for number, (channel, unit) in enumerate(zip(found.channels, found.units, strict=True))
+        ),
+        steady=steady(found.speed_rad_s),
+    )
 
 
-def whose(data: Sampled | Past) -> Whose:
-    """Whose values they are, and what they come from."""
+def centreline_series(data: Sampled | Past) -> CentrelineSeries:
+    """Mean positions wherever displacements are measured in both directions.
+
+    Raises
+    ------
+    RotorwatchError
+        If there is no such place, or there are not two positions.
+    """
+    pairs = recorded_pairs(data)
+    found = read_centreline(data, pairs, _CENTRELINE_S)
+    return CentrelineSeries(
+        **_whose(data),
+        times_ns=tuple(found.time_ns.tolist()),
+        speeds_rad_s=figures(np.asarray(found.speed_rad_s, dtype=np.float64)),
+        places=tuple(
+            PlaceCentreline(
+                location=pair[0].location, channels=tuple(one.name for one in pair), y_um=figures(y), z_um=figures(z)
+            )
+            for pair, y, z in zip(found.pairs, found.y_um.T, found.z_um.T, strict=True)
+        ),
+    )
+
+
+def _whose(data: Sampled | Past) -> dict[str, Any]:
+    """Whose values they are, and what they come from: first fields of the values of a plot."""
     site, machine = data.name.split("/")
-    recorded: Literal["newest samples", "recordings"] = "recordings" if isinstance(data, Recorded) else "newest samples"
-    return {"site": site, "machine": machine, "source": "history" if isinstance(data, Past) else recorded}
+    samples = "recordings" if isinstance(data, Recorded) else "newest samples"
+    return {"site": site, "machine": machine, "source": "history" if isinstance(data, Past) else samples}
 
 
 def _newest(excerpt: Excerpt) -> Excerpt:
