@@ -32,8 +32,8 @@ from service.history.records import Retention
 from service.history.store import Store
 from service.history.windows import BUCKET, packed
 from service.settings.service import LogSettings, QueueSettings
-from service.stream.clocks import Clocks
 from service.stream.inbox import RawBlock
+from service.stream.liveness import Clocks
 from service.stream.worker import MachineWorker
 from service.terminal.logs import configure_logging
 from simulator.scenario import load_scenario

@@ -23,9 +23,8 @@ from service.api.routes.plots import add_plot_routes
 from service.api.routes.recordings import add_recording_routes
 from service.api.routes.replays import add_replay_routes
 from service.api.routes.service import add_service_routes
-from service.api.routes.session import add_session_routes
 from service.api.routes.snapshots import add_snapshot_routes
-from service.api.routes.tokens import add_token_routes
+from service.api.routes.tokens import add_session_routes, add_token_routes
 from service.api.samples import SampleReader
 from service.api.views import PLACE, InPath, ServiceView
 from service.monitor.conversion import machine_description

@@ -1,10 +1,22 @@
-"""Whether a machine's thread still comes round."""
+"""What time it is for a machine's thread, and whether it still comes round."""
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 STUCK_S = 60.0
 """A thread that is at work on one block for longer is stuck; an evaluation takes a fraction of a second."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clocks:
+    """The computer's clocks; a test puts others in."""
+
+    monotonic_s: Callable[[], float] = time.monotonic  # seconds that only pass
+    utc_ns: Callable[[], int] = time.time_ns  # time of day
+
+
+COMPUTER = Clocks()
 
 
 class Pulse:

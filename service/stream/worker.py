@@ -29,9 +29,8 @@ from service.monitor.reports import MachineHealth, MonitorReport, Tally, identit
 from service.recordings.recorder import MachineRecorder
 from service.settings.service import QueueSettings
 from service.stream.checkpoints import StepWriter, recorded_after, recorded_since_ns, restored
-from service.stream.clocks import COMPUTER, Clocks
 from service.stream.inbox import Inbox, RawBlock
-from service.stream.liveness import Pulse
+from service.stream.liveness import COMPUTER, Clocks, Pulse
 from service.stream.monitored import MachineStatus, Outlet
 from service.stream.shedding import LoadShedding
 from service.terminal.logs import Limiter, logger

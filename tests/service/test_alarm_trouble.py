@@ -30,8 +30,8 @@ from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import Identity, identity_of
 from service.settings.service import QueueSettings
 from service.stream.checkpoints import checkpoint_step, restored, stored_readings
-from service.stream.clocks import Clocks
 from service.stream.inbox import RawBlock
+from service.stream.liveness import Clocks
 from service.stream.worker import MachineWorker
 from simulator.scenario import load_scenario
 from tests.service.live import START_NS, until

@@ -10,7 +10,7 @@ from fastapi import FastAPI
 from service.access.credentials import COOKIE
 from service.access.guard import Guard
 from service.access.scopes import Scope
-from service.api.routes.session import add_session_routes
+from service.api.routes.tokens import add_session_routes
 from service.settings.access import AccessSettings
 from tests.service.guarded import Guarded, application, guarded, problem
 

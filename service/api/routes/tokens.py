@@ -1,19 +1,24 @@
-"""Tokens over HTTP: which there are, a new one, the end of one. ``rotorwatch token`` does the same in a terminal."""
+"""Who calls over HTTP and what that caller may do: tokens, and how a browser signs in, with one in a cookie, and out.
+
+``rotorwatch token`` does the same with tokens in a terminal.
+"""
 
 import threading
 import time
 from typing import Annotated, Any
 
-from fastapi import Body, FastAPI, HTTPException, Path, Request
+from fastapi import Body, FastAPI, HTTPException, Path, Request, Response
 
 from models.errors import MachineFileError
 from rotorwatch.records.example import example
-from rotorwatch.records.monitor import TokenCreated, TokenEntry, TokenList, TokenRequest
+from rotorwatch.records.monitor import CallerRights, TokenCreated, TokenEntry, TokenList, TokenRequest
 from service.access.audit import AuditNote
+from service.access.credentials import COOKIE, presented_text
 from service.access.guard import Guard
 from service.access.problems import responses
-from service.access.scopes import Caller, Scope
+from service.access.scopes import NOBODY, Caller, Scope
 from service.access.tokens import NameTakenError, check_name_is_free, masked, new_token, token_state
+from service.api.routes.replays import NothingToSay
 from service.history.records import TokenRecord
 
 _PLACE = "/api/v1/tokens"
@@ -99,3 +104,35 @@ def _entry(guard: Guard, record: TokenRecord) -> TokenEntry:
         revoked_ns=record.revoked_ns,
         last_used_ns=guard.last_used_ns.get(record.token_id),
     )
+
+
+def add_session_routes(app: FastAPI, guard: Guard) -> None:
+    """Add the routes."""
+    common: dict[str, Any] = {"tags": ["service"]}
+
+    @app.get("/api/v1/caller", responses=responses(CallerRights), **common)
+    def caller(request: Request, caller: Annotated[Caller, guard.read]) -> CallerRights:
+        """Who calls, and which scopes that caller has; as a password a token lets its owner look and no more."""
+        looks = "authorization" in request.headers and presented_text(request.headers, "POST") is None
+        return _rights(caller.name, frozenset({Scope.READ}) if looks else caller.scopes)
+
+    @app.post("/api/v1/session", responses=responses(CallerRights, 400, 413, 415, 422), **common)
+    def sign_in(
+        request: Request, answer: Response, caller: Annotated[Caller, guard.read], order: NothingToSay
+    ) -> CallerRights:
+        """Let a browser keep the token that this request is made with, until it is closed or signs out."""
+        _ = order
+        token = presented_text(request.headers, request.method)
+        if token:
+            answer.set_cookie(COOKIE, token, secure=request.url.scheme == "https", httponly=True, samesite="strict")
+        return _rights(caller.name, caller.scopes)
+
+    @app.delete("/api/v1/session", dependencies=[guard.read], responses=responses(CallerRights), **common)
+    def sign_out(answer: Response) -> CallerRights:
+        """Let a browser forget the token, which stays valid."""
+        answer.delete_cookie(COOKIE, httponly=True, samesite="strict")
+        return _rights(NOBODY, frozenset())
+
+
+def _rights(name: str, scopes: frozenset[Scope]) -> CallerRights:
+    return CallerRights(name=name, scopes=tuple(scope.value for scope in Scope if scope in scopes))
