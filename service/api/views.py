@@ -73,6 +73,20 @@ def found_machine(service: ServiceView, site: str, name: str) -> Monitored:
     return machine
 
 
+def check_alarm(view: Monitored, name: str, status: int) -> None:
+    """Refuse an alarm that a machine cannot have.
+
+    Raises
+    ------
+    HTTPException
+        With this status, and the alarms there are.
+    """
+    levels = [f"{LEVEL}{channel.name}" for channel in view.machine.sensors if channel.quantity != "shaft_angle"]
+    if name not in ALARMS and name not in levels:
+        place = f"{view.machine.site}/{view.machine.name}"
+        raise HTTPException(status, f"{place}: no alarm {name[:80]}; there are: {', '.join((*ALARMS, *levels))}")
+
+
 async def _in_path(request: Request, site: SiteName, machine: MachineName) -> Monitored:
     return found_machine(request.app.state.service, site, machine)
 

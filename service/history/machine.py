@@ -256,6 +256,12 @@ class MachineStore:
                         break
         return tuple(found[:limit])
 
+    def names_of(self, quantity: str) -> frozenset[str]:
+        """Everything that was ever read as this quantity, that of an earlier machine file too."""
+        of = series.c
+        query = select(of.name).where(of.machine_id == self._claim.machine_id, of.quantity == quantity)
+        return frozenset(name for (name,) in self._database.rows(query))
+
     def downsampled(
         self,
         *,

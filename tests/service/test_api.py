@@ -21,6 +21,7 @@ from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, Spe
 from service.access.scopes import Scope
 from service.api.description import DescribedApp
 from service.api.routes.page import page_files
+from service.history.records import Step, StoredReading
 from service.runtime.runtime import Runtime
 from service.stream.worker import MachineWorker
 from tests.service.live import ROOT, START_NS
@@ -165,10 +166,29 @@ def test_readings_are_reduced_to_a_plot(http: httpx.Client) -> None:
         ("spectra?channel=nose", "demo/lab: channel is 'nose', which is not a channel of it; expected one of"),
         ("correlations?first=y1&first=y2&second=y1", "demo/lab: 2 values of first and 1 of second, expected"),
         ("spectra?from_hz=200", "demo/lab: band is 200 to"),
+        ("readings?name=k_bx", "demo/lab: name is 'k_bx', which is no parameter of it; expected one of k_by, c_by"),
+        ("readings?quantity=equation&name=32&points=9", "demo/lab: name is '32', which is no equation of it"),
+        ("readings?quantity=speed&name=misfit", "demo/lab: name is 'misfit', which is no speed of it; expected one of"),
+        (
+            "readings?quantity=level&name=y9:overall",
+            "demo/lab: name is 'y9:overall', which is no level of it; expected CHANNEL:MEASURE of the channels y1, z1",
+        ),
+        ("alarms?name=k_by&name=level:y9", "demo/lab: no alarm level:y9; there are: k_by"),
+        ("alarms/events?name=level:y9", "demo/lab: no alarm level:y9; there are: k_by"),
+        ("../../../trends?of=demo/lab/level/y9:overall", "demo/lab: of is 'y9:overall', which is no level of it"),
     ],
 )
 def test_arguments_that_do_not_fit_together_are_explained(http: httpx.Client, query: str, text: str) -> None:
     assert problem(http.get(f"{PLACE}/{query}"), 422).detail.startswith(text)
+
+
+def test_what_is_in_the_history_alone_is_still_to_be_had(seen: tuple[Runtime, MachineWorker]) -> None:
+    """A channel that the machine file no longer has."""
+    history = seen[1].history
+    history.commit(Step(readings=(StoredReading(START_NS, "level", "gone:overall", 2.5, None),)))
+    with client(seen[0]) as http:
+        found = answered(http.get(f"{PLACE}/readings?quantity=level&name=gone:overall"), ReadingList)
+        assert [one.value for one in found.readings] == [2.5]
 
 
 def test_alarms_and_their_events(http: httpx.Client) -> None:
@@ -211,7 +231,9 @@ def test_one_alarm_and_its_version(http: httpx.Client) -> None:
     never = http.get(f"{PLACE}/alarms/data-clock")
     assert never.headers["etag"] == '"-1"'
     assert answered(never, Alarm).state == "normal"
-    assert problem(http.get(f"{PLACE}/alarms/nose"), 404).detail.startswith("no alarm nose; there are: k_by, c_by")
+    assert problem(http.get(f"{PLACE}/alarms/nose"), 404).detail.startswith(
+        "demo/lab: no alarm nose; there are: k_by, c_by"
+    )
 
 
 def test_health_says_what_changed_since_when_and_who_agrees(http: httpx.Client) -> None:

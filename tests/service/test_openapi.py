@@ -57,6 +57,8 @@ CASES = int(os.environ.get("ROTORWATCH_API_CASES", "0"))
 #: Routes of whose arguments more must hold than a schema can say, such as that one is above another.
 DEPENDENT = {
     "GET /api/v1/events",
+    "GET /api/v1/machines/{site}/{machine}/alarms",
+    "GET /api/v1/machines/{site}/{machine}/alarms/events",
     "GET /api/v1/machines/{site}/{machine}/correlations",
     "GET /api/v1/machines/{site}/{machine}/full-spectra",
     "GET /api/v1/machines/{site}/{machine}/orbits",
@@ -65,6 +67,7 @@ DEPENDENT = {
     "GET /api/v1/machines/{site}/{machine}/vectors",
     "GET /api/v1/machines/{site}/{machine}/waterfalls",
     "GET /api/v1/machines/{site}/{machine}/waveforms",
+    "GET /api/v1/trends",
     "POST /api/v1/replays",
     "POST /api/v1/tokens",
 }

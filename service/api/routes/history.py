@@ -10,6 +10,9 @@ from fastapi.responses import Response
 from pydantic import AfterValidator
 from pydantic_core import PydanticCustomError
 
+from models.alarm_names import ALARMS
+from models.diagnosis.networks.equations import EQUATIONS
+from models.physics.rotor import PARAMETERS
 from rotorwatch.records.alarms import EventKind, Severity
 from rotorwatch.records.health import MEASURES
 from rotorwatch.records.history import (
@@ -22,6 +25,7 @@ from rotorwatch.records.history import (
     Trend,
     TrendList,
 )
+from rotorwatch.records.levels import LEVEL_MEASURES
 from rotorwatch.records.monitor import HistoryStatus
 from service.access.guard import Guard
 from service.access.problems import responses, written
@@ -35,8 +39,10 @@ from service.api.views import (
     SinceNs,
     SiteName,
     UntilNs,
+    check_alarm,
     found_machine,
 )
+from service.stream.monitored import Monitored
 
 _LARGEST = 2**63 - 1
 _PLACE = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
@@ -94,6 +100,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
         limit: Limit = 100,
     ) -> Response:
         """What happened to alarms, as CloudEvents: newest first, or with `after` oldest first, as followers want it."""
+        _check_logged(view, name)
         found = view.history.events(
             after=after,
             before=before,
@@ -124,8 +131,10 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
         ] = None,
     ) -> Response:
         """What an alarm rests on: report and pictures of before it, when it was raised, and after the change."""
-        text = found_machine(service, site, machine).history.evidence(name, occurrence)
+        view = found_machine(service, site, machine)
+        text = view.history.evidence(name, occurrence)
         if text is None:
+            check_alarm(view, name, 404)
             which = "" if occurrence is None else f"occurrence {occurrence} of "
             raise HTTPException(404, f"nothing was kept of {which}{name}: it was not raised on a window, or long ago")
         return Response(text, media_type="application/json")
@@ -154,6 +163,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
         """Parameters, residuals and measures over time: one by one, or with `points` for a plot of any length."""
         history = view.history
         names = name or [quantity] if quantity in MEASURES else name
+        _check_read(view, quantity, names, "name")
         if points is not None:
             if after is not None:
                 raise HTTPException(422, "after: goes with single readings, not with points")
@@ -201,7 +211,9 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
 def _trend(service: ServiceView, of: str, hours: int, points: int) -> Trend:
     site, machine, quantity, name = of.split("/")
     span_ns = hours * 3_600_000_000_000
-    found = found_machine(service, site, machine).history.latest(quantity, name, span_ns=span_ns, points=points)
+    view = found_machine(service, site, machine)
+    _check_read(view, quantity, [name], "of")
+    found = view.history.latest(quantity, name, span_ns=span_ns, points=points)
     buckets = [one for one in found if math.isfinite(one.mean)]
     return Trend(
         site=site,
@@ -212,6 +224,38 @@ def _trend(service: ServiceView, of: str, hours: int, points: int) -> Trend:
         starts_ns=tuple(one.start_ns for one in buckets),
         means=tuple(one.mean for one in buckets),
     )
+
+
+def _check_logged(view: Monitored, name: str | None) -> None:
+    """Refuse an alarm that a machine cannot have and never had."""
+    if name is not None and name not in ALARMS and not view.history.events(alarm=name, limit=1):
+        check_alarm(view, name, 422)
+
+
+def _check_read(view: Monitored, quantity: str, names: Sequence[str], field: str) -> None:
+    """Refuse a name under which nothing is read of a machine, nor was before its file changed.
+
+    Raises
+    ------
+    HTTPException
+        422, with the names there are.
+    """
+    channels = [one.name for one in view.machine.sensors if one.quantity != "shaft_angle"]
+    known: Sequence[str] = (quantity,)
+    if quantity == "parameter":
+        known = PARAMETERS
+    elif quantity == "equation":
+        known = [one.number for one in EQUATIONS]
+    elif quantity == "level":
+        known = [f"{channel}:{measure}" for channel in channels for measure in LEVEL_MEASURES]
+    unknown = set(names).difference(known)
+    if not unknown or not (unknown := unknown - view.history.names_of(quantity)):
+        return
+    expected = f"one of {', '.join(known)}"
+    if quantity == "level":
+        expected = f"CHANNEL:MEASURE of the channels {', '.join(channels)} and measures {', '.join(LEVEL_MEASURES)}"
+    place = f"{view.machine.site}/{view.machine.name}"
+    raise HTTPException(422, f"{place}: {field} is {min(unknown)!r}, which is no {quantity} of it; expected {expected}")
 
 
 def _listed(name: str, texts: Sequence[str], **cursors: int | None) -> Response:

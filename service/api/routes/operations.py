@@ -5,7 +5,6 @@ from typing import Annotated, Any
 
 from fastapi import Body, FastAPI, Header, HTTPException, Path, Query, Request, Response
 
-from models.alarm_names import ALARMS, LEVEL
 from models.errors import RotorwatchError
 from rotorwatch.records.alarms import Alarm, AlarmState, AlarmStates
 from rotorwatch.records.example import example
@@ -14,7 +13,7 @@ from service.access.audit import AuditNote
 from service.access.guard import Guard
 from service.access.problems import responses
 from service.access.scopes import Caller
-from service.api.views import PLACE, AlarmName, InPath, MachineName, ServiceView, SiteName, found_machine
+from service.api.views import PLACE, AlarmName, InPath, MachineName, ServiceView, SiteName, check_alarm, found_machine
 from service.monitor.alarm_conversion import alarm_entries
 from service.monitor.alarms.alarm import Alarm as AlarmRecord
 from service.monitor.alarms.operation import (
@@ -82,6 +81,8 @@ def _add_reading_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         all_: Annotated[bool, Query(alias="all", description="normal ones as well")] = False,
     ) -> AlarmStates:
         """Alarms that are not normal, or those that are asked for."""
+        for one in name:
+            check_alarm(view, one, 422)
         states = view.alarms(include_normal=all_ or bool(state or name))
         chosen = (
             one
@@ -152,9 +153,7 @@ def _present(view: Monitored, name: str) -> Alarm:
     HTTPException
         404 if there is no such alarm.
     """
-    levels = [f"{LEVEL}{channel.name}" for channel in view.machine.sensors if channel.quantity != "shaft_angle"]
-    if name not in ALARMS and name not in levels:
-        raise HTTPException(404, f"no alarm {name[:80]}; there are: {', '.join((*ALARMS, *levels))}")
+    check_alarm(view, name, 404)
     for one in view.alarms(include_normal=True).alarms:
         if one.name == name:
             return one
