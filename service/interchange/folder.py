@@ -178,7 +178,7 @@ def joined(
                     "the files of a folder one after the other"
                 )
             if offset_ns > end_ns + step_ns / 2:
-                read.gaps.append(Gap(end_ns, offset_ns, 0))
+                read.gaps.append(Gap(end_ns, offset_ns, 0, file.path.name))
             for piece in pieces(source, signals, clock, mapping, own):
                 time_ns = piece.time_ns + offset_ns
                 goes_on = abs(time_ns[0] - end_ns) <= step_ns / 2

@@ -152,8 +152,8 @@ def _gap_lines(done: Imported) -> list[str]:
     total_s = sum(gap.to_ns - gap.from_ns for gap in gaps) / 1e9
     lines = [f"gaps: {len(gaps)}, {total_s:.6g} s in all, kept as gaps" if gaps else "gaps: none"]
     lines += [
-        f"  before row {gap.row + 1}: {(gap.to_ns - gap.from_ns) / 1e9:.6g} s from "
-        f"{rfc3339(done.clock.origin_ns + round(gap.from_ns))}"
+        f"  before row {gap.row + 1}{f' of {gap.file}' if done.read.files > 1 else ''}: "
+        f"{(gap.to_ns - gap.from_ns) / 1e9:.6g} s from {rfc3339(done.clock.origin_ns + round(gap.from_ns))}"
         for gap in gaps[:_LISTED]
     ]
     if len(gaps) > _LISTED:

@@ -40,7 +40,8 @@ class Gap:
 
     from_ns: float
     to_ns: float
-    row: int
+    row: int  # of the file
+    file: str
 
 
 @dataclass(slots=True)
@@ -186,7 +187,7 @@ class _Splitter:
             yield self._bridge(last, piece, steps)
             yield piece
         else:
-            self._read.gaps.append(Gap(last.time_ns[-1] + self._step_ns, piece.time_ns[0], row))
+            self._read.gaps.append(Gap(last.time_ns[-1] + self._step_ns, piece.time_ns[0], row, self._clock.path.name))
             yield replace(piece, begins=True)
 
     def _bridge(self, last: Piece, piece: Piece, steps: int) -> Piece:

@@ -88,6 +88,7 @@ def test_a_snapshot_that_is_missing_is_told(tmp_path: Path) -> None:
     done, _ = imported(tmp_path, folder, NAMED, KIT)
     told = "\n".join(summary_lines(done))
     assert "gaps: 1, 38 s in all" in told
+    assert f"\n  before row 1 of {by_date(6)}: 38 s from " in told
 
 
 def test_files_that_follow_each_other_are_one_stretch(tmp_path: Path) -> None:
