@@ -12,6 +12,8 @@ from service.recordings.catalogue import PART, SUFFIX
 
 DAMAGED = ".damaged"
 LOCK = ".lock"
+_LONGEST_S = 60.0
+"""From the last message to the last writing of it: a recorder writes every second."""
 
 
 def lock(folder: Path) -> int:
@@ -95,10 +97,16 @@ def loss_text(salvage: Salvage) -> str:
     if salvage.unnamed_messages:
         texts.append(f"{salvage.unnamed_messages} messages whose key stood in a damaged chunk")
     texts.append(f"{salvage.lost_bytes} bytes that cannot be read")
-    texts.append(
-        f"what was still in memory: the file was last written {salvage.unaccounted_s:.3f} s after its last readable "
-        "message, and up to 1 s more was waiting"
-    )
+    if salvage.unaccounted_s < _LONGEST_S:
+        texts.append(
+            f"what was still in memory: the file was last written {salvage.unaccounted_s:.3f} s after its last "
+            "readable message, and up to 1 s more was waiting"
+        )
+    else:
+        texts.append(
+            "what was still in memory: how much is not known, because the file was written long after the times in it, "
+            "as an import or a copy is"
+        )
     return "lost: " + "; ".join(texts)
 
 
