@@ -312,6 +312,7 @@ class MachineMonitor:
             **prefixed("evaluator", self._evaluator.checkpoint()),
             **prefixed("levels", self._levels.checkpoint()),
             **prefixed("standstill", self._standstill.checkpoint()),
+            **prefixed("data_path", self._data_path.checkpoint()),
             "calm": np.array([self._calm.value]),
             "end_ns": np.array([] if self.end_ns is None else [self.end_ns], dtype=np.int64),
         }
@@ -342,6 +343,7 @@ class MachineMonitor:
         self._window.restore(unprefixed("window", arrays))
         self._evaluator.restore(unprefixed("evaluator", arrays))
         self._standstill.restore(unprefixed("standstill", arrays))
+        self._data_path.restore(unprefixed("data_path", arrays))
         self._test.state = test
         self.end_ns, self._calm = end_ns, HealthState(*calm)
         self._arrivals.resume(self._gate.courses)

@@ -182,6 +182,12 @@ def test_where_no_hop_is_whole_nothing_stays_healthy(torn: str) -> None:
     assert "no 5 s without a gap for 2" in events[0].alarm.note
     assert target.health().state is HealthState.NOT_EVALUABLE
     assert "nothing is evaluated: blocks are lost, or their times" in target.health().reason
+    stopped, again = watching(), monitor()  # a restart in the middle of it delays nothing
+    feed(stopped, spoilt[:100])
+    state = stopped.state(whole=True)
+    again.restore(state.state, [data for _, data in state.new_parts])
+    again.restore_alarms(state.alarms)
+    assert feed(again, spoilt[100:])[1] == events
     windows, events = feed(target, after[400:])
     assert windows
     assert target.health().state is HealthState.HEALTHY

@@ -1,6 +1,11 @@
 """Alarms that say nothing of the machine: on the stream, its clock, the sensors, and the monitor itself."""
 
+from collections.abc import Mapping
+
+import numpy as np
+
 from models.alarm_names import CLOCK, CONFLICT, FAULT, GAP, OVERLOADED, PHASE_REFERENCE, STREAM_LOST, data_alarm
+from models.checkpoint import checked
 from models.diagnosis.window import WindowStatistics
 from models.ingest import Admission
 from models.machine import MachineFile
@@ -24,6 +29,24 @@ class DataPathAlarms:
         self._hop_ns = round(machine.window.hop_s * 1e9)
         self._whole_ns: int | None = None  # end of the latest hop, or where the first could have begun
         self._unseen_windows, self._unseen_blocks, self._unseen_s = 0, 0, 0.0
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything as named arrays."""
+        whole_ns = [] if self._whole_ns is None else [self._whole_ns]
+        unseen = [self._unseen_windows, self._unseen_blocks, self._unseen_s]
+        return {"whole_ns": np.array(whole_ns, dtype=np.int64), "unseen": np.array(unseen, dtype=np.float64)}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called.
+
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form.
+        """
+        windows, blocks, self._unseen_s = checked(arrays, "unseen", np.float64, (3,)).tolist()
+        self._unseen_windows, self._unseen_blocks = int(windows), int(blocks)
+        self._whole_ns = next(iter(checked(arrays, "whole_ns", np.int64, (None,)).tolist()), None)
 
     def accepted(self, verdict: Admission, start_ns: int, dropped: int) -> str:
         """A block was accepted.
