@@ -17,6 +17,7 @@ from service.commands.running import (
     ListenOption,
     VersionOption,
     check_address_space,
+    finite,
     prepare_numerics,
     raise_file_limit,
 )
@@ -85,14 +86,16 @@ def run(
     [cyan]rotorwatch run --when-full wait[/cyan]
     """
     _prepare()
-    from models.signals.link import load_link  # noqa: PLC0415  # keeps --help quick
+    from models.mistakes import checked  # noqa: PLC0415  # keeps --help quick
+    from models.signals.link import load_link  # noqa: PLC0415
     from service.settings.service import MachineEntry, check_distinct, load_settings  # noqa: PLC0415
 
     settings = load_settings(config)
     update: dict[str, Any] = {}
     if machine:
         pairs = [text.partition("@") for text in machine]
-        update["machines"] = tuple(MachineEntry(file=file, bundle=bundle or None) for file, _, bundle in pairs)
+        named = [{"file": file, "bundle": bundle or None} for file, _, bundle in pairs]
+        update["machines"] = tuple(checked(MachineEntry, one, "--machine") for one in named)
     # Endpoints and role replace those of the settings altogether.
     ends = settings.link if link is None else load_link(link)
     if listen or connect:
@@ -241,7 +244,9 @@ def demo(
         typer.Option("--fault", help="What breaks first; with none, the machine stays healthy."),
     ] = "k_by",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Another realisation of all random forces and noise.")] = 1,
-    pace: Annotated[float, typer.Option("--pace", min=0.1, max=100, help="Data seconds per second.")] = 10.0,
+    pace: Annotated[
+        float, typer.Option("--pace", min=0.1, max=100, callback=finite, help="Data seconds per second.")
+    ] = 10.0,
     once: Annotated[
         bool,
         typer.Option("--once", help="End after the first fault; exit 0 only if exactly what was injected was named."),

@@ -1,5 +1,6 @@
 """What ``rotorsim`` and ``rotortrain`` share: refused arguments, ``--version``, and progress bars on stderr."""
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
@@ -51,6 +52,13 @@ def _say_version(context: typer.Context, wanted: bool) -> None:
 VersionOption = Annotated[
     bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say the version, and nothing else.")
 ]
+
+
+def finite(value: float | None) -> float | None:
+    """Refuse NaN, which no limit of an option does."""
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is no finite number.")
+    return value
 
 
 def bars(*, remaining: bool = False) -> Progress:

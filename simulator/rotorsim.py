@@ -18,7 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from models.errors import MachineFileError
 from models.machine import Machine, load_machine
 from models.signals.link import LinkSettings, load_link
-from simulator.commands import Commands, VersionOption
+from simulator.commands import Commands, VersionOption, finite
 from simulator.scenario import Scenario, load_scenario, parse_fault, shipped_scenarios
 
 if TYPE_CHECKING:  # the stream imports scipy, which --help must not wait for
@@ -105,11 +105,17 @@ def publish(
     wait_for_subscriber_s: Annotated[
         float | None,
         typer.Option(
-            "--wait-for-subscriber", min=0, help="Send nothing before someone listens; give up after SECONDS."
+            "--wait-for-subscriber",
+            min=0,
+            callback=finite,
+            help="Send nothing before someone listens; give up after SECONDS.",
         ),
     ] = None,
     linger_s: Annotated[
-        float, typer.Option("--linger", min=0, help="Stay this many seconds after the end, for subscribers that lag.")
+        float,
+        typer.Option(
+            "--linger", min=0, callback=finite, help="Stay this many seconds after the end, for subscribers that lag."
+        ),
     ] = 2.0,
 ) -> None:
     """Publish the stream of a simulated machine.

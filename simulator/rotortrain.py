@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from models.errors import RotorwatchError
-from simulator.commands import Commands, VersionOption
+from simulator.commands import Commands, VersionOption, finite
 
 app = typer.Typer(
     name="rotortrain",
@@ -45,7 +45,7 @@ def _program(_version: VersionOption = False) -> None:
 @app.command()
 def train(
     machine: MachineOption,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Directory of the bundle to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", file_okay=False, help="Directory of the bundle to write.")],
     windows: WindowsOption = _WINDOWS,
     draws: DrawsOption = _DRAWS,
     seed: SeedOption = _SEED,
@@ -73,7 +73,9 @@ def train(
 def calibrate(
     machine: MachineOption,
     bundle: Annotated[str, typer.Option("--bundle", "-b", help="Directory of a bundle, or a shipped one by name.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Directory of the bundle to write; may be the same.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", file_okay=False, help="Directory of the bundle to write; may be the same.")
+    ],
     processes: ProcessesOption = _CORES,
 ) -> None:
     """Calibrate the networks of a bundle anew, on simulated windows; they are not trained again.
@@ -104,7 +106,7 @@ def commission(
             help="Recording of the healthy machine; may be repeated, or followed by more.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Directory of the bundle and the report.")],
+    out: Annotated[Path, typer.Option("--out", "-o", file_okay=False, help="Directory of the bundle and the report.")],
     more: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -112,11 +114,19 @@ def commission(
         ),
     ] = None,
     first: Annotated[
-        float | None, typer.Option(min=1.0, metavar="SECONDS", help="Use only the first seconds of every recording.")
+        float | None,
+        typer.Option(
+            min=1.0, callback=finite, metavar="SECONDS", help="Use only the first seconds of every recording."
+        ),
     ] = None,
     wish: Annotated[
         float | None,
-        typer.Option(min=0.001, max=0.9, help="Relative change that shall be found; the alarm limit if left out."),
+        typer.Option(
+            min=0.001,
+            max=0.9,
+            callback=finite,
+            help="Relative change that shall be found; the alarm limit if left out.",
+        ),
     ] = None,
     why: Annotated[str, typer.Option(help="Why the machine is commissioned again; kept in the bundle.")] = "",
     networks: Annotated[

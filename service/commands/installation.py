@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import ENDPOINT, ConnectOption, ListenOption, prepare_numerics
+from service.commands.running import ENDPOINT, ConnectOption, ListenOption, finite, prepare_numerics
 
 if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from models.machine import MachineFile
@@ -69,7 +69,7 @@ def init(
     """
     site = site or _asked("--site", "Site (a group of machines)")
     name = name or _asked("--name", "Name of the machine")
-    rate = rate_hz or float(_asked("--rate-hz", "Samples per second and channel"))
+    rate = float(_asked("--rate-hz", "Samples per second and channel", float)) if rate_hz is None else rate_hz
     lines = sensor or _asked_sensors()
     from models.machine import MachineFile  # noqa: PLC0415  # keeps --help quick
     from models.mistakes import checked  # noqa: PLC0415
@@ -84,28 +84,34 @@ def init(
         "sensors": [_sensor(line) for line in lines],
     }
     machine_path, settings_path = folder / f"{name}.toml", folder / "rotorwatch.toml"
+    if machine_path == settings_path:
+        raise MachineFileError(f"--name is {name!r}: {settings_path} is the name of the settings, expected another one")
     machine = checked(MachineFile, {key: value for key, value in fields.items() if value is not None}, machine_path)
     for path in (machine_path, settings_path):
         if path.exists() and not overwrite:
             raise MachineFileError(f"{path}: exists already; --overwrite replaces it")
-    folder.mkdir(parents=True, exist_ok=True)
-    machine_path.write_text(_machine_text(machine, speed_rpm), encoding="utf-8")
-    settings_path.write_text(
-        f'[link]\nlisten = ["{ENDPOINT}"]\n\n[recording]\ndirectory = "recordings"\n\n'
-        f'[history]\nurl = "sqlite:///history.sqlite"\n\n[[machines]]\nfile = "{machine_path.name}"\n',
-        encoding="utf-8",
-    )
-    typer.echo(f"{machine_path}: {machine.title}, {len(machine.sensors)} channels at {rate:g} Hz")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        machine_path.write_text(_machine_text(machine, speed_rpm), encoding="utf-8")
+        settings_path.write_text(
+            f'[link]\nlisten = ["{ENDPOINT}"]\n\n[recording]\ndirectory = "recordings"\n\n'
+            f'[history]\nurl = "sqlite:///history.sqlite"\n\n[[machines]]\nfile = "{machine_path.name}"\n',
+            encoding="utf-8",
+        )
+    except OSError as error:
+        raise MachineFileError(f"--folder {folder}: cannot be written ({error.strerror or error})") from error
+    channels = f"{len(machine.sensors)} channels at {machine.rate_hz:g} Hz"
+    typer.echo(f"{machine_path}: {machine.title}, {channels}")
     typer.echo(f"{settings_path}: listens on {ENDPOINT}, records into {folder / 'recordings'}")
     typer.echo(f"samples are expected under {machine.keys.stream}; the wire format is in docs/wire.md")
     typer.echo(f"see what arrives: rotorwatch doctor --machine {machine_path}")
     typer.echo(f"monitor it:       rotorwatch run --config {settings_path}")
 
 
-def _asked(option: str, text: str) -> str:
+def _asked(option: str, text: str, kind: type[str] | type[float] = str) -> str:
     if not sys.stdin.isatty():
         raise MachineFileError(f"{option} is missing, and there is nobody to ask")
-    return str(typer.prompt(text))
+    return str(typer.prompt(text, type=kind))
 
 
 def _asked_sensors() -> list[str]:
@@ -163,6 +169,7 @@ def doctor(
             "--seconds",
             min=1,
             max=86400,
+            callback=finite,
             help="How long to listen; 10 s if left out, or until a snapshot must have come.",
         ),
     ] = None,
@@ -181,14 +188,15 @@ def doctor(
     """
     prepare_numerics()
     from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
+    from models.mistakes import checked  # noqa: PLC0415
     from models.signals.link import LinkSettings  # noqa: PLC0415
     from models.signals.recording import RecordedMessage  # noqa: PLC0415
     from service.analysis.arrival import examined  # noqa: PLC0415
     from service.stream.transport import Link, tap  # noqa: PLC0415
 
     known = load_machine_file(machine)
-    ends = LinkSettings(mode="client", connect=tuple(connect)) if connect else None
-    link = Link(ends or LinkSettings(listen=tuple(listen or (ENDPOINT,))))
+    ends = {"mode": "client", "connect": connect} if connect else {"listen": listen or [ENDPOINT]}
+    link = Link(checked(LinkSettings, ends, "command line"))
     heard: list[RecordedMessage] = []
     try:
         close = tap(link, known.keys, heard.append)

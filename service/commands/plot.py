@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import Commands, FromOption, ToOption, prepare_numerics
+from service.commands.running import Commands, FromOption, ToOption, finite, prepare_numerics
 
 if TYPE_CHECKING:
     from service.analysis.figures.spectrum import Lines
@@ -99,7 +99,9 @@ class _Picture:
     size: Annotated[
         str | None, typer.Option("--size", metavar="WxH", help="Width and height in inches, such as 10x6.")
     ] = None
-    dpi: Annotated[float, typer.Option("--dpi", min=30, max=600, help="Pixels per inch of a PNG.")] = 120.0
+    dpi: Annotated[float, typer.Option("--dpi", min=30, max=600, callback=finite, help="Pixels per inch of a PNG.")] = (
+        120.0
+    )
 
     def check(self) -> None:
         """Refuse what cannot be written, before anything is computed."""
@@ -372,4 +374,4 @@ def _speeds(text: str | None) -> tuple[float, float] | None:
 
 def _positive(name: str, number: float | None) -> None:
     if number is not None and not 0 < number < 1e9:
-        raise MachineFileError(f"{name} is {number:g}, expected a number above 0")
+        raise MachineFileError(f"{name} is {number:g}, expected a number above 0 and below 1e9")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from models.errors import MachineFileError, RecordingError, RotorwatchError
-from service.commands.running import ENDPOINT, FromOption, ToOption, prepare_numerics
+from service.commands.running import ENDPOINT, FromOption, ToOption, finite, prepare_numerics
 
 if TYPE_CHECKING:  # these import pydantic, numpy and pyarrow, which --help must not wait for
     from models.signals.keys import MachineKeys
@@ -121,7 +121,13 @@ def replay(
     ] = None,
     wait_s: Annotated[
         float,
-        typer.Option("--wait-for-subscriber", metavar="S", min=0, help="Hold the first block back at most this long."),
+        typer.Option(
+            "--wait-for-subscriber",
+            metavar="S",
+            min=0,
+            callback=finite,
+            help="Hold the first block back at most this long.",
+        ),
     ] = 0.0,
     progress: Annotated[
         Literal["auto", "json", "none"],
@@ -167,14 +173,15 @@ def replay(
     from_ns, to_ns = source.between(from_, to, *machines)
     _check_options(offline, {"--machine": machine, "--config": config, "--set": set_, "--ray": ray, "--out": out,
                              "--overwrite": overwrite},
-                   {"--prefix": prefix, "--connect": connect, "--listen": listen, "--all": everything})  # fmt: skip
+                   {"--prefix": prefix, "--connect": connect, "--listen": listen, "--all": everything,
+                    "--pace": pace != "1", "--loop": loop != "1", "--wait-for-subscriber": wait_s})  # fmt: skip
     wishes = Control()
     with _stoppable(wishes), orders(wishes, lines=control, keyboard=not offline and progress == "auto"):
         if offline:
             wanted = _machines_of(config, machine)
             for one in set_ or ():
                 if "=" not in one:
-                    raise MachineFileError(f"--set {one}: expected FIELD=VALUE, as alarms.on_delay_s=60")
+                    raise MachineFileError(f"--set {one!r}: expected FIELD=VALUE, as alarms.on_delay_s=60")
             changes = "\n".join(set_ or ())
             if ray is not None:
                 asked = [
@@ -414,11 +421,13 @@ def _check_prefix(option: str, prefix: str) -> None:
 
 def link_of(connect: list[str] | None, listen: list[str] | None) -> "LinkSettings":
     """Link settings of a command line that names endpoints, or none."""
-    from models.signals.link import LinkSettings  # noqa: PLC0415  # keeps --help quick
+    from models.mistakes import checked  # noqa: PLC0415  # keeps --help quick
+    from models.signals.link import LinkSettings  # noqa: PLC0415
 
+    ends: dict[str, object] = {"mode": "client", "connect": connect or [ENDPOINT]}
     if listen:
-        return LinkSettings(mode="peer", listen=tuple(listen), connect=tuple(connect or ()))
-    return LinkSettings(mode="client", connect=tuple(connect or (ENDPOINT,)))
+        ends = {"mode": "peer", "listen": listen, "connect": connect or []}
+    return checked(LinkSettings, ends, "command line")
 
 
 def _announce(plan: "NetworkPlan") -> None:

@@ -1,5 +1,6 @@
 """What the commands share: exit codes, one thread for linear algebra, common options."""
 
+import math
 import os
 import resource
 from collections.abc import Iterator
@@ -62,6 +63,13 @@ def _say_version(wanted: bool) -> None:
 VersionOption = Annotated[
     bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say the version, and nothing else.")
 ]
+
+
+def finite(value: float | None) -> float | None:
+    """Refuse NaN, which no limit of an option does."""
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is no finite number.")
+    return value
 
 
 class Commands(TyperGroup):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.commands.running import prepare_numerics
+from service.commands.running import finite, prepare_numerics
 
 if TYPE_CHECKING:  # imports numpy and scipy, which --help must not wait for
     from service.history.records import Retention
@@ -31,7 +31,8 @@ def size(
     networks: Annotated[bool, typer.Option(help="Trained networks beside the likelihood.")] = True,
     cores: Annotated[int, typer.Option("--cores", min=1, max=1024, help="Of a computer.")] = 8,
     busy: Annotated[
-        float, typer.Option("--busy", min=0.05, max=1.0, help="How much of them may be used in the mean.")
+        float,
+        typer.Option("--busy", min=0.05, max=1.0, callback=finite, help="How much of them may be used in the mean."),
     ] = 0.6,
     reports_days: Annotated[
         float | None, typer.Option("--reports-days", metavar="DAYS", help="How long reports are kept.")
