@@ -184,6 +184,8 @@ def record(
     start_ns = _time_ns(start)
     if not output.parent.is_dir():
         raise MachineFileError(f"{output}: the folder {output.parent} does not exist")
+    if output.is_dir():
+        raise MachineFileError(f"{output}: is a folder, expected the name of a recording (.mcap)")
     for existing in (output, output.with_name(output.name + ".part")):
         if existing.exists() and not overwrite:
             raise MachineFileError(f"{existing}: exists already; --overwrite replaces it")

@@ -30,7 +30,7 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message
 from mcap.stream_reader import CRCValidationError, breakup_chunk
-from mcap.writer import CompressionType, Writer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from models.errors import RecordingError
 
@@ -81,10 +81,12 @@ class RecordingWriter:
     Raises
     ------
     RecordingError
-        If one of them exists, or cannot be written; the message names it.
+        If one of them exists, or cannot be written, or `path` is a folder; the message names it.
     """
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
+        if path.is_dir():
+            raise RecordingError(f"{path}: is a folder, expected the name of a recording (.mcap)")
         self.path = path
         self._overwrite = overwrite
         self.part = path.with_name(path.name + ".part")
@@ -291,7 +293,15 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except EndOfFile as error:
-        raise RecordingError(f"{path}: the recording is incomplete{_RECOVER}") from error
     except DAMAGE as error:
-        raise RecordingError(f"{path}: not a complete recording{_RECOVER} ({error})") from error
+        with path.open("rb") as file:
+            begins = file.read(len(MCAP0_MAGIC))
+        if not begins:
+            why = "the file is empty, nothing was recorded in it"
+        elif begins != MCAP0_MAGIC:
+            why = "not a recording (MCAP); rotorwatch import makes recordings of files of other programs"
+        elif isinstance(error, EndOfFile):
+            why = f"the recording is incomplete{_RECOVER}"
+        else:
+            why = f"not a complete recording{_RECOVER} ({error})"
+        raise RecordingError(f"{path}: {why}") from error

@@ -190,3 +190,7 @@ def test_what_is_not_there_and_what_is_there_already_is_said(tmp_path: Path) -> 
         export(Selection((tmp_path / "run.mcap",)), "stream", "parquet", tmp_path / "run.mcap")
     with pytest.raises(RecordingError, match=r"run\.mcap: is one of the recordings"):
         export(Selection((tmp_path / "run.mcap",)), "stream", "parquet", tmp_path / "run.mcap", overwrite=True)
+    with pytest.raises(RecordingError, match=r"none/a\.csv: cannot be written \(No such file or directory\)"):
+        export(Selection((tmp_path / "run.mcap",)), "stream", "csv", tmp_path / "none" / "a.csv")
+    with pytest.raises(RecordingError, match="is a folder, expected the name of a file"):
+        export(Selection((tmp_path / "run.mcap",)), "stream", "csv", Path(), overwrite=True)

@@ -359,7 +359,7 @@ def test_the_catalogue_lists_what_is_there(tmp_path: Path) -> None:
     assert first.size_bytes == first.path.stat().st_size
     unfinished = found[f"b/m1/{stamp}.mcap.part"]
     assert (unfinished.start_ns, unfinished.messages, unfinished.complete) == (NOW_NS, None, False)
-    assert "not a complete recording" in found[f"b/m2/{stamp}.mcap"].problem
+    assert "not a recording (MCAP)" in found[f"b/m2/{stamp}.mcap"].problem
     assert [one.id for one in catalogue.recordings(machine="m2")] == [f"a/m2/{stamp}.mcap", f"b/m2/{stamp}.mcap"]
     assert [one.id for one in catalogue.recordings("a", "m2")] == [f"a/m2/{stamp}.mcap"]
     assert catalogue.recordings("a", "..") == ()

@@ -96,7 +96,7 @@ def test_files_that_cannot_be_used(tmp_path: Path, faulty: Path) -> None:
     (tmp_path / "text.mcap").write_text("no recording", encoding="utf-8")
     found = run(tmp_path / "text.mcap", "--offline")
     assert found.returncode == 2
-    assert "text.mcap: not a complete recording" in found.stderr
+    assert "text.mcap: not a recording (MCAP)" in found.stderr
     other = [message for message in read_recording(faulty) if message.key != LAB.keys.stream]
     found = run(write(tmp_path / "empty.mcap", other), "--offline")
     assert found.returncode == 2

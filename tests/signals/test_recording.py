@@ -125,6 +125,8 @@ def test_an_existing_recording_is_kept_unless_asked(tmp_path: Path) -> None:
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"none/run\.mcap\.part: cannot be written"):
         RecordingWriter(tmp_path / "none" / "run.mcap")
+    with pytest.raises(RecordingError, match="is a folder, expected the name of a recording"):
+        RecordingWriter(Path())
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
@@ -133,11 +135,18 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
             read(tmp_path / "none.mcap")
 
 
-def test_another_kind_of_file_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"\x89PNG\r\n\x1a\n" + bytes(1000), r"not a recording \(MCAP\); rotorwatch import"),
+        (b"", "the file is empty, nothing was recorded in it"),
+    ],
+)
+def test_another_kind_of_file_is_named(tmp_path: Path, content: bytes, told: str) -> None:
     path = tmp_path / "photo.mcap"
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(1000))
+    path.write_bytes(content)
     for read in (lambda path: list(read_recording(path)), summarize_recording):
-        with pytest.raises(RecordingError, match=r"photo\.mcap: not a complete recording; rotorwatch recover"):
+        with pytest.raises(RecordingError, match=rf"photo\.mcap: {told}"):
             read(path)
     with pytest.raises(RecordingError, match=r"photo\.mcap: nothing to recover"):
         salvage_recording(path, tmp_path / "new.mcap")
