@@ -8,6 +8,7 @@ import difflib
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
+from datetime import date
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -220,7 +221,7 @@ def expectation(fault: ErrorDetails, info: FieldInfo | None = None) -> str:
     elif kind == "string_pattern_mismatch":
         wanted = (info.description if info is not None else None) or f"text of the form {context['pattern']}"
     elif kind in {"too_short", "too_long", "string_too_short", "string_too_long"}:
-        one = "character" if kind.startswith("string") else "entry"
+        one = "character" if isinstance(value, str) else "entry"
         count = context.get("min_length", context.get("max_length"))
         most = "at least" if kind.endswith("short") else "at most"
         wanted = f"{most} {count} {one}" if count == 1 else f"{most} {count} {one.replace('entry', 'entrie')}s"
@@ -388,7 +389,7 @@ def _shown(fault: ErrorDetails) -> str:
     """The value found, as it stands in a file; nothing long, and no address, which may hold a password."""
     value = fault["input"]
     try:
-        text = str(value).lower() if isinstance(value, bool) else repr(value)
+        text = str(value).lower() if isinstance(value, bool | date) else repr(value)
     except ValueError:  # a number of thousands of digits
         return ""
     return "" if isinstance(value, Mapping) or "://" in text or len(text) > _LONGEST_SHOWN else f" (found {text})"

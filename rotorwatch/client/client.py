@@ -379,5 +379,5 @@ def _tls(url: str, ca: Path | None, certificate: tuple[Path, Path] | None) -> ss
             context.load_cert_chain(*certificate)
     except OSError as error:  # of which errors in certificates are a kind
         files = ", ".join(str(file) for file in (ca, *(certificate or ())) if file is not None)
-        raise ClientError(f"certificates {files}: cannot be used: {error}") from error
+        raise ClientError(f"certificates {files}: cannot be used: {error.strerror or error}") from error
     return context

@@ -238,6 +238,8 @@ class Database:
         reason = " ".join(str(cause).split()) or type(cause).__name__
         if isinstance(error, TimeoutError):
             reason = str(error) or "no answer in time"
+        elif isinstance(error, OSError) and error.strerror:
+            reason = f"{error.strerror} ({error.filename})"
         password = self._url.password
         if password:
             reason = reason.replace(str(password), "***")

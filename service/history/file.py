@@ -205,6 +205,8 @@ def restore(into: HistoryFile, backup: Path) -> Path | None:
 
 
 def _opened(file: Path) -> sqlite3.Connection:
+    if not file.is_file():  # of which SQLite says less
+        raise StoreError(f"{file}: {'is a folder, expected a file' if file.is_dir() else 'no such file'}")
     try:
         return sqlite3.connect(f"file:{quote(str(file))}?mode=ro", uri=True)
     except sqlite3.Error as error:

@@ -94,7 +94,7 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
         return ((since.days * 86400 + since.seconds) * 1_000_000 + since.microseconds) * 1000
 
 
-class Column(BaseModel, extra="forbid", frozen=True):
+class Column(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """Where a channel's samples are: sample = sign · (number · scale + offset) in `unit`."""
 
     column: _Name = Field(description="column, array, channel or data set")
@@ -119,7 +119,7 @@ class Acceleration(BaseModel, extra="forbid", frozen=True):
     channels: dict[str, Column] = Field(min_length=1, description="channel of the machine to accelerometer")
 
 
-class Keyphasor(BaseModel, extra="forbid", frozen=True):
+class Keyphasor(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """Shaft angle from pulses: their times, or a sampled signal that has them."""
 
     pulse_times: _Name | None = Field(default=None, description="array of the times of all pulses")
