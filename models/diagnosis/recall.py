@@ -38,7 +38,8 @@ class Piece:
 
 def digest_of(samples: FloatArray) -> bytes:
     """Digest of SI samples."""
-    return hashlib.blake2b(np.ascontiguousarray(samples).data, digest_size=_DIGEST).digest()
+    # Processors have instructions for it: half the time of blake2b, which was a fiftieth of a hop.
+    return hashlib.sha256(np.ascontiguousarray(samples).data).digest()[:_DIGEST]
 
 
 def pieces_of(pieces: Iterable[Piece]) -> dict[str, np.ndarray]:
