@@ -6,11 +6,15 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks.finite_elements.machines import rotor_named
+from benchmarks.finite_elements.observed import WindowSizes, plan, sampled, windows_of
+from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
 from benchmarks.studies.subjects import subject_named
 from models.commissioning.levels import learned_baseline
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.growth import Growth
-from models.diagnosis.baseline.learned import Baseline
+from models.diagnosis.baseline.learned import Baseline, learn_baseline
+from models.diagnosis.baseline.rows import COUPLED_ROWS
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
@@ -73,3 +77,44 @@ def test_a_window_of_another_force_that_the_relations_do_not_hold_in_names_nothi
     verdict = isolate_window(diagnosis, 0.01)
     assert verdict.outside
     assert verdict.changed == ()
+
+
+@cache
+def with_a_force_that_hides_a_plane() -> tuple[Baseline, tuple[WindowStatistics, ...]]:
+    """Learned in two conditions; and later windows of the one that hardly determines the horizontal plane."""
+    rotor, sizes = rotor_named("plain-bearings"), WindowSizes(length_s=30.0, hop_s=2.5, segment_s=2.5)
+    scene, planned = replace(COMMISSIONED, cutoff_hz=(130.0, 130.0)), plan(rotor, sizes)
+
+    def windows(layout: SourceLayout, count: int, seed: int) -> list[WindowStatistics]:
+        run = drawn_condition(rotor, layout, scene, {}, np.random.default_rng(1))
+        duration_s = 30.0 * count + planned.preamble / planned.rate_hz + 0.1
+        return windows_of(sampled(rotor, run, duration_s, seed), planned)
+
+    healthy = [*windows(SourceLayout.ONE_SOURCE, 3, 2), *windows(SourceLayout.INDEPENDENT, 3, 101)]
+    learned = learn_baseline(healthy, ["one"] * 3 + ["other"] * 3, COUPLED_ROWS)
+    return learned, tuple(windows(SourceLayout.ONE_SOURCE, 4, 7))
+
+
+def test_windows_that_hardly_determine_a_stiffness_show_no_growth_of_it() -> None:
+    horizontal = with_a_force_that_hides_a_plane()[0].growth[0]
+    assert horizontal is not None
+    assert abs(horizontal.slope) < min(2.0, 2 * horizontal.standard_error)
+
+
+def test_what_a_healthy_window_does_not_determine_is_not_evaluable_and_no_fault_of_a_sensor() -> None:
+    learned, later_windows = with_a_force_that_hides_a_plane()
+    # As what an earlier program learned may have it: a growth that is carried is no fault of a sensor either.
+    grown = replace(
+        learned, growth=tuple(one and replace(one, slope=9.0, standard_error=1.0) for one in learned.growth)
+    )
+    for baseline_ in (learned, grown):
+        monitor = BaselineDiagnostician(baseline_)
+        for window in later_windows:
+            diagnosis = monitor.diagnose(window)
+            reasons = {one.name: one.reason for one in diagnosis.parameters}
+            assert "does not determine it" in reasons["k_by"]
+            assert reasons["k_by"] == reasons["c_by"]
+            assert not reasons["k_bz"]
+            assert not diagnosis.suspect
+            assert diagnosis.misfit_z is not None
+            assert diagnosis.misfit_z < 3

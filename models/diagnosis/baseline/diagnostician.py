@@ -7,7 +7,7 @@ or of all that share a transducer, nothing else would show it.
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from models.diagnosis.baseline.force import alike, force_spectrum
 from models.diagnosis.baseline.growth import motion_power
 from models.diagnosis.baseline.lag_moments import row_window, shared_covariance
 from models.diagnosis.baseline.learned import Baseline, coefficient_slices, learned_rows, positive, unsuitable
-from models.diagnosis.baseline.relation import Relation, RowChange, one_source, read_row
+from models.diagnosis.baseline.relation import LOST, Relation, RowChange, one_source, read_row
 from models.diagnosis.baseline.rows import Row, parameters_of
 from models.diagnosis.baseline.unbalance import (
     SPEED_TOLERANCE,
@@ -96,7 +96,6 @@ def _row_suspicion(diagnosis: Diagnosis, row: Row, relation: Relation, tested: i
 _WORST_ERROR = 0.2
 _RPM = 30 / math.pi
 _GONE = -0.95  # a loss beyond this is no loss of a bearing
-_LOST = 0.5  # standard error of a stiffness beyond which the relation does not hold in the window at all
 _SURELY_OUTSIDE = 8.0
 # Factor on standard errors of the bearing in windows of another force, of a relation learned in one condition: its
 # error is not normal (decision 0012).
@@ -212,7 +211,10 @@ class BaselineDiagnostician:
             elsewhere=dict(zip(names, np.diag(elsewhere).tolist(), strict=False)),  # none of an e that was not read
             misfit_z=_misfit(changes),
         )
-        impossible = _impossible(diagnosis)
+        # What is carried for another force makes no reading impossible.
+        impossible = _impossible(
+            diagnosis, dict(zip(self._names, np.diag(bearing.noise + bearing.common), strict=True))
+        )
         if impossible:
             return replace(diagnosis, misfit_z=max(_SURELY_OUTSIDE, diagnosis.misfit_z or 0.0), suspect=impossible)
         suspicion = gain_suspicion(diagnosis, self._rows, self._baseline.relations) if known else None
@@ -369,13 +371,19 @@ def _unexplained(misfit_z: float | None) -> str:
     )
 
 
-def _impossible(diagnosis: Diagnosis) -> str:
-    """What no bearing does: a stiffness or damping that is gone or has changed its sign, or cannot be told at all."""
+def _impossible(diagnosis: Diagnosis, variances: Mapping[str, float]) -> str:
+    """What no bearing does: a stiffness or damping that is gone or has changed its sign, or cannot be told at all.
+
+    Parameters
+    ----------
+    variances : mapping of str to float
+        Of the readings by themselves, without what they carry for another force.
+    """
     for reading in diagnosis.evaluable:
         if reading.name == "e" or reading.relative_change is None or reading.standard_error is None:
             continue
         gone = reading.relative_change + 2 * reading.standard_error < _GONE
-        if gone or (reading.name.startswith("k") and reading.standard_error > _LOST):
+        if gone or (reading.name.startswith("k") and variances[reading.name] > LOST**2):
             return f"a sensor of this plane that is swapped, reversed or late ({reading.name} makes no sense)"
     return ""
 

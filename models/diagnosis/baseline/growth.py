@@ -48,7 +48,8 @@ class Growth:
 def growth_of(row: Row, relation: Relation, parts: Sequence[LagMoments]) -> Growth | None:
     """Regress what the hops of healthy windows read of a row's scale on the power of its motion.
 
-    Every window counts against its own mean. None where the row reads no scale, or the hops do not tell.
+    Every window counts against its own mean, and as sharply as it reads: one that hardly determines the scale reads
+    large numbers by chance. None where the row reads no scale, or the hops do not tell.
     """
     at = next((number for number, own in enumerate(row.own) if 0 in own.terms), None)
     powers = [one for part in parts if (one := motion_power(row, relation, part.of.window)) is not None]
@@ -62,9 +63,11 @@ def growth_of(row: Row, relation: Relation, parts: Sequence[LagMoments]) -> Grow
             change = change_of(row, relation, part)
         except (EstimationError, np.linalg.LinAlgError):
             return None
-        hops = part.hop_values @ change.combination @ change.projection[at]
-        levels.append(own - own.mean())
-        found.append(hops - hops.mean())
+        along = change.projection[at]
+        hops = part.hop_values @ change.combination @ along
+        error = np.sqrt(own.size * change.widening * (along @ part.covariance(change.combination) @ along))
+        levels.append((own - own.mean()) / error)
+        found.append((hops - hops.mean()) / error)
     x, y = np.concatenate(levels), np.concatenate(found)
     if not (power > 0 and x @ x > 0):
         return None

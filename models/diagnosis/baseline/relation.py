@@ -141,6 +141,7 @@ _FITS = 3.0  # standard deviations of χ² within which a relation is taken to f
 _LAG_ROUNDS = 2
 _LONGER_LAGS_S = (0.02, 0.028, 0.036, LONGEST_LAG_FROM_S)
 _CONVERGED = 1e-4  # standard errors
+LOST = 0.5  # standard error of a stiffness beyond which a window says nothing of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,6 +189,19 @@ class RowChange:
     widening: float  # scatter from hop to hop over what the spectra expect, at least 1, times the relation's allowance
     chi2: float  # what the change leaves, in units of all its errors
     degrees_of_freedom: int
+    unchanged: bool  # whether no change at all leaves no more than chance does
+
+    @property
+    def fits(self) -> bool:
+        """Whether what is left is within what scatter explains, of the change or of none."""
+        # Where the window does not determine the change the estimate wanders, to where the misfit is anything.
+        return self.unchanged or _by_chance(self.chi2, self.degrees_of_freedom)
+
+    def error(self, relation: Relation) -> FloatArray:
+        """Standard errors of the change, shape (n_own,), from the window and from its own row's coefficients."""
+        noise = self.projection @ self.moments.covariance(self.combination) @ self.projection.T * self.widening
+        uncertain = self.sensitivity @ relation.covariance @ self.sensitivity.T
+        return np.asarray(np.sqrt(np.diag(noise + uncertain)), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -394,13 +408,18 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
     Raises
     ------
     EstimationError
-        If the window does not determine them.
+        If the window does not determine them: it is explained as it is, and by nearly any change as well.
     """
     first = change_of(row, relation, window.beyond(max(LAG_FROM_S, relation.lag_from_s)))
     lag_s = max(relation.lag_from_s, lag_beyond_memory(window, first.combination))
     change = change_of(row, relation, window.beyond(lag_s))
-    fits, first_fits = (_by_chance(one.chi2, one.degrees_of_freedom) for one in (change, first))
-    return first if first_fits and not fits and lag_s < LAG_FROM_S else change
+    believed = first if first.fits and not change.fits and lag_s < LAG_FROM_S else change
+    errors = dict(zip(row.own, believed.error(relation), strict=True))
+    if believed.unchanged and any(error > LOST for own, error in errors.items() if 0 in own.terms):
+        raise EstimationError(
+            f"{row.title}: what this window holds beyond the memory of its force does not determine it"
+        )
+    return believed
 
 
 def change_of(row: Row, relation: Relation, moments: LagMoments) -> RowChange:
@@ -456,4 +475,5 @@ def change_of(row: Row, relation: Relation, moments: LagMoments) -> RowChange:
         widening=widening,
         chi2=chi2,
         degrees_of_freedom=freedom,
+        unchanged=criterion(np.zeros(d.size)) <= _FITS * np.sqrt(2 * rank),
     )
