@@ -19,7 +19,7 @@ from models.errors import RotorwatchError
 from models.signals.link import LinkSettings
 from service.runtime.shard import run_shard
 from service.settings.service import ServiceSettings
-from service.stream.shard_link import RelaySettings
+from service.stream.shard_link import relay_items
 from service.stream.transport import Link
 
 
@@ -82,9 +82,8 @@ class OneComputer:
         folder = Path(undo.enter_context(tempfile.TemporaryDirectory(prefix="rotorwatch-")))  # of mode 700
         streams, inner = (f"unixsock-stream/{folder / name}" for name in ("streams", "inner"))
         if self._link.listen:
-            listen = (*self._link.listen, streams)
-            relay = dict(self._link) | {"mode": "router", "listen": listen, "waits": self._waits}
-            self._router = Link(RelaySettings(**relay))
+            relay = dict(self._link) | {"mode": "router", "listen": (*self._link.listen, streams)}
+            self._router = Link(LinkSettings(**relay), more=relay_items(waits=self._waits))
             undo.callback(self._router.close)
             alone = {"mode": "client", "listen": (), "connect": (streams,), "tls": None, "user": None}
             self._link = self._link.model_copy(update=alone | {"password_file": None, "password_variable": None})

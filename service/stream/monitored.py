@@ -1,12 +1,10 @@
-"""A machine that is monitored, as others see it, in this process or from another one; and where it publishes."""
+"""A machine that is monitored, as others see it, in this process or from another one."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
 from models.errors import RotorwatchError
 from models.machine import MachineFile
-from models.signals.keys import Topic
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health
 from rotorwatch.records.machines import DetectableChanges
@@ -79,7 +77,3 @@ class Monitored(Protocol):
 
     def operate(self, operation: OperatorAction) -> tuple[AlarmCloudEvent, ...]:
         """Do what an operator asks for, and say what happened; raises as `AlarmBook.operate`, `NotInTime`."""
-
-
-Outlet = Callable[[Topic, str], None]
-"""Publishes what a worker says; `service.stream.transport.MachineLink.publish` is one."""

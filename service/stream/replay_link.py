@@ -32,7 +32,8 @@ _CACHE_OTHER = 100
 _HEARTBEAT_S = 0.5
 _POLL_S = 0.02
 _DRAIN_S = 60.0
-_BLOCKED_US = 20_000_000
+_PATIENT = {"transport/link/tx/queue/congestion_control/block/wait_before_close": str(20_000_000)}
+"""By default Zenoh closes the connection to a subscriber that makes the sender wait for five seconds."""
 _LIVENESS_TIMEOUT_S = 2.0
 
 _Publisher = zenoh.Publisher | zenoh.ext.AdvancedPublisher
@@ -68,15 +69,6 @@ class LiveMachineError(RotorwatchError):
     """A replay on the original keys would meet a live machine; the message says which."""
 
 
-class _PatientLink(LinkSettings):
-    """By default Zenoh closes the connection to a subscriber that makes the sender wait for five seconds."""
-
-    def zenoh_items(self) -> dict[str, str]:
-        items = super().zenoh_items()
-        items["transport/link/tx/queue/congestion_control/block/wait_before_close"] = str(_BLOCKED_US)
-        return items
-
-
 class ReplayLink:
     """A Zenoh session that publishes one pass of a replay after the other; a context manager.
 
@@ -94,7 +86,7 @@ class ReplayLink:
     """
 
     def __init__(self, settings: LinkSettings, on_live: Callable[[str], None]) -> None:
-        self._link = Link(_PatientLink.model_validate(settings.model_dump()), fail_fast=bool(settings.connect))
+        self._link = Link(settings, fail_fast=bool(settings.connect), more=_PATIENT)
         self._on_live = on_live
         self._machines: tuple[MachineKeys, ...] = ()
         self._prefix, self._wait = "", False

@@ -21,22 +21,16 @@ _HELD_UP_US = 2_000_000
 """By default five seconds, as long as a silence that is called one: machines of other shards would be called lost."""
 
 
-class RelaySettings(LinkSettings):
-    """Those of a router within a monitor, by which streams come to the shards."""
+def relay_items(*, waits: bool) -> dict[str, str]:
+    """Zenoh's settings of a router within a monitor, by which streams come to the shards.
 
-    waits: bool = Field(default=False, description="a shard that does not keep up slows down the source")
-
-    def zenoh_items(self) -> dict[str, str]:
-        """As `LinkSettings.zenoh_items`; what a publisher has kept comes at once, and is waited for.
-
-        A publisher of several machines waits for the slowest of their shards. One that takes nothing at all is cut off,
-        and gets what it missed when it comes again, from publishers that keep samples.
-        """
-        items, place = super().zenoh_items(), "transport/link/tx/queue/congestion_control"
-        items[f"{place}/drop/wait_before_drop"] = str(_DROPPED_US)
-        if not self.waits:
-            items[f"{place}/block/wait_before_close"] = str(_HELD_UP_US)
-        return items
+    What a publisher has kept comes at once, and is waited for. A publisher of several machines waits for the slowest of
+    their shards. One that takes nothing at all is cut off, unless it `waits` and slows down the source; it gets what it
+    missed when it comes again, from publishers that keep samples.
+    """
+    place = "transport/link/tx/queue/congestion_control"
+    cut_off = {} if waits else {f"{place}/block/wait_before_close": str(_HELD_UP_US)}
+    return {f"{place}/drop/wait_before_drop": str(_DROPPED_US)} | cut_off
 
 
 class KnownSettings(LinkSettings):

@@ -14,10 +14,11 @@ Callbacks run on Zenoh's threads. An exception in one is logged and counted here
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
+from types import MappingProxyType
 from typing import TypeVar
 
 import zenoh
@@ -87,6 +88,8 @@ class Link:
     fail_fast : bool
         Give up when no endpoint in `connect` answers within three seconds. Otherwise a client tries for ten, and a
         peer for ever, in the background.
+    more : mapping
+        Settings of Zenoh's besides, by their paths.
 
     Raises
     ------
@@ -94,10 +97,12 @@ class Link:
         If an endpoint is malformed, cannot be listened on, or does not answer in time.
     """
 
-    def __init__(self, settings: LinkSettings, *, fail_fast: bool = False) -> None:
+    def __init__(
+        self, settings: LinkSettings, *, fail_fast: bool = False, more: Mapping[str, str] = MappingProxyType({})
+    ) -> None:
         self.errors = 0  # exceptions in callbacks so far
         config = zenoh.Config()
-        items = settings.zenoh_items()
+        items = settings.zenoh_items() | dict(more)
         if fail_fast or settings.mode == "client":
             timeout_s = _QUICK_CONNECT_S if fail_fast else _CONNECT_S
             items["connect/timeout_ms"] = json.dumps(round(timeout_s * 1000))

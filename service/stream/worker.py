@@ -10,6 +10,7 @@ from concurrent.futures import Future
 from dataclasses import replace
 
 from models.commissioning.commissioned import Installed
+from models.signals.keys import Topic
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report, StreamStatus
@@ -31,7 +32,7 @@ from service.settings.service import QueueSettings
 from service.stream.checkpoints import StepWriter, recorded_after, recorded_since_ns, restored
 from service.stream.inbox import Inbox, RawBlock
 from service.stream.liveness import COMPUTER, Clocks, Pulse
-from service.stream.monitored import MachineStatus, Outlet
+from service.stream.monitored import MachineStatus
 from service.stream.shedding import LoadShedding
 from service.terminal.logs import Limiter, logger
 
@@ -107,7 +108,7 @@ class MachineWorker:
         self._missed = 0
         self._publisher_alive = self._replay_announced = False
         self._mismatch: tuple[str, ...] = ()
-        self._outlet: Outlet | None = None
+        self._outlet: Callable[[Topic, str], None] | None = None
         self._published_alarms: tuple[tuple[str, int, bool, bool], ...] = ()
         self._dropped_logged = 0
         self._ticking = False
@@ -146,7 +147,7 @@ class MachineWorker:
             reasons.append(f"{self._unevaluated_s:.0f} s of data have come in and no window was evaluated: {why}")
         return "; ".join(reasons)
 
-    def start(self, outlet: Outlet) -> None:
+    def start(self, outlet: Callable[[Topic, str], None]) -> None:
         """Start the thread; it publishes to `outlet`."""
         self._outlet = outlet
         self._begin_s = self._ticked_s = self._clocks.monotonic_s()

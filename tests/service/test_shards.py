@@ -26,7 +26,7 @@ from service.runtime.runtime import Runtime, running
 from service.runtime.shards import Shards, shard_count
 from service.runtime.standing import latest_from_bytes, latest_to_bytes
 from service.settings.service import HistorySettings, MachineEntry, ServiceSettings, ShardSettings
-from service.stream.shard_link import RelaySettings
+from service.stream.shard_link import relay_items
 from simulator.scenario import parse_fault
 from tests.service.live import (
     PATIENT,
@@ -296,6 +296,6 @@ def test_a_machine_that_cannot_be_monitored_is_named(tmp_path: Path) -> None:
 
 def test_a_shard_that_takes_nothing_is_cut_off_before_machines_of_others_are_called_silent() -> None:
     place = "transport/link/tx/queue/congestion_control/block/wait_before_close"
-    cut_off_s = int(RelaySettings().zenoh_items()[place]) / 1e6
+    cut_off_s = int(relay_items(waits=False)[place]) / 1e6
     assert cut_off_s < IngestSettings().no_data_after_s / 2
-    assert place not in RelaySettings(waits=True).zenoh_items()  # there the source is to wait
+    assert place not in relay_items(waits=True)  # there the source is to wait

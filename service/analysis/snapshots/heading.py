@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -39,17 +40,8 @@ class LatestData:
         return None if self.window is None else self.window.end_ns, self.parameters, self.filled, self.why_not
 
 
-class Heading(Identity):
-    """First fields of every snapshot."""
-
-    start_ns: int | None
-    end_ns: int | None
-    filled: float
-    speed_rad_s: float | None
-
-
-def heading(subject: Subject, data: LatestData) -> Heading:
-    """Whose snapshot this is, and of which window."""
+def heading(subject: Subject, data: LatestData) -> dict[str, Any]:
+    """Whose snapshot this is, and of which window: first fields of every snapshot."""
     window = data.window
     speed = np.nan if window is None else window.speed_rad_s
     return {
