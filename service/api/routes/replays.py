@@ -5,6 +5,7 @@ import re
 import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -350,14 +351,9 @@ def _results(
     job = desk.found(replay_id)
     if job.view.mode != "offline":
         raise HTTPException(404, "a paced replay only publishes: ask the monitor in its namespace what it found")
-    found: list[str] = []
-    for number, message in enumerate(_messages(job, topic)):
-        if number < offset or (number - offset) % every:
-            continue
-        if len(found) == limit:
-            return found, number
-        found.append(message)
-    return found, None
+    chosen = islice(enumerate(_messages(job, topic)), offset, None, every)
+    found = [message for _, message in islice(chosen, limit)]
+    return found, next((number for number, _ in chosen), None)
 
 
 def _messages(job: RunningJob | None, topic: str) -> Iterator[str]:

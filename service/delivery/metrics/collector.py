@@ -38,33 +38,13 @@ class MeasuredService(Protocol):
     webhooks: Webhooks
 
 
-class _EventCounts:
-    """Alarm events of one machine by kind, counted in its history from now on."""
-
-    def __init__(self, machine: Monitored) -> None:
-        self._history = machine.history
-        self._after = machine.history.last_sequence()
-        self._kinds: Counter[str] = Counter()
-
-    def read(self) -> Counter[str]:
-        """Count what has come since the last time; while the history cannot be read, nothing is added."""
-        with suppress(StoreError):
-            while self._after < self._history.last_sequence():
-                page = self._history.events(after=self._after, limit=_PAGE)
-                if not page:
-                    break
-                self._kinds.update(event.kind for event in page)
-                self._after = page[-1].sequence
-        return self._kinds
-
-
 class Metrics:
     """The metrics of a service."""
 
     def __init__(self, service: MeasuredService, requests: RequestCounts) -> None:
         self._service = service
         self._requests = requests
-        self._events: dict[str, _EventCounts] = {}
+        self._events: dict[str, tuple[int, Counter[str]]] = {}  # up to which one they are counted, and how many by kind
         self._one_at_a_time = threading.Lock()
         self._registry = CollectorRegistry()
         self._registry.register(self)
@@ -72,7 +52,7 @@ class Metrics:
 
     def watch(self, machine: Monitored) -> None:
         """Count the alarm events of a machine from now on."""
-        self._events[machine.machine.title] = _EventCounts(machine)
+        self._events[machine.machine.title] = machine.history.last_sequence(), Counter()
 
     def text(self) -> bytes:
         """Everything in the text format of Prometheus; for any thread."""
@@ -82,15 +62,24 @@ class Metrics:
     def collect(self) -> Iterator[Metric]:
         """Every metric, as the library wants them."""
         readiness = self._service.readiness()
-        observed = []
-        for one in self._service.machines():
-            events = self._events.get(one.machine.title)
-            counts = Counter() if events is None else events.read()
-            observed.append(Observed(one, one.health(), one.status(), counts))
+        observed = [Observed(one, one.health(), one.status(), self._counted(one)) for one in self._service.machines()]
         yield from machine_families(observed)
         yield from _service_families(readiness)
         yield from _webhook_families(self._service.webhooks.statuses())
         yield from self._http_families()
+
+    def _counted(self, machine: Monitored) -> Counter[str]:
+        """Count the events that have come since the last time; while the history cannot be read, nothing is added."""
+        after, kinds = self._events[machine.machine.title]
+        with suppress(StoreError):
+            while after < machine.history.last_sequence():
+                page = machine.history.events(after=after, limit=_PAGE)
+                if not page:
+                    break
+                kinds.update(event.kind for event in page)
+                after = page[-1].sequence
+        self._events[machine.machine.title] = after, kinds
+        return kinds
 
     def _http_families(self) -> Iterator[Metric]:
         answered = CounterMetricFamily(
