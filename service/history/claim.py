@@ -14,7 +14,6 @@ from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import NamedTuple
 
 import zstandard
 
@@ -28,12 +27,8 @@ _LIKE_REPORTS = zstandard.ZstdCompressionDict(
 )
 
 
-class PackedReport(NamedTuple):
-    """A report, when it was recorded, and its text compressed."""
-
-    recorded_ns: int
-    report: StoredReport
-    text: bytes
+PackedReport = tuple[int, StoredReport, bytes]
+"""When a report was recorded, the report, and its text compressed."""
 
 
 @dataclass(slots=True)
@@ -150,7 +145,7 @@ def pack(machine: str, step: Step, recorded_ns: int) -> tuple[PackedReport, ...]
     if step.checkpoint is not None:
         _check(machine, "checkpoint", step.checkpoint.head)
     compressor = zstandard.ZstdCompressor(_LEVEL, dict_data=_LIKE_REPORTS)
-    return tuple(PackedReport(recorded_ns, each, compressor.compress(each.text.encode())) for each in step.reports)
+    return tuple((recorded_ns, each, compressor.compress(each.text.encode())) for each in step.reports)
 
 
 def unpack(text: bytes) -> str:

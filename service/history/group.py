@@ -45,8 +45,6 @@ def write_group(
 
     Parameters
     ----------
-    database, connection : Database, Connection
-        Within a transaction.
     claims : sequence of Claim
         Each with an attempt.
     known : dict

@@ -105,13 +105,6 @@ def runs_of_pulses(
 ) -> list[FloatArray]:
     """Times of the pulses of a first file and of others, on its clock; those of files without a break in one run.
 
-    Parameters
-    ----------
-    begun : ndarray, shape (n_pulses,)
-        Of the first file.
-    files : sequence of SnapshotFile
-        The others.
-
     Raises
     ------
     SourceError
@@ -143,12 +136,6 @@ def joined(
 
     Parameters
     ----------
-    begun : iterator of Piece
-        Of the first file.
-    files : sequence of SnapshotFile
-        The others.
-    first : Clock
-        Of the first file.
     read : Read
         What was met, all files together; is kept up to date.
 

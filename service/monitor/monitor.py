@@ -13,6 +13,7 @@ into another one, which goes on as if nothing had happened.
 from collections import deque
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ from service.monitor.alarms.operation import OperatorAction
 from service.monitor.evaluation import evaluator_for
 from service.monitor.levels import LevelWatch
 from service.monitor.parts import divided, joined
-from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, WindowHeading, counted, identity_of
+from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, counted, identity_of
 
 _RPM = 30 / np.pi
 _SKIPPED = "not evaluated: this computer cannot keep up; levels and sensors were judged"
@@ -477,7 +478,8 @@ class MachineMonitor:
             shapes=evaluation.shapes,
         )
 
-    def _window_now(self, start_ns: int, end_ns: int, state: HealthState) -> WindowHeading:
+    def _window_now(self, start_ns: int, end_ns: int, state: HealthState) -> dict[str, Any]:
+        """What every report on a window begins with."""
         little = state in {HealthState.UNCHANGED, HealthState.WATCHING}  # is claimed: what would be seen has to be said
         return {
             **self.identity,

@@ -9,7 +9,6 @@ from models.commissioning.commissioned import Installed
 from models.ingest import Admission
 from models.machine import MachineFile
 from rotorwatch.records.health import HealthState, Quality, Report
-from rotorwatch.records.levels import ChannelLevels, LevelGrowth
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 
 
@@ -20,17 +19,6 @@ class Identity(TypedDict):
     machine: str
     bundle: str | None
     machine_hash: str
-
-
-class WindowHeading(Identity):
-    """What every report on a window begins with."""
-
-    start_ns: int
-    end_ns: int
-    state: HealthState
-    filled: float
-    levels: tuple[ChannelLevels, ...]
-    level_growth: LevelGrowth | None
 
 
 def identity_of(installed: Installed) -> Identity:
