@@ -58,9 +58,11 @@ class Selection:
         names = ", ".join(str(path) for path in self.recordings)
         if self.machine is not None and self.machine not in machines:
             raise RecordingError(f"{names}: no machine {self.machine}; there are {', '.join(machines) or 'none'}")
+        if not machines:
+            raise RecordingError(f"{names}: no message of a machine in there")
         if self.machine is None and len(machines) != 1:
             raise RecordingError(
-                f"{names}: expected one machine, there are {', '.join(machines) or 'none'}; choose one with --machine"
+                f"{names}: expected one machine, there are {', '.join(machines)}; choose one with --machine"
             )
         return f"{PREFIX}/{self.machine or machines[0]}"
 

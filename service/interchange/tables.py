@@ -55,11 +55,20 @@ class CsvSource(_Table):
     def __init__(self, path: Path, form: CsvFormat, time_column: str | None, *, datetimes: bool) -> None:
         self._form, self._time_column = form, time_column
         self._time_type = pa.timestamp("ns", tz="UTC") if datetimes else pa.float64()
-        with readable(path, self.kind), self._reader(path, None) as reader:
-            names = list(reader.schema.names)
-            label = "" if time_column is None else self._label(time_column)
-            if not datetimes and label in names and reader.schema.field(names.index(label)).type == pa.int64():
-                self._time_type = pa.int64()
+        try:
+            with readable(path, self.kind), self._reader(path, None) as reader:
+                schema = reader.schema
+        except SourceError as error:
+            if not isinstance(error.__cause__, pa.ArrowInvalid) or not path.stat().st_size:
+                raise
+            raise SourceError(
+                f"{error}; taken with {form.delimiter!r} between cells and {form.skip_lines} lines before the table: "
+                "[csv] in the mapping says otherwise, with delimiter, decimal, header and skip_lines"
+            ) from error
+        names = list(schema.names)
+        label = "" if time_column is None else self._label(time_column)
+        if not datetimes and label in names and schema.field(names.index(label)).type == pa.int64():
+            self._time_type = pa.int64()
         if not form.header:
             names = [str(number + 1) for number in range(len(names))]
         super().__init__(path, [name.strip() for name in names])

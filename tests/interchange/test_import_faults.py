@@ -126,6 +126,12 @@ def test_a_row_that_is_too_short_is_named(tmp_path: Path) -> None:
     assert "Expected 4 columns, got 2" in text
 
 
+def test_a_table_with_other_signs_than_said_is_told_where_to_say_them(tmp_path: Path) -> None:
+    text = fault(tmp_path, [row.replace(",", ";").replace(".", ",") for row in good_rows()], header="t;x;v;a")
+    assert "run.csv: damaged, or no CSV file" in text
+    assert "taken with ',' between cells and 0 lines before the table: [csv] in the mapping says otherwise" in text
+
+
 def test_a_time_that_goes_back_is_named(tmp_path: Path) -> None:
     rows = good_rows()
     rows[600], rows[601] = rows[601], rows[600]

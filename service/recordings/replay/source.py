@@ -99,6 +99,8 @@ class RecordingSource:
         what = "reports or sample blocks" if reports else "sample blocks"
         place = ", ".join(path.name for path in self.paths)
         if wanted is None:
+            if not there:
+                raise MachineFileError(f"{place}: no {what} in there")
             if len(there) != 1:
                 raise MachineFileError(f"{place}: machines with {what}: {listed}; name one, as --key SITE/MACHINE")
             return next(iter(there.values()))
