@@ -6,11 +6,11 @@ from typing import Annotated, Literal
 
 import typer
 
+from models.errors import MachineFileError
 from service.commands.running import prepare_numerics
 
 commands = typer.Typer()
 _LISTED = 5
-_TIMES = ["%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%dT%H:%M:%SZ", "%Y-%m-%dT%H:%M:%S.%fZ", "%Y-%m-%d"]
 
 
 @commands.command("import")
@@ -63,11 +63,9 @@ def export(
     machine: Annotated[
         str | None, typer.Option("--machine", metavar="SITE/MACHINE", help="Which one, if there are several.")
     ] = None,
-    from_: Annotated[
-        datetime | None, typer.Option("--from", formats=_TIMES, metavar="TIME", help="Data from this time (UTC) on.")
-    ] = None,
+    from_: Annotated[str | None, typer.Option("--from", metavar="TIME", help="Data from this time (UTC) on.")] = None,
     to_time: Annotated[
-        datetime | None, typer.Option("--to-time", formats=_TIMES, metavar="TIME", help="Data up to this time (UTC).")
+        str | None, typer.Option("--to-time", metavar="TIME", help="Data up to this time (UTC).")
     ] = None,
     si: Annotated[bool, typer.Option("--si", help="Samples in SI units instead of those of the channels.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
@@ -88,7 +86,9 @@ def export(
     from service.interchange.exported import Selection  # noqa: PLC0415  # keeps --help quick
     from service.interchange.exporting import export as write  # noqa: PLC0415
 
-    selection = Selection(tuple(recordings), machine, _nanoseconds(from_), _nanoseconds(to_time), si)
+    selection = Selection(
+        tuple(recordings), machine, _nanoseconds("--from", from_), _nanoseconds("--to-time", to_time), si
+    )
     table = write(selection, what, to, out, overwrite=overwrite)
     typer.echo(f"{out}: {table.rows} rows, {len(table.schema)} columns")
     for text in table.skipped[:_LISTED]:
@@ -97,9 +97,13 @@ def export(
         typer.echo(f"left out: {len(table.skipped) - _LISTED} more", err=True)
 
 
-def _nanoseconds(time: datetime | None) -> int | None:
+def _nanoseconds(option: str, text: str | None) -> int | None:
     """A time without a zone is UTC."""
-    if time is None:
+    if text is None:
         return None
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise MachineFileError(f"{option} is {text!r}, expected a time such as 2026-01-31T12:00:00Z (UTC)") from error
     since = (time if time.tzinfo else time.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
     return (since // timedelta(microseconds=1)) * 1000

@@ -110,8 +110,9 @@ def status(
 
     [cyan]rotorwatch status --json | jq -r '.machines[] | .machine + " " + .state'[/cyan]
     """
-    if not url.startswith(("http://", "https://")):
-        raise MachineFileError(f"--url is {url!r}, expected http:// or https:// before it; did you mean http://{url}?")
+    if not re.match("https?://[^/]", url):
+        meant = f"; did you mean http://{url}?" if url and "://" not in url else ""
+        raise MachineFileError(f"--url is {url!r}, expected http://HOST:PORT or https://HOST:PORT{meant}")
     healths, code, why = [], _NO_ANSWER, ""
     try:
         healths = _fetch_healths(url.rstrip("/"), token, ca)
