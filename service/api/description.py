@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -23,18 +24,16 @@ class DescribedApp(FastAPI):
 
     def __init__(self, **arguments: Any) -> None:
         super().__init__(generate_unique_id_function=lambda route: route.name, **arguments)
-        self._arguments: Mapping[Any, frozenset[str]] | None = None
         self._describing = threading.Lock()
 
-    def arguments(self, endpoint: object) -> frozenset[str]:
-        """Names of the query arguments that an endpoint takes."""
-        if self._arguments is None:
-            self._arguments = {
-                context.endpoint: frozenset(_queried(context.dependant))
-                for context in iter_route_contexts(self.routes)
-                if isinstance(context.original_route, APIRoute)
-            }
-        return self._arguments.get(endpoint, frozenset())
+    @cached_property
+    def arguments(self) -> Mapping[Any, frozenset[str]]:
+        """Names of the query arguments that each endpoint takes."""
+        return {
+            context.endpoint: frozenset(_queried(context.dependant))
+            for context in iter_route_contexts(self.routes)
+            if isinstance(context.original_route, APIRoute)
+        }
 
     def openapi(self) -> dict[str, Any]:
         """Return the description; made once, while others who ask wait for it: half made it is not to be seen."""
@@ -67,7 +66,7 @@ def only_known_arguments(request: Request) -> None:
     given = request.query_params.keys()
     if not given or not request.scope["path"].startswith(_STRICT) or not isinstance(request.app, DescribedApp):
         return
-    known = request.app.arguments(request.scope.get("endpoint"))
+    known = request.app.arguments.get(request.scope.get("endpoint"), frozenset())
     expected = f"expected one of {', '.join(sorted(known))}" if known else "expected none"
     faults = [
         {"loc": ("query", name[:64]), "msg": f"no argument of this route, {expected}"}

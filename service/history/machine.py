@@ -43,6 +43,8 @@ class MachineStore:
     def __init__(
         self, database: Database, writer: Writer, claim: Claim, now_ns: Callable[[], int], bucket_ns: int
     ) -> None:
+        self.title = claim.title
+        self.report_log = ReportLog(database, claim.site, claim.name)
         self._database = database
         self._bucket_ns = bucket_ns
         self._writer = writer
@@ -51,11 +53,6 @@ class MachineStore:
         log = alarm_events.c
         latest = select(func.max(log.sequence)).where(log.machine_id == claim.machine_id)
         self._last_sequence: int = next((last for (last,) in database.rows(latest) if last is not None), -1)
-
-    @property
-    def title(self) -> str:
-        """``site/name``."""
-        return self._claim.title
 
     @property
     def waiting(self) -> int:
@@ -76,11 +73,6 @@ class MachineStore:
     def news(self) -> str:
         """What happened to the file then."""
         return self._database.news
-
-    @property
-    def report_log(self) -> ReportLog:
-        """The reports as others read them, who do not write."""
-        return ReportLog(self._database, *self.title.split("/"))
 
     def go_on_from(self, sequence: int) -> None:
         """Number the next alarm event after this one, where the log of a file that was begun anew has fewer."""

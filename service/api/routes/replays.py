@@ -5,6 +5,7 @@ import re
 import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
@@ -68,7 +69,6 @@ class ReplayRequests:
     def __init__(self, settings: ServiceSettings, index: Catalogue | None) -> None:
         self._settings = settings
         self._index = index
-        self._entries: dict[str, MachineEntry] | None = None
         plan = settings.replay
         folder = None if index is None else index.directory / REPLAYS
         self.jobs = ReplayJobs(folder, limit=plan.jobs, nice=plan.nice, kept=plan.kept)
@@ -168,7 +168,7 @@ class ReplayRequests:
 
     def _machine(self, request: ReplayRequest, recorded: str) -> str | None:
         """FILE or FILE@BUNDLE; None leaves the choice to the recorded name."""
-        monitored = self._monitored()
+        monitored = self._monitored
         name, bundle = request.machine, request.bundle
         if name is None:
             if bundle is not None:
@@ -201,15 +201,13 @@ class ReplayRequests:
             if not is_shipped_bundle(request.bundle):
                 raise HTTPException(422, f"bundle: {request.bundle!r} is not the name of shipped networks")
             return request.bundle
-        entry = self._monitored().get(recorded)
+        entry = self._monitored.get(recorded)
         bundle = None if entry is None or entry.bundle is None else Path(entry.bundle)
         return None if bundle is None or not (bundle / COMMISSIONED).is_file() else str(bundle.resolve())
 
+    @cached_property
     def _monitored(self) -> dict[str, MachineEntry]:
-        if self._entries is None:
-            loaded = ((entry.load(), entry) for entry in self._settings.machines)
-            self._entries = {machine.title: entry for machine, entry in loaded}
-        return self._entries
+        return {entry.load().title: entry for entry in self._settings.machines}
 
 
 def _check_changes(request: ReplayRequest, machine: str | None) -> None:
