@@ -183,15 +183,12 @@ def replay(
                 if "=" not in one:
                     raise MachineFileError(f"--set {one!r}: expected FIELD=VALUE, as alarms.on_delay_s=60")
             changes = "\n".join(set_ or ())
-            if ray is not None:
-                asked = [
-                    _Offline(one, wanted(one), changes, from_ns, to_ns, out, overwrite, "none") for one in machines
-                ]
+            chosen = (source.machine(key),) if ray is None else machines
+            asked = [_Offline(one, wanted(one), changes, from_ns, to_ns, out, overwrite, progress) for one in chosen]
+            if ray is None:
+                _evaluate(source, asked[0], wishes)
+            else:
                 _evaluate_all(source, asked, ray)
-                return
-            only = source.machine(key)
-            request = _Offline(only, wanted(only), changes, from_ns, to_ns, out, overwrite, progress)
-            _evaluate(source, request, wishes)
             return
         from service.stream.replay_link import NetworkPlan, replay_to_network  # noqa: PLC0415
 
@@ -235,9 +232,7 @@ def _evaluate(source: "RecordingSource", request: _Offline, control: "Control") 
         raise MachineFileError("--progress json writes to standard output: name a file for the results with --out")
     installed = choose_machine(request.keys, request.machine, request.changes)
     with _lines(request.out, request.overwrite) as write:
-        run = OfflineReplay(
-            source, request.keys, installed, write, from_ns=request.from_ns, to_ns=request.to_ns
-        )  # fmt: skip
+        run = OfflineReplay(source, request.keys, installed, write, from_ns=request.from_ns, to_ns=request.to_ns)
         for text in run.descriptor_differences:
             typer.echo(f"the recorded channel descriptor differs from the machine file: {text}", err=True)
         # Lines and a bar in one terminal would spoil each other.
@@ -303,10 +298,10 @@ def _machines_of(config: Path | None, machine: str | None) -> "Callable[[Machine
         raise MachineFileError("--machine and --config both name machine files, expected one of them")
     from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
 
-    entries = {(one.load().site, one.load().name): one for one in load_settings(config).machines}
+    entries = {one.load().title: one for one in load_settings(config).machines}
 
     def named(keys: "MachineKeys") -> str | None:
-        if (one := entries.get((keys.site, keys.machine))) is None:
+        if (one := entries.get(f"{keys.site}/{keys.machine}")) is None:
             raise MachineFileError(f"{config}: machines: none is {keys.site}/{keys.machine}, which was recorded")
         return one.file if one.bundle is None else f"{one.file}@{one.bundle}"
 
