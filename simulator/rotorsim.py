@@ -251,6 +251,8 @@ def _time_ns(text: str) -> int:
         raise MachineFileError(f"--start is {text!r}, expected ISO 8601 such as 2026-01-01T00:00:00Z") from error
     if moment.tzinfo is None:
         moment = moment.replace(tzinfo=UTC)
+    if not datetime(1970, 1, 1, tzinfo=UTC) <= moment < datetime(2262, 1, 1, tzinfo=UTC):
+        raise MachineFileError(f"--start is {text!r}, expected a time from 1970 to 2261")
     since = moment - datetime(1970, 1, 1, tzinfo=UTC)
     return ((since.days * 86400 + since.seconds) * 10**6 + since.microseconds) * 1000
 

@@ -14,6 +14,8 @@ from service.interchange.mapping import TimeBase
 from service.interchange.source import Array, Reference, Source, SourceError, Timing
 
 _MOST_RATIO = 2000
+_LATEST_NS = 9_214_646_400 * 10**9  # 2262: nanoseconds since 1970 fill 64 bits soon after
+_YEAR_NS = 31_556_952e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +88,11 @@ def clock_for(
         raise SourceError(
             f"{path}: column {column} has {measured:.9g} rows per second, but {declared:.9g} are declared; "
             "expected the same"
+        )
+    if not 0 <= origin_ns < _LATEST_NS:
+        year = round(1970 + origin_ns / _YEAR_NS)
+        raise SourceError(
+            f"{path}: the first row is of about the year {year}, expected 1970 to 2261 (time.start, unit)"
         )
     rate_hz = declared if declared is not None else measured
     ratio = _ratio(path, rate_hz, tolerance, base, machine)

@@ -182,6 +182,12 @@ def test_nothing_tells_the_start(tmp_path: Path) -> None:
     assert "give time.start in the mapping" in text
 
 
+@pytest.mark.parametrize("year", [1900, 2300, 9999])
+def test_a_year_that_nanoseconds_since_1970_do_not_reach_is_told(tmp_path: Path, year: int) -> None:
+    text = fault(tmp_path, good_rows(), TIME.replace(START, f"{year}-01-01T00:00:00Z") + CHANNELS)
+    assert f"run.csv: the first row is of about the year {year}, expected 1970 to 2261" in text
+
+
 def test_an_index_outside_the_table_is_named(tmp_path: Path) -> None:
     np.savez(tmp_path / "run.npz", x=np.zeros((1000, 3)))
     mapping = f'[time]\nrate_hz = 2000.0\nstart = "{START}"\n' + CHANNELS.replace('"x"', '"x", index = 3')
