@@ -33,7 +33,7 @@ _PAGE = 500
 
 _MACHINES = "/api/v1/machines"
 _PLACE = re.compile(r"[A-Za-z0-9_-]+/[A-Za-z0-9_-]+")
-_BELOW = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*")
+_BELOW = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.:-]*(/[A-Za-z0-9_-][A-Za-z0-9_.:-]*)*")
 
 M = TypeVar("M", bound=BaseModel)
 _Parameter = str | int | float | bool | None | Sequence[str]
@@ -366,7 +366,7 @@ def _path(place: str, below: str) -> str:
     if not _PLACE.fullmatch(place):
         raise ClientError(f"{place!r}: expected a machine as site/machine, such as demo/lab")
     if below and not _BELOW.fullmatch(below):
-        raise ClientError(f"{below!r}: expected a name of letters, digits, - and _, such as k_by")
+        raise ClientError(f"{below!r}: expected a name of letters, digits, - and _, such as k_by or level:DE-H")
     return f"{_MACHINES}/{place}/{below}".rstrip("/")
 
 

@@ -86,6 +86,7 @@ def test_alarms_and_their_log(plant: Client, seen: tuple[Runtime, MachineWorker]
     raised = plant.alarm(PLACE, "k_by")
     assert raised in everything.alarms
     assert plant.alarms(PLACE, states=[raised.state], names=["k_by", "e"]).alarms == (raised,)
+    assert plant.alarm(PLACE, "level:y1_dot").name == "level:y1_dot"
     assert plant.alarms(PLACE, names=["e"]).alarms == tuple(one for one in everything.alarms if one.name == "e")
     forwards = list(plant.alarm_events(PLACE, after=-1))
     assert [event.data.sequence for event in forwards] == list(range(everything.sequence + 1))
@@ -134,6 +135,7 @@ def test_snapshots(plant: Client) -> None:
     ("ask", "kind", "told"),
     [
         (lambda plant: plant.health("demo/pump"), NotFound, "no machine demo/pump; there are: demo/lab"),
+        (lambda plant: plant.alarm(PLACE, "level:a.b"), NotFound, "no alarm level:a.b; there are: k_by"),
         (lambda plant: plant.alarm(PLACE, "k_bx"), NotFound, "no alarm k_bx; there are: k_by"),
         (lambda plant: plant.detectable(PLACE, -2.0), RequestRefused, "change: Input should be greater than -1"),
         (lambda plant: plant.health("demo/../../audit"), ClientError, "expected a machine as site/machine"),

@@ -128,6 +128,7 @@ def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path) -> No
         (("bode", "--speeds", "900-600"), "--speeds is '900-600', expected the slowest and the fastest, rpm"),
         (("bode", "--speeds", "600-900"), "--speeds: demo/lab measures the shaft angle"),
         (("polar", "--channel", "theta"), "--channel is 'theta', which is the shaft angle"),
+        (("waveform", "--window", "0.0001"), "--window is 0.0001 s, expected at least 0.001 s, two samples"),
         (("waveform", "--window", "0"), "--window is 0, expected a number above 0"),
         (("full-spectrum", "--place", "DE"), "--place is 'DE', where demo/lab has no displacements in y and z"),
         (("full-spectrum", "--to-hz", "1"), "--to-hz is 1, expected at least four lines"),

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from models.errors import RotorwatchError
+from models.errors import MachineFileError, RotorwatchError
 from models.signals.channels import Channel
 from service.analysis.figures.style import COLOURS, GREY, Look, Paint, heading, place_text, rpm
 from service.analysis.recorded import Recorded
@@ -26,6 +26,10 @@ def waveform(data: Recorded, channels: Sequence[str], window_s: float | None) ->
     found = data.latest(chosen, length_s + _SOON_S)
     if not found:
         raise RotorwatchError(f"{data.place}: no sample blocks of {data.name} in this stretch of time")
+    if length_s * found[-1].rate_hz < 2:
+        raise MachineFileError(
+            f"--window is {length_s:g} s, expected at least {2 / found[-1].rate_hz:g} s, two samples"
+        )
     begin_ns = found[-1].end_ns - round(length_s * 1e9)
     cut = [one.part(max(0, round((begin_ns - one.start_ns) / 1e9 * one.rate_hz)), len(one.samples)) for one in found]
     return partial(_paint, [one for one in cut if len(one.samples)], chosen, data.name)
