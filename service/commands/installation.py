@@ -108,21 +108,29 @@ def init(
     typer.echo(f"monitor it:       rotorwatch run --config {settings_path}")
 
 
-def _asked(option: str, text: str, kind: type[str] | type[float] = str) -> str:
+def _asked(option: str, text: str, kind: type[str] | type[float] = str, *, empty: bool = False) -> str:
     if not sys.stdin.isatty():
         raise MachineFileError(f"{option} is missing, and there is nobody to ask")
-    return str(typer.prompt(text, type=kind))
+    return str(typer.prompt(text, type=kind, default="" if empty else None, show_default=False))
 
 
 def _asked_sensors() -> list[str]:
-    """Channels, one a line, until an empty one."""
+    """Channels, one a line, until an empty one; one that cannot be used is asked for again."""
+    from models.mistakes import checked  # noqa: PLC0415  # keeps --help quick
+    from models.signals.channels import Channel  # noqa: PLC0415
+
     typer.echo(f"Channels of the stream, in their order: {' '.join(_SENSOR)} [{_ANGLE}]; such as: {_EXAMPLE}")
     found: list[str] = []
-    while line := _asked("--sensor", f"Channel {len(found) + 1} (empty: no more)" if not found else "Next").strip():
-        found.append(line)
-        if not typer.confirm("Another one?", default=True):
-            break
-    return found
+    while True:
+        more = " (empty: no more)" if found else ""
+        line = _asked("--sensor", f"Channel {len(found) + 1}{more}", empty=bool(found))
+        if not line.strip():
+            return found
+        try:
+            checked(Channel, _sensor(line), "--sensor")
+            found.append(line)
+        except MachineFileError as error:
+            typer.echo(str(error))
 
 
 def _sensor(line: str) -> dict[str, str]:

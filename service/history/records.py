@@ -47,7 +47,7 @@ class StoredReport:
 class StoredReading:
     """One number of the window that ended at `end_ns`; neither value nor standard error is ever NaN.
 
-    `quantity` is ``parameter``, ``equation``, ``misfit`` or ``speed``, `name` says which one.
+    `quantity` is ``parameter``, ``equation``, ``level``, ``misfit`` or ``speed``, `name` says which one.
     """
 
     end_ns: int

@@ -1,5 +1,6 @@
 """From nothing to the first trend: `rotorwatch init`, `doctor`, `run` and `plot trend` on a stranger's two sensors."""
 
+import os
 import subprocess
 import sys
 import threading
@@ -170,6 +171,21 @@ def test_a_strangers_two_sensors_have_a_trend_in_three_commands(tmp_path: Path) 
     done = run("plot", "trend", *recordings, "--out", str(tmp_path / "trend.svg"))
     assert done.returncode == 0, done.stderr
     assert "DE-H" in (tmp_path / "trend.svg").read_text(encoding="utf-8")
+
+
+def test_init_asks_until_a_channel_is_empty_and_again_for_what_cannot_be_used(tmp_path: Path) -> None:
+    keyboard, terminal = os.openpty()
+    wrong = "two thousand", "DE-H acceleration g DE", "DE-H acceleration furlong DE horizontal"
+    typed = ("plant", "fan", wrong[0], "2560", *wrong[1:], FAN[10], FAN[12], "")
+    os.write(keyboard, "".join(f"{line}\n" for line in typed).encode())
+    command = [sys.executable, "-m", "service.rotorwatch", "init", "--folder", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, stdin=terminal, capture_output=True, text=True, timeout=60, check=False)
+    for end in (keyboard, terminal):
+        os.close(end)
+    assert done.returncode == 0, done.stderr
+    assert "has 4 words, expected 5" in done.stdout
+    assert "unit 'furlong' is not one of" in done.stdout
+    assert [one.name for one in load_machine_file(tmp_path / "fan.toml").sensors] == ["DE-H", "NDE-V"]
 
 
 def test_init_asks_nobody_where_nobody_is(tmp_path: Path) -> None:
