@@ -193,9 +193,8 @@ class RowChange:
 
     @property
     def fits(self) -> bool:
-        """Whether what is left is within what scatter explains, of the change or of none."""
-        # Where the window does not determine the change the estimate wanders, to where the misfit is anything.
-        return self.unchanged or _by_chance(self.chi2, self.degrees_of_freedom)
+        """Whether what is left is within what scatter explains."""
+        return _by_chance(self.chi2, self.degrees_of_freedom)
 
     def error(self, relation: Relation) -> FloatArray:
         """Standard errors of the change, shape (n_own,), from the window and from its own row's coefficients."""
@@ -413,9 +412,11 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
     first = change_of(row, relation, window.beyond(max(LAG_FROM_S, relation.lag_from_s)))
     lag_s = max(relation.lag_from_s, lag_beyond_memory(window, first.combination))
     change = change_of(row, relation, window.beyond(lag_s))
-    believed = first if first.fits and not change.fits and lag_s < LAG_FROM_S else change
-    errors = dict(zip(row.own, believed.error(relation), strict=True))
-    if believed.unchanged and any(error > LOST for own, error in errors.items() if 0 in own.terms):
+    longest = first if lag_s < LAG_FROM_S else change
+    # An estimate that the window does not determine wanders, to where the misfit is anything: no change counts as well.
+    believed = longest if (longest.fits or longest.unchanged) and not change.fits else change
+    errors = zip(row.own, believed.error(relation), strict=True)
+    if (change.unchanged or longest.unchanged) and any(error > LOST for own, error in errors if 0 in own.terms):
         raise EstimationError(
             f"{row.title}: what this window holds beyond the memory of its force does not determine it"
         )
@@ -475,5 +476,5 @@ def change_of(row: Row, relation: Relation, moments: LagMoments) -> RowChange:
         widening=widening,
         chi2=chi2,
         degrees_of_freedom=freedom,
-        unchanged=criterion(np.zeros(d.size)) <= _FITS * np.sqrt(2 * rank),
+        unchanged=bool(criterion(np.zeros(d.size)) <= _FITS * np.sqrt(2 * rank)),
     )
