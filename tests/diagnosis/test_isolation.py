@@ -54,7 +54,7 @@ def draw(rng: np.random.Generator, changed: int, rate: float, smallest: float) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("rate", "windows"), [(0.05, 2_000), pytest.param(0.01, 20_000, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("rate", "windows"), [(0.05, 1_000), pytest.param(0.01, 20_000, marks=pytest.mark.long)])
 def test_a_healthy_window_is_called_changed_at_the_declared_rate(rate: float, windows: int) -> None:
     rng = np.random.default_rng(SEED)
     called = sum(bool(draw(rng, 0, rate, 0.0)[1].changed) for _ in range(windows))
@@ -68,7 +68,7 @@ def test_a_healthy_window_is_called_changed_at_the_declared_rate(rate: float, wi
 def test_one_or_two_faults_are_named_exactly(changed: int) -> None:
     """Faults of 6 to 12 of their free standard errors, at 1 % false alarms per window."""
     rng = np.random.default_rng(SEED + changed)
-    windows, exact, wrong = 1000, 0, 0
+    windows, exact, wrong = 400, 0, 0
     sure: list[float] = []
     for _ in range(windows):
         true, verdict = draw(rng, changed, 0.01, 6.0)
@@ -80,10 +80,10 @@ def test_one_or_two_faults_are_named_exactly(changed: int) -> None:
     assert float(np.mean(sure)) < exact / windows + 0.002  # the confidence is not overstated
 
 
-@pytest.mark.parametrize("changed", [3, 4, 6])
+@pytest.mark.parametrize("changed", [3, 6])
 def test_more_than_two_are_nameable(changed: int) -> None:
     rng = np.random.default_rng(SEED + changed)
-    hits = [true == set(found.changed) for true, found in (draw(rng, changed, 0.01, 9.0) for _ in range(400))]
+    hits = [true == set(found.changed) for true, found in (draw(rng, changed, 0.01, 9.0) for _ in range(150))]
     assert np.mean(hits) > 0.98
 
 
@@ -91,10 +91,10 @@ def test_more_than_two_are_nameable(changed: int) -> None:
 def test_the_confidence_is_calibrated_near_the_limit() -> None:
     """Single faults of 2 to 4 standard errors: verdicts given with 60 to 90 % are right about as often or more."""
     rng = np.random.default_rng(SEED + 50)
-    drawn = [draw(rng, 1, 0.01, 2.5) for _ in range(1200)]
+    drawn = [draw(rng, 1, 0.01, 2.5) for _ in range(700)]
     named = [(true == set(found.changed), found.confidence) for true, found in drawn if found.changed]
     middle = [(right, sure) for right, sure in named if 0.6 < sure < 0.9]
-    assert len(middle) > 100
+    assert len(middle) > 60
     assert np.mean([right for right, _ in middle]) > np.mean([sure for _, sure in middle]) - 0.05
 
 

@@ -81,19 +81,20 @@ def test_an_error_that_all_windows_share_is_not_averaged_away() -> None:
     named = {}
     for common in (None, shared):
         hops, test = gaussian(SEED + 40), SequentialTest(SETTINGS)
-        for _ in range(12 * 32 + 12):
+        for number in range(1, 12 * 32 + 1):
             looks = hops.looks(offset)
-            if looks:
+            if number % 12 == 0:
                 verdict = test.update({12: replace(looks[12], common=common)})  # sums are made of whole windows
         named[common is None] = [finding.name for finding in verdict.changed]
     assert named == {True: ["k_by"], False: []}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n_hops", [2_500, pytest.param(10_000, marks=pytest.mark.long)])
-def test_false_alarms_come_at_the_declared_rate(n_hops: int) -> None:
-    """Hours of a healthy machine at 4000 declared false alarms per month: 19 are expected in 2500 hops."""
-    declared = 4000.0
+@pytest.mark.parametrize(
+    ("declared", "n_hops"), [(8000.0, 1_250), pytest.param(4000.0, 10_000, marks=pytest.mark.long)]
+)
+def test_false_alarms_come_at_the_declared_rate(declared: float, n_hops: int) -> None:
+    """Hours of a healthy machine at 8000 declared false alarms per month: 19 are expected in 1250 hops."""
     settings = replace(SETTINGS, false_alarms_per_month=declared, systematic=0.0)
     verdicts = play(SequentialTest(settings), gaussian(SEED, settings), (n_hops, true()))
     last, count = -1000, 0
@@ -117,7 +118,7 @@ def test_false_alarms_come_at_the_declared_rate(n_hops: int) -> None:
 )
 def test_delays_stay_within_twice_those_of_a_fixed_length(name: str, change: float) -> None:
     """95 of 100 changes are found, and named, within twice the data of a test made for exactly this change."""
-    study = detection_delays(SETTINGS, COVARIANCE, {name: change}, trials=40, seed=SEED, before_hops=14, after_hops=24)
+    study = detection_delays(SETTINGS, COVARIANCE, {name: change}, trials=20, seed=SEED, before_hops=14, after_hops=24)
     allowed_s = 2 * fixed_length_s(name, change)
     assert np.quantile(study.detected_s, 0.95) <= allowed_s
     assert np.quantile(study.named_s, 0.95) <= allowed_s
@@ -139,7 +140,7 @@ def test_a_small_change_accumulates_over_windows() -> None:
 @pytest.mark.slow
 def test_large_changes_are_named_within_two_hops_and_nothing_else_ever() -> None:
     study = detection_delays(
-        SETTINGS, COVARIANCE, {"k_by": -0.25}, trials=15, seed=SEED + 3, before_hops=14, after_hops=26
+        SETTINGS, COVARIANCE, {"k_by": -0.25}, trials=8, seed=SEED + 3, before_hops=14, after_hops=26
     )
     assert study.named_s.max() <= 10.0
     assert study.wrong == 0
@@ -158,7 +159,7 @@ def straddling(looks: dict[int, Stretch], since: int, bias: FloatArray) -> dict[
 @pytest.mark.slow
 def test_what_a_straddling_window_reads_wrong_is_not_named() -> None:
     """k_by drops by 25 %; stretches across the change read c_by up to 7 % too large, five standard errors."""
-    for seed in range(6):
+    for seed in range(3):
         test, hops = SequentialTest(SETTINGS), gaussian(SEED + 100 + seed)
         play(test, hops, (14, true()))
         said: list[tuple[str, ...]] = []
@@ -206,8 +207,8 @@ def test_a_window_astride_a_change_says_how_much_it_does_not_know() -> None:
         name, change = ("k_by", "c_by", "e")[trial % 3], float(rng.choice([-0.25, -0.15, 0.15, 0.3, 0.5]))
         test, hops, share = SequentialTest(settings), gaussian(SEED + 30 + trial, settings), float(rng.uniform())
         mixed = true(**{name: change}) * share
-        for number in range(60):
-            looks = hops.looks(true() if number < 40 else mixed if number == 40 else true(**{name: change}))
+        for number in range(40):
+            looks = hops.looks(true() if number < 20 else mixed if number == 20 else true(**{name: change}))
             if not looks:
                 continue
             verdict = test.update(looks)
@@ -216,7 +217,7 @@ def test_a_window_astride_a_change_says_how_much_it_does_not_know() -> None:
             if quoted:
                 (low, high), (after, before) = quoted[0] or (0.0, 0.0), found[name] or (0, 0)
                 sizes.append(low <= change <= high)
-                dates.append(after <= (41 - share) * 5e9 <= before < after + 60e9)
+                dates.append(after <= (21 - share) * 5e9 <= before < after + 60e9)
                 break
     assert len(sizes) == 40
     assert sum(sizes) >= 34  # 95 % of 40 are fewer once in 80
@@ -228,7 +229,7 @@ def test_what_is_too_small_to_be_named_is_not_held_at_nothing() -> None:
     rng, cov = np.random.default_rng(SEED + 23), np.diag(np.full(6, 1e-4))
     cov[0, 1] = cov[1, 0] = 0.8e-4
     held = nominal = alone = 0
-    for _ in range(200):
+    for _ in range(100):
         values = rng.multivariate_normal(true(k_by=-0.3) + 0.045 * np.eye(6)[1], cov)
         look = stretch_of(window(values, cov), 0, 60 * 10**9)
         named = [PARAMETERS.index(name) for name in isolate(look, SETTINGS.thresholds(12)).changed]
@@ -238,8 +239,8 @@ def test_what_is_too_small_to_be_named_is_not_held_at_nothing() -> None:
         (restricted,) = [one for one in isolate(look, SETTINGS.thresholds(12)).readings if one.name == "k_by"]
         low, high = restricted.interval_95 or (0.0, 0.0)
         nominal += low <= -0.3 <= high
-    assert alone > 150
-    assert held >= 140 > 40 > nominal  # how sure one is that the other changed differs from window to window
+    assert alone > 75
+    assert held >= 70 > 20 > nominal  # how sure one is that the other changed differs from window to window
 
 
 def test_what_is_outside_the_model_is_said_of_clean_data() -> None:
@@ -391,7 +392,7 @@ def test_the_change_is_found_in_95_of_100_windows(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_correlated_parameters_are_found_more_often_never_less(seed: int) -> None:
     cov = covariance(np.random.default_rng(SEED_OF_DETECTABLE + seed))
     assert min(power(cov, "k_bz", SEED_OF_DETECTABLE + seed)) > 0.925
