@@ -69,21 +69,21 @@ def monitor_of(machine: MachineFile) -> MachineMonitor:
 
 def test_a_machine_that_stops_and_starts_raises_nothing_and_is_healthy_again_after_a_restart_too() -> None:
     stream = list(stopping(KIT, "machine"))
-    monitor = monitor_of(KIT)
-    reports, events = watched(monitor, stream)
-    assert events == []
+    half = len(stream) // 2  # while it stands
+    monitor, after = monitor_of(KIT), monitor_of(KIT)
+    reports, events = watched(monitor, stream[:half])
+    state = monitor.state(whole=True)
+    after.restore(state.state, tuple(data for _, data in state.new_parts))
+    rest = watched(monitor, stream[half:])
+    assert watched(after, stream[half:]) == rest
+    reports += rest[0]
+    assert events + rest[1] == []
     states = {round((one.end_ns - stream[0].start_ns) / 1e9): one.state for one in reports}
     assert states[38] is states[168] is HealthState.HEALTHY
     standing = [one for one in reports if "the machine stands" in one.reason]
     assert {one.state for one in standing} == {HealthState.NOT_EVALUABLE}
     assert standing[-1].end_ns - standing[0].end_ns >= (STARTS_S - STANDS_S) * 1e9
     assert not any(one.sensors for one in standing)
-    half = len(stream) // 2  # while it stands
-    before, after = monitor_of(KIT), monitor_of(KIT)
-    seen, _ = watched(before, stream[:half])
-    state = before.state(whole=True)
-    after.restore(state.state, tuple(data for _, data in state.new_parts))
-    assert seen + watched(after, stream[half:])[0] == reports
 
 
 @pytest.mark.parametrize(("what", "alarm"), [("angle", PHASE_REFERENCE), ("signals", "data-stuck")])

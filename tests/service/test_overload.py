@@ -200,7 +200,7 @@ def test_what_is_loud_is_heard_in_skipped_windows_as_soon_as_in_others(kit: Inst
 
 
 def test_a_change_is_named_although_every_other_window_is_skipped(kit: Installed) -> None:
-    stream = scenario_blocks(120.0, parse_fault("k_by=-0.33@50"))
+    stream = scenario_blocks(90.0, parse_fault("k_by=-0.33@50"))
     hop_ns = round(kit.machine.window.hop_s * 1e9)
     monitor = MachineMonitor(kit, lambda end_ns: (end_ns - START_NS) // hop_ns % 2 == 0)
     events = [one for _, told in fed(monitor, stream) for one in told]
@@ -209,34 +209,34 @@ def test_a_change_is_named_although_every_other_window_is_skipped(kit: Installed
 
 
 def test_a_monitor_goes_on_from_between_skipped_windows_as_if_nothing_had_happened(kit: Installed) -> None:
-    stream = scenario_blocks(120.0, parse_fault("k_by=-0.33@50"))
+    stream = scenario_blocks(90.0, parse_fault("k_by=-0.33@50"))
     hop_ns = round(kit.machine.window.hop_s * 1e9)
 
     def every_third(end_ns: int) -> bool:
         return (end_ns - START_NS) // hop_ns % 3 == 0
 
-    first, at = MachineMonitor(kit, every_third), 737
-    before = list(fed(first, stream[:at]))
+    first, at = MachineMonitor(kit, every_third), 637
+    list(fed(first, stream[:at]))
     state, second = first.state(whole=True), MachineMonitor(kit, every_third)
     second.restore(state.state, [data for _, data in state.new_parts])
     second.restore_alarms(state.alarms)
-    assert before + list(fed(second, stream[at:])) == list(fed(MachineMonitor(kit, every_third), stream))
+    assert list(fed(second, stream[at:])) == list(fed(first, stream[at:])) != []
 
 
 def test_what_grows_beside_a_named_change_is_heard_in_skipped_windows(kit: Installed) -> None:
     """A skipped window does not know whether the change still explains the growth."""
     levels = LevelSettings(reference="first windows", reference_windows=2)
     monitor = MachineMonitor(
-        install(kit.machine.model_copy(update={"levels": levels}), None), lambda end_ns: end_ns > START_NS + 160 * S
+        install(kit.machine.model_copy(update={"levels": levels}), None), lambda end_ns: end_ns > START_NS + 85 * S
     )
     gain = np.array([1.7] * 8 + [1.0], np.float32)
     told = {}
-    for block in scenario_blocks(230.0, parse_fault("k_by=-0.15@60")):
-        louder = replace(block, samples=block.samples * gain) if block.start_ns >= START_NS + 170 * S else block
+    for block in scenario_blocks(130.0, parse_fault("k_by=-0.15@40")):
+        louder = replace(block, samples=block.samples * gain) if block.start_ns >= START_NS + 95 * S else block
         for event in monitor.step(louder).events:
             told[f"{event.kind.value} {event.alarm.name}"] = (event.time_ns - START_NS) / S
-    assert told["raised k_by"] < 160
-    assert 170 < told[f"raised {LEVEL}y1"] < 200
+    assert told["raised k_by"] < 85
+    assert 95 < told[f"raised {LEVEL}y1"] < 125
 
 
 # Which blocks say that it is behind
