@@ -43,9 +43,9 @@ def test_a_film_that_couples_the_planes_is_learned_and_its_changes_are_named() -
         # -k_yz/k_y of the bearing and of what else holds the shaft
         assert relation.coefficients[4] == pytest.approx(-across, abs=0.03)
     monitor = BaselineDiagnostician(learned)
-    assert [isolate_window(monitor.diagnose(later("fluid-film", {}, n)), 0.01).changed for n in range(6)] == [()] * 6
-    softer = [isolate_window(monitor.diagnose(later("fluid-film", {"k_by": -0.1}, n)), 0.01) for n in range(4)]
-    assert sum(one.changed == ("k_by",) for one in softer) >= 3
+    assert [isolate_window(monitor.diagnose(later("fluid-film", {}, n)), 0.01).changed for n in range(3)] == [()] * 3
+    softer = [isolate_window(monitor.diagnose(later("fluid-film", {"k_by": -0.1}, n)), 0.01) for n in range(2)]
+    assert all(one.changed == ("k_by",) for one in softer)
 
 
 @pytest.mark.slow

@@ -42,9 +42,7 @@ def e_of(window: WindowStatistics) -> tuple[Parameter, UnbalanceVector]:
     return diagnosis.parameters[-1], diagnosis.unbalance
 
 
-@pytest.mark.parametrize(
-    ("e", "degrees"), [(-0.5, -170.0), (-0.5, 40.0), (0.0, -90.0), (0.0, 180.0), (1.0, -170.0), (1.0, 40.0)]
-)
+@pytest.mark.parametrize(("e", "degrees"), [(-0.5, -170.0), (0.0, 180.0), (1.0, 40.0)])
 def test_a_turned_heavy_spot_is_read_as_a_vector_and_never_below_nothing(e: float, degrees: float) -> None:
     reading, vector = e_of(turned(drawn(1, e), degrees))
     assert vector.magnitude_change == pytest.approx(e, abs=4.5 * vector.magnitude_error)

@@ -20,7 +20,7 @@ def test_errors_of_an_oracle_are_those_of_the_bound(changes: dict[str, float]) -
     condition = drawn_condition(rotor, SourceLayout.ONE_SOURCE, COMMISSIONED, {}, np.random.default_rng(31))
     changed = replace(condition, changes=changes)
     healthy = windows_of(sampled(rotor, condition, 24 * 30.0 + 3, 1), sizes)[:24]
-    later = windows_of(sampled(rotor, changed, 24 * 30.0 + 3, 2), sizes)[:24]
+    later = windows_of(sampled(rotor, changed, 12 * 30.0 + 3, 2), sizes)[:12]
     before, after = (expected(rotor, one, later[0]) for one in (condition, changed))
     # means of what is simulated, and what is expected
     mean = np.mean([one.spectrum for one in later], axis=0)
