@@ -20,6 +20,7 @@ T = np.arange(N) / RATE_HZ
 MACHINE: MachineFile = NOTHING
 
 
+@cache
 def noise(seed: int) -> FloatArray:
     return np.random.default_rng([20261130, seed]).standard_normal(N)
 
@@ -105,7 +106,7 @@ def test_one_that_is_weak_is_not_told() -> None:
     assert new_line(lines(line(33.0, 0.1)), healthy(), 2 * np.pi * SPEED_HZ) is None
 
 
-@pytest.mark.parametrize(("hz", "beside"), [(21.55, 1), (21.93, 1), (22.08, 1), (44.1, 2), (65.9, 3)])
+@pytest.mark.parametrize(("hz", "beside"), [(21.55, 1), (22.08, 1), (65.9, 3)])
 def test_a_line_that_beats_with_a_multiple_of_the_speed_is_found_beside_it(hz: float, beside: int) -> None:
     (found,) = lines(line(hz))
     (backwards,) = lines(line(hz), turns=-1)

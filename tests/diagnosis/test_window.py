@@ -106,7 +106,7 @@ def test_products_are_their_definition_whatever_the_hop(hop: int) -> None:
     np.testing.assert_allclose(products / np.outer(scale, scale), direct / np.outer(scale, scale), atol=1e-12)
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(cuts=st.lists(st.integers(1, 1199), max_size=40), seed=st.integers(0, 1000))
 def test_any_splitting_gives_identical_statistics_after_every_block(cuts: list[int], seed: int) -> None:
     plan, samples = small_plan(), signal(1200, seed)
