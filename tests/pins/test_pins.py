@@ -7,7 +7,8 @@ import pytest
 from tests.pins.pinned import differences
 from tests.service.preloaded import ran
 
-CHANGES = ("healthy", "k_by=-0.25", "c_by=0.4", "k_bz=-0.2", "e=0.5")
+FURTHER = (pytest.param(change, marks=pytest.mark.long) for change in ("c_by=0.4", "k_bz=-0.2"))
+CHANGES = ("healthy", "k_by=-0.25", "e=0.5", *FURTHER)
 
 
 @pytest.mark.slow
