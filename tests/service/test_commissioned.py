@@ -120,7 +120,7 @@ def test_what_grows_beside_a_name_is_heard_where_the_name_does_not_explain_it() 
 def test_a_wrong_gain_of_a_place_is_told_and_what_it_is_taken_for_is_named_with_reserve(place: str) -> None:
     names = [channel.name for channel in LAB.sensors]
     wrong = [names.index(f"y{place}"), names.index(f"y{place}_dot")]
-    healthy = stream(85.0, SEED + 8)
+    healthy = stream(70.0, SEED + 8)
     samples = samples_of(healthy)
     samples[:, wrong] *= 0.8
     windows, events = feed(MachineMonitor(installed()), with_samples(healthy, samples))
@@ -141,7 +141,7 @@ def test_a_wrong_gain_of_a_place_is_told_and_what_it_is_taken_for_is_named_with_
     ],
 )
 def test_a_line_that_the_healthy_machine_did_not_have_is_told(hz: float, told: tuple[str, ...]) -> None:
-    healthy = stream(85.0, SEED + 9)
+    healthy = stream(70.0, SEED + 9)
     samples = samples_of(healthy)
     turned = 2 * np.pi * hz * np.arange(len(samples)) / LAB.rate_hz
     for column, one in enumerate(LAB.sensors):
@@ -231,7 +231,7 @@ def with_sensors(columns: list[int], duration_s: float) -> Installed:
 def test_with_too_few_sensors_only_changed_or_not_changed_is_said() -> None:
     bearing = [n for n, channel in enumerate(MACHINE.sensors) if channel.location != "disc"]
     few = with_sensors(bearing, 250.0)
-    windows, events = feed(MachineMonitor(few), of_sensors(bearing, stream(85.0, SEED + 1)[:700]))
+    windows, events = feed(MachineMonitor(few), of_sensors(bearing, stream(85.0, SEED + 1)[:650]))
     assert {window.state for window in full(windows)} == {HealthState.UNCHANGED}
     assert not events
     assert all("no equation can be evaluated" in window.reason for window in full(windows))
