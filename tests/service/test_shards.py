@@ -3,8 +3,6 @@
 import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,6 +33,7 @@ from tests.service.live import (
     endpoint,
     machine_file,
     open_session,
+    program,
     scenario_blocks,
     send,
     settings,
@@ -217,23 +216,19 @@ def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -
 def test_processes_end_with_the_monitor_that_started_them(tmp_path: Path) -> None:
     plan = plan_for(tmp_path, 2)
     machines = "[" + ",".join(one.model_dump_json() for one in plan.machines) + "]"
-    environment = {
-        **os.environ,
-        "ROTORWATCH_MACHINES": machines,
-        "ROTORWATCH_SHARDS__COUNT": "2",
-        "ROTORWATCH_HTTP__PORT": "0",
-        "ROTORWATCH_LINK__LISTEN": f'["{endpoint()}"]',
-        "ROTORWATCH_HISTORY__URL": plan.history.database,
-    }
-    command = [sys.executable, "-m", "service.rotorwatch", "run"]
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert next(line for line in process.stdout if line.startswith("HTTP API"))
-    started = children(process.pid)
-    assert len(started) == 2
-    process.kill()
-    process.wait()
-    process.stdout.close()
+    with program(
+        tmp_path,
+        *("service.rotorwatch", "run"),
+        ROTORWATCH_MACHINES=machines,
+        ROTORWATCH_SHARDS__COUNT="2",
+        ROTORWATCH_HTTP__PORT="0",
+        ROTORWATCH_LINK__LISTEN=f'["{endpoint()}"]',
+        ROTORWATCH_HISTORY__URL=plan.history.database,
+    ) as monitor:
+        monitor.wait_for("HTTP API")
+        started = children(monitor.process.pid)
+        assert len(started) == 2
+        monitor.kill()
     until(lambda: not any(Path(f"/proc/{one}").exists() for one in started), "end of all processes")
     with running(plan) as runtime:  # which has their machines at once
         assert runtime.readiness().ready
