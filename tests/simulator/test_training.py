@@ -43,11 +43,12 @@ def windows(machine: Machine, purpose: Purpose, stream: int, count: int, kept: t
 
 @contextmanager
 def briefly() -> Iterator[None]:
-    """Fewer steps and fewer draws for the principal directions, where nothing is asked of how accurate networks are."""
+    """Fewer steps, draws and degrees of freedom to choose from, where nothing is asked of how accurate networks are."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("models.diagnosis.networks.training._ROUNDS", 3)
         patch.setattr("simulator.training.spectral_draws._BASIS_DRAWS", 96)
         patch.setattr("simulator.training.calibration._AMORTISED_SHARE", 1)
+        patch.setattr("models.diagnosis.networks.calibration._RELATION_FREEDOMS", (4.0,))
         yield
 
 
