@@ -178,7 +178,7 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
     with client(plant.runtime) as http:
         _two_operators(browser, plant, http)
     broken: list[str] = []
-    for kind, phone, dark in (("light", False, False), ("dark", False, True), ("phone", True, False)):
+    for kind, phone, dark in (("light", False, False), ("dark phone", True, True)):
         with looking(browser, url, phone=phone, dark=dark) as page:
             for view, path in VIEWS.items():
                 page.goto(f"{url}/#/{path}")
