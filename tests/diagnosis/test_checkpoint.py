@@ -110,8 +110,7 @@ def test_a_monitor_stopped_at_any_block_goes_on_to_the_last_bit(machine: str, re
     assert sum(not report.verdict.continuous for report in expected) == 3  # two gaps, one repetition
 
 
-@pytest.mark.parametrize("forgotten", ["line/searched", "last"])
-def test_what_the_likelihood_remembers_matters(forgotten: str) -> None:
+def test_what_the_likelihood_remembers_matters() -> None:
     """The test above would notice: from another maximum the next readings differ in their last digits at least."""
     machine = "no phase reference"
     blocks, expected = stream(machine), uninterrupted(machine)
@@ -121,12 +120,8 @@ def test_what_the_likelihood_remembers_matters(forgotten: str) -> None:
         running.step(block)
     state = running.state(whole=True)
     arrays = from_bytes(state.state)
-    name = f"evaluator/likelihood/window/{forgotten}"
-    if forgotten == "last":  # cold: nothing to start from, nothing to follow
-        arrays = {key: array for key, array in arrays.items() if "/window/line" not in key and key[-7:] != "/states"}
-        arrays[name] = np.empty(0)
-    else:
-        arrays[name] = arrays[name] * (1 + 1e-9)
+    name = "evaluator/likelihood/window/line/searched"
+    arrays[name] = arrays[name] * (1 + 1e-9)
     again = monitor(machine)
     again.restore(to_bytes(arrays), [data for _, data in state.new_parts])
     again.restore_alarms(state.alarms)
