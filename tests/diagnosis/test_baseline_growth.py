@@ -24,7 +24,7 @@ _SEED = 6101
 
 @cache
 def baseline(name: str, commissioning: int) -> Baseline:
-    return learned_baseline(subject_named(name).healthy(_SEED, commissioning, 4), ["one"] * 4)
+    return learned_baseline(subject_named(name).healthy(_SEED, commissioning, 3), ["one"] * 3)
 
 
 def later(name: str, commissioning: int, number: int) -> WindowStatistics:
