@@ -64,7 +64,7 @@ def test_a_machine_file_says_how_much_is_known() -> None:
     assert "lacks I2_kg_m2" in knowledge_of(without_inertia).text
 
 
-@pytest.mark.parametrize("known", [LAB, PARTIAL, NOTHING])
+@pytest.mark.parametrize("known", [LAB, NOTHING])
 def test_where_no_motion_is_measured_levels_are_all_there_is_whatever_is_known(known: MachineFile) -> None:
     machine = elsewhere(known)
     assert install(machine, None).watching

@@ -140,7 +140,7 @@ class Plant:
 
 @pytest.mark.slow
 @settings(
-    max_examples=3,
+    max_examples=2,
     phases=[Phase.explicit, Phase.reuse, Phase.generate],  # the parts of a story are drawn from its seed
 )
 @given(seed=st.integers(0, 2**32 - 1), strikes=st.integers(0, 3), repeated=st.floats(0.0, 0.5))

@@ -248,7 +248,7 @@ def _all(scenario: Scenario, machine: Machine, block_s: float = 0.1) -> tuple[Fl
     return np.asarray(samples, dtype=np.float64), [entry for _, truth in stream for entry in truth]
 
 
-@pytest.mark.parametrize("block_s", [0.0005, 0.013, 0.37, 2.0, 100.0])
+@pytest.mark.parametrize("block_s", [0.0005, 0.37, 100.0])
 def test_the_cut_into_blocks_changes_no_bit(scenario: Scenario, machine: Machine, block_s: float) -> None:
     samples, truth = _all(scenario, machine)
     again, truth_again = _all(scenario, machine, block_s)
