@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import NamedTuple
 
 import zstandard
 
@@ -27,8 +28,12 @@ _LIKE_REPORTS = zstandard.ZstdCompressionDict(
 )
 
 
-PackedReport = tuple[int, StoredReport, bytes]
-"""When a report was recorded, the report, and its text compressed."""
+class PackedReport(NamedTuple):
+    """A report, when it was recorded, and its text compressed."""
+
+    recorded_ns: int
+    report: StoredReport
+    text: bytes
 
 
 @dataclass(slots=True)
@@ -145,7 +150,7 @@ def pack(machine: str, step: Step, recorded_ns: int) -> tuple[PackedReport, ...]
     if step.checkpoint is not None:
         _check(machine, "checkpoint", step.checkpoint.head)
     compressor = zstandard.ZstdCompressor(_LEVEL, dict_data=_LIKE_REPORTS)
-    return tuple((recorded_ns, each, compressor.compress(each.text.encode())) for each in step.reports)
+    return tuple(PackedReport(recorded_ns, each, compressor.compress(each.text.encode())) for each in step.reports)
 
 
 def unpack(text: bytes) -> str:
