@@ -86,7 +86,8 @@ _TABLES = (
         {
             "streams": len,
             "commissioning refused": lambda rows: r.rate("refused" in row for row in rows),
-            "an alarm": r.share("heard"),
+            "an alarm": lambda rows: r.rate(row["heard"] or row["early"] for row in rows),
+            "outside the model": r.share("model"),
         },
         partial(r.where, fault=HEALTHY),
         "The same streams without a fault:",

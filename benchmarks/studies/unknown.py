@@ -49,6 +49,7 @@ _KINDS = {
     "e +20 %": r.among(r.share("exact"), changed="e +20%"),
 }
 _FALSE_ALARMS = r.among(r.share("any"), changed="healthy")
+_OUTSIDE = r.among(r.share("outside"), changed="healthy")
 _CHANGED = tuple(changed_in(changes) for changes in _CHANGES[1:])
 
 
@@ -70,6 +71,7 @@ _TABLES = (
             "commissioning refused": _refused,
             "healthy: any named": _FALSE_ALARMS,
             "healthy: named beyond 10 %": _beyond_limit,
+            "healthy: called outside": _OUTSIDE,
             **{f"{kind} located": located for kind, located in _KINDS.items()},
             "another named": r.among(r.share("wrong"), changed=_CHANGED),
         },
@@ -108,6 +110,7 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
     bearing = r.where(rows, changed=_CHANGED[:4])
     yield r.within("bearing changed, another parameter named", r.each(bearing, by, r.share("wrong")), 0.0, 0.01)
     yield r.within("false alarms of healthy windows", r.each(rows, by, _FALSE_ALARMS), 0.0, 0.01)
+    yield r.within("healthy windows called outside the model", r.each(rows, by, _OUTSIDE), 0.0, 0.01)
 
 
 def unknown(options: Options) -> Study:
