@@ -199,24 +199,27 @@ class LevelJudge:
     def _line(self, levels: WindowLevels, state: OperatingState) -> str:
         """The loudest line that the healthy machine did not have; empty if there is none."""
         parts = levels.line_parts
-        if parts is None or levels.bands is None or not state.lines:
+        if parts is None or levels.moments is None or levels.bands is None or not state.lines:
             return ""
         unknown = [math.nan] * len(parts)
         healthy = np.array([state.lines.get(one.name, unknown) for one in self._channels]).T
         if healthy.shape != parts.shape:
             return ""
-        found = new_line(levels.bands, parts, healthy, levels.values["not_x1"] ** 2)
+        without_1x, all_of_it = levels.values["not_x1"] ** 2, levels.moments[0].mean(axis=0)
+        power = np.where(np.isnan(without_1x), all_of_it, without_1x)  # the rotation may not be known
+        found = new_line(levels.bands, parts, healthy, power, abs(levels.speed_rad_s or 0.0) / (2 * math.pi))
         if found is None:
             return ""
         column, (low_hz, high_hz), share = found
-        times = ""
+        times = without = ""
         if levels.speed_rad_s:
             low, high = (2 * math.pi * edge / abs(levels.speed_rad_s) for edge in (low_hz, high_hz))
             times = f"{low:.3g} to {high:.3g} times running speed, "
+            without = " without its 1x"
         return (
             f"a line within {_plain(low_hz)} to {_plain(high_hz)} Hz ({times}{share:.0%} of the vibration of "
-            f"{self._channels[column].name} without its 1x) that the healthy machine did not have: gears, blades, a "
-            "bearing or a neighbouring machine"
+            f"{self._channels[column].name}{without}) that the healthy machine did not have: gears, blades, a bearing "
+            "or a neighbouring machine"
         )
 
     def _departure(self, levels: WindowLevels, column: int, state: OperatingState, n_errors: float) -> float:

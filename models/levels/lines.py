@@ -48,7 +48,7 @@ def learn_lines(windows: Sequence[FloatArray], bands: BandLevels, hops: float, u
 
 
 def new_line(
-    levels: BandLevels, parts: FloatArray, healthy: FloatArray, power: FloatArray
+    levels: BandLevels, parts: FloatArray, healthy: FloatArray, power: FloatArray, turning_hz: float
 ) -> tuple[int, tuple[float, float], float] | None:
     """The new line that has most of its channel's power; None where there is none.
 
@@ -60,6 +60,8 @@ def new_line(
         See `learn_lines`; nan where it is not known.
     power : ndarray, shape (n,)
         Mean square of each channel without 1x.
+    turning_hz : float
+        At which there is 1x, which an unbalance lifts; 0 where it is not known.
 
     Returns
     -------
@@ -69,7 +71,9 @@ def new_line(
     padded = np.pad(healthy, ((1, 1), (0, 0)), mode="edge")  # a line moves to the next band when the speed does
     before = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
     new = (before < _HAD_ONE) & (parts > np.maximum(LINE, _OVER_HEALTHY * before))  # not where it is not known
-    share = np.where(new, parts * levels.rms**2 / power, 0.0)
+    # The taper spreads a line over the edges of its band.
+    new[(turning_hz > 0.97 * levels.edges_hz[:-1]) & (turning_hz < 1.03 * levels.edges_hz[1:])] = False
+    share = np.divide(parts * levels.rms**2, power, out=np.zeros(parts.shape), where=new & (power > 0))
     band, column = divmod(int(share.argmax()), share.shape[1])
     if share[band, column] < _LOUD:
         return None

@@ -23,7 +23,15 @@ TIME_S = np.arange(HOP * HOPS) / RATE_HZ
 
 
 def window(
-    seed: int, *, loud: float = 1.0, mesh: float = 0.0, damping: float = 0.02, wander: float = 0.0
+    seed: int,
+    *,
+    loud: float = 1.0,
+    mesh: float = 0.0,
+    damping: float = 0.02,
+    wander: float = 0.0,
+    speed_hz: float = SPEED_HZ,
+    unbalance: float = 0.5,
+    known: bool = True,
 ) -> WindowLevels:
     """A resonance at 480 Hz that noise excites, 1x, and a mesh of 22 teeth in the first channel.
 
@@ -33,20 +41,25 @@ def window(
         Of the noise, whose rms is 1 otherwise.
     wander : float
         Of the speed, up and down within a hop, relative.
+    unbalance : float
+        Amplitude of 1x.
+    known : bool
+        Whether the shaft angle is.
     """
     rng = np.random.default_rng([20261240, seed])
     pole = np.exp(2 * np.pi * 480.0 / RATE_HZ * (-damping + 1j))
     noise = lfilter([1.0], [1.0, -2 * pole.real, abs(pole) ** 2], rng.standard_normal((2, TIME_S.size)))
     noise = loud * (noise / noise.std() + 0.3 * rng.standard_normal(noise.shape))
-    angle = 2 * np.pi * SPEED_HZ * (TIME_S + wander / (2 * np.pi * 0.33) * np.sin(2 * np.pi * 0.33 * TIME_S))
-    samples = noise + 0.5 * np.cos(angle)
+    angle = 2 * np.pi * speed_hz * (TIME_S + wander / (2 * np.pi * 0.33) * np.sin(2 * np.pi * 0.33 * TIME_S))
+    samples = noise + unbalance * np.cos(angle)
     samples[0] += mesh * np.cos(22 * angle + rng.uniform(0, 2 * np.pi))
     hops = []
     for part, turning in zip(np.split(samples, HOPS, axis=1), np.split(angle, HOPS), strict=True):
         waveform, deviations = waveform_of(part.T)
-        hops.append((hop_levels(PLAN, waveform, deviations, turning), (turning[-1] - turning[0]) / (HOP / RATE_HZ)))
+        speed_rad_s = (turning[-1] - turning[0]) / (HOP / RATE_HZ) if known else np.nan
+        hops.append((hop_levels(PLAN, waveform, deviations, turning if known else None), speed_rad_s))
     speeds = np.array([speed for _, speed in hops])
-    return window_levels(PLAN, [levels for levels, _ in hops], speeds, phase_reference=True)
+    return window_levels(PLAN, [levels for levels, _ in hops], speeds, phase_reference=known)
 
 
 def told(levels: WindowLevels, healthy: list[WindowLevels]) -> str:
@@ -80,6 +93,23 @@ def test_noise_is_no_line_whatever_its_level_or_resonance(healthy: list[WindowLe
 
 def test_a_line_that_is_little_of_the_vibration_is_not_told(healthy: list[WindowLevels]) -> None:
     assert told(window(300, loud=3.0, mesh=0.3), healthy) == ""
+
+
+def test_an_unbalance_is_no_new_line() -> None:
+    balanced = [window(700 + number, loud=0.3, speed_hz=100.0, unbalance=0.003) for number in range(4)]
+    assert "a line" not in told(window(710, loud=0.3, speed_hz=100.0, unbalance=1.0), balanced)
+
+
+def test_where_the_speed_is_not_known_a_line_is_part_of_all_vibration() -> None:
+    healthy = [window(800 + number, loud=0.3, known=False) for number in range(4)]
+    text = told(window(810, loud=0.3, mesh=0.4, known=False), healthy)
+    assert "a line within 460 to 487 Hz (18% of the vibration of V) that" in text
+    assert told(window(811, loud=0.3, mesh=0.4, unbalance=4.0, known=False), healthy) == ""
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_channel_without_any_signal_has_no_line(healthy: list[WindowLevels]) -> None:
+    assert told(window(820, loud=0.0, unbalance=0.0), healthy) == ""
 
 
 @pytest.mark.parametrize("wander", [0.0, 0.01])
