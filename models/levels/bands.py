@@ -61,6 +61,7 @@ class BandReference(BaseModel):
     edges_hz: tuple[_Level, ...]
     mean: tuple[_Level, ...]
     high: tuple[_Level, ...]  # largest of the windows
+    low: tuple[_Level, ...] = Field(default=(), exclude_if=lambda found: not found)  # smallest of them
     error: tuple[_Level, ...]  # mean standard error of one window
     freedom: tuple[_Level, ...]  # degrees of freedom of `mean`
 
@@ -73,6 +74,7 @@ def learn_bands(windows: Sequence[BandLevels], column: int) -> BandReference:
         edges_hz=_short(windows[0].edges_hz),
         mean=_short(rms.mean(axis=0)),
         high=_short(rms.max(axis=0)),
+        low=_short(rms.min(axis=0)),
         error=_short(errors.mean(axis=0)),
         freedom=_short(np.asarray(sum(one.freedom for one in windows))),
     )

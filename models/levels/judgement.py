@@ -202,12 +202,15 @@ class LevelJudge:
         if parts is None or levels.moments is None or levels.bands is None or not state.lines:
             return ""
         unknown = [math.nan] * len(parts)
-        healthy = np.array([state.lines.get(one.name, unknown) for one in self._channels]).T
-        if healthy.shape != parts.shape:
+        names = [one.name for one in self._channels]
+        healthy = np.array([state.lines.get(name, unknown) for name in names]).T
+        quietest = [state.bands[name].low if name in state.bands else () for name in names]
+        if healthy.shape != parts.shape or any(len(low) != len(parts) for low in quietest):
             return ""
         without_1x, all_of_it = levels.values["not_x1"] ** 2, levels.moments[0].mean(axis=0)
         power = np.where(np.isnan(without_1x), all_of_it, without_1x)  # the rotation may not be known
-        found = new_line(levels.bands, parts, healthy, power, abs(levels.speed_rad_s or 0.0) / (2 * math.pi))
+        turning_hz = abs(levels.speed_rad_s or 0.0) / (2 * math.pi)
+        found = new_line(levels.bands, parts, healthy, np.array(quietest).T, power, turning_hz)
         if found is None:
             return ""
         column, (low_hz, high_hz), share = found

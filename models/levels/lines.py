@@ -48,7 +48,12 @@ def learn_lines(windows: Sequence[FloatArray], bands: BandLevels, hops: float, u
 
 
 def new_line(
-    levels: BandLevels, parts: FloatArray, healthy: FloatArray, power: FloatArray, turning_hz: float
+    levels: BandLevels,
+    parts: FloatArray,
+    healthy: FloatArray,
+    quietest: FloatArray,
+    power: FloatArray,
+    turning_hz: float,
 ) -> tuple[int, tuple[float, float], float] | None:
     """The new line that has most of its channel's power; None where there is none.
 
@@ -58,6 +63,9 @@ def new_line(
         Part of each band's power that the strongest bin of a hop has.
     healthy : ndarray, shape (n_bands, n)
         See `learn_lines`; nan where it is not known.
+    quietest : ndarray, shape (n_bands, n)
+        Level of each band in the healthy window in which it is least: a line that is no louder may have been there,
+        under noise, or spread by a speed that varied within a hop.
     power : ndarray, shape (n,)
         Mean square of each channel without 1x.
     turning_hz : float
@@ -71,9 +79,12 @@ def new_line(
     padded = np.pad(healthy, ((1, 1), (0, 0)), mode="edge")  # a line moves to the next band when the speed does
     before = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
     new = (before < _HAD_ONE) & (parts > np.maximum(LINE, _OVER_HEALTHY * before))  # not where it is not known
+    least = np.pad(quietest**2, ((1, 1), (0, 0)))  # a line that is spread over an edge is in both bands
+    strongest = parts * levels.rms**2
+    new &= OF_BIN * strongest > least[1:-1] + np.maximum(least[:-2], least[2:])
     # The taper spreads a line over the edges of its band.
     new[(turning_hz > 0.97 * levels.edges_hz[:-1]) & (turning_hz < 1.03 * levels.edges_hz[1:])] = False
-    share = np.divide(parts * levels.rms**2, power, out=np.zeros(parts.shape), where=new & (power > 0))
+    share = np.divide(strongest, power, out=np.zeros(parts.shape), where=new & (power > 0))
     band, column = divmod(int(share.argmax()), share.shape[1])
     if share[band, column] < _LOUD:
         return None

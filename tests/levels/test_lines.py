@@ -120,6 +120,13 @@ def test_a_line_of_the_healthy_machine_is_none_steadier_or_not(wander: float) ->
     assert "a line" not in told(window(501, mesh=0.5, loud=0.3, wander=0.005), geared)
 
 
+def test_a_line_that_noise_or_an_unsteady_speed_hid_on_the_healthy_machine_is_not_told() -> None:
+    under_noise = [window(900 + number, mesh=0.15) for number in range(4)]
+    assert "a line" not in told(window(910, mesh=0.15, loud=0.1), under_noise)
+    spread = [window(920 + number, mesh=0.4, loud=0.3, wander=0.03) for number in range(4)]
+    assert "a line" not in told(window(930, mesh=0.4, loud=0.3), spread)
+
+
 def test_commissionings_and_plans_without_lines_have_none_to_tell(healthy: list[WindowLevels]) -> None:
     assert level_plan(CHANNELS, RATE_HZ, (10.0, 1000.0)).lines is False
     without = [type(one)(one.values, one.errors, one.vectors, one.speed_rad_s, one.hops, one.bands) for one in healthy]
