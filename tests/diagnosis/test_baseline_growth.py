@@ -79,11 +79,14 @@ def test_a_window_of_another_force_that_the_relations_do_not_hold_in_names_nothi
     assert verdict.changed == ()
 
 
+SIZES = WindowSizes(length_s=30.0, hop_s=2.5, segment_s=2.5)
+
+
 @cache
 def with_a_force_that_hides_a_plane() -> tuple[Baseline, tuple[WindowStatistics, ...]]:
     """Learned in two conditions; and later windows of the one that hardly determines the horizontal plane."""
-    rotor, sizes = rotor_named("plain-bearings"), WindowSizes(length_s=30.0, hop_s=2.5, segment_s=2.5)
-    scene, planned = replace(COMMISSIONED, cutoff_hz=(130.0, 130.0)), plan(rotor, sizes)
+    rotor = rotor_named("plain-bearings")
+    scene, planned = replace(COMMISSIONED, cutoff_hz=(130.0, 130.0)), plan(rotor, SIZES)
 
     def windows(layout: SourceLayout, count: int, seed: int) -> list[WindowStatistics]:
         run = drawn_condition(rotor, layout, scene, {}, np.random.default_rng(1))
@@ -118,3 +121,13 @@ def test_what_a_healthy_window_does_not_determine_is_not_evaluable_and_no_fault_
             assert not diagnosis.suspect
             assert diagnosis.misfit_z is not None
             assert diagnosis.misfit_z < 3
+
+
+def test_a_reversed_sensor_is_suspected_although_the_force_that_it_leaves_hides_the_plane() -> None:
+    learned, _ = with_a_force_that_hides_a_plane()
+    rotor, planned = rotor_named("plain-bearings"), plan(rotor_named("plain-bearings"), SIZES)
+    run = drawn_condition(rotor, SourceLayout.INDEPENDENT, COMMISSIONED, {}, np.random.default_rng(1))
+    samples = sampled(rotor, run, 30.0 + planned.preamble / planned.rate_hz + 0.1, 99)
+    samples[:, 0] *= -1
+    diagnosis = BaselineDiagnostician(learned).diagnose(windows_of(samples, planned)[0])
+    assert "swapped, reversed or late" in diagnosis.suspect

@@ -189,7 +189,9 @@ class RowChange:
     widening: float  # scatter from hop to hop over what the spectra expect, at least 1, times the relation's allowance
     chi2: float  # what the change leaves, in units of all its errors
     degrees_of_freedom: int
-    unchanged: bool  # whether no change at all leaves no more than chance does
+    # Whether no change at all leaves no more than chance does, of a row whose parts add up to less than they are: where
+    # a sensor is reversed or late the force that is left is so large that chance leaves anything.
+    unchanged: bool
 
     @property
     def fits(self) -> bool:
@@ -476,5 +478,12 @@ def change_of(row: Row, relation: Relation, moments: LagMoments) -> RowChange:
         widening=widening,
         chi2=chi2,
         degrees_of_freedom=freedom,
-        unchanged=bool(criterion(np.zeros(d.size)) <= _FITS * np.sqrt(2 * rank)),
+        unchanged=bool(criterion(np.zeros(d.size)) <= _FITS * np.sqrt(2 * rank))
+        and not _cancels_nothing(relation, moments),
     )
+
+
+def _cancels_nothing(relation: Relation, moments: LagMoments) -> bool:
+    """Whether more is left of the row as it was learned than its parts hold, as if one of them had another sign."""
+    parts = [np.trace(moments.covariance(part)) for part in np.diag(relation.combination)]
+    return bool(np.trace(moments.covariance(relation.combination)) > sum(parts))
