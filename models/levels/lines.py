@@ -80,12 +80,11 @@ def new_line(
     before = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
     new = (before < _HAD_ONE) & (parts > np.maximum(LINE, _OVER_HEALTHY * before))  # not where it is not known
     least = np.pad(quietest**2, ((1, 1), (0, 0)))  # a line that is spread over an edge is in both bands
-    strongest = parts * levels.rms**2
-    new &= OF_BIN * strongest > least[1:-1] + np.maximum(least[:-2], least[2:])
+    power_of_line = OF_BIN * parts * levels.rms**2
+    new &= power_of_line > least[1:-1] + np.maximum(least[:-2], least[2:])
     # The taper spreads a line over the edges of its band.
     new[(turning_hz > 0.97 * levels.edges_hz[:-1]) & (turning_hz < 1.03 * levels.edges_hz[1:])] = False
-    share = np.divide(strongest, power, out=np.zeros(parts.shape), where=new & (power > 0))
+    share = np.divide(power_of_line, power, out=np.zeros(parts.shape), where=new & (power > 0))
     band, column = divmod(int(share.argmax()), share.shape[1])
-    if share[band, column] < _LOUD:
-        return None
-    return column, (float(levels.edges_hz[band]), float(levels.edges_hz[band + 1])), float(share[band, column])
+    part, (low_hz, high_hz) = min(1.0, float(share[band, column])), levels.edges_hz[band : band + 2].tolist()
+    return None if part < _LOUD else (column, (low_hz, high_hz), part)

@@ -229,7 +229,7 @@ class FirstWindows:
             return
         self._end_ns = end_ns
         # Only diagnosis needs a healthy kurtosis or contact, and a machine that is diagnosed is commissioned.
-        self._seen.append(replace(levels, moments=None, contact=None))
+        self._seen.append(replace(levels, moments=None, contact=None, lines=None))
         if len(self._seen) == self._count:
             learned, self._seen = learn_levels(self._source, self._channels, self._seen), []
             states = (*(() if before is None else before.states), *learned.states)

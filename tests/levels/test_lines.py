@@ -103,7 +103,7 @@ def test_an_unbalance_is_no_new_line() -> None:
 def test_where_the_speed_is_not_known_a_line_is_part_of_all_vibration() -> None:
     healthy = [window(800 + number, loud=0.3, known=False) for number in range(4)]
     text = told(window(810, loud=0.3, mesh=0.4, known=False), healthy)
-    assert "a line within 460 to 487 Hz (18% of the vibration of V) that" in text
+    assert "a line within 460 to 487 Hz (27% of the vibration of V) that" in text
     assert told(window(811, loud=0.3, mesh=0.4, unbalance=4.0, known=False), healthy) == ""
 
 
