@@ -24,6 +24,10 @@ _FIRST_BIN = 2
 _COUNTS = 0.01
 """Part of a channel's rms below which a band is not looked at: what is there is mostly the noise of the sensor."""
 _CHANCE = 1e-9
+LINE = 0.2
+"""Least part of the power of its band that the strongest bin of a line has."""
+OF_BIN = 1.5
+"""Power of a line over that of its strongest bin, where it is in the middle of it."""
 _Level = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
@@ -174,3 +178,14 @@ def _around(values: FloatArray) -> FloatArray:
     """Largest of each band and its two neighbours."""
     padded = np.pad(values, 1, mode="edge")
     return np.asarray(np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:]))
+
+
+def band_in_words(band_hz: tuple[float, float]) -> str:
+    """From and to, without a power of ten.
+
+    Examples
+    --------
+    >>> band_in_words((94.567, 5202.4))
+    '94.6 to 5202 Hz'
+    """
+    return "{} to {} Hz".format(*(f"{edge:.3g}" if edge < 1000 else f"{edge:.0f}" for edge in band_hz))

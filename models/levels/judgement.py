@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from models.levels.bands import Growth, growth
+from models.levels.bands import Growth, band_in_words, growth
 from models.levels.contact import LatestContact
 from models.levels.gains import place_of, wrong_gain
 from models.levels.kurtosis import GAUSSIAN, departure, fallen_by_lines, without_lines
@@ -141,7 +141,8 @@ class LevelJudge:
         state, seen = reference.at(levels.speed_rad_s)
         found = ""
         if seen:
-            found = self._contact(levels, state, latest, reference.states.index(state)) or self._line(levels, state)
+            found = self._contact(levels, state, latest, reference.states.index(state))
+            found = found or new_line(levels, [one.name for one in self._channels], state.lines, state.bands)
         if not found and reference.gains is not None and levels.bands is not None:
             wrong = wrong_gain(levels.bands, [place_of(one) for one in self._channels], reference.gains)
             if wrong is not None:
@@ -194,35 +195,6 @@ class LevelJudge:
         return (
             f"a shaft at {y.name} and {z.name} ({y.location}) that is pushed back where it is far out, as by a rub or "
             f"a stop: {mean + most:.1f} standard errors in a mean hop, {mean:.1f} on the healthy machine"
-        )
-
-    def _line(self, levels: WindowLevels, state: OperatingState) -> str:
-        """The loudest line that the healthy machine did not have; empty if there is none."""
-        parts = levels.line_parts
-        if parts is None or levels.moments is None or levels.bands is None or not state.lines:
-            return ""
-        unknown = [math.nan] * len(parts)
-        names = [one.name for one in self._channels]
-        healthy = np.array([state.lines.get(name, unknown) for name in names]).T
-        quietest = [state.bands[name].low if name in state.bands else () for name in names]
-        if healthy.shape != parts.shape or any(len(low) != len(parts) for low in quietest):
-            return ""
-        without_1x, all_of_it = levels.values["not_x1"] ** 2, levels.moments[0].mean(axis=0)
-        power = np.where(np.isnan(without_1x), all_of_it, without_1x)  # the rotation may not be known
-        turning_hz = abs(levels.speed_rad_s or 0.0) / (2 * math.pi)
-        found = new_line(levels.bands, parts, healthy, np.array(quietest).T, power, turning_hz)
-        if found is None:
-            return ""
-        column, (low_hz, high_hz), share = found
-        times = without = ""
-        if levels.speed_rad_s:
-            low, high = (2 * math.pi * edge / abs(levels.speed_rad_s) for edge in (low_hz, high_hz))
-            times = f"{low:.3g} to {high:.3g} times running speed, "
-            without = " without its 1x"
-        return (
-            f"a line within {_plain(low_hz)} to {_plain(high_hz)} Hz ({times}{share:.0%} of the vibration of "
-            f"{self._channels[column].name}{without}) that the healthy machine did not have: gears, blades, a bearing "
-            "or a neighbouring machine"
         )
 
     def _departure(self, levels: WindowLevels, column: int, state: OperatingState, n_errors: float) -> float:
@@ -278,7 +250,7 @@ class LevelJudge:
             limits = self._limits[key] = self._limits_of(column, alike, standard, zone, edge)
         if grown is not None and relative is not None:
             limits = limits | {"growth": self._growth(relative.source, grown.limit)}
-            words = {**_WORDS, "growth": "{} to {} Hz".format(*map(_plain, grown.band_hz))}
+            words = {**_WORDS, "growth": band_in_words(grown.band_hz)}
         record["zone"] = zone
         record["limits"] = tuple(
             [
@@ -378,17 +350,6 @@ class LevelJudge:
                 "text": f"{said} {value:.3g} {unit}, {what}",
             }
         )
-
-
-def _plain(value: float) -> str:
-    """Three digits, and no power of ten.
-
-    Examples
-    --------
-    >>> _plain(94.567), _plain(5202.4)
-    ('94.6', '5202')
-    """
-    return f"{value:.0f}" if value >= 1000 else f"{value:.3g}"
 
 
 def _blank(plan: LevelPlan, channel: Channel) -> ChannelLevels:

@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from models.levels.bands import BandLevels, BandReference
-from models.levels.lines import LINE, OF_BIN
+from models.levels.bands import LINE, OF_BIN, BandLevels, BandReference
 from models.signals.block import FloatArray
 
 

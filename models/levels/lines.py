@@ -5,17 +5,17 @@ power is spread says more, and is the same in all of them: of n independent bins
 (ln n + γ)/n of the power, γ = 0.577, for that is the mean of the largest of n exponentials; of a line two thirds.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from models.levels.bands import BandLevels
+from models.levels.bands import LINE, OF_BIN, BandLevels, BandReference, band_in_words
+from models.levels.measures import WindowLevels
 from models.signals.block import FloatArray
 
-LINE, _OVER_HEALTHY = 0.2, 2.0
-"""Least part of its band that a line has, and times the largest of the healthy machine."""
-OF_BIN = 1.5
-"""Power of a line over that of its strongest bin, where it is in the middle of it."""
+_OVER_HEALTHY = 2.0
+"""Times the largest part that the strongest bin of a band had on the healthy machine, from which on it is a line."""
 _HAD_ONE = 0.25
 """Part from which on the healthy machine is taken to have a line there; a narrow resonance has less."""
 _NOISE, _STEADY = 2.0, 1e-3
@@ -48,43 +48,52 @@ def learn_lines(windows: Sequence[FloatArray], bands: BandLevels, hops: float, u
 
 
 def new_line(
-    levels: BandLevels,
-    parts: FloatArray,
-    healthy: FloatArray,
-    quietest: FloatArray,
-    power: FloatArray,
-    turning_hz: float,
-) -> tuple[int, tuple[float, float], float] | None:
-    """The new line that has most of its channel's power; None where there is none.
+    levels: WindowLevels,
+    channels: Sequence[str],
+    healthy_parts: Mapping[str, Sequence[float]],
+    healthy_bands: Mapping[str, BandReference],
+) -> str:
+    """The line that the healthy machine did not have and that has most of its channel's power; empty if there is none.
 
     Parameters
     ----------
-    parts : ndarray, shape (n_bands, n)
-        Part of each band's power that the strongest bin of a hop has.
-    healthy : ndarray, shape (n_bands, n)
-        See `learn_lines`; nan where it is not known.
-    quietest : ndarray, shape (n_bands, n)
-        Level of each band in the healthy window in which it is least: a line that is no louder may have been there,
-        under noise, or spread by a speed that varied within a hop.
-    power : ndarray, shape (n,)
-        Mean square of each channel without 1x.
-    turning_hz : float
-        At which there is 1x, which an unbalance lifts; 0 where it is not known.
-
-    Returns
-    -------
-    tuple of int, (float, float) and float, or None
-        Column, edges of the band, Hz, and part of that power.
+    channels : sequence of str
+        Names of the columns.
+    healthy_parts : mapping of str to sequence of float, shape (n_bands,)
+        By channel, see `learn_lines`.
+    healthy_bands : mapping of str to BandReference
+        By channel. A line that is no louder than its band was in the quietest window may have been there, under noise,
+        or spread by a speed that varied within a hop.
     """
+    bands, parts = levels.bands, levels.line_parts
+    if bands is None or parts is None or levels.moments is None:
+        return ""
+    known = [name in healthy_bands and len(healthy_bands[name].low) == len(parts) for name in channels]
+    if not all(known) or any(len(healthy_parts.get(name, ())) != len(parts) for name in channels):
+        return ""
+    healthy = np.array([healthy_parts[name] for name in channels]).T
     padded = np.pad(healthy, ((1, 1), (0, 0)), mode="edge")  # a line moves to the next band when the speed does
     before = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
-    new = (before < _HAD_ONE) & (parts > np.maximum(LINE, _OVER_HEALTHY * before))  # not where it is not known
+    new = (before < _HAD_ONE) & (parts > np.maximum(LINE, _OVER_HEALTHY * before))
+    quietest = np.array([healthy_bands[name].low for name in channels]).T
     least = np.pad(quietest**2, ((1, 1), (0, 0)))  # a line that is spread over an edge is in both bands
-    power_of_line = OF_BIN * parts * levels.rms**2
-    new &= power_of_line > least[1:-1] + np.maximum(least[:-2], least[2:])
-    # The taper spreads a line over the edges of its band.
-    new[(turning_hz > 0.97 * levels.edges_hz[:-1]) & (turning_hz < 1.03 * levels.edges_hz[1:])] = False
-    share = np.divide(power_of_line, power, out=np.zeros(parts.shape), where=new & (power > 0))
+    power = OF_BIN * parts * bands.rms**2
+    new &= power > least[1:-1] + np.maximum(least[:-2], least[2:])
+    turning_hz = abs(levels.speed_rad_s or 0.0) / (2 * math.pi)
+    # 1x is lifted by an unbalance, and the taper spreads a line over the edges of its band.
+    new[(turning_hz > 0.97 * bands.edges_hz[:-1]) & (turning_hz < 1.03 * bands.edges_hz[1:])] = False
+    without_1x = levels.values["not_x1"] ** 2
+    total = np.where(np.isnan(without_1x), levels.moments[0].mean(axis=0), without_1x)  # the rotation may not be known
+    share = np.divide(power, total, out=np.zeros(parts.shape), where=new & (total > 0))
     band, column = divmod(int(share.argmax()), share.shape[1])
-    part, (low_hz, high_hz) = min(1.0, float(share[band, column])), levels.edges_hz[band : band + 2].tolist()
-    return None if part < _LOUD else (column, (low_hz, high_hz), part)
+    part, (low_hz, high_hz) = min(1.0, float(share[band, column])), bands.edges_hz[band : band + 2].tolist()
+    if part < _LOUD:
+        return ""
+    times = without = ""
+    if turning_hz:
+        times = f"{low_hz / turning_hz:.3g} to {high_hz / turning_hz:.3g} times running speed, "
+        without = " without its 1x"
+    return (
+        f"a line within {band_in_words((low_hz, high_hz))} ({times}{part:.0%} of the vibration of {channels[column]}"
+        f"{without}) that the healthy machine did not have: gears, blades, a bearing or a neighbouring machine"
+    )
