@@ -146,7 +146,7 @@ def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingS
         bands={
             channel: learn_bands(bands, column) for column, channel in enumerate(channels) if len(bands) == len(group)
         },
-        lines=dict(zip(channels, map(tuple, lines.T.round(3).tolist()), strict=False)),
+        lines=dict(zip(channels, map(tuple, lines.T.round(3).tolist()), strict=False)),  # of all channels, or none
         kurtosis=_hops(channels, kurtosis),
         contact={
             # As theory says; and no push outwards, which is made by something else, hides one inwards.
