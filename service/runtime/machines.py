@@ -2,10 +2,10 @@
 
 ::
 
-    Zenoh threads            one thread per machine              supervisor
-    -------------            ----------------------              ----------
-    stream callback --> Inbox --> MachineMonitor.step_payload
-      (bounded, counts)           |        |        |            four times a second:
+    one thread for all       one thread per machine              supervisor
+    ------------------       ----------------------              ----------
+    Intake ---------------> Inbox --> MachineMonitor.step_payload
+              (bounded, counts)   |        |        |            four times a second:
                                   |                 '--> snapshot --> health topic, listener
                                   '--> Store (one thread, commits)
                                          '--> then report, alarm topics; listener

@@ -28,11 +28,13 @@ class Pulse:
     ----------
     call : callable
         Has a function called by the thread; False if it never will be. `service.stream.inbox.Inbox.call` is one.
+    work : callable
+        What the thread does when it comes round.
 
     Examples
     --------
     >>> waiting, now_s = [], 5.0
-    >>> pulse = Pulse(lambda function: not waiting.append(function), lambda: now_s)
+    >>> pulse = Pulse(lambda function: not waiting.append(function), lambda: None, lambda: now_s)
     >>> pulse.beat()
     >>> now_s = 75.0
     >>> pulse.beat()
@@ -43,8 +45,14 @@ class Pulse:
     0.0
     """
 
-    def __init__(self, call: Callable[[Callable[[], None]], bool], clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        call: Callable[[Callable[[], None]], bool],
+        work: Callable[[], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._call = call
+        self._work = work
         self._clock = clock
         self._sent_s: float | None = None
 
@@ -63,3 +71,4 @@ class Pulse:
 
     def _answered(self) -> None:
         self._sent_s = None
+        self._work()

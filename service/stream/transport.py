@@ -19,7 +19,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from types import MappingProxyType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import zenoh
 import zenoh.ext
@@ -30,6 +30,7 @@ from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage
 from models.signals.wire import REPLAY_MARK
 from service.stream.inbox import RawBlock
+from service.stream.intake import Intake
 from service.stream.log_query import read_log_query
 from service.terminal.logs import logger
 
@@ -38,6 +39,8 @@ _CLOUD_EVENT = "application/cloudevents+json"
 _HEARTBEAT_S = 1.0
 _CACHED_BLOCKS = 1200
 """Fewer than a queue takes by default: what comes at once after a restart must not overflow it."""
+_WAITING_BLOCKS = 4096
+"""Far more than come between two looks of the thread that takes them; beyond, the network waits."""
 _CACHED_EVENTS = 200
 _QUERY_TIMEOUT_S = 10.0
 _QUICK_CONNECT_S = 3.0
@@ -101,6 +104,7 @@ class Link:
         self, settings: LinkSettings, *, fail_fast: bool = False, more: Mapping[str, str] = MappingProxyType({})
     ) -> None:
         self.errors = 0  # exceptions in callbacks so far
+        self.intake = Intake()
         config = zenoh.Config()
         items = settings.zenoh_items() | dict(more)
         if fail_fast or settings.mode == "client":
@@ -133,6 +137,7 @@ class Link:
 
     def close(self) -> None:
         """Close the session."""
+        self.intake.close()
         self.session.close()  # type: ignore[no-untyped-call]
 
 
@@ -188,8 +193,12 @@ class MachineLink:
             ).undeclare
         )
         keep(alive.declare_subscriber(keys.publisher_alive, guarded(self._take_alive), history=True).undeclare)
-        stream = _stream_subscriber(session, keys.stream, guarded(self._take_block), wait=wait_when_full)
+        take = guarded(self._take_block)
+        directly = zenoh.handlers.Callback(take, indirect=False) if wait_when_full else None
+        stream = _stream_subscriber(session, keys.stream, directly)
         keep(stream.undeclare)
+        if not wait_when_full:
+            keep(self._link.intake.add(stream.try_recv, take))
         keep(stream.sample_miss_listener(guarded(self._take_miss)).undeclare)
         keep(alive.declare_token(keys.monitor_alive).undeclare)
 
@@ -261,7 +270,7 @@ def tap(link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], N
     with ExitStack() as undo:
         undo.callback(session.declare_subscriber(f"{keys.root}/**", link.guarded(take)).undeclare)
         # The stream as the monitor takes it: blocks that were lost on the way are fetched again.
-        undo.callback(_stream_subscriber(session, keys.stream, link.guarded(take_block), wait=False).undeclare)
+        undo.callback(_stream_subscriber(session, keys.stream, link.guarded(take_block)).undeclare)
         liveliness = session.liveliness()
         alive = liveliness.declare_subscriber(keys.publisher_alive, link.guarded(take_alive), history=True)
         undo.callback(alive.undeclare)
@@ -372,22 +381,28 @@ def _advanced_publisher(session: zenoh.Session, key: str, encoding: str, cache: 
 
 
 def _stream_subscriber(
-    session: zenoh.Session, key: str, callback: Callable[[zenoh.Sample], None], *, wait: bool
-) -> zenoh.ext.AdvancedSubscriber[None]:
+    session: zenoh.Session, key: str, callback: Callable[[zenoh.Sample], None] | None
+) -> zenoh.ext.AdvancedSubscriber[Any]:
     """Subscribe to sample blocks: those of a publisher's cache first, those lost on the way fetched again.
 
-    With `wait` the callback may hold up the network's own thread, and no heartbeat is listened to. But what is missing
-    is fetched there as well: where blocks of the cache and new ones meet, a new one may overtake.
+    Parameters
+    ----------
+    callback : callable or None
+        Takes each of them; if None, they are to be received. One that is called on the network's own thread may hold it
+        up, and no heartbeat is listened to then. But what is missing is fetched there as well: where blocks of the
+        cache and new ones meet, a new one may overtake.
     """
+    waits = isinstance(callback, zenoh.handlers.Callback) and not callback.indirect
     # The period is of no use but to have missing blocks fetched at all, without heartbeats.
     fetched = zenoh.ext.RecoveryConfig(
-        periodic_queries=_NEVER if wait else None,  # type: ignore[arg-type]  # the stub says seconds
-        heartbeat=None if wait else True,
+        periodic_queries=_NEVER if waits else None,  # type: ignore[arg-type]  # the stub says seconds
+        heartbeat=None if waits else True,
     )
+    handler: Any = zenoh.handlers.FifoChannel(_WAITING_BLOCKS) if callback is None else callback
     return zenoh.ext.declare_advanced_subscriber(
         session,
         key,
-        zenoh.handlers.Callback(callback, indirect=not wait),
+        handler,
         history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=_CACHED_BLOCKS),
         recovery=fetched,
         subscriber_detection=True,

@@ -111,8 +111,7 @@ class MachineWorker:
         self._outlet: Callable[[Topic, str], None] | None = None
         self._published_alarms: tuple[tuple[str, int, bool, bool], ...] = ()
         self._dropped_logged = 0
-        self._ticking = False
-        self._pulse = Pulse(self.inbox.call)
+        self._pulse = Pulse(self.inbox.call, self._tick)
         self._thread = threading.Thread(target=self._run, name=f"monitor {machine.title}", daemon=True)
 
     def _restored(self, installed: Installed) -> tuple[MachineMonitor, str]:
@@ -288,9 +287,6 @@ class MachineWorker:
     def tick(self) -> None:
         """Let the machine's thread notice that time passes, with data or without; called every now and then."""
         self._pulse.beat()
-        if not self._ticking:
-            self._ticking = True
-            self.inbox.call(self._tick)
 
     @property
     def _silent(self) -> bool:
@@ -313,7 +309,6 @@ class MachineWorker:
         return end_ns + round((now_s - self._latest_data_s) * 1e9)
 
     def _tick(self) -> None:
-        self._ticking = False
         now_s, limit_s = self._clocks.monotonic_s(), self.machine.ingest.no_data_after_s
         if now_s - self._ticked_s > _HELD_UP_S and self._ticked_s - self._heard_s < limit_s:
             self._held_up_s = now_s  # a silence that had begun before goes on

@@ -170,7 +170,7 @@ def machine(**changes: object) -> MachineReadiness:
 
 
 def test_a_pulse_that_nobody_will_answer_is_not_waited_for() -> None:
-    pulse = Pulse(lambda _: False, clock=iter([1.0, 100.0]).__next__)
+    pulse = Pulse(lambda _: False, lambda: None, clock=iter([1.0, 100.0]).__next__)
     pulse.beat()
     assert pulse.busy_s == 0.0
 
