@@ -41,6 +41,9 @@ _STEADY = 0.15
 """Range of speed within a window, relative, up to which the rotation taken out hop by hop leaves nothing behind: on the
 rotor kit readings stay unbiased at ramps of 5, 10 and 15 % (16 seeds each, ``tests/diagnosis/test_window.py``)."""
 
+_OUTSIDE = 4.0
+"""Standard deviations of the misfit from which the short stretches of a window are tested for themselves."""
+
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
@@ -232,10 +235,12 @@ class KnownMachineEvaluator(WindowEvaluator):
             short = dict(sorted(short.items())[: int(straddles)])
         else:
             self._explained_ns = window.end_ns
+        # Where the window is outside the model it may be astride a change: then its newest hops are inside.
+        closely = deciding.misfit_z is not None and deciding.misfit_z > _OUTSIDE
         evaluated = {}
         for hops, statistics in short.items():
             try:
-                evaluated[hops] = self._decide(statistics, partial(self._likelihood.short, hops))
+                evaluated[hops] = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
             except EstimationError:
                 continue  # too little data for itself; the window has said what there is to say
         equations: tuple[Equation, ...] = ()

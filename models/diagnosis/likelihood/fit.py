@@ -456,15 +456,20 @@ class LengthFits:
         self._hop += 1
         return self._window.diagnose(window)
 
-    def short(self, hops: int, stretch: WindowStatistics) -> Diagnosis:
+    def short(self, hops: int, stretch: WindowStatistics, *, closely: bool = False) -> Diagnosis:
         """Estimate the parameters of the window's latest hops: at a glance if they say what the window says.
+
+        Parameters
+        ----------
+        closely : bool
+            Not at a glance, which does not say whether the stretch is outside the model.
 
         Raises
         ------
         EstimationError
             As `LikelihoodFit.diagnose`.
         """
-        seen = self._window.glance(stretch)
+        seen = None if closely else self._window.glance(stretch)
         if seen is not None:
             return seen
         fit = self._short.setdefault(hops, LikelihoodFit(self._machine))

@@ -43,6 +43,8 @@ _PROBABLE = 0.05  # least probability of a parameter that is told as one that ma
 # Standard errors that a reading astride its change must be from zero; with fewer it is a guess of when rather than of
 # how much, and leans to what is too large.
 _CLEAR = 3.0
+# Standard deviations of the misfit below which a short stretch takes back that the machine is outside the model.
+_INSIDE = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +168,8 @@ class SequentialTest:
         if deciding:
             outside, confidence = model_test(clean[deciding[-1]], self._thresholds[deciding[-1]])
         unexplained = clean[deciding[-1]].unexplained if deciding else ""
-        by = deciding[-1] if deciding else None
-        outside = self._outside(outside or bool(unexplained), by, own[window_hops].end_ns)
+        by = clean[deciding[-1]] if deciding else None
+        outside = self._outside(outside or bool(unexplained), by, own[window_hops])
         loud = {hops: self._isolate(hops, look) for hops, look in every.items() if self._is_loud(hops, look)}
         verdicts = {hops: verdict for hops, verdict in loud.items() if verdict.changed}
         decided, isolation = self._decide(every, clean, verdicts)
@@ -224,27 +226,30 @@ class SequentialTest:
             found[windows] = total
         return found
 
-    def _outside(self, said: bool, by: int | None, end_ns: int) -> bool:
+    def _outside(self, said: bool, by: Stretch | None, window: Stretch) -> bool:
         """Whether the machine counts as outside the model.
 
-        What has been said for longer than any window is astride a change, a whole clean window alone takes back: on a
-        machine that no parameters explain stretches contradict each other, and a short one explains little of what it
-        is asked.
+        While the window is outside, a short stretch takes back what has been said only if it is well inside: it has
+        little power, and with a few hops none. What has been said for longer than any window is astride a change, a whole clean window alone takes back: on a machine that no
+        parameters explain stretches contradict each other, and a short one explains little of what it is asked.
 
         Parameters
         ----------
         said : bool
             By the longest clean stretch of a window at most.
-        by : int or None
-            Its hops; None without one.
+        by : Stretch or None
+            That stretch; None without one.
         """
-        state, window_hops = self.state, self.settings.window_hops
+        state = self.state
         if said:
-            state.outside_ns = end_ns if state.outside_ns is None else state.outside_ns
+            state.outside_ns = window.end_ns if state.outside_ns is None else state.outside_ns
             return True
-        lasting_s = 0.0 if state.outside_ns is None else (end_ns - state.outside_ns) / 1e9
-        if lasting_s >= window_hops * self.settings.hop_s and by != window_hops:
-            return True
+        if state.outside_ns is not None and (by is None or by.start_ns > window.start_ns):
+            lasting_s = (window.end_ns - state.outside_ns) / 1e9
+            whole = model_test(window, self._thresholds[self.settings.window_hops])[0] or bool(window.unexplained)
+            doubtful = by is not None and (by.misfit_z is None or by.misfit_z > _INSIDE)
+            if (whole and doubtful) or lasting_s >= self.settings.window_hops * self.settings.hop_s:
+                return True
         if by is not None:
             state.outside_ns = None
         return False
