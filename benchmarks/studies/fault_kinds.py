@@ -204,6 +204,7 @@ Change = Callable[[Rotor, Seen, np.random.Generator], Seen]
 RUBS = {"rub, light": (0.5, 2.0), "rub, intermittent": (3.0, 1.6), "rub, heavy": (2.0, 1.0)}
 """Stiffness of the contact over the shaft's, and clearance over the radial rms of the disc."""
 CRACK = "breathing crack"
+ANOTHER = "no rotor: another one"
 HEALTHY = "none"
 FAULTS: Mapping[str, Change] = {
     **dict.fromkeys((HEALTHY, *RUBS, CRACK), as_simulated),
@@ -221,5 +222,6 @@ FAULTS: Mapping[str, Change] = {
     "no rotor: white noise": _noise(0.0),
     "no rotor: 1/f noise": _noise(1.0),
     "no rotor: a copied channel": _copied,
+    ANOTHER: as_simulated,
 }
 """Their place is part of the seed."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 
 from benchmarks.studies import results as r
-from benchmarks.studies.fault_kinds import CRACK, FAULTS, HEALTHY, RUBS
+from benchmarks.studies.fault_kinds import ANOTHER, CRACK, FAULTS, HEALTHY, RUBS
 from benchmarks.studies.results import Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from benchmarks.studies.subjects import SHIPPED, SUBJECTS
@@ -28,12 +28,16 @@ def _measure(seed: int, name: str, level: KnowledgeLevel, _: None, number: int) 
     subject = Subject(name, level, seed, number)
     installed = commissioned(subject.file, *map(subject.healthy, range(CONDITIONS)))
     # The rotor of finite elements touches nothing and does not crack.
-    faults = [fault for fault in FAULTS if name in SHIPPED or fault not in {*RUBS, CRACK}]
+    faults = [fault for fault in FAULTS if fault != ANOTHER and (name in SHIPPED or fault not in {*RUBS, CRACK})]
     said: dict[str, Value] = {}
     if isinstance(installed, str):  # what is left is to watch its levels, against its first windows
         said = {"refused": installed}
         subject, installed = replace(subject, windows=_FIRST_WINDOWS), Installed(subject.file)
-    return [{"fault": fault, **said, **_watched(subject, MachineMonitor(installed), fault)} for fault in faults]
+    found = [{"fault": fault, **said, **_watched(subject, MachineMonitor(installed), fault)} for fault in faults]
+    if level is KnowledgeLevel.FULL:  # from the beginning, and nobody has commissioned it
+        subject = replace(subject, windows=0)
+        found.append({"fault": ANOTHER, **_watched(subject, MachineMonitor(Installed(subject.file)), ANOTHER)})
+    return found
 
 
 def _watched(subject: Subject, monitor: MachineMonitor, fault: str) -> dict[str, Value]:

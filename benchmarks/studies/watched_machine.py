@@ -12,7 +12,7 @@ from benchmarks.finite_elements.machines import rotor_named
 from benchmarks.finite_elements.observed import RATE_HZ, RunCondition, sampled
 from benchmarks.finite_elements.rotor import BeamRotor
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
-from benchmarks.studies.fault_kinds import CRACK, MOTIONS, RUBS, Change, Rotor, Seen, as_simulated
+from benchmarks.studies.fault_kinds import ANOTHER, CRACK, MOTIONS, RUBS, Change, Rotor, Seen, as_simulated
 from benchmarks.studies.subjects import (
     ALIKE,
     SHIPPED,
@@ -109,6 +109,8 @@ class Subject:
         rng = self._rng(0, condition)
         if self.name in SHIPPED:
             machine = load_machine(self.name)
+            if fault == ANOTHER:
+                machine = _another(machine, rng)
             draw = drawn_in_one_condition(machine, rng, condition)
             scenario = draw_condition(draw, realisation).overridden(duration_s=seconds)
             return _of_shipped(machine, _speed_rad_s(scenario), _samples(machine, scenario, fault, self.begins_s))
@@ -118,6 +120,15 @@ class Subject:
         beam = rotor_named(self.name)
         ran = drawn_condition(beam, layout, scene, {}, rng)
         return _of_beam(beam, ran, seconds, [self.seed, self.number, condition, realisation])
+
+
+def _another(machine: Machine, rng: np.random.Generator) -> Machine:
+    """A machine with another rotor: both masses, inertia and length off by 30 to 60 %."""
+    parts = ("m1_kg", "m2_kg", "I2_kg_m2", "shaft_length_m")
+    off = {name: 1 + rng.choice([-1, 1]) * float(rng.uniform(0.3, 0.6)) for name in parts}
+    off["I2p_kg_m2"] = off["I2_kg_m2"]
+    update = {name: factor * getattr(machine.rotor, name) for name, factor in off.items()}
+    return machine.model_copy(update={"rotor": machine.rotor.model_copy(update=update)})
 
 
 def _of_beam(beam: BeamRotor, ran: RunCondition, seconds: float, seed: list[int]) -> tuple[Rotor, Seen]:

@@ -200,6 +200,18 @@ def test_a_name_needs_to_be_as_good_as_certain() -> None:
     assert judged([SURE | {"c_by": 0.6}] * 3) == ["raised c_bz"]  # one name is there: the other is waited for
 
 
+def test_where_most_has_changed_outside_the_model_nothing_is_named() -> None:
+    most = dict.fromkeys(("k_by", "c_by", "k_bz", "c_bz"), 0.99)
+    assert judged([most] * 3) == [f"raised {name}" for name in most]
+    assert judged([most] * 3, outside=True) == ["raised model"]
+    assert judged([most | {"k_by": 0.1}] * 3, outside=True) == [
+        "raised c_by",
+        "raised k_bz",
+        "raised c_bz",
+        "raised model",
+    ]
+
+
 def test_a_name_is_held_with_reserve_once_nothing_explains_the_machine() -> None:
     book = AlarmBook(SETTINGS)
     read = Parameter(name="c_bz", text="c_bz", by="", relative_change=0.2, standard_error=0.03)

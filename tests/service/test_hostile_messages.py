@@ -28,7 +28,7 @@ from service.monitor.monitor import MachineMonitor
 from service.runtime.runtime import running
 from service.stream.inbox import Inbox, RawBlock
 from service.stream.transport import Link, route
-from tests.service.foreign import FOREIGN, Foreign, as_blocks, foreign
+from tests.service.foreign import FOREIGN, Foreign, as_blocks, foreign, simulated
 from tests.service.live import (
     LAB,
     Feed,
@@ -420,3 +420,26 @@ CASES = [
 @pytest.mark.parametrize(("name", "kind"), CASES)
 def test_no_parameter_is_blamed_on_other_machines(name: str, kind: Foreign) -> None:
     judge(name, kind, SEED + 2)
+
+
+# As factors of both masses, length and inertia. The first fits no parameters but for ten seconds at a time, the second
+# one those of a machine with another shaft.
+@pytest.mark.parametrize("factors", [(0.44, 0.7, 0.54, 0.61), (0.56, 1.33, 0.7, 0.44)])
+def test_no_parameter_is_blamed_where_the_file_is_that_of_another_rotor(
+    factors: tuple[float, float, float, float],
+) -> None:
+    machine = load_machine("lab")
+    rotor, (m1, m2, length, inertia) = machine.rotor, factors
+    other = rotor.model_copy(
+        update={
+            "m1_kg": m1 * rotor.m1_kg,
+            "m2_kg": m2 * rotor.m2_kg,
+            "shaft_length_m": length * rotor.shaft_length_m,
+            "I2_kg_m2": inertia * rotor.I2_kg_m2,
+            "I2p_kg_m2": inertia * rotor.I2p_kg_m2,
+        }
+    )
+    monitor = MachineMonitor(install(machine, None))
+    samples = simulated(machine.model_copy(update={"rotor": other}), SEED, 110.0)
+    events = [one for block in as_blocks(machine, samples) for one in monitor.step(block).events]
+    assert {one.alarm.name for one in events if one.kind is EventKind.RAISED} == {MODEL}

@@ -43,6 +43,7 @@ _GROUPS = 150  # the band over the widest group
 # that the theory explains most searches have ended by then.
 _PATIENCE, _HOPELESS = 30, 2.0
 _OUTSIDE = "a sensor is at fault, or something outside the model has changed"
+_STIFFEST, _SURELY = 0.5, 3.0  # a shaft cracks or is exchanged; none becomes stiffer by half, in standard errors
 _SYNCHRONOUS_BINS = 3
 _FOLLOWED = 12  # windows in a row that may start from one window's units and slopes before a search takes its own
 
@@ -187,6 +188,7 @@ class LikelihoodFit:
         structural = covariance[:n, :n] + np.diag(found.remaining**2)
         self._latest = window, model, found.whitened.point, structural, speed
         read = self._read(*self._latest)
+        unexplained = unexplained or self._too_stiff(read)
         return replace(
             read,
             misfit_z=goodness.misfit_z,
@@ -368,6 +370,17 @@ class LikelihoodFit:
             return ""
         self.reset()  # perhaps the search has followed another maximum: the next window is searched anew
         return f"{self._machine.name}: the theory does not explain this window: {why}; {_OUTSIDE}"
+
+    def _too_stiff(self, read: Diagnosis) -> str:
+        """Why a shaft that reads much stiffer means another machine than that of the file; empty if it does not."""
+        at = STRUCTURAL.index("EI")
+        change, error = read.parameters[at].relative_change, read.parameters[at].standard_error
+        if change is None or error is None or change - _SURELY * error < _STIFFEST:
+            return ""
+        return self._stated(
+            f"it would take a shaft {change:.0%} stiffer than that of the machine file, which no fault makes: masses "
+            "or lengths there are not those of this machine"
+        )
 
 
 def _searched(search: FisherScoring, line: Linearised) -> Maximum | None:

@@ -230,8 +230,9 @@ class SequentialTest:
         """Whether the machine counts as outside the model.
 
         While the window is outside, a short stretch takes back what has been said only if it is well inside: it has
-        little power, and with a few hops none. What has been said for longer than any window is astride a change, a whole clean window alone takes back: on a machine that no
-        parameters explain stretches contradict each other, and a short one explains little of what it is asked.
+        little power, and with a few hops none. What has been said for longer than any window is astride a change, a
+        whole clean window alone takes back: on a machine that no parameters explain stretches contradict each other,
+        and a short one explains little of what it is asked.
 
         Parameters
         ----------

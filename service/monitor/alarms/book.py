@@ -33,6 +33,9 @@ from service.monitor.alarms.operation import (
 
 _TAKEN_BACK = 0.5
 """Probability below which a parameter that was named is no longer taken to have changed."""
+_ANOTHER = 4
+"""Parameters that seem to have changed outside the model from which none is named: it is another machine, or what is
+wrong concerns all of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,9 +103,11 @@ class AlarmBook:
         suspect : str
             What explains data outside the model best; empty if nothing does.
         """
-        named = {finding.name for finding in verdict.changed}
+        named = [finding.name for finding in verdict.changed]
         probability = {one.name: one.probability for one in verdict.candidates}
-        sure = {name for name in named if probability.get(name, 0.0) >= self._settings.name_confidence}
+        another = verdict.outside_model and len(named) >= _ANOTHER
+        sure = {one for one in named if not another and probability.get(one, 0.0) >= self._settings.name_confidence}
+        held = {*named, *(one for one, likely in probability.items() if likely >= _TAKEN_BACK)}
         start_ns = end_ns - round(verdict.decided_s * 1e9)
         evidence = Evidence(start_ns=start_ns, end_ns=end_ns, confidence=verdict.confidence)
         for reading in verdict.current:
@@ -113,9 +118,7 @@ class AlarmBook:
                     reading.standard_error,
                     end_ns,
                     named=reading.name in sure,
-                    taken_back=verdict.settled
-                    and reading.name not in named
-                    and probability.get(reading.name, 0.0) < _TAKEN_BACK,
+                    taken_back=another or (verdict.settled and reading.name not in held),
                     low_confidence=verdict.outside_model,
                     evidence=evidence,
                     note="" if reading.vector is None else reading.vector.text,
@@ -128,7 +131,7 @@ class AlarmBook:
         if verdict.current:
             # Outside the model no candidate need be right, and `model` says so; and one cause has one alarm.
             told = verdict.outside_model or any(self.present(name) for name in probability)
-            nameless = set() if sure or told else named
+            nameless = [] if sure or told else named
             changes = [
                 (abs(one.relative_change or 0.0), self._settings.for_parameter(one.name))
                 for one in verdict.current
@@ -143,7 +146,8 @@ class AlarmBook:
                 danger=any(change > limits.danger_above for change, limits in changes),
             )
         if verdict.current or unexplained:
-            note = "; ".join(filter(None, (unexplained, suspect and f"best explained by: {suspect}")))
+            at_once = f"{', '.join(named)} seem to have changed at once, so none is named" if another else ""
+            note = "; ".join(filter(None, (unexplained, suspect and f"best explained by: {suspect}", at_once)))
             outside = verdict.outside_model
             self.update_state(MODEL, outside, end_ns, note, evidence=evidence)
 
