@@ -319,7 +319,9 @@ class Installed:
     @property
     def thorough(self) -> bool:
         """Whether what the healthy machine has of a contact, or of lines, is known: one can be told then."""
-        levels = None if self.commissioned is None else self.commissioned.levels
+        if self.commissioned is None:
+            return self.known is not None  # by theory
+        levels = self.commissioned.levels
         return levels is not None and any(state.contact or state.lines for state in levels.states)
 
     @property

@@ -13,7 +13,7 @@ from models.errors import CheckpointError
 from models.levels.bands import BandLevels, BandReference, learn_bands
 from models.levels.gains import GainReference
 from models.levels.kurtosis import HopReference, learn_hops
-from models.levels.lines import learn_lines
+from models.levels.lines import expected_lines, learn_lines
 from models.levels.measures import COMPARED, WindowLevels
 from models.signals.block import FloatArray
 
@@ -22,6 +22,8 @@ _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Level = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _SAME_SPEED = 0.03
 """Windows whose speeds differ by less, relative, are of one operating state."""
+_BY_THEORY, _OF_MEANS = 1000, 0.6
+"""Hops that are as good as known, and the largest mean of a dozen of what is standard normal, of as many windows."""
 QUIET = 0.25
 """Part of the running vibration below which a machine may stand; what its neighbours shake it with should be less."""
 
@@ -122,6 +124,47 @@ def learn_levels(
             groups.append([levels])
     states = tuple(_state(channels, group) for group in groups)
     return LevelReference(source=source, states=states, gains=gains, lines=lines, beside=lines is not None)
+
+
+def expected_levels(
+    channels: Sequence[str],
+    levels: WindowLevels,
+    speeds_rad_s: tuple[float, float],
+    modes: Sequence[tuple[float, float]],
+) -> LevelReference:
+    """What theory says of a machine with these modes that is shaken at random, whatever shakes it: no levels.
+
+    Its shaft touches nothing, and there are no lines in its bands but what is narrow of its modes.
+
+    Parameters
+    ----------
+    channels : sequence of str
+        Names of the columns.
+    levels : WindowLevels
+        Of any window of the machine.
+    speeds_rad_s : tuple of float
+        Between which it runs.
+    modes : sequence of tuple of float
+        Natural frequency, Hz, and damping ratio of each.
+    """
+    bands, parts, nothing = {}, {}, HopReference(mean=0.0, scatter=1.0, hops=_BY_THEORY, range=_OF_MEANS)
+    if levels.bands is not None and levels.lines is not None:
+        edges_hz, none = tuple(levels.bands.edges_hz.tolist()), (0.0,) * len(levels.bands.freedom)
+        silent = BandReference(
+            edges_hz=edges_hz, mean=none, high=none, low=none, error=none, freedom=tuple(levels.bands.freedom.tolist())
+        )
+        found = tuple(expected_lines(levels.bands, levels.hops, modes).round(3).tolist())
+        bands, parts = dict.fromkeys(channels, silent), dict.fromkeys(channels, found)
+    state = OperatingState(
+        windows=1,
+        speed_rad_s=speeds_rad_s,
+        levels={},
+        hops=levels.hops,
+        bands=bands,
+        lines=parts,
+        contact={} if levels.contact is None else dict.fromkeys(channels, nothing),
+    )
+    return LevelReference(source="the machine file", states=(state,))
 
 
 def _speed(levels: WindowLevels) -> float:

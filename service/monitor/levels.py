@@ -9,14 +9,15 @@ import numpy as np
 
 from models.alarm_names import LEVEL
 from models.commissioning.commissioned import Installed
+from models.diagnosis.likelihood.motions import natural_frequencies
 from models.diagnosis.lines import new_line, steady_lines
 from models.diagnosis.moments import Plan
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.levels.contact import LatestContact
 from models.levels.judgement import LevelJudge, channel_state, fallen
 from models.levels.measures import WindowLevels
-from models.levels.reference import FirstWindows, LevelReference
-from models.machine import MachineFile
+from models.levels.reference import FirstWindows, LevelReference, expected_levels
+from models.machine import Machine, MachineFile
 from models.signals.channels import state_name, with_channel_names
 from rotorwatch.records.alarms import Evidence
 from rotorwatch.records.levels import ChannelLevels
@@ -50,11 +51,14 @@ class LevelWatch:
     def __init__(self, plan: Plan, machine: MachineFile, installed: Installed) -> None:
         if plan.levels is None:
             raise ValueError(f"{machine.title}: no levels are planned")
+        self._columns = plan.columns
         channels = [machine.sensors[column] for column in plan.columns]
         self._judge = LevelJudge(plan.levels, channels, machine.levels)
         of = machine.levels.reference or ("first windows" if installed.watching else "commissioned")
         self._takes_first = of == "first windows"
         self._commissioned = None if installed.commissioned is None else installed.commissioned.levels
+        self._by_theory = installed.known if installed.commissioned is None else None
+        self._expected: LevelReference | None = None
         self._by_angle = plan.angle_column is not None
         turns = self._by_angle or plan.speed_rad_s is not None
         given = machine.levels
@@ -113,7 +117,16 @@ class LevelWatch:
                     "machine, whirl or looseness"
                 )
                 return with_channel_names(text, self._machine.sensors)
-        return self._judge.foreign(self._found, self.latest, self.reference, self._contact, named=named)
+        if self._by_theory is not None:
+            healthy = self._expected = self._expected or self._by_file(self._by_theory, self._found)
+        return self._judge.foreign(self._found, self.latest, healthy, self._contact, named=named)
+
+    def _by_file(self, machine: Machine, levels: WindowLevels) -> LevelReference:
+        """What theory says of a machine that nobody has commissioned."""
+        operation, names = machine.operation, [machine.sensors[column].name for column in self._columns]
+        slowest, fastest = (operation.speed_rad_s * (1 + sign * operation.speed_tolerance) for sign in (-1, 1))
+        modes = zip(*(each.tolist() for each in natural_frequencies(machine)), strict=True)
+        return expected_levels(names, levels, (slowest, fastest), tuple(modes))
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """What is remembered, as named arrays: the first windows, and what the latest hops had of a contact."""

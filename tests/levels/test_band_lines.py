@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 from models.levels.contact import LatestContact
 from models.levels.judgement import LevelJudge
 from models.levels.measures import WindowLevels, hop_levels, level_plan, window_levels
-from models.levels.reference import learn_levels
+from models.levels.reference import LevelReference, expected_levels, learn_levels
 from models.levels.settings import LevelSettings
 from models.signals.channels import Channel
 from models.signals.waveform import waveform_of
@@ -62,9 +62,9 @@ def window(
     return window_levels(PLAN, [levels for levels, _ in hops], speeds, phase_reference=known)
 
 
-def told(levels: WindowLevels, healthy: list[WindowLevels]) -> str:
+def told(levels: WindowLevels, healthy: list[WindowLevels] | LevelReference) -> str:
     judge = LevelJudge(PLAN, CHANNELS, LevelSettings())
-    reference = learn_levels("commissioned", NAMES, healthy)
+    reference = learn_levels("commissioned", NAMES, healthy) if isinstance(healthy, list) else healthy
     reference = type(reference).model_validate_json(reference.model_dump_json())
     return judge.foreign(levels, judge.judge(levels, reference), reference, LatestContact(4), named=False)
 
@@ -131,3 +131,22 @@ def test_commissionings_and_plans_without_lines_have_none_to_tell(healthy: list[
     assert level_plan(CHANNELS, RATE_HZ, (10.0, 1000.0)).lines is False
     without = [type(one)(one.values, one.errors, one.vectors, one.speed_rad_s, one.hops, one.bands) for one in healthy]
     assert told(window(600, loud=0.3, mesh=0.4), without) == ""
+
+
+def by_theory(levels: WindowLevels, damping: float, natural_hz: float = 480.0) -> str:
+    """What is told of a machine with this mode that nobody has commissioned."""
+    speeds = (0.98 * 2 * np.pi * SPEED_HZ, 1.02 * 2 * np.pi * SPEED_HZ)
+    return told(levels, expected_levels(NAMES, levels, speeds, [(natural_hz, damping)]))
+
+
+@pytest.mark.parametrize("damping", [0.02, 0.001])
+def test_a_machine_that_was_not_commissioned_has_the_lines_of_theory(damping: float) -> None:
+    assert not any(by_theory(window(100 + n, damping=damping, loud=loud), damping) for n, loud in enumerate([0.3, 3.0]))
+    text = by_theory(window(102, mesh=4.0, damping=damping), damping)
+    assert "a line within 4" in text
+    assert "that no rotor of the machine file makes" in text
+
+
+def test_a_mode_without_damping_cannot_be_told_from_a_line() -> None:
+    assert not by_theory(window(104, mesh=4.0), 1e-5)
+    assert by_theory(window(104, mesh=4.0), 1e-5, natural_hz=700.0)  # that of another frequency can

@@ -1,6 +1,6 @@
 """The monitor of a machine that was commissioned without its parameters, from block to alarm."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
@@ -83,14 +83,26 @@ def test_another_speed_is_not_evaluable_here_and_raises_nothing_but_levels() -> 
 
 
 @pytest.mark.parametrize(
-    ("clearance_m", "size"), [(4e-5, 2.0), pytest.param(8e-5, 0.5, marks=pytest.mark.long)], ids=["heavy", "light"]
+    ("clearance_m", "size", "of"),
+    [
+        pytest.param(4e-5, 2.0, installed, id="heavy"),
+        pytest.param(8e-5, 0.5, installed, marks=pytest.mark.long, id="light"),
+        pytest.param(
+            8e-5,
+            0.5,
+            lambda: Installed(LAB.model_copy(update={"alarms": MACHINE.alarms})),
+            id="light, not commissioned",
+        ),
+    ],
 )
-def test_a_rub_is_told_and_what_it_is_taken_for_is_named_with_reserve(clearance_m: float, size: float) -> None:
+def test_a_rub_is_told_and_what_it_is_taken_for_is_named_with_reserve(
+    clearance_m: float, size: float, of: Callable[[], Installed]
+) -> None:
     scenario, machine = load_scenario("healthy")
     rubbing = scenario.model_copy(
         update={"rub": Rub(clearance_m=clearance_m), "events": (Event(at_s=0.0, anomaly="rub", size=size),)}
     ).overridden(duration_s=66.0, seed=SEED + 7)
-    windows, events = feed(MachineMonitor(installed()), [block for block, _ in blocks(rubbing, machine)])
+    windows, events = feed(MachineMonitor(of()), [block for block, _ in blocks(rubbing, machine)])
     assert "(disc) that is pushed back where it is far out, as by a rub" in full(windows)[-1].suspect
     raised = {event.alarm.name: event.alarm for event in events}
     assert "as by a rub" in raised[MODEL].note

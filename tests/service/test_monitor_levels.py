@@ -281,3 +281,24 @@ def test_a_dead_sensor_elsewhere_is_told_and_the_rotor_is_diagnosed_as_before() 
     assert [one.states for one in told.sensors] == [("@DE-H",)]
     assert (told.state, told.verdict) == (plain.state, plain.verdict)
     assert [one.name for one in monitor.health().alarms if one.raised] == ["data-stuck"]
+
+
+MESH = 17.0
+"""Times running speed; twice the band that the likelihood looks at."""
+
+
+def test_a_machine_that_was_not_commissioned_shows_lines_that_theory_does_not_have() -> None:
+    monitor = MachineMonitor(install(LAB, "lab"))
+    fast = [n for n, one in enumerate(LAB.sensors) if (one.quantity, one.location) == ("velocity", "bearing")]
+    meshing: list[SampleBlock] = []
+    for block in scenario_blocks(95.0):
+        samples = block.samples.copy()
+        if len(meshing) >= 650:
+            turned = block.samples[:, [-1]]
+            samples[:, fast] += 0.7 * samples[:, fast].std(axis=0) * np.cos(MESH * turned)
+        meshing.append(replace(block, samples=samples))
+    _, ((kind, name, _),) = run(monitor, iter(meshing))
+    assert (kind, name) == (EventKind.RAISED, "model")
+    note = next(one for one in monitor.health().alarms if one.name == "model").note
+    assert "a line within 3" in note
+    assert "that no rotor of the machine file makes" in note
