@@ -162,6 +162,12 @@ def test_every_kind_of_fault_of_a_sensor_raises_its_alarm(kind: FaultKind) -> No
 
 def judged(hops: Sequence[Mapping[str, float]], *, settled: bool = True, outside: bool = False) -> list[str]:
     """What alarms say of hops, each with the probability of every parameter; the likelier half is what has changed."""
+    return [f"{event.kind} {event.alarm.name}" for event in happened(hops, settled=settled, outside=outside)]
+
+
+def happened(
+    hops: Sequence[Mapping[str, float]], *, settled: bool = True, outside: bool = False
+) -> tuple[AlarmEvent, ...]:
     book = AlarmBook(SETTINGS)
     for number, probability in enumerate(hops):
         changed = [name for name in probability if probability[name] > 0.5]
@@ -186,7 +192,7 @@ def judged(hops: Sequence[Mapping[str, float]], *, settled: bool = True, outside
             "",
             number * 5_000_000_000,
         )
-    return [f"{event.kind} {event.alarm.name}" for event in book.take()]
+    return book.take()
 
 
 NOT_SURE, SURE = {"c_by": 0.4, "c_bz": 0.6}, {"c_by": 0.03, "c_bz": 0.97}
@@ -246,4 +252,6 @@ def test_a_name_that_is_taken_back_is_cleared_however_large_its_reading() -> Non
     nothing = {"c_by": 0.02, "c_bz": 0.04}
     assert judged([SURE] * 3 + [nothing] * 3) == ["raised c_bz"]
     assert judged([SURE] * 3 + [nothing] * 4) == ["raised c_bz", "cleared c_bz"]
+    text = happened([SURE] * 3 + [nothing] * 4)[-1].text
+    assert text == "cleared: bearing damping, vertical (c_bz) is named no longer; it reads +20.0% ± 5.9%"
     assert judged([SURE] * 3 + [nothing] * 9, settled=False) == ["raised c_bz"]  # too little data to take it back

@@ -25,6 +25,7 @@ class Alarm:
     change: float | None = None
     standard_error: float | None = None
     low_confidence: bool = False
+    taken_back: bool = False  # it reads as changed as before, but need not be the parameter that has changed
     note: str = ""
     evidence: Evidence | None = None
     shelf: Shelf | None = None
@@ -90,5 +91,7 @@ class AlarmEvent:
                 return f"{alarm.severity.upper()}: {what} changed by {size}{reserve}"
             case EventKind.ESCALATED:
                 return f"{alarm.severity.upper()}: {what} changed further, now {size}{reserve}"
+            case _ if alarm.taken_back:
+                return f"cleared: {what} is named no longer; it reads {size}"
             case _:
                 return f"cleared: {what} is back {alarm_kind(alarm.name).cleared} at {size}"

@@ -185,6 +185,7 @@ class AlarmBook:
             change=change,
             standard_error=standard_error,
             low_confidence=low_confidence,
+            taken_back=taken_back and size >= limits.clear_below,
             evidence=evidence,
             note=note,
         )
