@@ -240,6 +240,18 @@ def test_a_name_is_held_with_reserve_once_nothing_explains_the_machine() -> None
     assert reserves == [(False, False)] * 2 + [(True, False), (True, True), (True, True), (True, False)]
 
 
+def test_what_levels_show_is_told_while_nothing_can_be_read() -> None:
+    book, suspect = AlarmBook(SETTINGS), "a line at 65 Hz"
+    seen = Verdict(
+        changed=(), text="", detected=False, confidence=1.0, candidates=(), low_confidence=True, outside_model=True,
+        outside_confidence=None, decided_s=60.0, settled=False, current=(),
+    )  # fmt: skip
+    for number in range(3):
+        book.found(seen, "", suspect, number * 5_000_000_000)
+    (event,) = book.take()
+    assert event.text == f"ALERT: outside the model: best explained by: {suspect}"
+
+
 def test_what_has_its_alarm_raises_no_other_when_it_becomes_less_sure() -> None:
     assert judged([SURE] * 3 + [NOT_SURE] * 6) == ["raised c_bz"]
 

@@ -145,7 +145,7 @@ class AlarmBook:
                 evidence=evidence,
                 danger=any(change > limits.danger_above for change, limits in changes),
             )
-        if verdict.current or unexplained:
+        if verdict.current or unexplained or verdict.outside_model:
             at_once = f"{', '.join(named)} seem to have changed at once, so none is named" if another else ""
             note = "; ".join(filter(None, (unexplained, suspect and f"best explained by: {suspect}", at_once)))
             outside = verdict.outside_model
