@@ -49,8 +49,8 @@ def main() -> None:
     scenario, machine = load_scenario("healthy")
     scenario = scenario.overridden(seed=1, duration_s=DATA_S)
     stream = [block for block, _ in blocks(scenario, machine)]
-    bundle, plan = load_bundle("lab", machine), plan_for(machine, levels=True, thorough=False)
-    window, touching = SlidingWindow(plan), replace(plan, thorough=True)
+    bundle, plan = load_bundle("lab", machine), plan_for(machine, levels=True)
+    window, untouched = SlidingWindow(plan), replace(plan, thorough=False)
     windows: list[WindowStatistics] = []
     measures: list[WindowLevels] = []
     samples = np.concatenate([plan.to_si(block.samples) for block in stream])
@@ -96,7 +96,7 @@ def main() -> None:
     costs = {
         "Fourier transforms alone (yardstick)": median_s(yardstick, 1),
         "moments of a hop": median_s(lambda: hop_moments(plan, piece, level, 0), 1),
-        "  with contact, as a commissioned machine": median_s(lambda: hop_moments(touching, piece, level, 0), 1),
+        "  without contact": median_s(lambda: hop_moments(untouched, piece, level, 0), 1),
         "  of which levels of the hop": often(lambda: hop_levels(measured, *seen, angle, spectrum)),
         "levels of a window": often(lambda: window.levels(errors=False)),
         "  judged, known machine": often(lambda: judge.judge(measures[-1], None)),
