@@ -142,10 +142,9 @@ class LevelJudge:
         found = ""
         if seen:
             found = self._contact(levels, state, latest, reference.states.index(state))
-            names, unlike = [one.name for one in self._channels], "the healthy machine did not have"
-            if not state.levels:  # by theory
-                unlike = "no rotor of the machine file makes"
-            found = found or new_line(levels, names, state.lines, state.bands, unlike)
+            names = [one.name for one in self._channels]
+            by_theory = {} if state.levels else {"unlike": "no rotor of the machine file makes"}
+            found = found or new_line(levels, names, state.lines, state.bands, **by_theory)
         if not found and reference.gains is not None and levels.bands is not None:
             wrong = wrong_gain(levels.bands, [place_of(one) for one in self._channels], reference.gains)
             if wrong is not None:

@@ -21,11 +21,11 @@ _HAD_ONE = 0.25
 _NOISE, _STEADY = 2.0, 1e-3
 """Where healthy hops of one window differed by more than this in speed, lines were spread over several bins, and become
 narrower when it is steadier: what had more than so many times the part of noise may be one."""
-_MOVED = 1.2
+_MOVED = 1.35
 """Times its natural frequency by which a mode may be off that of the machine file, or have changed."""
 _OTHERS = 0.16
 """Part that the strongest bin of any band may have by theory: a machine has modes that its file knows nothing of."""
-_SCATTERS, _MODE, _LIKE_A_LINE = 1.8, 0.24, 0.45
+_SCATTERS, _MODE, _LIKE_A_LINE = 1.8, 0.2, 0.45
 """Times the mean part of a mode's power that its strongest bin may have in a window, the most that is reckoned with,
 and the mean from which on a mode cannot be told from a line. On the rotor kits, 36 windows in conditions of their own
 (seed 20261341), the strongest bins had up to 0.26 where modes are damped by 0.1 % and 0.40 would be the mean, and 0.21
@@ -87,9 +87,9 @@ def new_line(
     channels: Sequence[str],
     healthy_parts: Mapping[str, Sequence[float]],
     healthy_bands: Mapping[str, BandReference],
-    healthy: str = "the healthy machine did not have",
+    unlike: str = "the healthy machine did not have",
 ) -> str:
-    """The line that the healthy machine did not have and that has most of its channel's power; empty if there is none.
+    """The new line that has most of its channel's power; empty if there is none.
 
     Parameters
     ----------
@@ -100,8 +100,8 @@ def new_line(
     healthy_bands : mapping of str to BandReference
         By channel. A line that is no louder than its band was in the quietest window may have been there, under noise,
         or spread by a speed that varied within a hop.
-    healthy : str
-        What is said of it besides.
+    unlike : str
+        How the sentence goes on: what no such line is of.
     """
     bands, parts = levels.bands, levels.line_parts
     if bands is None or parts is None or levels.moments is None:
@@ -119,8 +119,10 @@ def new_line(
     power = OF_BIN * parts * bands.rms**2
     new &= power > least[1:-1] + np.maximum(least[:-2], least[2:])
     turning_hz = abs(levels.speed_rad_s or 0.0) / (2 * math.pi)
-    # 1x is lifted by an unbalance, and the taper spreads a line over the edges of its band.
-    new[(turning_hz > 0.97 * bands.edges_hz[:-1]) & (turning_hz < 1.03 * bands.edges_hz[1:])] = False
+    # 1x is lifted by an unbalance, goes where the speed goes, and the taper spreads it over the edges of its band.
+    off = 0.03 + min(levels.unsteady if math.isfinite(levels.unsteady) else 0.0, 0.5)
+    of_1x = (turning_hz * (1 + off) > bands.edges_hz[:-1]) & (turning_hz * (1 - off) < bands.edges_hz[1:])
+    new[of_1x] = False
     without_1x = levels.values["not_x1"] ** 2
     total = np.where(np.isnan(without_1x), levels.moments[0].mean(axis=0), without_1x)  # the rotation may not be known
     share = np.divide(power, total, out=np.zeros(parts.shape), where=new & (total > 0))
@@ -134,5 +136,5 @@ def new_line(
         without = " without its 1x"
     return (
         f"a line within {band_in_words((low_hz, high_hz))} ({times}{part:.0%} of the vibration of {channels[column]}"
-        f"{without}) that {healthy}: gears, blades, a bearing or a neighbouring machine"
+        f"{without}) that {unlike}: gears, blades, a bearing or a neighbouring machine"
     )

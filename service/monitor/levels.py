@@ -118,7 +118,9 @@ class LevelWatch:
                 )
                 return with_channel_names(text, self._machine.sensors)
         if self._by_theory is not None:
-            healthy = self._expected = self._expected or self._by_file(self._by_theory, self._found)
+            healthy = self._expected or self._by_file(self._by_theory, self._found)
+            if self._found.contact is not None and self._found.lines is not None:  # all of it can be told
+                self._expected = healthy
         return self._judge.foreign(self._found, self.latest, healthy, self._contact, named=named)
 
     def _by_file(self, machine: Machine, levels: WindowLevels) -> LevelReference:

@@ -49,7 +49,7 @@ class Intake:
 
         def end() -> None:
             with self._lock:
-                self._sources.remove(source)
+                self._sources = [one for one in self._sources if one is not source]
 
         return end
 
@@ -62,11 +62,13 @@ class Intake:
     def _run(self) -> None:
         while not self._closed.wait(_EVERY_S):
             with self._lock:
-                for receive, take in self._sources:
+                for source in tuple(self._sources):
+                    receive, take = source
                     try:
                         for _ in range(_AT_ONCE):
                             if (message := receive()) is None:
                                 break
                             take(message)
-                    except Exception:  # of one source; the others are taken all the same
-                        _log.exception("messages could not be taken")
+                    except Exception:  # a channel that is no more raises for ever; the others are taken all the same
+                        _log.exception("messages can no longer be taken")
+                        self._sources.remove(source)

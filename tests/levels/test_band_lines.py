@@ -1,5 +1,7 @@
 """A line that the healthy machine did not have is told, however loud the healthy machine was in another condition."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -133,9 +135,9 @@ def test_commissionings_and_plans_without_lines_have_none_to_tell(healthy: list[
     assert told(window(600, loud=0.3, mesh=0.4), without) == ""
 
 
-def by_theory(levels: WindowLevels, damping: float, natural_hz: float = 480.0) -> str:
+def by_theory(levels: WindowLevels, damping: float, natural_hz: float = 480.0, speed_hz: float = SPEED_HZ) -> str:
     """What is told of a machine with this mode that nobody has commissioned."""
-    speeds = (0.98 * 2 * np.pi * SPEED_HZ, 1.02 * 2 * np.pi * SPEED_HZ)
+    speeds = (0.9 * 2 * np.pi * speed_hz, 1.1 * 2 * np.pi * speed_hz)
     return told(levels, expected_levels(NAMES, levels, speeds, [(natural_hz, damping)]))
 
 
@@ -150,3 +152,9 @@ def test_a_machine_that_was_not_commissioned_has_the_lines_of_theory(damping: fl
 def test_a_mode_without_damping_cannot_be_told_from_a_line() -> None:
     assert not by_theory(window(104, mesh=4.0), 1e-5)
     assert by_theory(window(104, mesh=4.0), 1e-5, natural_hz=700.0)  # that of another frequency can
+
+
+def test_running_speed_that_goes_away_from_its_mean_is_no_line() -> None:
+    slow = replace(window(105, speed_hz=137.0, unbalance=5.0), speed_rad_s=2 * np.pi * 150.0)
+    assert not by_theory(replace(slow, unsteady=0.1), 0.02, speed_hz=150.0)
+    assert by_theory(slow, 0.02, speed_hz=150.0)  # as if the speed had been steady

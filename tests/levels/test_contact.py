@@ -78,10 +78,10 @@ def test_single_samples_that_are_off_are_no_contact() -> None:
     assert np.all(z(told(20261130, spikes=6.0)) < 4.5)
 
 
-@pytest.mark.parametrize("change", ["short", "dead", "copied"])
+@pytest.mark.parametrize("change", ["short", "dead", "copied", "coarse"])
 def test_it_is_not_known_where_nothing_can_be_told(change: str) -> None:
     pair = np.random.default_rng(20261129).standard_normal((2, 900 if change == "short" else N))
-    pair[1] = {"short": pair[1], "dead": 0.0, "copied": pair[0]}[change]
+    pair[1] = {"short": pair[1], "dead": 0.0, "copied": pair[0], "coarse": np.round(8 * pair[1])}[change]
     angle = 0.07 * np.arange(pair.shape[1])
     found = contact(pair, np.stack([np.cos(angle), np.sin(angle)]), 0.07 * pair.shape[1] / (2 * np.pi), 2000.0)
     assert np.all(np.abs(found) < 4.5) if change == "copied" else np.all(np.isnan(found))

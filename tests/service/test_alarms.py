@@ -210,6 +210,8 @@ def test_where_most_has_changed_outside_the_model_nothing_is_named() -> None:
     most = dict.fromkeys(("k_by", "c_by", "k_bz", "c_bz"), 0.99)
     assert judged([most] * 3) == [f"raised {name}" for name in most]
     assert judged([most] * 3, outside=True) == ["raised model"]
+    assert judged([SURE] * 3 + [most] * 9, outside=True, settled=False) == ["raised c_bz", "raised model"]
+    assert judged([SURE] * 3 + [most] * 9, outside=True)[-1] == "cleared c_bz"
     assert judged([most | {"k_by": 0.1}] * 3, outside=True) == [
         "raised c_by",
         "raised k_bz",

@@ -43,7 +43,7 @@ _GROUPS = 150  # the band over the widest group
 # that the theory explains most searches have ended by then.
 _PATIENCE, _HOPELESS = 30, 2.0
 _OUTSIDE = "a sensor is at fault, or something outside the model has changed"
-_STIFFEST, _SURELY = 0.5, 3.0  # a shaft cracks or is exchanged; none becomes stiffer by half, in standard errors
+_STIFFEST, _SURELY = 0.5, 3.0  # no shaft becomes stiffer by half; in standard errors
 _SYNCHRONOUS_BINS = 3
 _FOLLOWED = 12  # windows in a row that may start from one window's units and slopes before a search takes its own
 
@@ -377,9 +377,9 @@ class LikelihoodFit:
         change, error = read.parameters[at].relative_change, read.parameters[at].standard_error
         if change is None or error is None or change - _SURELY * error < _STIFFEST:
             return ""
-        return self._stated(
-            f"it would take a shaft {change:.0%} stiffer than that of the machine file, which no fault makes: masses "
-            "or lengths there are not those of this machine"
+        return (
+            f"{self._machine.name}: it would take a shaft {100 * change:.0f} % stiffer than that of the machine file, "
+            "which no fault makes: masses or lengths there are not those of this machine, or its shaft is another one"
         )
 
 

@@ -118,7 +118,7 @@ class AlarmBook:
                     reading.standard_error,
                     end_ns,
                     named=reading.name in sure,
-                    taken_back=another or (verdict.settled and reading.name not in held),
+                    taken_back=verdict.settled and (another or reading.name not in held),
                     low_confidence=verdict.outside_model,
                     evidence=evidence,
                     note="" if reading.vector is None else reading.vector.text,
