@@ -109,9 +109,8 @@ def new_line(
     known = [name in healthy_bands and len(healthy_bands[name].low) == len(parts) for name in channels]
     if not all(known) or any(len(healthy_parts.get(name, ())) != len(parts) for name in channels):
         return ""
-    padded = np.pad(
-        np.array([healthy_parts[name] for name in channels]).T, ((1, 1), (0, 0)), mode="edge"
-    )  # a line moves to the next band when the speed does
+    # A line moves to the next band when the speed does.
+    padded = np.pad(np.array([healthy_parts[name] for name in channels]).T, ((1, 1), (0, 0)), mode="edge")
     before = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
     new = (before < _HAD_ONE) & (parts > np.maximum(LINE, _OVER_HEALTHY * before))
     quietest = np.array([healthy_bands[name].low for name in channels]).T

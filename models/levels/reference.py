@@ -23,7 +23,8 @@ _Level = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _SAME_SPEED = 0.03
 """Windows whose speeds differ by less, relative, are of one operating state."""
 _BY_THEORY, _OF_MEANS = 1000, 0.6
-"""Hops that are as good as known, and the largest mean of a dozen of what is standard normal, of as many windows."""
+"""What theory knows is known as from so many hops; and how far the mean of a window of twelve is off, of one in
+thirty windows."""
 QUIET = 0.25
 """Part of the running vibration below which a machine may stand; what its neighbours shake it with should be less."""
 
@@ -132,7 +133,7 @@ def expected_levels(
     speeds_rad_s: tuple[float, float],
     modes: Sequence[tuple[float, float]],
 ) -> LevelReference:
-    """What theory says of a machine with these modes that is shaken at random, whatever shakes it: no levels.
+    """What theory says of a machine with these modes that is shaken at random: no levels, for they depend on the force.
 
     Its shaft touches nothing, and there are no lines in its bands but what is narrow of its modes.
 
