@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import partial
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -41,6 +42,8 @@ _CACHED_BLOCKS = 1200
 """Fewer than a queue takes by default: what comes at once after a restart must not overflow it."""
 _WAITING_BLOCKS = 4096
 """Far more than come between two looks of the thread that takes them; beyond, the network waits."""
+_AT_ONCE = 1000
+"""Blocks of one machine before the others have their turn."""
 _CACHED_EVENTS = 200
 _QUERY_TIMEOUT_S = 10.0
 _QUICK_CONNECT_S = 3.0
@@ -193,12 +196,11 @@ class MachineLink:
             ).undeclare
         )
         keep(alive.declare_subscriber(keys.publisher_alive, guarded(self._take_alive), history=True).undeclare)
-        take = guarded(self._take_block)
-        directly = zenoh.handlers.Callback(take, indirect=False) if wait_when_full else None
+        directly = zenoh.handlers.Callback(guarded(self._take_block), indirect=False) if wait_when_full else None
         stream = _stream_subscriber(session, keys.stream, directly)
         keep(stream.undeclare)
         if not wait_when_full:
-            keep(self._link.intake.add(stream.try_recv, take))
+            keep(self._link.intake.add(partial(guarded(self._take_blocks), stream)))
         keep(stream.sample_miss_listener(guarded(self._take_miss)).undeclare)
         keep(alive.declare_token(keys.monitor_alive).undeclare)
 
@@ -222,6 +224,12 @@ class MachineLink:
         if sample.kind == zenoh.SampleKind.PUT and not encoding.endswith(REPLAY_MARK):
             attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
             self._callbacks.on_block(RawBlock(sample.payload.to_bytes(), attachment, encoding, _source(sample)))
+
+    def _take_blocks(self, stream: zenoh.ext.AdvancedSubscriber[Any]) -> None:
+        for _ in range(_AT_ONCE):
+            if (sample := stream.try_recv()) is None:
+                return
+            self._take_block(sample)
 
     def _take_miss(self, miss: zenoh.ext.Miss) -> None:
         self._callbacks.on_missed(miss.nb)
