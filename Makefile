@@ -15,7 +15,7 @@ RUN := $(VENV)/.run
 READY := $(VENV)/.ready
 # Modules are compiled when first imported; of most of what is installed, nothing ever is.
 INSTALL := $(BIN)/python -m pip install --no-compile --quiet --disable-pip-version-check --constraint constraints.txt --editable
-MODELS_AND_MONITOR := tests/test_doctests.py tests/physics tests/signals tests/diagnosis tests/commissioning $(wildcard tests/service/test_monitor*.py)
+MODELS_AND_MONITOR := tests/test_doctests.py tests/physics tests/signals tests/diagnosis tests/commissioning $(wildcard tests/service/monitor/test_monitor*.py)
 # Three times the cores of a small computer: many tests wait more than they compute.
 WORKERS ?= 6
 FAULT ?= k_by
@@ -75,7 +75,7 @@ browser:
 		echo "installing Chromium, for the tests of the page ..."; \
 		(timeout 60 apt-get update && timeout 300 apt-get install --yes --no-install-recommends chromium) >/dev/null 2>&1 && exit 0; \
 	fi; \
-	echo "NO BROWSER: tests/service/test_browser*.py are left out; install Chromium, or name one in ROTORWATCH_CHROMIUM"
+	echo "NO BROWSER: tests/service/api/page/test_browser*.py are left out; install Chromium, or name one in ROTORWATCH_CHROMIUM"
 
 tests: $(READY) browser
 	$(BIN)/pytest -n $(WORKERS)
@@ -102,8 +102,8 @@ wheels:
 	done
 
 FLOORS := $(CURDIR)/build/floors
-FLOOR_TESTS := tests/signals/test_recording.py tests/interchange/test_formats.py $(patsubst %,tests/service/test_%.py,access_http api api_events client metrics \
-  plots replay_http rotorwatch_cli snapshots store transport webhooks)
+FLOOR_TESTS := tests/signals/test_recording.py tests/interchange/test_formats.py $(foreach name,access_http api api_events client metrics \
+  plots replay_http rotorwatch_cli snapshots store transport webhooks,$(wildcard tests/service/*/test_$(name).py))
 
 floors:
 	@rm -rf $(FLOORS) && $(PYTHON) -m venv $(FLOORS)

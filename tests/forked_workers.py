@@ -13,11 +13,11 @@ from types import ModuleType
 
 from execnet.gateway_base import ExecModel, Popen2IO
 
-from tests.service.preloaded import CONTEXT, PROGRAMS
+from tests.service.rig.preloaded import CONTEXT, PROGRAMS
 
 CONTEXT.set_forkserver_preload(
     [
-        *(*PROGRAMS, "tests.service.live", "tests.interchange.material", "tests.faults.measure"),
+        *(*PROGRAMS, "tests.service.rig.live", "tests.interchange.material", "tests.faults.measure"),
         *("models.commissioning.commission", "service.analysis.figures.spectrum", "simulator.commission.page"),
         *("service.interchange.importing", "scipy.io", "scipy.optimize", "scipy.stats", "pyarrow.parquet"),
         *("h5py", "nptdms", "playwright.sync_api", "psycopg", "pytest", "pyuff", "trustme", "yaml"),

@@ -21,7 +21,7 @@ from models.machine import load_machine, load_machine_file
 from service.rotorwatch import app as rotorwatch
 from simulator.rotorsim import app as rotorsim
 from simulator.rotortrain import app as rotortrain
-from tests.service.live import ROOT, endpoint
+from tests.service.rig.live import ROOT, endpoint
 
 TABLES = Path(__file__).parent / "mistakes"
 PROGRAMS = {"rotorwatch": rotorwatch, "rotorsim": rotorsim, "rotortrain": rotortrain}

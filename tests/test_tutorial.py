@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.pins.pinned import differences
-from tests.service.preloaded import ran
+from tests.service.rig.preloaded import ran
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")

@@ -26,7 +26,7 @@ from models.signals.wire import encode_block
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MonitorReport
 from simulator.scenario import Event
-from tests.service.live import LAB, scenario_blocks
+from tests.service.rig.live import LAB, scenario_blocks
 
 FAULT_S, DURATION_S = 78.0, 106.0
 WITHOUT_ANGLE = LAB.model_copy(update={"sensors": tuple(one for one in LAB.sensors if one.name != "theta")})

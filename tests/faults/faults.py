@@ -15,8 +15,8 @@ from rotorwatch.records.health import HealthState
 from service.history.records import Retention
 from service.history.store import Store
 from tests.faults.rig import Plant, Seen, locked, pause
-from tests.service.hooked import Got, hook, settings_for
-from tests.service.live import Feed, endpoint, open_session, program, scenario_blocks, until
+from tests.service.delivery.hooked import Got, hook, settings_for
+from tests.service.rig.live import Feed, endpoint, open_session, program, scenario_blocks, until
 
 _PAGE = 8192
 _FED_S = 0.1  # length of the blocks of `scenario_blocks`

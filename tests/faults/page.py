@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from tests.faults.measure import Outcome
 from tests.faults.scenarios import ROWS, Row
-from tests.service.live import ROOT
+from tests.service.rig.live import ROOT
 
 PAGE = ROOT / "docs" / "reliability.md"
 

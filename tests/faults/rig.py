@@ -25,8 +25,8 @@ from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import Health, HealthState
 from rotorwatch.records.monitor import Readiness
 from tests.loopback import session_of
-from tests.service.hooked import Hook
-from tests.service.live import LAB, Program, endpoint, program
+from tests.service.delivery.hooked import Hook
+from tests.service.rig.live import LAB, Program, endpoint, program
 
 BLOCK_S = 0.2
 _PLACE = "/api/v1/machines/demo/lab"

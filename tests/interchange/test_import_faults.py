@@ -15,7 +15,7 @@ from models.signals.channels import unit_factor
 from service.interchange.importing import summary_lines
 from service.interchange.mapping import Acceleration, Column, CsvFormat, Keyphasor, Mapping, TimeBase
 from tests.interchange.material import CHANNELS, START, START_NS, imported, signals, stretches
-from tests.service.preloaded import rotorwatch as run
+from tests.service.rig.preloaded import rotorwatch as run
 
 TIME = f'[time]\ncolumn = "t"\nstart = "{START}"\n'
 

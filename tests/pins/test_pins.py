@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.pins.pinned import differences
-from tests.service.preloaded import ran
+from tests.service.rig.preloaded import ran
 
 FURTHER = (pytest.param(change, marks=pytest.mark.long) for change in ("c_by=0.4", "k_bz=-0.2"))
 CHANGES = ("healthy", "k_by=-0.25", "e=0.5", *FURTHER)

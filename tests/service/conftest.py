@@ -11,9 +11,9 @@ import pytest
 from pydantic import TypeAdapter
 
 from service.history.store import Store
-from tests.service.guarded import Guarded, guarded
-from tests.service.postgres import KINDS, database_url, opened
-from tests.service.preloaded import Piped
+from tests.service.rig.guarded import Guarded, guarded
+from tests.service.rig.postgres import KINDS, database_url, opened
+from tests.service.rig.preloaded import Piped
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -37,7 +37,7 @@ fastapi._compat.v2.TypeAdapter = _adapter  # type: ignore[attr-defined, assignme
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator["Browser"]:
-    from tests.service.browsing import chromium  # noqa: PLC0415  # only who looks at pages waits for the library
+    from tests.service.api.page.browsing import chromium  # noqa: PLC0415  # only who looks at pages waits for the library
 
     with chromium() as found:
         yield found
@@ -62,6 +62,6 @@ def store(url: str) -> Iterator[Store]:
 
 @pytest.fixture
 def replays_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replays that a service of this process starts need import nothing first, see `tests.service.preloaded`."""
+    """Replays that a service of this process starts need import nothing first, see `tests.service.rig.preloaded`."""
     started = SimpleNamespace(**{**vars(subprocess), "Popen": Piped})
     monkeypatch.setattr("service.recordings.replay.jobs.subprocess", started)

@@ -14,7 +14,7 @@ from models.machine import load_machine_file
 from simulator.recorder import record
 from simulator.rotortrain import app
 from tests.commissioning.rotor_kit import LAB, stream
-from tests.service.preloaded import ran
+from tests.service.rig.preloaded import ran
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = (ROOT / "models" / "machines" / "lab.toml").read_text(encoding="utf-8")

@@ -21,7 +21,7 @@ from simulator.publisher import PublishError, PublishSettings, publish
 from simulator.scenario import ChannelSettings, Event, Scenario, Sensors, load_scenario, parse_fault
 from simulator.stream import DEFAULT_START_NS, RunSummary, TruthRecord, blocks
 from tests.loopback import endpoint, session_of
-from tests.service.live import until
+from tests.service.rig.live import until
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from simulator.rotorsim import app
 from simulator.scenario import load_scenario
 from simulator.stream import DEFAULT_START_NS, TruthRecord, blocks
 from tests.loopback import endpoint, session_of
-from tests.service.live import program
+from tests.service.rig.live import program
 
 ROOT = Path(__file__).parents[2]
 

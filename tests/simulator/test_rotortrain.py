@@ -9,7 +9,7 @@ import pytest
 
 from models.diagnosis.networks.bundle import load_bundle
 from models.machine import load_machine
-from tests.service.live import machine_file
+from tests.service.rig.live import machine_file
 
 ROOT = Path(__file__).parents[2]
 

@@ -1,0 +1,152 @@
+"""Baselines of several speeds and conditions, kept as JSON, and what they say of themselves."""
+
+import json
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from benchmarks.finite_elements.observed import windows_of
+from benchmarks.finite_elements.rotor import BeamRotor, changed_rotor
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician, gain_suspicion
+from models.diagnosis.baseline.learned import Baseline, disagreements, learn_baseline, learned_rows, undetermined
+from models.diagnosis.baseline.rows import ROWS
+from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.readings import Diagnosis, parameter_reading
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
+from tests.diagnosis.baseline.fe_rotor import INDEPENDENT, ROTOR, Excitation, plan, simulate
+
+FAST = replace(ROTOR, speed_rad_s=2 * np.pi * 33.0)
+OTHER = Excitation(cutoff_hz=50.0, sources=INDEPENDENT)
+
+
+@cache
+def recorded(rotor: BeamRotor, excitation: Excitation, seed: int, count: int) -> tuple[WindowStatistics, ...]:
+    return tuple(windows_of(simulate(rotor, excitation, 60.0 * count + 3, seed), plan()))
+
+
+@cache
+def baseline() -> Baseline:
+    return learn_baseline(
+        [*recorded(ROTOR, Excitation(), 81, 2), *recorded(FAST, OTHER, 82, 2)], conditions=["slow"] * 2 + ["fast"] * 2
+    )
+
+
+@pytest.mark.slow
+def test_every_commissioned_speed_has_its_own_unbalance() -> None:
+    assert [round(one.speed_rad_s / 2 / np.pi) for one in baseline().rotations] == [24, 33]
+    monitor = BaselineDiagnostician(baseline())
+    for seed, rotor in ((83, ROTOR), (84, FAST)):
+        heavier = changed_rotor(rotor, {"e": 0.6})
+        e = monitor.diagnose(*recorded(heavier, Excitation(), seed, 1)).evaluable[-1]
+        assert e.name == "e"
+        assert e.relative_change is not None
+        assert e.standard_error is not None
+        assert abs(e.relative_change - 0.6) < 3 * e.standard_error
+    between = replace(ROTOR, speed_rad_s=2 * np.pi * 28.0)
+    found = {one.name: one.reason for one in monitor.diagnose(*recorded(between, OTHER, 85, 1)).parameters}
+    assert found["e"] == "speed 1680 rpm, the baseline was learned at 1440, 1980 rpm"
+    assert found["k_by"] == ""
+
+
+def test_conditions_that_agree_leave_no_doubt() -> None:
+    assert {one.condition for one in baseline().consistency} == {"slow", "fast"}
+    assert max(abs(each.z) for one in baseline().consistency for each in one.agreements) < 4
+    assert disagreements(baseline()) == ()
+    assert undetermined(baseline()) == ("", "")
+
+
+def test_a_condition_with_another_bearing_is_found_and_widens_later_intervals() -> None:
+    softer = recorded(changed_rotor(ROTOR, {"k_by": -0.15}), OTHER, 86, 2)
+    mixed = learn_baseline([*recorded(ROTOR, Excitation(), 81, 2), *softer], conditions=["a", "a", "b", "b"])
+    assert any("bearing stiffness, horizontal" in sentence for sentence in disagreements(mixed))
+    horizontal, vertical = mixed.relations
+    assert horizontal is not None
+    assert vertical is not None
+    assert horizontal.allowance > 5
+    assert vertical.allowance < 3
+
+
+@pytest.mark.slow
+def test_an_unphysical_relation_is_not_determined() -> None:
+    first, second = baseline().relations
+    assert first is not None
+    heavy_bearing = first.coefficients.copy()
+    heavy_bearing[2] = 3 * heavy_bearing[1]
+    doubtful = replace(baseline(), relations=(replace(first, coefficients=heavy_bearing), second))
+    reason, none = undetermined(doubtful)
+    assert "3.0 times the disc" in reason
+    assert "record a second condition" in reason
+    assert none == ""
+    vague = replace(doubtful, relations=(replace(first, covariance=first.covariance * 400), second))
+    assert "damping, horizontal is known to" in undetermined(vague)[0]
+
+
+def test_conditions_are_one_for_each_window() -> None:
+    with pytest.raises(EstimationError, match="2 conditions are given for 1 healthy windows"):
+        learn_baseline(recorded(ROTOR, Excitation(), 81, 2)[:1], conditions=["a", "b"])
+
+
+def test_a_restored_baseline_reads_the_same_to_the_last_bit() -> None:
+    text = BaselineRecord.of(baseline()).model_dump_json()
+    again = BaselineRecord.model_validate_json(text).baseline()
+    assert BaselineRecord.of(again).model_dump_json() == text
+    (window,) = recorded(changed_rotor(ROTOR, {"c_by": -0.3}), OTHER, 87, 1)
+    one, other = (BaselineDiagnostician(each).diagnose(window) for each in (baseline(), again))
+    assert one.parameters == other.parameters
+    assert one.misfit_z == other.misfit_z
+    for a, b in ((one.covariance, other.covariance), (one.common, other.common)):
+        assert a is not None
+        assert b is not None
+        assert np.array_equal(a, b)
+
+
+@pytest.mark.parametrize("damage", ["nan", "shape", "reason", "unknown", "text"])
+def test_a_damaged_baseline_is_refused(damage: str) -> None:
+    record = json.loads(BaselineRecord.of(baseline()).model_dump_json())
+    relation = record["relations"][0]
+    if damage == "nan":
+        relation["coefficients"][0] = math.nan
+    elif damage == "shape":
+        relation["covariance"][1].pop()
+    elif damage == "reason":
+        record["reasons"][0] = "not measured"
+    elif damage == "unknown":
+        relation["code"] = "import os"
+    else:
+        relation["coefficients"][0] = "1.0"
+    with pytest.raises(ValidationError):
+        BaselineRecord.model_validate_json(json.dumps(record))
+
+
+def suspected(k: float, c: float, states: tuple[str, ...] = ("y1", "y2")) -> str:
+    errors = np.array([0.005, 0.02])
+    readings = tuple(
+        parameter_reading(name, "baseline", value, float(error))
+        for name, value, error in zip(("k_by", "c_by"), (k, c), errors, strict=True)
+    )
+    first, _ = baseline().relations
+    assert first is not None
+    relations = (replace(first, states=states), None)
+    diagnosis = Diagnosis("baseline", readings, covariance=np.diag(errors**2))
+    found = gain_suspicion(diagnosis, learned_rows(ROWS), relations)
+    return "" if found is None else f"{found.sentence} {100 * found.factor:.0f} {found.z > 5}"
+
+
+def test_equal_changes_of_stiffness_and_damping_look_like_a_gain() -> None:
+    assert suspected(-0.1, -0.1) == "gain of y1 or of y2 -10 True"
+    assert suspected(0.2, 0.19) == "gain of y1 or of y2 20 True"
+    assert suspected(-0.1, 0.0) == ""
+    assert suspected(0.0, -0.3) == ""
+    assert suspected(-0.1, -0.3) == ""
+    assert suspected(0.001, 0.01) == ""
+
+
+def test_all_sensors_of_a_place_may_share_a_wrong_gain() -> None:
+    both = ("y1", "y1_dot", "y2", "y2_dot")
+    assert suspected(-0.1, -0.1, both) == "gain of y1 and y1_dot or of y2 and y2_dot -10 True"
+    assert suspected(-0.1, 0.0, both) == ""

@@ -1,0 +1,100 @@
+"""Following a sliding window reads what searching it anew reads; news is noticed."""
+
+from contextlib import suppress
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from models.diagnosis.likelihood.fit import LengthFits, LikelihoodFit
+from models.diagnosis.moments import plan_for
+from models.diagnosis.readings import Diagnosis
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.errors import UnexplainedError
+from models.machine import load_machine
+from models.signals.block import FloatArray
+from simulator.scenario import Event
+from simulator.stream import blocks
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition
+from tests.service.rig.foreign import Foreign, as_blocks, foreign
+
+LAB = load_machine("lab")
+SEED = 61
+
+
+@lru_cache
+def slid(layout: Layout, step: tuple[str, float] | None = None) -> tuple[SlidingWindow, tuple[WindowStatistics, ...]]:
+    """A minute and six hops; a parameter may change three hops before the end. The window as it is at the end."""
+    draw = Draw(LAB, SEED, Purpose.EVALUATION, 7, layout=layout)
+    faults = [] if step is None else [Event(at_s=77.5, parameter=step[0], relative_change=step[1])]
+    scenario = draw_condition(draw, 0).overridden(duration_s=92.6, faults=faults)
+    plan = plan_for(LAB)
+    window, found = SlidingWindow(plan), []
+    for block, _ in blocks(scenario, LAB, block_s=1.0):
+        for _ in window.feed(plan.to_si(block.samples), block.start_ns):
+            full = window.statistics()
+            found += [] if full is None else [full]
+    return window, tuple(found)
+
+
+def values(diagnosis: Diagnosis) -> tuple[FloatArray, FloatArray]:
+    read = diagnosis.evaluable
+    return np.array([one.relative_change or 0.0 for one in read]), np.array([one.standard_error or 0.0 for one in read])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", [Layout.ONE_SOURCE, pytest.param(Layout.INDEPENDENT, marks=pytest.mark.long)])
+def test_followed_or_at_a_glance_a_window_reads_what_a_search_reads(layout: Layout) -> None:
+    sliding, windows = slid(layout)
+    assert len(windows) == 7
+    following, searching = LikelihoodFit(LAB, follow=True), LikelihoodFit(LAB)
+    for window in windows:
+        (followed, followed_error), (searched, error) = (values(fit.diagnose(window)) for fit in (following, searching))
+        assert np.all(np.abs(followed - searched) < 0.7 * error)  # each is converged to 0.15 errors
+        np.testing.assert_allclose(followed_error, error, rtol=0.1)
+    for hops in (2, 4, 7):
+        stretch = sliding.statistics(hops)
+        assert stretch is not None
+        seen = following.glance(stretch)
+        assert seen is not None
+        assert seen.misfit_z is None
+        near = LikelihoodFit(LAB)
+        near.start_near(following)
+        (glanced, glanced_error), (searched, error) = values(seen), values(near.diagnose(stretch))
+        assert np.all(np.abs(glanced - searched) < 0.8 * error)
+        np.testing.assert_allclose(glanced_error, error, rtol=0.15)
+
+
+def test_news_is_not_read_at_a_glance() -> None:
+    window, windows = slid(Layout.INDEPENDENT, ("k_by", -0.2))
+    fits, fit = LengthFits(LAB), LikelihoodFit(LAB, follow=True)
+    for full in windows:
+        fits.window(full)
+        fit.diagnose(full)
+    stretch = window.statistics(2)
+    assert stretch is not None
+    assert fit.glance(stretch) is None
+    change, error = values(fits.short(2, stretch))
+    assert abs(change[0] + 0.2) < 4 * error[0] < 0.2
+
+
+def test_nothing_is_glanced_at_before_a_window_was_searched() -> None:
+    window, _ = slid(Layout.INDEPENDENT)
+    stretch = window.statistics(2)
+    assert stretch is not None
+    assert LikelihoodFit(LAB, follow=True).glance(stretch) is None
+
+
+@pytest.mark.parametrize("kind", ["drift", "late copy"])
+def test_what_could_not_be_explained_leaves_nothing_behind(kind: Foreign) -> None:
+    """A window of something else in between: the next one is read as if it were the first."""
+    plan, window = plan_for(LAB), SlidingWindow(plan_for(LAB))
+    for block in as_blocks(LAB, foreign(LAB, kind, SEED, 70.0)):
+        tuple(window.feed(plan.to_si(block.samples), block.start_ns))
+    strange = window.statistics()
+    assert strange is not None
+    fit = LikelihoodFit(LAB, follow=True)
+    with suppress(UnexplainedError):
+        assert fit.diagnose(strange).unexplained
+    ours = slid(Layout.ONE_SOURCE)[1][0]
+    np.testing.assert_array_equal(values(fit.diagnose(ours)), values(LikelihoodFit(LAB, follow=True).diagnose(ours)))

@@ -1,0 +1,263 @@
+"""Noise that rises in one sensor is found and put down to it; a shaft angle that cannot be believed is named."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from models.diagnosis.moments import Plan, plan_for
+from models.diagnosis.sensors.check import sensor_findings
+from models.diagnosis.sensors.reference import SensorReference, learn_sensor_reference
+from models.diagnosis.window import WindowStatistics
+from models.signals.block import FloatArray
+from rotorwatch.records.windows import SensorFault
+from simulator.scenario import Event, Scenario, Sensors
+from simulator.stream import blocks
+from tests.diagnosis.sensors.test_sensor_checks import MORE_S, WINDOW_S, column, machine_of, only, sources_along
+from tests.diagnosis.sensors.test_sensor_checks import windows_of as windows_in
+
+DISPLACEMENTS = ("y1", "z1", "y2", "z2")
+
+
+@cache
+def plan_of(name: str, *, displacements: bool = False) -> Plan:
+    plan = plan_for(machine_of(name), lagged=False)
+    if not displacements:
+        return plan
+    keep = [plan.states.index(state) for state in DISPLACEMENTS]
+    return replace(plan, states=DISPLACEMENTS, columns=plan.columns[keep], scales=plan.scales[keep])
+
+
+@cache
+def recorded(
+    name: str, seed: int, windows: int = 1, *, directions: int = 4, noise: float = 0.02, events: tuple[Event, ...] = ()
+) -> FloatArray:
+    """SI samples of all channels and, last, the shaft angle; level and cutoff are drawn from the seed."""
+    rng, machine = np.random.default_rng([seed, 6]), machine_of(name)
+    force_N = machine.rotor.m2_kg * machine.rotor.e_m * machine.operation.speed_rad_s**2 * rng.uniform(0.5, 2)
+    cutoff_hz = rng.uniform(*machine.condition.cutoff_hz)
+    rows = np.eye(6)[[0, 1, 3, 4]] if directions == 4 else rng.standard_normal((1, 6)) * [1, 1, 0.05, 1, 1, 0.05]
+    scenario = Scenario(
+        machine=name,
+        seed=seed,
+        duration_s=windows * WINDOW_S + MORE_S,
+        sources=sources_along(rows, cutoff_hz, force_N),
+        sensors=Sensors(noise_relative=noise),
+        events=events,
+    )
+    return np.concatenate([plan_of(name).to_si(block.samples) for block, _ in blocks(scenario, machine, 1.0)])
+
+
+def windows_of(name: str, samples: FloatArray, *, displacements: bool = False) -> list[WindowStatistics]:
+    plan = plan_of(name, displacements=displacements)
+    if displacements:
+        samples = samples[:, [*(plan_of(name).states.index(state) for state in DISPLACEMENTS), -1]]
+    return windows_in(plan, samples)
+
+
+@cache
+def reference_of(name: str, *, displacements: bool = False) -> SensorReference:
+    """Learned with one source: what moves the machine later is another matter."""
+    samples = recorded(name, 900, 2, directions=1)
+    return learn_sensor_reference(windows_of(name, samples, displacements=displacements))
+
+
+def found_in(
+    samples: FloatArray, *, displacements: bool = False, reference: SensorReference | None = None
+) -> tuple[SensorFault, ...]:
+    (window,) = windows_of("lab", samples, displacements=displacements)
+    reference = reference_of("lab", displacements=displacements) if reference is None else reference
+    return sensor_findings(window, reference, machine_of("lab").sensors)
+
+
+def with_noise(samples: FloatArray, state: str, part: float, seed: int = 0) -> FloatArray:
+    """White noise of a part of the channel's rms."""
+    noisy, at = samples.copy(), column(state)
+    noisy[:, at] += part * samples[:, at].std() * np.random.default_rng(seed).standard_normal(len(samples))
+    return noisy
+
+
+def with_hum(samples: FloatArray, state: str, part: float, line_hz: float = 50.0) -> FloatArray:
+    """A line, its rms a part of the channel's."""
+    humming, at = samples.copy(), column(state)
+    t_s = np.arange(len(samples)) / machine_of("lab").rate_hz
+    humming[:, at] += part * samples[:, at].std() * np.sqrt(2) * np.sin(2 * np.pi * line_hz * t_s)
+    return humming
+
+
+def in_band(part: float) -> float:
+    """Of white noise of this size, what lies in the band, over the rms of channel and noise."""
+    low, high = machine_of("lab").window.band_hz
+    return float(part * np.sqrt((high - low) / (machine_of("lab").rate_hz / 2)) / np.hypot(1, part))
+
+
+@pytest.mark.parametrize("name", ["lab", pytest.param("heavy", marks=pytest.mark.long)])
+@pytest.mark.parametrize("displacements", [False, True])
+def test_healthy_sensors_are_quiet_under_another_excitation(name: str, displacements: bool) -> None:
+    reference = reference_of(name, displacements=displacements)
+    for directions, noise in ((1, 0.05), (4, 0.05), (4, 0.01)):
+        samples = recorded(name, 910 + directions, directions=directions, noise=noise)
+        (window,) = windows_of(name, samples, displacements=displacements)
+        assert sensor_findings(window, reference) == ()
+
+
+@pytest.mark.parametrize("state", ["y1", "z2", "z1_dot", "y2_dot"])
+def test_of_two_sensors_of_a_motion_the_noisy_one_is_named_with_its_noise(state: str) -> None:
+    finding = only(found_in(with_noise(recorded("lab", 920), state, 0.3)))
+    assert (finding.kind, finding.states) == ("noise", (state,))
+    assert finding.value == pytest.approx(in_band(0.3), rel=0.3)
+    assert finding.z is not None
+    assert finding.z > 5
+
+
+def test_with_one_sensor_for_each_motion_noise_is_found_where_it_lies_over_the_machine() -> None:
+    for state in ("y2", "z2"):
+        finding = only(found_in(with_noise(recorded("lab", 920), state, 0.8), displacements=True))
+        assert (finding.kind, finding.states) == ("noise", (state,))
+        assert finding.value == pytest.approx(in_band(0.8), rel=0.3)
+
+
+@pytest.mark.parametrize("displacements", [False, True])
+def test_mains_hum_in_one_channel_is_noise(displacements: bool) -> None:
+    finding = only(found_in(with_hum(recorded("lab", 920), "z2", 0.08), displacements=displacements))
+    assert (finding.kind, finding.states) == ("noise", ("z2",))
+    assert finding.value == pytest.approx(0.08, rel=0.25)
+    assert ("50 Hz" in finding.text) == displacements
+
+
+@pytest.mark.parametrize(("line_hz", "hums"), [(60.0, True), (100.2, True), (3 * 22.0, False), (87.3, False)])
+def test_a_line_that_one_sensor_sees_is_the_mains_or_the_machines(line_hz: float, hums: bool) -> None:
+    found = found_in(with_hum(recorded("lab", 920), "z2", 0.1, line_hz), displacements=True)
+    assert [(one.kind, one.states) for one in found] == ([("noise", ("z2",))] if hums else [])
+
+
+def test_a_line_that_the_machine_shows_in_all_channels_is_none_of_a_sensors() -> None:
+    samples = recorded("lab", 920).copy()
+    t_s = np.arange(len(samples)) / machine_of("lab").rate_hz
+    for place, size in zip(DISPLACEMENTS, (0.05, 0.1, 0.15, 0.1), strict=True):
+        samples[:, column(place)] += size * samples[:, column(place)].std() * np.sin(2 * np.pi * 50 * t_s)
+    assert found_in(samples, displacements=True) == ()
+
+
+def test_noise_that_rises_in_all_channels_is_no_single_sensors() -> None:
+    samples = recorded("lab", 920)
+    assert only(found_in(with_noise(samples, "y1", 0.25))).kind == "noise"
+    for state in plan_of("lab").states:
+        samples = with_noise(samples, state, 0.25, seed=column(state))
+    assert found_in(samples) == ()
+
+
+def test_a_little_more_noise_is_not_worth_a_finding() -> None:
+    assert found_in(with_noise(recorded("lab", 920), "y1", 0.04)) == ()
+
+
+CHANGES = {"k_by": -0.25, "e": 1.0}
+
+
+@pytest.mark.parametrize(("parameter", "at_s"), [("k_by", 31.0), ("e", 31.0), ("e", 0.0)])
+def test_a_fault_of_the_machine_is_none_of_its_sensors(parameter: str, at_s: float) -> None:
+    event = Event(at_s=at_s, parameter=parameter, relative_change=CHANGES[parameter])
+    samples = recorded("lab", 925, events=(event,))
+    assert found_in(samples) == ()
+    assert found_in(samples, displacements=True) == ()
+
+
+def test_without_a_reference_of_noise_none_is_found_and_an_old_reference_stays_as_it_was() -> None:
+    noisy = with_noise(recorded("lab", 920), "y1", 0.2)
+    (window,) = windows_of("lab", noisy)
+    assert sensor_findings(window) == ()
+    content = reference_of("lab").model_dump(mode="json")
+    for one in (*content["channels"], *content["pairs"]):
+        one.pop("noise", None)
+    old = SensorReference.model_validate(content, strict=False)
+    assert "noise" not in old.model_dump_json()
+    assert found_in(noisy, reference=old) == ()
+    assert found_in(noisy)[0].kind == "noise"
+
+
+def test_a_reference_of_noise_comes_back_and_is_checked() -> None:
+    reference = reference_of("lab")
+    again = SensorReference.model_validate_json(reference.model_dump_json())
+    assert again == reference
+    assert all(pair.noise is not None for pair in again.pairs)
+    assert all(channel.noise is not None for channel in reference_of("lab", displacements=True).channels)
+    broken = reference.model_dump(mode="json")
+    broken["pairs"][0]["noise"]["share"].pop()
+    with pytest.raises(ValidationError, match="density holds 24 bands and share 23"):
+        SensorReference.model_validate(broken, strict=False)
+
+
+def jumped(theta: FloatArray) -> FloatArray:
+    return theta + np.where(np.arange(theta.size) > 0.55 * theta.size, np.pi / 2, 0.0)
+
+
+def lost_a_turn(theta: FloatArray) -> FloatArray:
+    """One missing pulse: for two turns the angle goes at half speed."""
+    first, turn = theta.size // 3, round(2 * np.pi * theta.size / (theta[-1] - theta[0]))
+    late = np.clip((np.arange(theta.size) - first) / (2 * turn), 0, 1)
+    return np.asarray(theta - 2 * np.pi * late)
+
+
+def slipping(theta: FloatArray) -> FloatArray:
+    return theta * 1.001
+
+
+def of_another_shaft(theta: FloatArray) -> FloatArray:
+    return theta * 0.8
+
+
+def jittering(theta: FloatArray) -> FloatArray:
+    return np.asarray(theta + 0.8 * np.random.default_rng(1).standard_normal(theta.size))
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "kind", "value", "displacements"),
+    [
+        (jumped, "offset", np.pi / 2, False),
+        (jumped, "offset", np.pi / 2, True),
+        (lost_a_turn, "incoherent", 1.0, False),
+        (slipping, "incoherent", 1.001, True),
+        (of_another_shaft, "incoherent", 0.8, False),
+        (jittering, "noise", 0.8, False),
+        (jittering, "noise", 0.8, True),
+    ],
+)
+def test_a_wrong_shaft_angle_is_named(
+    spoilt: Callable[[FloatArray], FloatArray], kind: str, value: float, displacements: bool
+) -> None:
+    samples = recorded("lab", 920).copy()
+    samples[:, -1] = np.mod(spoilt(np.unwrap(samples[:, -1])), 2 * np.pi)
+    finding = only(found_in(samples, displacements=displacements))
+    assert (finding.kind, finding.states) == (kind, ("theta",))
+    assert finding.value == pytest.approx(value, rel=0.15)
+
+
+def test_a_shaft_that_changes_its_speed_has_a_sound_angle() -> None:
+    speed_rpm = machine_of("lab").operation.speed_rpm
+    event = Event(at_s=25.0, ramp_s=10.0, speed_rpm=1.03 * speed_rpm)
+    assert found_in(recorded("lab", 927, events=(event,))) == ()
+
+
+@pytest.mark.parametrize(("wanders", "resonance"), [(0.0, 1.0), (0.0, 1.01), (0.01, 1.0), (0.01, 1.2)])
+@pytest.mark.parametrize("damping", [0.002, 0.01])
+def test_a_lightly_damped_shaft_near_its_resonance_has_a_sound_angle(
+    wanders: float, resonance: float, damping: float
+) -> None:
+    rng, plan = np.random.default_rng([60120, round(1e4 * damping), round(100 * resonance)]), plan_of("lab")
+    plan = replace(plan, states=("y1",), columns=plan.columns[:1], scales=plan.scales[:1])
+    machine = machine_of("lab")
+    t_s = np.arange(round((WINDOW_S + MORE_S) * machine.rate_hz)) / machine.rate_hz
+    speed_hz = machine.operation.speed_rpm / 60
+    knots_s = np.arange(0.0, t_s[-1] + 8.0, 4.0)
+    turning_hz = speed_hz * (1 + wanders * np.interp(t_s, knots_s, rng.standard_normal(knots_s.size)))
+    theta = 2 * np.pi * np.cumsum(turning_hz) / machine.rate_hz
+    f, own_hz = np.fft.rfftfreq(t_s.size, 1 / machine.rate_hz), resonance * speed_hz
+    force = np.fft.rfft(rng.standard_normal(t_s.size))
+    shaken = np.fft.irfft(force / (own_hz**2 - f**2 + 2j * damping * own_hz * f), t_s.size)
+    motion = 1e-4 * (np.cos(theta) + shaken / shaken.std() / np.sqrt(2))
+    (window,) = windows_in(plan, np.stack([motion, np.mod(theta, 2 * np.pi)], axis=1))
+    assert window.removed_by_hop == (wanders > 0)
+    assert sensor_findings(window) == ()

@@ -1,0 +1,422 @@
+"""The sequential test on Gaussian hops: declared rate, delays, location, repair, thresholds, what it can find."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats.qmc import MultivariateNormalQMC
+
+from models.diagnosis.readings import Z95
+from models.diagnosis.verdict.calibration import (
+    MONTH_S,
+    crossing_rate,
+    detectable_changes,
+    length_to_find,
+    month_thresholds,
+    overshoot_correction,
+    window_thresholds,
+)
+from models.diagnosis.verdict.change_point import read_changes
+from models.diagnosis.verdict.isolation import isolate
+from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
+from models.diagnosis.verdict.sequential_state import SequentialState, hop_arrays
+from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
+from models.physics.rotor import PARAMETERS
+from models.signals.block import FloatArray
+from rotorwatch.records.windows import Verdict
+from tests.diagnosis.verdict.gaussian_hops import GaussianHops, detection_delays
+from tests.diagnosis.verdict.test_isolation import covariance, window
+
+SEED = 88_300
+SETTINGS = SequentialSettings(hop_s=5.0, window_hops=12)
+ERRORS = np.array([0.0036, 0.0135, 0.0036, 0.0135, 0.018, 0.002])
+"""Of the rotor kit in 60 s, at the limit of what any method can read."""
+COVARIANCE = np.diag(ERRORS**2)
+
+
+def true(**changes: float) -> FloatArray:
+    values = np.zeros(len(PARAMETERS))
+    for name, change in changes.items():
+        values[PARAMETERS.index(name)] = to_scale(name, change)
+    return values
+
+
+def play(test: SequentialTest, hops: GaussianHops, *story: tuple[int, FloatArray]) -> list[tuple[int, Verdict]]:
+    """Feed hops with these true values; verdicts with the number of the hop."""
+    verdicts, number = [], 0
+    for count, values in story:
+        for _ in range(count):
+            looks = hops.looks(values)
+            if looks:
+                wanted = (*test.wanted(), SETTINGS.window_hops)
+                verdicts.append((number, test.update({h: look for h, look in looks.items() if h in wanted})))
+            number += 1
+    return verdicts
+
+
+def again(state: SequentialState) -> SequentialState:
+    return SequentialState.restored(state.checkpoint(), [hop_arrays(came) for _, came in sorted(state.hops().items())])
+
+
+def gaussian(seed: int, settings: SequentialSettings = SETTINGS) -> GaussianHops:
+    return GaussianHops(settings, COVARIANCE, np.random.default_rng(seed))
+
+
+def fixed_length_s(name: str, change: float) -> float:
+    """Data that a test of one fixed length needs at the same rate, with 95 % power."""
+    length_s, stretch = 60.0, stretch_of(window(np.zeros(len(PARAMETERS)), COVARIANCE), 0, 60_000_000_000)
+    for _ in range(50):
+        thresholds = month_thresholds(1.0, 5.0, max(1, round(length_s / 5.0)), len(PARAMETERS))
+        (found,) = (one for one in detectable_changes(stretch, thresholds, 60.0) if one.name == name)
+        length_s = length_to_find(found, change)
+    return length_s
+
+
+@pytest.mark.slow
+def test_an_error_that_all_windows_share_is_not_averaged_away() -> None:
+    """A commissioning that was one of its standard errors off: 32 windows must not make a finding of it."""
+    shared = np.zeros((6, 6))
+    shared[0, 0] = 0.02**2
+    offset = true(k_by=0.02)
+    named = {}
+    for common in (None, shared):
+        hops, test = gaussian(SEED + 40), SequentialTest(SETTINGS)
+        for number in range(1, 12 * 32 + 1):
+            looks = hops.looks(offset)
+            if number % 12 == 0:
+                verdict = test.update({12: replace(looks[12], common=common)})  # sums are made of whole windows
+        named[common is None] = [finding.name for finding in verdict.changed]
+    assert named == {True: ["k_by"], False: []}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("declared", "n_hops"), [(8000.0, 1_250), pytest.param(4000.0, 10_000, marks=pytest.mark.long)]
+)
+def test_false_alarms_come_at_the_declared_rate(declared: float, n_hops: int) -> None:
+    """Hours of a healthy machine at 8000 declared false alarms per month: 19 are expected in 1250 hops."""
+    settings = replace(SETTINGS, false_alarms_per_month=declared, systematic=0.0)
+    verdicts = play(SequentialTest(settings), gaussian(SEED, settings), (n_hops, true()))
+    last, count = -1000, 0
+    for number, verdict in verdicts:
+        if verdict.detected:
+            # What one stretch of noise does to stretches of several lengths is one alarm.
+            count += number - last > 24
+            last = number
+    expected = declared * n_hops * SETTINGS.hop_s / MONTH_S
+    # Lengths overlap, so what they see is partly the same: the declared rate is an upper bound.
+    assert 0.4 * expected < count < expected + 3 * expected**0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("c_by", -0.1),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in (("k_by", -0.05), ("c_by", -0.2), ("e", 0.2))),
+    ],
+)
+def test_delays_stay_within_twice_those_of_a_fixed_length(name: str, change: float) -> None:
+    """95 of 100 changes are found, and named, within twice the data of a test made for exactly this change."""
+    study = detection_delays(SETTINGS, COVARIANCE, {name: change}, trials=20, seed=SEED, before_hops=14, after_hops=24)
+    allowed_s = 2 * fixed_length_s(name, change)
+    assert np.quantile(study.detected_s, 0.95) <= allowed_s
+    assert np.quantile(study.named_s, 0.95) <= allowed_s
+    assert study.wrong == 0
+    assert study.early == 0
+
+
+def test_a_small_change_accumulates_over_windows() -> None:
+    """Damping 4 % down is no more than three standard errors of a window; sums of windows find it."""
+    verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 2), (24, true()), (160, true(c_by=-0.04)))
+    number, first = next((n, v) for n, v in verdicts if v.changed)
+    (finding,) = first.changed
+    assert finding.name == "c_by"
+    assert finding.stretch_s >= 120.0
+    assert 36 < number < 24 + 120
+    assert {f.name for _, verdict in verdicts for f in verdict.changed} == {"c_by"}
+
+
+@pytest.mark.slow
+def test_large_changes_are_named_within_two_hops_and_nothing_else_ever() -> None:
+    study = detection_delays(
+        SETTINGS, COVARIANCE, {"k_by": -0.25}, trials=8, seed=SEED + 3, before_hops=14, after_hops=26
+    )
+    assert study.named_s.max() <= 10.0
+    assert study.wrong == 0
+
+
+def straddling(looks: dict[int, Stretch], since: int, bias: FloatArray) -> dict[int, Stretch]:
+    """The same, but stretches that straddle the change some hops ago read another parameter wrong."""
+    return {
+        hops: replace(look, vector=look.vector + look.information @ (bias * 4 * (since / hops) * (1 - since / hops)))
+        if since < hops
+        else look
+        for hops, look in looks.items()
+    }
+
+
+@pytest.mark.slow
+def test_what_a_straddling_window_reads_wrong_is_not_named() -> None:
+    """k_by drops by 25 %; stretches across the change read c_by up to 7 % too large, five standard errors."""
+    for seed in range(3):
+        test, hops = SequentialTest(SETTINGS), gaussian(SEED + 100 + seed)
+        play(test, hops, (14, true()))
+        said: list[tuple[str, ...]] = []
+        for since in range(1, 26):  # to where two whole windows have left the change behind
+            looks = straddling(hops.looks(true(k_by=-0.25)), since, true(c_by=0.07))
+            said.append(tuple(finding.name for finding in test.update(looks).changed))
+        assert set(said[1:]) == {("k_by",)}
+
+
+def test_two_changes_at_once_and_one_after_the_other() -> None:
+    both, first = true(k_by=-0.2, c_bz=-0.25), true(k_by=-0.2)
+    for story in [((20, true()), (30, both)), ((20, true()), (30, first), (30, both))]:
+        verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 4), *story)
+        assert [f.name for f in verdicts[-1][1].changed] == ["k_by", "c_bz"]
+        named = {tuple(f.name for f in verdict.changed) for _, verdict in verdicts}
+        assert named <= {(), ("k_by",), ("c_bz",), ("k_by", "c_bz")}
+    k_by, c_bz = verdicts[-1][1].changed
+    assert k_by.since_ns < c_bz.since_ns  # each change has its own date
+    assert abs(k_by.since_ns / 5e9 - 20) <= 4
+    assert abs(c_bz.since_ns / 5e9 - 50) <= 4
+
+
+def test_a_repair_is_noticed_within_seconds() -> None:
+    verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 5), (20, true()), (30, true(k_by=-0.25)), (20, true()))
+    late = [verdict for number, verdict in verdicts if number >= 50 + 4]
+    assert all(not verdict.changed for verdict in late)
+    assert not late[0].settled
+    (k_by,) = (reading for reading in late[0].current if reading.name == "k_by")
+    assert abs(k_by.relative_change or 1.0) < 0.04
+
+
+def test_readings_are_those_of_the_new_machine_while_the_window_straddles() -> None:
+    verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 6), (20, true()), (6, true(k_by=-0.25)))
+    last = verdicts[-1][1]
+    (k_by,) = (reading for reading in last.current if reading.name == "k_by")
+    assert k_by.relative_change == pytest.approx(-0.25, abs=0.03)
+    assert not last.settled
+
+
+def test_a_window_astride_a_change_says_how_much_it_does_not_know() -> None:
+    """Windows alone, as without parameters: size and date of what is quoted first hold the truth."""
+    settings, rng = SequentialSettings(hop_s=5.0, window_hops=12, short_hops=()), np.random.default_rng(SEED + 21)
+    sizes, dates = [], []
+    for trial in range(40):
+        name, change = ("k_by", "c_by", "e")[trial % 3], float(rng.choice([-0.25, -0.15, 0.15, 0.3, 0.5]))
+        test, hops, share = SequentialTest(settings), gaussian(SEED + 30 + trial, settings), float(rng.uniform())
+        mixed = true(**{name: change}) * share
+        for number in range(40):
+            looks = hops.looks(true() if number < 20 else mixed if number == 20 else true(**{name: change}))
+            if not looks:
+                continue
+            verdict = test.update(looks)
+            found = {one.name: one.between_ns for one in verdict.changed}
+            quoted = [one.interval_95 for one in verdict.current if one.name == name and name in found]
+            if quoted:
+                (low, high), (after, before) = quoted[0] or (0.0, 0.0), found[name] or (0, 0)
+                sizes.append(low <= change <= high)
+                dates.append(after <= (21 - share) * 5e9 <= before < after + 60e9)
+                break
+    assert len(sizes) == 40
+    assert sum(sizes) >= 34  # 95 % of 40 are fewer once in 80
+    assert sum(dates) >= 34
+
+
+def test_what_is_too_small_to_be_named_is_not_held_at_nothing() -> None:
+    """Of two parameters that hang together one changed much and the other by too little: the first still reads true."""
+    rng, cov = np.random.default_rng(SEED + 23), np.diag(np.full(6, 1e-4))
+    cov[0, 1] = cov[1, 0] = 0.8e-4
+    held = nominal = alone = 0
+    for _ in range(100):
+        values = rng.multivariate_normal(true(k_by=-0.3) + 0.045 * np.eye(6)[1], cov)
+        look = stretch_of(window(values, cov), 0, 60 * 10**9)
+        named = [PARAMETERS.index(name) for name in isolate(look, SETTINGS.thresholds(12)).changed]
+        alone += named == [0]
+        found = read_changes([look], named, 5 * 10**9, 0)
+        held += bool(abs(found.values[0] - np.log(0.7)) <= Z95 * found.errors[0])
+        (restricted,) = [one for one in isolate(look, SETTINGS.thresholds(12)).readings if one.name == "k_by"]
+        low, high = restricted.interval_95 or (0.0, 0.0)
+        nominal += low <= -0.3 <= high
+    assert alone > 75
+    assert held >= 70 > 20 > nominal  # how sure one is that the other changed differs from window to window
+
+
+def test_what_is_outside_the_model_is_said_of_clean_data() -> None:
+    test, hops = SequentialTest(SETTINGS), gaussian(SEED + 7)
+    for misfit, outside in [(1.0, False), (8.0, True)]:
+        for _ in range(20):
+            looks = {h: replace(look, misfit_z=misfit) for h, look in hops.looks(true()).items()}
+            if looks:
+                assert test.update(looks).outside_model == outside
+
+
+@pytest.mark.parametrize(("before", "lasting"), [(13, True), (4, False)])
+def test_what_has_long_been_outside_the_model_is_taken_back_by_a_whole_window_alone(before: int, lasting: bool) -> None:
+    """Not by stretches too short to show it; but what is outside while a window is astride a change may be that."""
+    test, hops = SequentialTest(SETTINGS), gaussian(SEED + 47)
+    said: list[bool] = []
+    for count, values, misfit in ((15, true(), 0.0), (before, true(), 8.0), (11, true(k_by=0.4), 8.0)):
+        for _ in range(count):
+            looks = {
+                h: replace(one, misfit_z=misfit if h == SETTINGS.window_hops else 0.0)
+                for h, one in hops.looks(values).items()
+            }
+            if looks:
+                said.append(test.update(looks).outside_model)
+    assert all(said[-11 - before : -11])
+    assert said[-9:] == [lasting] * 9  # from the second hop on the change shows
+    for _ in range(3):
+        looks = {h: replace(one, misfit_z=0.0) for h, one in hops.looks(true(k_by=0.4)).items()}
+        outside = test.update(looks).outside_model
+    assert not outside
+
+
+def test_a_gap_is_no_part_of_a_sum() -> None:
+    test, hops = SequentialTest(SETTINGS), gaussian(SEED + 8)
+    play(test, hops, (24, true()))
+    assert len(test.state.sums[2]) == 1
+    shift_ns = 3_600_000_000_000
+    looks = hops.looks(true())
+    moved = {
+        h: replace(look, start_ns=look.start_ns + shift_ns, end_ns=look.end_ns + shift_ns) for h, look in looks.items()
+    }
+    test.update(moved)
+    assert len(test.state.sums[1]) == 1
+    assert len(test.state.sums[2]) == 1  # nothing was added to what was there before
+    assert test.state.sums[2][0].end_ns < shift_ns
+
+
+def test_a_restored_test_goes_on_as_if_nothing_had_happened() -> None:
+    hops = gaussian(SEED + 9)
+    going = SequentialTest(SETTINGS)
+    play(going, hops, (60, true()), (30, true(c_by=-0.15)))
+    restored = SequentialTest(SETTINGS)
+    restored.state = again(going.state)
+    for _ in range(30):
+        looks = hops.looks(true(c_by=-0.15))
+        assert restored.update(looks) == going.update(looks)
+    assert going.state.findings[0].name == "c_by"
+    going.clear()
+    assert again(going.state) == SequentialState()
+
+
+SEED_OF_CALIBRATION = 88_001
+
+
+@pytest.mark.parametrize("rate", [1e-2, 1e-3])
+def test_window_rate_is_kept_over_all_parameters(rate: float) -> None:
+    """400 000 healthy windows of six independent parameters."""
+    rng = np.random.default_rng(SEED_OF_CALIBRATION)
+    largest = np.abs(rng.standard_normal((400_000, 6))).max(axis=1)
+    counted = int((largest > window_thresholds(rate, 6).first).sum())
+    expected = 400_000 * rate
+    assert abs(counted - expected) < 4 * expected**0.5
+
+
+def moving_averages(hops: int, overlap: int, seed: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    total = np.concatenate([[0.0], np.cumsum(np.random.default_rng(seed).standard_normal(hops + overlap - 1))])
+    return np.asarray((total[overlap:] - total[:-overlap]) / overlap**0.5)
+
+
+@pytest.mark.parametrize("overlap", [2, 12, 192, *(pytest.param(n, marks=pytest.mark.long) for n in (4, 48))])
+@pytest.mark.parametrize("threshold", [3.0, 3.6])
+def test_new_crossings_of_a_sliding_window(overlap: int, threshold: float) -> None:
+    """Four million hops; an exceedance is new if none came in the window's length before it."""
+    hops = 4_000_000
+    above = np.flatnonzero(np.abs(moving_averages(hops, overlap, SEED_OF_CALIBRATION + overlap)) > threshold)
+    fresh = 1 + int((np.diff(above) > overlap).sum())
+    expected = 2 * crossing_rate(threshold, overlap) * hops
+    # The rate is asymptotic in the threshold; crossings of one window's noise sometimes come in two groups.
+    assert fresh == pytest.approx(expected, rel=0.12, abs=4 * expected**0.5)
+
+
+def test_windows_that_do_not_overlap_cross_with_their_tail_probability() -> None:
+    assert crossing_rate(3.0, 1) == pytest.approx(1.3499e-3, rel=1e-4)
+
+
+def test_overshoot_correction_has_its_known_limits() -> None:
+    assert overshoot_correction(1e-9) == 1.0
+    assert overshoot_correction(0.2) == pytest.approx(np.exp(-0.583 * 0.2), rel=0.01)  # Siegmund's expansion
+    assert overshoot_correction(12.0) == pytest.approx(2 / 12.0**2, rel=0.01)
+
+
+@pytest.mark.parametrize("overlap", [1, 2, 12, 768])
+def test_month_thresholds_have_the_declared_rate(overlap: int) -> None:
+    found = month_thresholds(0.5, 5.0, overlap, 6, 9)
+    hops = MONTH_S / 5.0
+    assert 2 * 6 * 9 * hops * crossing_rate(found.first, overlap) == pytest.approx(0.5)
+    assert hops * crossing_rate(found.outside, overlap) == pytest.approx(0.5)
+    assert found.further > found.first > 3.5
+
+
+def test_rates_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(ValueError, match="rate is 0 for 6 parameters"):
+        window_thresholds(0, 6)
+    with pytest.raises(ValueError, match="expected positive numbers"):
+        month_thresholds(-1, 5.0, 12, 6)
+    assert month_thresholds(1e9, 5.0, 12, 6).first == 1.0  # more often than that nothing is crossed
+
+
+SEED_OF_DETECTABLE = 88_200
+
+
+def healthy(seed: int) -> Stretch:
+    cov = covariance(np.random.default_rng(seed))
+    return stretch_of(window(np.zeros(6), cov), 0, 60_000_000_000)
+
+
+def power(cov: FloatArray, name: str, seed: int) -> list[float]:
+    """Share of windows in which the minimum detectable loss and gain are named: 256, spread as evenly as can be."""
+    thresholds, shares, scatter = window_thresholds(0.01, 6), [], MultivariateNormalQMC(np.zeros(6), cov, rng=seed)
+    stretch = stretch_of(window(np.zeros(6), cov), 0, 60_000_000_000)
+    (found,) = (one for one in detectable_changes(stretch, thresholds, 60.0) if one.name == name)
+    for change in (found.loss, found.gain):
+        true = np.zeros(6)
+        true[PARAMETERS.index(name)] = to_scale(name, change)
+        values = true + scatter.random(256)
+        shares.append(
+            float(
+                np.mean([name in isolate(stretch_of(window(value, cov), 0, 1), thresholds).changed for value in values])
+            )
+        )
+    return shares
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["c_by", "e"])
+def test_the_change_is_found_in_95_of_100_windows(name: str) -> None:
+    cov = np.diag(np.geomspace(0.001, 0.02, 6) ** 2)
+    assert power(cov, name, SEED_OF_DETECTABLE) == pytest.approx([0.95, 0.95], abs=0.025)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_correlated_parameters_are_found_more_often_never_less(seed: int) -> None:
+    cov = covariance(np.random.default_rng(SEED_OF_DETECTABLE + seed))
+    assert min(power(cov, "k_bz", SEED_OF_DETECTABLE + seed)) > 0.925
+
+
+def test_loss_and_gain_are_ratios_of_each_other() -> None:
+    for found in detectable_changes(healthy(1), month_thresholds(1.0, 5.0, 12, 6), 60.0):
+        if found.name == "e":
+            assert found.loss == -found.gain or found.loss == -1
+        else:
+            assert (1 + found.loss) * (1 + found.gain) == pytest.approx(1)
+        assert -1 <= found.loss < 0 < found.gain
+
+
+def test_length_and_change_are_inverse() -> None:
+    stretch, thresholds = healthy(2), window_thresholds(1e-3, 6)
+    found = {one.name: one for one in detectable_changes(stretch, thresholds, 60.0)}
+    for one in found.values():
+        for change in (one.loss, one.gain):
+            assert length_to_find(one, change) == pytest.approx(60.0)
+    assert length_to_find(found["e"], 0.05) == pytest.approx(4 * length_to_find(found["e"], 0.10))
+
+
+@pytest.mark.parametrize("change", [0.0, -1.0, -2.0])
+def test_changes_that_cannot_be_are_refused(change: float) -> None:
+    with pytest.raises(ValueError, match="expected above -1 and not 0"):
+        length_to_find(detectable_changes(healthy(3), window_thresholds(0.01, 6), 60.0)[0], change)

@@ -1,0 +1,231 @@
+"""Who is let in over HTTP and who is refused: a real server, a real store."""
+
+import base64
+import hmac
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi import FastAPI, WebSocket
+
+from service.access.guard import AccessError
+from service.access.scopes import Scope
+from service.settings.access import AccessSettings
+from tests.service.rig.guarded import JSON, Guarded, application, basic, guarded, problem, served
+
+READ, OPERATE, CONFIGURE = Scope
+DAY_NS = 86_400 * 10**9
+ASKED = 'Bearer realm="rotorwatch"'
+
+
+def test_a_wrong_expired_or_revoked_token_gets_the_same_answer(monitor: Guarded) -> None:
+    record, good = monitor.issue(*Scope)
+    expired = monitor.token(READ, days=1, now_ns=record.created_ns - 2 * DAY_NS)
+    revoked_record, revoked = monitor.issue(READ)
+    with monitor.client(revoked) as client:
+        assert client.get("/health").status_code == 200
+        monitor.store.tokens.revoke(revoked_record.token_id, 1)
+        refused = client.get("/health")
+    answers = [refused]
+    last = "0" if good[-1] != "0" else "1"
+    for token in (expired, good[:-1] + last, "rw_" + "0" * 12 + good[15:], good[:-1], good + "0", "ä", "x" * 5000):
+        with monitor.client() as client:
+            answers.append(client.get("/health", headers={b"authorization": f"Bearer {token}".encode()}))
+    texts = {answer.text for answer in answers}
+    assert {answer.status_code for answer in answers} == {401}
+    assert {answer.headers["www-authenticate"] for answer in answers} == {f'{ASKED}, error="invalid_token"'}
+    assert len(texts) == 1
+    with monitor.client() as client:
+        without = client.get("/health")
+        in_no_form = client.get("/health", headers={"authorization": f"Token {good}"})
+    details = {problem(answer, 401) for answer in (refused, without, in_no_form)}
+    assert len(details) == 3  # nothing given, nothing that could be a token, and a token that is none of ours
+    assert "error" not in without.headers["www-authenticate"]
+    with monitor.client(good) as client:
+        assert client.get("/health").json()["name"] == "ops"
+
+
+def test_a_token_counts_only_in_its_header(monitor: Guarded) -> None:
+    token = monitor.token(*Scope)
+    header = f"Bearer {token}"
+    with monitor.client() as client:
+        for answer in (
+            client.get("/health", params={"token": token, "access_token": token}),
+            client.get("/health", headers={"cookie": f"token={token}; authorization={token}"}),
+            client.get("/health", headers=[("authorization", header)] * 2),
+            client.get("/health", headers={"authorization": f"Token {token}"}),
+            client.post("/large", json={}, headers=basic(token)),
+        ):
+            problem(answer, 401)
+        assert client.get("/health", headers={"authorization": header}).status_code == 200
+    assert not monitor.done
+    assert all(token not in str(entry) for entry in monitor.entries())
+
+
+def test_browsers_give_the_token_as_password(monitor: Guarded) -> None:
+    token = monitor.token(READ)
+    with monitor.client() as client:
+        for given in ({}, basic("rw_000000000000_" + 43 * "0")):
+            asked = client.get("/docs", headers={"accept": "text/html,*/*"} | given)
+            assert asked.status_code == 401
+            bearer, in_browsers = asked.headers.get_list("www-authenticate")  # Chromium reads one challenge a line
+            assert bearer == ASKED + (', error="invalid_token"' if given else "")
+            assert in_browsers == 'Basic realm="rotorwatch", charset="UTF-8"'
+        assert client.get("/docs", headers=basic(token)).status_code == 200
+        assert client.get("/docs", headers=basic(token, "")).status_code == 200
+        for wrong in ("Basic", "Basic ===", "Basic eA==", f"Basic {base64.b64encode(b'x:' + bytes([255])).decode()}"):
+            problem(client.get("/docs", headers={"authorization": wrong}), 401)
+
+
+def test_a_route_that_declares_nothing_is_refused_to_everybody(monitor: Guarded) -> None:
+    with monitor.client(monitor.token(*Scope)) as client:
+        assert "declares no scope" in problem(client.get("/forgotten"), 403)
+        assert "declares no scope" in problem(client.post("/forgotten", headers=JSON), 403)
+    assert not monitor.done
+
+
+def test_a_route_that_is_added_too_late_is_refused_as_well(monitor: Guarded) -> None:
+    @monitor.app.get("/late")
+    def late() -> str:
+        return "late"
+
+    with monitor.client(monitor.token(*Scope)) as client:
+        problem(client.get("/late"), 403)
+        monitor.app.mount("/static", FastAPI())
+        assert "/static" in problem(client.get("/health"), 403)
+
+
+def test_what_the_gate_does_not_stand_before_cannot_be_protected(monitor: Guarded) -> None:
+    def without_gate(app: FastAPI) -> None:
+        @app.get("/x", dependencies=[monitor.guard.read])
+        def route() -> str:
+            return "x"
+
+    def socketed(app: FastAPI) -> None:
+        @app.websocket("/ws")
+        async def route(socket: WebSocket) -> None:
+            await socket.accept()
+
+    gate = monitor.guard.gate
+    apps = {
+        "/x": FastAPI(openapi_url=None),
+        "/ws": FastAPI(dependencies=[gate], openapi_url=None),
+        "/docs": FastAPI(dependencies=[gate]),
+    }
+    without_gate(apps["/x"])
+    socketed(apps["/ws"])
+    for path, app in apps.items():
+        with pytest.raises(AccessError, match=path):
+            monitor.guard.protect(app)
+
+
+def test_without_the_middleware_nobody_gets_past_the_gate(monitor: Guarded) -> None:
+    app = application(monitor.guard, monitor.done)
+    with served(app) as url, httpx.Client(base_url=url, trust_env=False, timeout=180.0) as client:
+        headers = {"authorization": f"Bearer {monitor.token(*Scope)}"}
+        assert client.get("/health", headers=headers).status_code == 401
+        assert client.post("/alarms/e/shelve", json={"reason": "r"}, headers=headers).status_code == 401
+    assert not monitor.done
+
+
+def test_secrets_are_compared_in_constant_time_even_if_there_is_no_such_token(
+    monitor: Guarded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compared: list[tuple[int, int]] = []
+    original = hmac.compare_digest
+
+    def watched(one: bytes, other: bytes) -> bool:
+        compared.append((len(one), len(other)))
+        return original(one, other)
+
+    monkeypatch.setattr("service.access.tokens.hmac.compare_digest", watched)
+    good = monitor.token(READ)
+    for token, status in ((good, 200), ("rw_" + "0" * 12 + good[15:], 401)):
+        compared.clear()
+        with monitor.client(token) as client:
+            assert client.get("/health").status_code == status
+        assert compared
+        assert set(compared) == {(32, 32)}
+
+
+def test_answers_carry_safe_headers(monitor: Guarded) -> None:
+    with monitor.client(monitor.token(READ)) as client:
+        for path in ("/docs", "/health", "/nowhere", "/healthz", "/openapi.json"):
+            headers = client.get(path).headers
+            assert headers["x-content-type-options"] == "nosniff"
+            assert headers["cache-control"] == "no-store"
+            assert headers["content-security-policy"].startswith("default-src 'none'; base-uri 'none';")
+            assert "server" not in headers
+
+
+# What may come from elsewhere
+
+
+def test_another_page_changes_nothing_even_with_a_token(monitor: Guarded) -> None:
+    with monitor.client(monitor.token(*Scope)) as client:
+        for headers in (
+            {"origin": "http://evil.example"},
+            {"origin": "null"},
+            {"origin": "http://["},
+            {"origin": "http://127.0.0.1:1"},
+            {"sec-fetch-site": "cross-site"},
+            {"sec-fetch-site": "same-site"},
+        ):
+            assert "may not do this" in problem(client.delete("/machine", headers=headers), 403)
+            assert client.get("/health", headers=headers).status_code == 200
+    assert not monitor.done
+
+
+def test_our_own_page_may(tmp_path: Path) -> None:
+    with guarded(tmp_path, AccessSettings(hosts=("plant.example",))) as monitor:
+        ours: tuple[dict[str, str], ...] = (
+            {"origin": monitor.url, "sec-fetch-site": "same-origin"},
+            {"origin": "https://plant.example"},
+            {},
+        )
+        with monitor.client(monitor.token(*Scope)) as client:
+            for headers in ours:
+                assert client.delete("/machine", headers=headers).status_code == 200
+            problem(client.delete("/machine", headers={"origin": "https://plant.example:8443"}), 403)
+
+
+def test_a_form_cannot_be_sent(monitor: Guarded) -> None:
+    with monitor.client(monitor.token(*Scope)) as client:
+        for headers in ({"content-type": "text/plain"}, {"content-type": "application/x-www-form-urlencoded"}, {}):
+            problem(client.post("/alarms/e/shelve", content=b'{"reason": "r"}', headers=headers), 415)
+    assert not monitor.done
+
+
+def test_open_on_loopback_everybody_is_anonymous_and_written_down(tmp_path: Path) -> None:
+    with guarded(tmp_path, AccessSettings(open_on_loopback=True, hosts=("Plant.example",))) as monitor:
+        with monitor.client() as client:
+            assert client.get("/health").json() == {"name": "anonymous", "address": "127.0.0.1"}
+            assert client.delete("/machine").status_code == 200
+            for token in ("wrong", monitor.token(READ)):
+                assert client.get("/health", headers={"authorization": f"Bearer {token}"}).status_code == 200
+            assert client.get("/health", headers={"authorization": "Basic ==="}).status_code == 200
+            port = httpx.URL(monitor.url).port
+            for host in ("localhost", f"localhost:{port}", "127.0.0.1", "[::1]:8080", "plant.example"):
+                assert client.get("/health", headers={"host": host}).status_code == 200
+            for host in ("evil.example", f"evil.example:{port}", "127.0.0.1.evil.example", "[::1", ""):
+                assert "host" in problem(client.get("/health", headers={"host": host}), 403)
+                problem(client.delete("/machine", headers={"host": host}), 403)
+            assert "proxy" in problem(client.get("/health", headers={"x-forwarded-for": "10.0.0.1"}), 403)
+            problem(client.delete("/machine", headers={"origin": "http://evil.example"}), 403)
+            problem(client.get("/forgotten"), 403)
+        assert monitor.done == ["remove"]
+        kept = [(entry.actor, entry.method, entry.status) for entry in monitor.entries() if entry.method == "DELETE"]
+        assert kept[:2] == [("anonymous", "DELETE", 0), ("anonymous", "DELETE", 200)]
+
+
+def test_a_caller_cannot_choose_its_address(monitor: Guarded) -> None:
+    with monitor.client(monitor.token(READ)) as client:
+        assert client.get("/health", headers={"x-forwarded-for": "10.1.2.3"}).json()["address"] == "127.0.0.1"
+
+
+def test_a_named_proxy_says_who_calls(tmp_path: Path) -> None:
+    with (
+        guarded(tmp_path, AccessSettings(proxies=("127.0.0.1",))) as monitor,
+        monitor.client(monitor.token(READ)) as client,
+    ):
+        assert client.get("/health", headers={"x-forwarded-for": "10.1.2.3"}).json()["address"] == "10.1.2.3"

@@ -1,0 +1,339 @@
+"""How much a caller may ask for, and what is written down of it: a real server, a real store."""
+
+import asyncio
+import logging
+import re
+import socket
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi import FastAPI, Request, Response
+from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
+from structlog.testing import capture_logs
+
+from service.access.audit import STARTED
+from service.access.guard import Guard
+from service.access.scopes import Caller, Scope
+from service.history.records import TokenRecord
+from service.settings.access import AccessSettings, LimitSettings
+from tests.service.rig.guarded import JSON, Guarded, application, basic, guarded, problem
+from tests.service.rig.live import until
+
+READ, OPERATE, CONFIGURE = Scope
+DAY_NS = 86_400 * 10**9
+
+
+# How much
+
+
+def test_large_bodies_are_refused_while_they_are_read(tmp_path: Path) -> None:
+    with (
+        guarded(tmp_path, AccessSettings(limits=LimitSettings(body_bytes=10_000))) as monitor,
+        monitor.client(monitor.token(READ, OPERATE)) as client,
+    ):
+        sent = 0
+
+        def pieces(count: int) -> Iterator[bytes]:
+            nonlocal sent
+            yield b'{"reason": "'
+            for _ in range(count):
+                sent += 1
+                yield b"x" * 1000
+            yield b'"}'
+
+        assert client.post("/large", content=b"x" * 10_000, headers=JSON).json() == 10_000
+        assert "10000 bytes" in problem(client.post("/large", content=b"x" * 10_001, headers=JSON), 413)
+        assert client.post("/alarms/e/shelve", content=pieces(5), headers=JSON).status_code == 200
+        for path in ("/alarms/e/shelve", "/large"):
+            assert "10000 bytes" in problem(client.post(path, content=pieces(50), headers=JSON), 413)
+        assert monitor.done == ["shelve e ops"]
+        assert [entry.status for entry in monitor.entries() if entry.status][-2:] == [413, 413]
+
+
+def test_what_others_make_of_a_body_that_was_cut_off_is_not_sent(tmp_path: Path) -> None:
+    """Between a middleware of this kind and the route the refusal turns into a bad request."""
+
+    async def passed_on(request: Request, call_next: RequestResponseEndpoint) -> Response:
+        return await call_next(request)
+
+    def build(guard: Guard, done: list[str]) -> FastAPI:
+        app = application(guard, done)
+        app.add_middleware(BaseHTTPMiddleware, dispatch=passed_on)
+        return app
+
+    limits = LimitSettings(body_bytes=1000)
+    with guarded(tmp_path, AccessSettings(limits=limits), build) as monitor:
+        with monitor.client(monitor.token(READ, OPERATE)) as client:
+            body = iter([b"x" * 600, b"x" * 600])
+            problem(client.post("/alarms/e/shelve", content=body, headers=JSON), 413)
+        assert not monitor.done
+
+
+def test_a_body_that_never_ends_is_cut_off(tmp_path: Path) -> None:
+    """Answered before the sender is through, however much it says it will send."""
+    with guarded(tmp_path, AccessSettings(limits=LimitSettings(body_bytes=1000))) as monitor:
+        url, token = httpx.URL(monitor.url), monitor.token(OPERATE)
+        for length in ("content-length: 99999999999999999999", "transfer-encoding: chunked"):
+            with socket.create_connection((url.host, url.port or 0), timeout=180) as raw:
+                head = f"POST /large HTTP/1.1\r\nhost: {url.host}\r\nauthorization: Bearer {token}\r\n"
+                raw.sendall(f"{head}content-type: application/json\r\n{length}\r\n\r\n".encode())
+                if "chunked" in length:
+                    raw.sendall(b"800\r\n" + b"x" * 0x800 + b"\r\n")
+                assert raw.recv(100).startswith(b"HTTP/1.1 413")
+
+
+def test_so_many_requests_a_minute_of_a_caller(tmp_path: Path) -> None:
+    with guarded(tmp_path, AccessSettings(limits=LimitSettings(requests_per_minute=5))) as monitor:
+        one, other = monitor.client(monitor.token(READ)), monitor.client(monitor.token(READ))
+        with one, other, monitor.client() as nobody:
+            assert [one.get("/health").status_code for _ in range(5)] == [200] * 5
+            monitor.clock.now_s += 20.5
+            refused = one.get("/health")
+            assert "requests" in problem(refused, 429)
+            assert refused.headers["retry-after"] == "40"
+            assert other.get("/health").status_code == 200
+            assert [nobody.get("/health").status_code for _ in range(6)] == [401] * 5 + [429]
+            monitor.clock.now_s += 40.0
+            assert one.get("/health").status_code == 200
+
+
+def test_tokens_cannot_be_tried_out(tmp_path: Path) -> None:
+    with guarded(tmp_path, AccessSettings(limits=LimitSettings(failures_per_minute=3))) as monitor:
+        wrong = monitor.token(READ)[:-3] + "000"
+        with monitor.client(wrong) as stranger:
+            assert [stranger.get("/health").status_code for _ in range(5)] == [401] * 3 + [429] * 2
+            assert stranger.get("/health").headers["retry-after"] == "60"
+            monitor.clock.now_s += 60.0
+            assert stranger.get("/health").status_code == 401
+        # Nor by taking another one each time.
+        assert [_asked(monitor, f"{wrong[:-3]}{number:03}") for number in range(1, 5)] == [401] * 2 + [429] * 2
+
+
+def test_wrong_tokens_of_others_lock_nobody_out(tmp_path: Path) -> None:
+    """Behind a proxy that is not named in the settings, everybody has the same address."""
+    with guarded(tmp_path, AccessSettings(limits=LimitSettings(failures_per_minute=3))) as monitor:
+        in_use, fresh, old = monitor.token(READ), monitor.token(READ), monitor.token(READ)
+        assert _asked(monitor, in_use) == 200
+        tried = [_asked(monitor, f"{old[:-3]}{number:03}") for number in range(20)]
+        assert tried == [401] * 3 + [429] * 17
+        assert [_asked(monitor, token) for token in (in_use, fresh, old)] == [200] * 3
+
+
+def test_a_wrong_token_is_looked_up_a_few_times_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with guarded(tmp_path, AccessSettings(limits=LimitSettings(failures_per_minute=3))) as monitor:
+        looked_up: list[str] = []
+        find = monitor.store.tokens.find
+
+        def counted(token_id: str) -> TokenRecord | None:
+            looked_up.append(token_id)
+            return find(token_id)
+
+        monkeypatch.setattr(monitor.store.tokens, "find", counted)
+        wrong = monitor.token(READ)[:-3] + "000"
+        for _ in range(20):
+            _asked(monitor, wrong)
+        assert len(looked_up) == 3
+
+
+def test_probes_are_never_limited_away(tmp_path: Path) -> None:
+    limits = LimitSettings(requests_per_minute=3, failures_per_minute=3)
+    with (
+        guarded(tmp_path, AccessSettings(limits=limits)) as monitor,
+        monitor.client(monitor.token(READ)) as client,
+        monitor.client() as nobody,
+    ):
+        for _ in range(5):
+            client.get("/health")
+            nobody.get("/health")
+        assert [client.get("/health").status_code, nobody.get("/health").status_code] == [429, 429]
+        assert {nobody.get("/healthz").status_code for _ in range(10)} == {200}
+        assert {client.get("/readyz").status_code for _ in range(10)} == {200}
+        assert {nobody.get("/readyz").status_code for _ in range(10)} == {401}
+
+
+def _asked(monitor: Guarded, token: str) -> int:
+    with monitor.client(token) as client:
+        return client.get("/health").status_code
+
+
+def test_so_many_streams(tmp_path: Path) -> None:
+    limits = LimitSettings(streams_per_caller=2, streams=3)
+    with guarded(tmp_path, AccessSettings(limits=limits)) as monitor:
+        seats = monitor.guard.seats
+        one, other = monitor.client(monitor.token(READ)), monitor.client(monitor.token(READ))
+        with one, other:
+            with one.stream("GET", "/events") as first, one.stream("GET", "/events"):
+                # Piece by piece, not at the end, of which there is none.
+                pieces = first.iter_text()
+                assert "data: 0" in next(pieces)
+                refused = one.get("/events")
+                assert "event streams of yours" in problem(refused, 429)
+                assert int(refused.headers["retry-after"]) >= 1
+                with other.stream("GET", "/events") as third:
+                    assert third.status_code == 200
+                    assert "which is the most this service has" in problem(other.get("/events"), 429)
+            until(lambda: seats.taken == 0, "streams that were left give their seats back")
+            with one.stream("GET", "/events") as again:
+                assert again.status_code == 200
+
+
+# What is written down
+
+
+def test_what_is_done_is_written_down_before_and_after(monitor: Guarded) -> None:
+    token = monitor.token(READ, OPERATE, name="control room")
+    with monitor.client(token) as client:
+        client.get("/health")
+        assert client.post("/alarms/k_by/shelve?token=q", json={"reason": "bolt is being replaced"}).status_code == 200
+        assert client.post("/alarms/k_by/shelve", json={"wrong": 1}).status_code == 422
+        assert client.post("/broken", headers=JSON).status_code == 500
+        assert client.post("/nowhere", headers=JSON).status_code == 404
+    entries = monitor.entries()
+    assert [(entry.status, entry.action) for entry in entries] == [
+        (0, STARTED), (200, "shelve"), (0, STARTED), (422, ""), (0, STARTED), (500, ""), (404, "")
+    ]  # fmt: skip
+    before, after = entries[:2]
+    assert before.at_ns == after.at_ns
+    assert (after.actor, after.address, after.method) == ("control room", "127.0.0.1", "POST")
+    assert (after.path, after.machine, after.alarm) == ("/alarms/k_by/shelve", "demo/lab", "k_by")
+    assert after.reason == "bolt is being replaced"
+    assert len({entry.at_ns for entry in entries}) == 4
+    assert monitor.done == ["shelve k_by control room"]
+
+
+def test_nothing_is_done_that_cannot_be_written_down(monitor: Guarded, tmp_path: Path) -> None:
+    token = monitor.token(*Scope)
+    with monitor.client(token) as client:
+        assert client.get("/health").status_code == 200
+        with sqlite3.connect(tmp_path / "history.sqlite") as database:
+            database.execute(
+                "CREATE TRIGGER full BEFORE INSERT ON audit_log BEGIN SELECT RAISE(ABORT, 'the disk is full'); END"
+            )
+        database.close()
+        for answer in (client.delete("/machine"), client.post("/alarms/e/shelve", json={"reason": "r"})):
+            assert "nothing was done" in problem(answer, 503)
+        assert client.get("/health").status_code == 200
+    assert not monitor.done
+
+
+def test_an_outcome_that_cannot_be_written_is_in_the_log_at_least(monitor: Guarded, tmp_path: Path) -> None:
+    with sqlite3.connect(tmp_path / "history.sqlite") as database:
+        database.execute(
+            "CREATE TRIGGER full BEFORE INSERT ON audit_log WHEN NEW.status > 0 "
+            "BEGIN SELECT RAISE(ABORT, 'the disk is full'); END"
+        )
+    database.close()
+    with monitor.client(monitor.token(*Scope)) as client, capture_logs() as lines:
+        assert client.delete("/machine").status_code == 200
+    assert monitor.done == ["remove"]
+    assert [entry.action for entry in monitor.entries()] == [STARTED]
+    assert any("outcome is missing" in line["event"] and line["status"] == 200 for line in lines)
+
+
+def test_without_the_database_those_who_were_there_may_look_on(monitor: Guarded) -> None:
+    known, fresh = monitor.token(*Scope), monitor.token(READ)
+    with monitor.client(known) as client, monitor.client(fresh) as late:
+        assert client.get("/health").status_code == 200
+        monitor.store.close()
+        assert client.get("/health").status_code == 200
+        refused = problem(client.delete("/machine"), 503)
+        assert "looked up" in refused
+        assert "sqlite" not in refused
+        problem(late.get("/health"), 503)
+        monitor.clock.now_s += 901.0
+        problem(client.get("/health"), 503)
+    assert not monitor.done
+
+
+def test_refusals_do_not_flood_the_audit_log(tmp_path: Path) -> None:
+    limits = LimitSettings(refusals_recorded_per_minute=4, failures_per_minute=10)
+    with guarded(tmp_path, AccessSettings(limits=limits)) as monitor:
+        with monitor.client("wrong") as client, monitor.client() as nobody:
+            for _ in range(30):
+                client.get("/health")
+                nobody.post("/large", content=b"x")
+                nobody.delete("/machine", headers={"origin": "http://evil.example"})
+            assert [entry.status for entry in monitor.entries()] == [401] * 4
+            monitor.clock.now_s += 61.0
+            client.get("/health")
+            assert monitor.entries()[-1].reason.endswith("86 refused requests before this one are not in this log")
+        # What a token's owner does is written down all the same.
+        with monitor.client(monitor.token(*Scope)) as client:
+            assert client.delete("/machine").status_code == 200
+        assert [entry.status for entry in monitor.entries()][-2:] == [0, 200]
+
+
+def test_no_secret_is_written_anywhere(monitor: Guarded, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    good, wrong = monitor.token(*Scope), monitor.token(READ)[:-3] + "000"
+    bodies: list[str] = []
+    with capture_logs() as lines:
+        for token in (good, wrong):
+            with monitor.client(token) as client:
+                for answer in (
+                    client.get("/health"),
+                    client.get(f"/{token}", params={"token": token}),
+                    client.post(f"/alarms/{token}/shelve", json={"reason": f"use {token}"}),
+                    client.post("/broken", headers=JSON),
+                    client.delete("/machine", headers={"origin": f"http://{token}"}),
+                    client.get("/health", headers={"authorization": f"Bearer {token} {token}"}),
+                    client.get("/docs", headers=basic(token)),
+                ):
+                    bodies.append(str(answer.headers))
+    # The client logs what it sends, and the server's own log of requests is off in the service.
+    others = ("httpx", "httpcore", "uvicorn.access")
+    logged = [one.getMessage() for one in caplog.records if not one.name.startswith(others)]
+    written = "\n".join([repr(lines), *logged, *bodies, *map(repr, monitor.entries())])
+    secrets = [token.rpartition("_")[2] for token in (good, wrong)]
+    assert "rw_" in written
+    for secret in secrets:
+        assert secret not in written
+    stored = b"".join(path.read_bytes() for path in tmp_path.glob("history.sqlite*"))
+    assert secrets[0].encode() not in stored
+
+
+def test_what_strangers_send_does_not_spoil_the_log(monitor: Guarded) -> None:
+    with monitor.client() as client:
+        client.get("/%00%1b[31mred%0d%0aline%ff/" + "x" * 2000)
+    (entry,) = monitor.entries()
+    assert entry.path.isprintable()
+    assert len(entry.path) == 500
+    assert re.match(r"/..\[31mred..line./x", entry.path)
+
+
+def test_a_stream_can_ask_whether_its_token_still_holds(monitor: Guarded) -> None:
+    record, token = monitor.issue(READ)
+    with monitor.client(token) as client:
+        assert client.get("/health").status_code == 200
+    caller = Caller("ops", frozenset((READ,)), "127.0.0.1", record.token_id)
+    assert monitor.guard.still_valid(caller)
+    monitor.store.tokens.revoke(record.token_id, 1)
+    assert not monitor.guard.still_valid(caller)
+    assert not monitor.guard.still_valid(Caller("x", frozenset(), "", "unknown"))
+    assert monitor.guard.still_valid(Caller("anonymous"))
+
+
+def test_a_websocket_is_refused(monitor: Guarded) -> None:
+    async def receive() -> dict[str, str]:
+        return {"type": "websocket.connect"}
+
+    sent: list[object] = []
+
+    async def run() -> None:
+        async def send(message: object) -> None:
+            sent.append(message)
+
+        scope: dict[str, object] = {
+            "type": "websocket",
+            "path": "/health",
+            "headers": [],
+            "query_string": b"",
+            "client": None,
+        }
+        await monitor.app(scope, receive, send)
+
+    asyncio.run(run())
+    assert sent == [{"type": "websocket.close", "code": 1008}]

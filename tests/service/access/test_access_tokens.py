@@ -1,0 +1,300 @@
+"""Tokens: made, taken apart, checked, hidden; rates and settings beside them; and the certificates of TLS."""
+
+import ssl
+from pathlib import Path
+
+import httpx
+import pytest
+import trustme
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models.errors import MachineFileError
+from models.mistakes import in_folder
+from service.access.credentials import network_of
+from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
+from service.access.scopes import Scope
+from service.access.tls import server_arguments, tls_context
+from service.access.tokens import masked, new_token, parse_token, token_is_valid
+from service.history.records import TokenRecord
+from service.settings.access import AccessSettings, HttpTlsSettings, check_access
+from tests.service.rig.guarded import guarded
+
+DAY_NS = 86_400 * 10**9
+ALPHABET = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
+
+
+def made(name: str = "ops", days: int | None = None) -> tuple[TokenRecord, str]:
+    return new_token(name, [Scope.READ], now_ns=0, days=days)
+
+
+def test_tokens_differ_and_hold_256_bits() -> None:
+    tokens = [made()[1] for _ in range(200)]
+    secrets = {token.rpartition("_")[2] for token in tokens}
+    assert len(secrets) == len({token[:15] for token in tokens}) == 200
+    assert {len(secret) for secret in secrets} == {43}
+    assert 62**42 < 2**256 <= 62**43
+    # Every digit of the last place occurs, the first is small because 62**43 is more than 2**256.
+    assert len({secret[-1] for secret in secrets}) > 50
+
+
+def test_only_the_hash_of_the_secret_is_in_the_record() -> None:
+    record, text = made()
+    secret = text.rpartition("_")[2]
+    assert secret not in repr(record)
+    assert len(record.secret_hash) == 32
+    parsed = parse_token(text)
+    assert parsed is not None
+    assert parsed.token_id == record.token_id
+    assert secret not in repr(parsed)
+    assert repr(parsed.secret_hash) not in repr(parsed)
+
+
+@given(st.text())
+def test_any_text_is_no_token_and_breaks_nothing(text: str) -> None:
+    assert parse_token(text) is None
+    assert not token_is_valid(made()[0], parse_token(text), 1)
+
+
+@given(place=st.integers(0, 58), other=st.sampled_from([*ALPHABET, "_", "-", " ", "\n", "é", "\0"]))
+def test_one_wrong_character_is_enough(place: int, other: str) -> None:
+    record, text = made()
+    assert len(text) == 59
+    other = "!" if other == text[place] else other
+    for wrong in (text[:place] + other + text[place + 1 :], text[:place], text + other, other + text):
+        assert not token_is_valid(record, parse_token(wrong), 1)
+    assert token_is_valid(record, parse_token(text), 1)
+
+
+@given(st.text(alphabet=ALPHABET, min_size=12, max_size=12), st.text(alphabet=ALPHABET, min_size=43, max_size=43))
+def test_whatever_has_the_form_is_taken_apart(token_id: str, secret: str) -> None:
+    parsed = parse_token(f"rw_{token_id}_{secret}")
+    assert parsed is not None
+    assert parsed.token_id == token_id
+    assert not token_is_valid(None, parsed, 1)
+
+
+def test_expiry_and_revocation() -> None:
+    record, text = made(days=2)
+    presented = parse_token(text)
+    assert token_is_valid(record, presented, 2 * DAY_NS - 1)
+    assert not token_is_valid(record, presented, 2 * DAY_NS)
+    fields = {name: getattr(record, name) for name in TokenRecord.__dataclass_fields__}
+    assert not token_is_valid(TokenRecord(**{**fields, "revoked_ns": 1}), presented, 1)
+    # The right secret under another token's name.
+    assert not token_is_valid(TokenRecord(**{**fields, "token_id": "0" * 12}), presented, 1)
+
+
+@given(st.text(alphabet=" /?&=é\n"), st.text(alphabet=" /?&=é\n_"), st.integers(1, 43))
+def test_secrets_are_hidden_wherever_they_stand_and_if_they_are_cut_off(before: str, after: str, length: int) -> None:
+    text = made()[1]
+    assert masked(f"{before}{text[: 16 + length]}{after}") == f"{before}{text[:16]}…{after}"
+
+
+# Rates
+
+
+@given(st.integers(1, 5), st.lists(st.tuples(st.sampled_from("ab"), st.floats(0.0, 40.0)), max_size=60))
+def test_never_more_than_so_many_in_any_minute(amount: int, hits: list[tuple[str, float]]) -> None:
+    now_s = 0.0
+    window = MovingWindow(amount, clock=lambda: now_s)
+    admitted: dict[str, list[float]] = {"a": [], "b": []}
+    for key, pause_s in hits:
+        now_s += pause_s
+        recent = [one for one in admitted[key] if one > now_s - 60.0]
+        assert (window.wait(key) == 0.0) == (len(recent) < amount)
+        wait_s = window.hit(key)
+        if wait_s == 0.0:
+            admitted[key].append(now_s)
+        else:
+            assert wait_s == recent[0] + 60.0 - now_s
+        assert (wait_s == 0.0) == (len(recent) < amount)
+
+
+def test_many_addresses_do_not_fill_the_memory() -> None:
+    window = MovingWindow(1, clock=lambda: 0.0, keys=100)
+    for number in range(1000):
+        window.hit(str(number))
+    assert len(window) == 100
+    assert window.wait("999") == 60.0
+
+
+def test_what_is_over_is_forgotten() -> None:
+    now_s = 0.0
+    window = MovingWindow(1, clock=lambda: now_s)
+    window.hit("a")
+    now_s = 60.0
+    assert window.wait("a") == 0.0
+    assert len(window) == 0
+
+
+def test_seats_come_back_after_an_error() -> None:
+    seats = StreamSeats(1, 2)
+    with pytest.raises(RuntimeError, match="broken"), seats.seat("a"):
+        raise RuntimeError("broken")
+    assert seats.taken == 0
+    with seats.seat("a"), seats.seat("b"):
+        with pytest.raises(TooManyStreamsError, match="of yours"), seats.seat("a"):
+            pass
+        with pytest.raises(TooManyStreamsError, match="this service has"), seats.seat("c"):
+            pass
+        assert seats.taken == 2
+    assert seats.taken == 0
+
+
+@pytest.mark.parametrize(
+    ("address", "network"),
+    [
+        ("10.0.0.1", "10.0.0.1"),
+        ("::ffff:10.0.0.1", "10.0.0.1"),
+        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
+        ("2001:db8:1:2::9", "2001:db8:1:2::/64"),
+        ("fe80::1%eth0", "fe80::/64"),
+        ("", ""),
+        ("unix", "unix"),
+    ],
+)
+def test_what_counts_as_one_address(address: str, network: str) -> None:
+    assert network_of(address) == network
+
+
+# Settings
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "10.0.0.1", "monitor.plant", ""])  # noqa: S104  # refused
+def test_open_to_all_only_on_loopback(host: str) -> None:
+    access = AccessSettings(open_on_loopback=True)
+    with pytest.raises(MachineFileError, match=r"plant\.toml: access\.open_on_loopback is true, but http\.host"):
+        check_access("plant.toml", access, host)
+    check_access("plant.toml", AccessSettings(), host)
+
+
+def test_open_on_loopback_stands() -> None:
+    for host in ("127.0.0.1", "127.1.2.3", "::1", "localhost"):
+        check_access("plant.toml", AccessSettings(open_on_loopback=True), host)
+    with pytest.raises(MachineFileError, match=r"access\.proxies names 10\.0\.0\.1"):
+        check_access("plant.toml", AccessSettings(open_on_loopback=True, proxies=("10.0.0.1",)), "127.0.0.1")
+
+
+def test_settings_refuse_what_they_do_not_know() -> None:
+    for fields in ({"open": True}, {"proxies": ["proxy.plant"]}, {"limits": {"body_bytes": 1}}, {"tls": {"key": "k"}}):
+        with pytest.raises(ValueError, match="validation error"):
+            AccessSettings.model_validate(fields)
+
+
+def test_certificates_are_beside_the_settings_file() -> None:
+    tls = HttpTlsSettings(certificate=Path("c.pem"), key=Path("/keys/k.pem"), client_ca=Path("ca.pem"))
+    found = in_folder(AccessSettings(tls=tls), Path("/etc/rotorwatch")).tls
+    assert found == HttpTlsSettings(
+        certificate=Path("/etc/rotorwatch/c.pem"), key=Path("/keys/k.pem"), client_ca=Path("/etc/rotorwatch/ca.pem")
+    )
+    assert in_folder(AccessSettings(), Path("/x")) == AccessSettings()
+
+
+@pytest.fixture
+def authority() -> trustme.CA:
+    return trustme.CA(key_type=trustme.KeyType.ECDSA)
+
+
+def files(folder: Path, authority: trustme.CA, *, client_ca: bool = False) -> HttpTlsSettings:
+    issued = authority.issue_cert("127.0.0.1", key_type=trustme.KeyType.ECDSA)
+    certificate, key, ca = folder / "certificate.pem", folder / "key.pem", folder / "ca.pem"
+    certificate.write_bytes(b"".join(part.bytes() for part in issued.cert_chain_pems))
+    key.write_bytes(issued.private_key_pem.bytes())
+    key.chmod(0o600)
+    authority.cert_pem.write_to_path(str(ca))
+    return HttpTlsSettings(certificate=certificate, key=key, client_ca=ca if client_ca else None)
+
+
+def trusting(authority: trustme.CA) -> ssl.SSLContext:
+    context = ssl.create_default_context()
+    authority.configure_trust(context)
+    return context
+
+
+def test_https_is_served_and_nothing_older_than_tls_1_2(tmp_path: Path, authority: trustme.CA) -> None:
+    with guarded(tmp_path, AccessSettings(tls=files(tmp_path, authority))) as monitor:
+        assert monitor.url.startswith("https://")
+        token = monitor.token(Scope.READ)
+        with monitor.client(token, verify=trusting(authority)) as client:
+            assert client.get("/health").status_code == 200
+        with monitor.client(token, verify=trusting(trustme.CA())) as client, pytest.raises(httpx.ConnectError):
+            client.get("/health")
+        with httpx.Client(trust_env=False, timeout=180.0) as client, pytest.raises(httpx.HTTPError):
+            client.get(monitor.url.replace("https", "http"))
+    assert tls_context(files(tmp_path, authority)).minimum_version == ssl.TLSVersion.TLSv1_2
+
+
+def test_a_client_without_a_certificate_is_refused_where_one_is_asked_for(
+    tmp_path: Path, authority: trustme.CA
+) -> None:
+    with guarded(tmp_path, AccessSettings(tls=files(tmp_path, authority, client_ca=True))) as monitor:
+        token = monitor.token(Scope.READ)
+        known, stranger = trusting(authority), trusting(authority)
+        authority.issue_cert("operator@plant.example").configure_cert(known)
+        trustme.CA().issue_cert("operator@plant.example").configure_cert(stranger)
+        with monitor.client(token, verify=known) as client:
+            assert client.get("/health").status_code == 200
+        for context in (stranger, trusting(authority)):
+            with monitor.client(token, verify=context) as client, pytest.raises(httpx.TransportError):
+                client.get("/health")
+
+
+def test_without_tls_plain_http_and_no_proxy_is_believed() -> None:
+    assert server_arguments(AccessSettings()) == {
+        "proxy_headers": False, "forwarded_allow_ips": [], "server_header": False
+    }  # fmt: skip
+
+
+def refused(tls: HttpTlsSettings) -> str:
+    with pytest.raises(MachineFileError) as caught:
+        server_arguments(AccessSettings(tls=tls))
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["certificate", "key", "client_ca"])
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, authority: trustme.CA, name: str) -> None:
+    tls = files(tmp_path, authority, client_ca=True)
+    path: Path = getattr(tls, name)
+    path.unlink()
+    assert refused(tls) == f"{path}: tls.{name} cannot be read: No such file or directory"
+    path.mkdir()
+    assert refused(tls) == f"{path}: tls.{name} cannot be read: Is a directory"
+
+
+@pytest.mark.parametrize("name", ["certificate", "key", "client_ca"])
+@pytest.mark.parametrize("content", [b"", b"nonsense\n", b"\0\xff"])
+def test_a_file_that_is_none_is_named(tmp_path: Path, authority: trustme.CA, name: str, content: bytes) -> None:
+    tls = files(tmp_path, authority, client_ca=True)
+    path: Path = getattr(tls, name)
+    path.write_bytes(content)
+    assert refused(tls).startswith(f"{path}: tls.{name} holds no ")
+
+
+def test_a_key_of_another_certificate_is_refused(tmp_path: Path, authority: trustme.CA) -> None:
+    tls = files(tmp_path, authority)
+    tls.key.write_bytes(authority.issue_cert("x", key_type=trustme.KeyType.ECDSA).private_key_pem.bytes())
+    assert refused(tls) == f"{tls.key}: tls.key is not the key of tls.certificate {tls.certificate}"
+
+
+def test_a_key_that_everybody_can_read_is_refused(tmp_path: Path, authority: trustme.CA) -> None:
+    tls = files(tmp_path, authority)
+    tls.key.chmod(0o644)
+    assert "readable by every user" in refused(tls)
+    tls.key.chmod(0o640)
+    server_arguments(AccessSettings(tls=tls))
+
+
+def test_a_key_with_a_password_is_refused_without_asking_for_it(tmp_path: Path, authority: trustme.CA) -> None:
+    from cryptography.hazmat.primitives import serialization  # noqa: PLC0415  # comes with trustme, used here alone
+
+    tls = files(tmp_path, authority)
+    key = serialization.load_pem_private_key(tls.key.read_bytes(), None)
+    tls.key.write_bytes(
+        key.private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.BestAvailableEncryption(b"secret"),
+        )
+    )
+    assert "protected by a password" in refused(tls)

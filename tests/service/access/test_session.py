@@ -1,0 +1,94 @@
+"""Signing in with a browser: the token in a cookie, and what may not be done with it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+from service.access.credentials import COOKIE
+from service.access.guard import Guard
+from service.access.scopes import Scope
+from service.api.routes.tokens import add_session_routes
+from service.settings.access import AccessSettings
+from tests.service.rig.guarded import Guarded, application, guarded, problem
+
+READ, OPERATE, _ = Scope
+SESSION = "/api/v1/session"
+BODY = {"reason": "known"}
+
+
+def with_sessions(guard: Guard, done: list[str]) -> FastAPI:
+    app = application(guard, done)
+    add_session_routes(app, guard)
+    return app
+
+
+@pytest.fixture
+def monitor(tmp_path: Path) -> Iterator[Guarded]:
+    with guarded(tmp_path, build=with_sessions) as running:
+        yield running
+
+
+def signed_in(monitor: Guarded, client: httpx.Client, token: str) -> httpx.Response:
+    return client.post(SESSION, json={}, headers={"authorization": f"Bearer {token}", "origin": monitor.url})
+
+
+def test_who_signed_in_looks_and_operates_until_signing_out(monitor: Guarded) -> None:
+    token = monitor.token(READ, OPERATE)
+    with monitor.client() as client:
+        answer = signed_in(monitor, client, token)
+        assert answer.json() == {"name": "ops", "scopes": ["read", "operate"]}
+        attributes = {one.strip().lower() for one in answer.headers["set-cookie"].split(";")[1:]}
+        assert {"httponly", "samesite=strict", "path=/"} <= attributes
+        assert not any(one.startswith(("max-age", "expires", "domain")) for one in attributes)
+        assert client.get("/health").json()["name"] == "ops"
+        assert client.post("/alarms/k_by/shelve", json=BODY, headers={"origin": monitor.url}).json() == "shelved"
+        assert client.delete(SESSION, headers={"origin": monitor.url}).json() == {"name": "", "scopes": []}
+        assert COOKIE not in client.cookies
+        problem(client.get("/health"), 401)
+    assert monitor.done == ["shelve k_by ops"]
+    logged = {(entry.method, entry.actor) for entry in monitor.entries() if entry.path == SESSION}
+    assert logged == {("POST", "ops"), ("DELETE", "ops")}
+
+
+def test_the_cookie_alone_changes_nothing_and_no_page_from_elsewhere_can_use_it(monitor: Guarded) -> None:
+    token = monitor.token(READ, OPERATE)
+    with monitor.client() as client:
+        signed_in(monitor, client, token)
+        here, elsewhere = {"origin": monitor.url}, {"origin": "https://elsewhere.example"}
+        for headers in ({}, elsewhere, {"origin": "null"}, here | {"sec-fetch-site": "cross-site"}):
+            assert problem(client.post("/alarms/k_by/shelve", json=BODY, headers=headers), 403)
+            assert problem(client.delete(SESSION, headers=headers), 403)
+        assert client.get("/health", headers=elsewhere).status_code == 200  # other pages may ask, but cannot read it
+        problem(client.post("/alarms/k_by/shelve", content=b"reason=known", headers=here), 415)
+    assert not monitor.done
+
+
+def test_a_wrong_or_revoked_token_is_not_kept_and_one_that_was_kept_is_refused(monitor: Guarded) -> None:
+    record, token = monitor.issue(READ)
+    with monitor.client() as client:
+        problem(signed_in(monitor, client, token[:-1]), 401)
+        problem(client.post(SESSION, json={}), 401)
+        assert not client.cookies
+        signed_in(monitor, client, token)
+        monitor.store.tokens.revoke(record.token_id, 1)
+        assert "no longer signed in" in problem(client.get("/health"), 401)
+        # A token that is given counts, whatever the browser has kept.
+        other = monitor.token(READ, name="other")
+        assert client.get("/health", headers={"authorization": f"Bearer {other}"}).json()["name"] == "other"
+
+
+def test_wrong_cookies_are_counted_as_attempts(tmp_path: Path) -> None:
+    settings = AccessSettings.model_validate({"limits": {"failures_per_minute": 2}})
+    with guarded(tmp_path, settings, build=with_sessions) as monitor, monitor.client() as client:
+        client.cookies.set(COOKIE, "rw_nothing")
+        assert [client.get("/health").status_code for _ in range(4)] == [401, 401, 429, 429]
+
+
+def test_where_no_token_is_needed_none_is_kept(tmp_path: Path) -> None:
+    settings = AccessSettings.model_validate({"open_on_loopback": True})
+    with guarded(tmp_path, settings, build=with_sessions) as monitor, monitor.client() as client:
+        assert client.post(SESSION, json={}).json()["name"] == "anonymous"
+        assert not client.cookies

@@ -1,0 +1,204 @@
+"""Values of plots, of the newest samples, of recordings and of the history: against closed forms, and over HTTP."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from models.errors import RotorwatchError
+from rotorwatch.records.plots import (
+    CentrelineSeries,
+    FullSpectrumSnapshot,
+    VectorSeries,
+    WaterfallSnapshot,
+    WaveformSnapshot,
+)
+from rotorwatch.records.recordings import RecordingList
+from service.analysis.past import Past
+from service.analysis.recorded import Held, Sampled
+from service.analysis.snapshots.plots import (
+    centreline_series,
+    full_spectrum_snapshot,
+    vector_series,
+    waterfall_snapshot,
+    waveform_snapshot,
+)
+from service.api import samples
+from service.runtime.runtime import Runtime
+from tests.service.analysis.snapshotting import numbers
+from tests.service.rig.live import LAB, START_NS
+from tests.service.rig.monitored import PLACE, answered, client, faulty, problem
+from tests.service.rig.replaying import S, recorded, recording
+from tests.service.rig.run_up import BLOCKS, CHANNELS, FROM_HZ, LAG, RUNOUT_UM, SECONDS, SHAFT_UM, TO_HZ, angle
+
+
+@pytest.fixture(scope="module", params=["newest samples", "recordings"])
+def data(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Sampled:
+    if request.param == "newest samples":
+        return Held(LAB, BLOCKS)
+    return recorded(recording(tmp_path_factory.mktemp("run-up") / "made.mcap", BLOCKS))
+
+
+def test_a_waveform_is_the_newest_revolutions_with_their_pulses(data: Sampled) -> None:
+    found = waveform_snapshot(data, CHANNELS, 6, None)
+    assert (found.revolutions, len(found.pulses_s), found.reason) == (6, 7, "")
+    assert found.start_ns is not None
+    t = (found.start_ns - START_NS) / S + np.array(found.times_s)
+    for one, expected in zip(found.waveforms, (np.cos(angle(t) - LAG), np.sin(angle(t) - LAG)), strict=True):
+        assert np.abs(numbers(one.values) - SHAFT_UM * expected).max() < 0.6  # its mean and the drift are taken away
+    at_pulses = angle((found.start_ns - START_NS) / S + np.array(found.pulses_s)) / (2 * np.pi)
+    assert at_pulses == pytest.approx(np.round(at_pulses), abs=2e-3)
+    assert found.waveforms[0].mean == pytest.approx(RUNOUT_UM, rel=1e-2)
+    assert found.speed_rad_s == pytest.approx(2 * np.pi * TO_HZ, rel=0.02)
+
+
+def test_a_waveform_without_speed_is_the_newest_moment_and_says_so() -> None:
+    plain = LAB.model_copy(update={"sensors": CHANNELS})
+    columns = [LAB.sensors.index(one) for one in CHANNELS]
+    blocks = [type(one)(one.start_ns, one.sequence, one.run, one.rate_hz, one.samples[:, columns]) for one in BLOCKS]
+    found = waveform_snapshot(Held(plain, blocks), CHANNELS, 6, None)
+    assert found.revolutions == 0
+    assert "neither the shaft angle nor the speed is known" in found.reason
+    assert len(found.times_s) == round(0.5 * LAB.rate_hz)
+    assert found.speed_rad_s is None
+
+
+def test_forward_and_reverse_circles_keep_their_sides(data: Sampled) -> None:
+    found = full_spectrum_snapshot(data)
+    (bearing, _) = found.places
+    assert (bearing.location, bearing.channels) == ("bearing", ("y1", "z1"))
+    lines, values = np.array(found.frequencies_hz), numbers(bearing.values)
+    run = (np.abs(lines) > FROM_HZ) & (np.abs(lines) < TO_HZ)
+    forward, reverse = (float(np.nansum(values[run & (sign * lines > 0)] ** 2)) for sign in (1, -1))
+    assert reverse < 1e-3 * forward
+    assert np.isnan(values[np.abs(lines) < 1]).all()
+
+
+def test_a_waterfall_follows_the_run_up(data: Sampled) -> None:
+    found = waterfall_snapshot(data, CHANNELS[0], "time")
+    assert (found.unit, found.channel) == ("µm p-p", "y1")
+    assert len(found.rows) == 40
+    frequencies = np.array(found.frequencies_hz)
+    for row in found.rows:
+        assert row.start_ns is not None
+        assert row.speed_rad_s is not None
+        highest = frequencies[np.argmax(numbers(row.values))]
+        middle_hz = FROM_HZ + (TO_HZ - FROM_HZ) / SECONDS * ((row.start_ns - START_NS) / S + 0.25)
+        assert highest == pytest.approx(middle_hz, abs=2.1)
+        assert row.speed_rad_s == pytest.approx(2 * np.pi * middle_hz, rel=0.02)
+    by_speed = waterfall_snapshot(data, CHANNELS[0], "speed").rows
+    speeds = np.array([row.speed_rad_s or np.nan for row in by_speed]) / (2 * np.pi)
+    assert (np.diff(speeds) > 0).all()
+    tops = np.array([frequencies[np.argmax(numbers(row.values))] for row in by_speed])
+    assert np.abs(tops - speeds).max() < 2.6
+
+
+def test_vectors_of_a_run_up_have_its_amplitude_and_lag(data: Sampled) -> None:
+    found = vector_series(data, CHANNELS, 1, 5, None)
+    assert found.source == ("newest samples" if isinstance(data, Held) else "recordings")
+    assert (found.steady, found.revolutions) == ("", 5)
+    speed = numbers(found.speeds_rad_s) / (2 * np.pi)
+    at_s = (np.array(found.times_ns) - START_NS) / S
+    assert speed == pytest.approx(FROM_HZ + (TO_HZ - FROM_HZ) / SECONDS * at_s, rel=5e-3)
+    for one, lag in zip(found.channels, (40.0, 130.0), strict=True):
+        assert one.unit == "µm p-p"
+        assert numbers(one.amplitude) == pytest.approx(2 * SHAFT_UM, rel=0.02)
+        assert numbers(one.phase_lag_deg) == pytest.approx(lag, abs=2)
+    bare = vector_series(data, CHANNELS, 1, 5, 1000.0)
+    assert np.median(numbers(bare.channels[0].amplitude)) < 1  # the slow roll was all there was
+
+
+def test_the_centreline_moves_with_the_mean(data: Sampled) -> None:
+    found = centreline_series(data)
+    bearing = found.places[0]
+    at_s = (np.array(found.times_ns) - START_NS) / S
+    assert numbers(bearing.y_um) == pytest.approx(RUNOUT_UM, abs=1)
+    assert numbers(bearing.z_um) == pytest.approx(-4 * at_s, abs=1)
+
+
+@pytest.fixture(scope="module")
+def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Runtime, Path]]:
+    folder = tmp_path_factory.mktemp("machine")
+    with faulty(folder) as (running, _):
+        yield running, recording(folder / "recordings" / "demo" / "lab" / "run-up.mcap", BLOCKS)
+
+
+@pytest.fixture(scope="module")
+def http(runtime: tuple[Runtime, Path]) -> Iterator[httpx.Client]:
+    with client(runtime[0]) as found:
+        yield found
+
+
+def test_values_come_from_what_was_asked_for(runtime: tuple[Runtime, Path], http: httpx.Client) -> None:
+    (worker,) = runtime[0].machines()
+    now = answered(http.get(f"{PLACE}/waveforms"), WaveformSnapshot)
+    assert (now.source, now.revolutions) == ("newest samples", 8)
+    assert now.end_ns is not None
+    assert START_NS + 78 * S - now.end_ns < S // 10
+    assert [one.channel for one in now.waveforms] == ["y1", "z1", "y2", "z2"]
+    assert answered(http.get(f"{PLACE}/full-spectra"), FullSpectrumSnapshot).averages == 19
+    assert answered(http.get(f"{PLACE}/waterfalls?channel=y2"), WaterfallSnapshot).channel == "y2"
+    steady = answered(http.get(f"{PLACE}/waterfalls?over=speed"), WaterfallSnapshot)
+    assert "need a run-up or coast-down" in steady.reason
+    assert not steady.rows
+
+    past = answered(http.get(f"{PLACE}/vectors?channel=y2"), VectorSeries)
+    assert (past.source, past.revolutions) == ("history", None)
+    assert "1320 rpm" in past.steady
+    reported = {one.end_ns: one for one in Past.of(LAB, worker.history.report_log, None, None, 400).reports}
+    for number, time_ns in enumerate(past.times_ns):
+        (levels,) = (one for one in reported[time_ns].levels if one.channel == "y2")
+        assert past.channels[0].amplitude[number] == pytest.approx(levels.x1, rel=1e-5)
+        assert past.channels[0].phase_lag_deg[number] == pytest.approx(levels.x1_phase_lag_deg, rel=1e-5)
+    later = answered(http.get(f"{PLACE}/vectors", params={"since_ns": past.times_ns[-1]}), VectorSeries)
+    assert later.times_ns == past.times_ns[-1:]
+    never = answered(http.get(f"{PLACE}/centrelines?until_ns=5"), CentrelineSeries)
+    assert (never.places, never.reason) == ((), "demo/lab: no reports in this stretch of time")
+
+    run_up = {"recording": "run-up.mcap"}
+    found = answered(http.get(f"{PLACE}/vectors", params={"channel": "y1", **run_up}), VectorSeries)
+    assert found.source == "recordings"
+    assert numbers(found.channels[0].amplitude) == pytest.approx(2 * SHAFT_UM, rel=0.03)
+    for name, model in (
+        ("waveforms", WaveformSnapshot),
+        ("full-spectra", FullSpectrumSnapshot),
+        ("waterfalls", WaterfallSnapshot),
+        ("centrelines", CentrelineSeries),
+    ):
+        read = answered(http.get(f"{PLACE}/{name}", params=run_up), model)
+        assert read.model_dump()["source"] == "recordings", name
+        assert read.model_dump()["reason"] == "", name
+
+
+def test_what_cannot_be_answered_is_refused_or_explained(http: httpx.Client) -> None:
+    listed = answered(http.get("/api/v1/recordings"), RecordingList).recordings
+    (writing,) = (one.id.rsplit("/", 1)[1] for one in listed if not one.complete)
+    assert "run-up.mcap.part" not in writing
+    problem(http.get(f"{PLACE}/vectors", params={"recording": writing}), 422)
+    problem(http.get(f"{PLACE}/vectors?recording=other.mcap"), 404)
+    problem(http.get(f"{PLACE}/vectors?recording=..%2Fpump%2Fx.mcap"), 422)
+    assert "theta" in problem(http.get(f"{PLACE}/waveforms?channel=theta"), 422).detail
+    assert "name a recording" in problem(http.get(f"{PLACE}/vectors?slow_roll_rpm=300"), 422).detail
+    explained = answered(http.get(f"{PLACE}/vectors?order=3"), VectorSeries)
+    assert "are kept of 1x and 2x" in explained.reason
+
+
+def test_recordings_are_read_for_one_at_a_time_and_not_too_many(
+    http: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = f"{PLACE}/waterfalls?recording=run-up.mcap"
+    with monkeypatch.context() as patched:
+        patched.setattr(samples, "_MOST_BYTES", 1000)
+        assert "expected at most" in problem(http.get(path), 422).detail
+    monkeypatch.setattr(samples, "_PATIENCE_S", 0.01)
+    with samples._ONE_AT_A_TIME:
+        assert "for somebody else" in problem(http.get(path), 503).detail
+    assert answered(http.get(path), WaterfallSnapshot).rows
+
+
+def test_an_evaluation_without_samples_says_so() -> None:
+    short = Held(LAB, BLOCKS[:2])
+    with pytest.raises(RotorwatchError, match="needs 1 s without a gap"):
+        full_spectrum_snapshot(short)

@@ -1,0 +1,355 @@
+"""What pictures of recordings show: orbits, spectra, correlations and trends, before anything is drawn."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.commissioning.commissioned import install
+from models.diagnosis.networks.bundle import load_bundle
+from models.errors import MachineFileError, RotorwatchError
+from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix
+from models.signals.block import FloatArray
+from models.signals.recording import RecordedMessage
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.example import example
+from rotorwatch.records.health import MEASURES, Report
+from service.analysis.correlation import correlations_of, latest_window
+from service.analysis.figures.spectrum import Lines, paint_spectrum, paint_waterfall
+from service.analysis.figures.style import Look
+from service.analysis.orbit import phase_lag_deg, read_orbits
+from service.analysis.recorded import Recorded
+from service.analysis.spectrum import read_spectrum, read_waterfall, shown_as
+from service.analysis.trend import TrendSeries, read_trend, trend_of
+from service.recordings.replay.offline import OfflineReplay
+from service.recordings.replay.source import RecordingSource
+from simulator.scenario import load_scenario, parse_fault
+from simulator.stream import blocks
+from tests.service.rig.live import LAB, START_NS, scenario_blocks
+from tests.service.rig.replaying import S, machine_blocks, recorded, recording, write
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Healthy for 62 s, then half of the vertical bearing damping more."""
+    return recording(
+        tmp_path_factory.mktemp("plots") / "faulty.mcap", scenario_blocks(102.0, parse_fault("c_bz=0.5@62"))
+    )
+
+
+@pytest.fixture(scope="module")
+def lines(faulty: Path) -> list[dict[str, object]]:
+    """What an offline replay of it says, with the networks."""
+    found: list[dict[str, object]] = []
+    source = RecordingSource([faulty])
+    OfflineReplay(source, LAB.keys, install(LAB, "lab"), lambda line: found.append(json.loads(line))).run()
+    return found
+
+
+@pytest.fixture(scope="module")
+def computed(faulty: Path) -> TrendSeries:
+    """Its trend, computed from the samples."""
+    source = RecordingSource([faulty])
+    return read_trend(Recorded(source, LAB.keys, source.span().start_ns, source.span().end_ns + 1))
+
+
+def reports_of(lines: list[dict[str, object]]) -> list[Report]:
+    return [Report.model_validate(line["message"]) for line in lines if line["topic"] == LAB.keys.report]
+
+
+def test_the_orbit_of_a_simulated_unbalance_is_the_ellipse_of_the_equations_of_motion(tmp_path: Path) -> None:
+    scenario, machine = load_scenario("healthy")
+    quiet = scenario.model_copy(
+        update={"sources": (), "sensors": type(scenario.sensors)(), "duration_s": 12.0}
+    )  # nothing but unbalance
+    path = recording(tmp_path / "unbalance.mcap", [block for block, _ in blocks(quiet, machine, start_ns=START_NS)])
+    found = read_orbits(recorded(path), 8)
+
+    W, rotor = machine.operation.speed_rad_s, machine.rotor
+    H = H_matrix(rotor, W)
+    dynamic = -(W**2) * M_matrix(rotor) + 1j * W * P_matrix(rotor, W) + Q_matrix(rotor)
+    q_um = 1e6 * np.linalg.solve(dynamic, H[:, 0] - 1j * H[:, 1])  # rows y1, y2, psi, z1, z2, phi
+    assert [orbit.location for orbit in found.orbits] == ["bearing", "disc"]
+    assert found.speed_rad_s == pytest.approx(W, rel=1e-4)
+    assert found.end_ns - found.start_ns == pytest.approx(8 * 2e9 * np.pi / W, rel=1e-4)
+    for orbit, y, z in zip(found.orbits, q_um[[0, 1]], q_um[[3, 4]], strict=True):
+        assert orbit.ellipse.y == pytest.approx(y, rel=2e-3)
+        assert orbit.ellipse.z == pytest.approx(z, rel=2e-3)
+        circle = np.exp(1j * np.linspace(0, 2 * np.pi, 20_000))
+        radius = np.hypot(np.real(y * circle), np.real(z * circle))
+        assert 2 * orbit.ellipse.semi_major == pytest.approx(2 * radius.max(), rel=2e-3)
+        assert 2 * orbit.ellipse.semi_minor == pytest.approx(2 * radius.min(), rel=2e-3)
+        assert np.ptp(orbit.y_um) == pytest.approx(2 * abs(y), rel=5e-3)
+        assert orbit.ellipse.precession == "forward"
+        assert orbit.marks_um.shape == (9, 2)  # the pulse that begins and the one that ends, and between
+        assert orbit.marks_um == pytest.approx(np.tile([y.real, z.real], (9, 1)), abs=0.01 * abs(y))
+
+
+def test_a_shaft_that_turns_backwards(tmp_path: Path) -> None:
+    """Angle falls; y peaks 90° after the pulse; the motion goes against the rotation."""
+    turn = 2 * np.pi * 25.0
+    path = recording(
+        tmp_path / "back.mcap",
+        machine_blocks(
+            {
+                "theta": lambda t: (1.0 - turn * t) % (2 * np.pi),
+                "y1": lambda t: 30 * np.cos(turn * t - 1.0 - np.pi / 2) + 400,
+                "z1": lambda t: 10 * np.sin(turn * t - 1.0 - np.pi / 2) - 300,
+            },
+            3.0,
+        ),
+    )
+    found = read_orbits(recorded(path), 5)
+    bearing = found.orbits[0]
+    assert found.direction == -1
+    assert found.speed_rad_s == pytest.approx(-turn, rel=1e-3)
+    ellipse = bearing.ellipse
+    assert 2 * abs(ellipse.y) == pytest.approx(60, rel=1e-3)
+    assert phase_lag_deg(ellipse.y, found.direction) == pytest.approx(90, abs=0.2)
+    assert phase_lag_deg(ellipse.z, found.direction) == pytest.approx(180, abs=0.2)
+    assert (2 * ellipse.semi_major, 2 * ellipse.semi_minor) == pytest.approx((60, 20), rel=1e-3)
+    assert ellipse.precession == "backward"  # y to z, and the shaft turns from z to y
+    assert abs(bearing.y_um.mean()) < 1
+
+
+def test_orbits_need_so_many_revolutions_without_a_gap(tmp_path: Path) -> None:
+    path = recording(
+        tmp_path / "gap.mcap",
+        machine_blocks(
+            {"theta": lambda t: (2 * np.pi * 20.0 * t + 1) % (2 * np.pi), "y1": lambda t: t}, 4.0, without=[34]
+        ),
+    )
+    assert read_orbits(recorded(path), 9).revolutions == 9
+    with pytest.raises(RotorwatchError, match=r"--revolutions is 10, but only 9 whole revolutions"):
+        read_orbits(recorded(path), 10)
+
+
+@pytest.mark.parametrize("off_line", [0.0, 0.25, 0.5])
+@pytest.mark.parametrize(("name", "stated", "factor"), [("y2", "µm p-p", 2.0), ("y2_dot", "mm/s rms", 0.5**0.5)])
+def test_a_sine_reads_as_its_quantity_is_stated_within_the_scalloping_of_the_window(
+    tmp_path: Path, off_line: float, name: str, stated: str, factor: float
+) -> None:
+    """Displacement peak to peak, velocity rms."""
+    hz, amplitude = 50.0 + 0.5 * off_line, 12.0
+    path = recording(
+        tmp_path / "sine.mcap", machine_blocks({name: lambda t: amplitude * np.sin(2 * np.pi * hz * t) + 900}, 21.0)
+    )
+    stream = recorded(path)
+    found = read_spectrum(stream, stream.channels([name]), 20.0, 0.5, "amplitude")
+    scalloping = abs(np.sinc(off_line) / (1 - off_line**2))  # of the Hann window
+    assert found.values[0].max() == pytest.approx(factor * amplitude * scalloping, rel=1e-3)
+    assert found.frequencies_hz[found.values[0].argmax()] == pytest.approx(hz, abs=0.251)
+    assert (found.averages, found.resolution_hz) == (19, 0.5)
+    assert (found.start_ns, found.end_ns) == (START_NS + 1 * S, START_NS + 21 * S)
+    density = read_spectrum(stream, stream.channels([name]), 20.0, 0.5, "density")
+    assert density.values[0].sum() * 0.5 == pytest.approx(amplitude**2 / 2, rel=1e-3)
+    panel = paint_spectrum(found, "demo/lab", Look(), Lines(20.0, 0.5, "amplitude", log=False)).axes[0]
+    assert panel.get_ylabel() == stated
+    fall = read_waterfall(stream, stream.channels([name])[0], 4.0, 0.5, "amplitude")
+    assert fall.values.max() == pytest.approx(factor * amplitude * scalloping, rel=1e-3)
+
+
+def test_metres_are_shown_as_engineers_read_them() -> None:
+    factors = {"y1": {"m": 2e6, "mm": 2e3, "mil": 2.0}, "y1_dot": {"m/s": 1e3 * 0.5**0.5, "in/s": 0.5**0.5}}
+    said = []
+    for name, units in factors.items():
+        for unit, expected in units.items():
+            channel = next(one for one in LAB.sensors if one.name == name).model_copy(update={"unit": unit})
+            text, factor = shown_as(channel, "amplitude")
+            said.append(text)
+            assert factor == pytest.approx(expected)
+    assert said == ["µm p-p", "µm p-p", "mil p-p", "mm/s rms", "in/s rms"]
+
+
+def test_frequencies_and_heights_that_are_shown(tmp_path: Path) -> None:
+    """Slow drift, and nothing above the second harmonic: neither makes the picture."""
+    signals = {
+        "theta": lambda t: (2 * np.pi * 20.0 * t) % (2 * np.pi),
+        "y1": lambda t: 3000 * np.sin(0.3 * t) + 10 * np.sin(2 * np.pi * 20.0 * t) + 4 * np.sin(2 * np.pi * 40.0 * t),
+    }
+    stream = recorded(recording(tmp_path / "drift.mcap", machine_blocks(signals, 30.0)))
+    found = read_spectrum(stream, stream.channels(["y1"]), 20.0, 0.5, "amplitude")
+    fall = read_waterfall(stream, stream.channels(["y1"])[0], 4.0, 0.5, "amplitude")
+    for log in (False, True):
+        panel = paint_spectrum(found, "demo/lab", Look(), Lines(20.0, 0.5, "amplitude", log)).axes[0]
+        assert panel.get_xlim() == (1.0, 80.0)  # two lines, from which on the window lets no mean through, to 4×
+        assert panel.get_ylim()[1] > 20
+    low, high = paint_spectrum(found, "demo/lab", Look(), Lines(20.0, 0.5, "amplitude", log=True)).axes[0].get_ylim()
+    assert high / low < 10**5
+    lines = Lines(4.0, 0.5, "amplitude", log=True)
+    for cascade in (False, True):
+        axes = paint_waterfall(fall, "demo/lab", Look(), (), lines, over_speed=False, cascade=cascade).axes[0]
+        assert axes.get_xlim() == (1.0, 80.0)
+    wide = paint_spectrum(found, "demo/lab", Look(), Lines(20.0, 0.5, "amplitude", False, 500.0)).axes[0]
+    assert wide.get_xlim() == (1.0, 500.0)
+
+
+def test_spectra_do_not_reach_across_gaps(tmp_path: Path) -> None:
+    """A step across the gap would be broadband; segments on either side do not see it."""
+    path = recording(
+        tmp_path / "step.mcap", machine_blocks({"y1": lambda t: np.where(t > 4.05, 1000.0, 0.0)}, 10.0, without=[40])
+    )
+    stream = recorded(path)
+    found = read_spectrum(stream, stream.channels(["y1"]), 10.0, 1.0, "amplitude")
+    assert found.values.max() < 1e-9
+    assert found.averages == 7 + 10  # 4.0 s and 5.9 s in halves of a second
+    assert np.isnan(found.speed_rad_s) or found.speed_rad_s == 0
+    with pytest.raises(RotorwatchError, match=r"needs 10 s without a gap, .* in the last 10 s is 5.9 s"):
+        read_spectrum(stream, stream.channels(["y1"]), 10.0, 0.1, "amplitude")
+    with pytest.raises(MachineFileError, match="--window is 1 s, expected at least 2 s"):
+        read_spectrum(stream, stream.channels(["y1"]), 1.0, 0.5, "amplitude")
+
+
+def test_a_waterfall_follows_a_run_up_over_time_and_speed(tmp_path: Path) -> None:
+    def turns(t: FloatArray) -> FloatArray:  # 10 Hz to 40 Hz in 60 s
+        return 10 * t + 0.25 * t**2
+
+    path = recording(
+        tmp_path / "runup.mcap",
+        machine_blocks(
+            {"theta": lambda t: (2 * np.pi * turns(t)) % (2 * np.pi), "y1": lambda t: 5 * np.cos(2 * np.pi * turns(t))},
+            60.0,
+            without=range(300, 330),
+        ),
+    )
+    stream = recorded(path)
+    found = read_waterfall(stream, stream.channels(["y1"])[0], 2.0, 0.5, "amplitude")
+    assert found.values.shape[0] == 15 + 13  # 3 s are missing, and what is left before the end is no segment
+    strongest_hz = found.frequencies_hz[found.values.argmax(axis=1)]
+    middle_s = ((found.start_ns + found.end_ns) / 2 - START_NS) / S
+    assert strongest_hz == pytest.approx(10 + 0.5 * middle_s, abs=0.76)
+    assert found.speed_rad_s / (2 * np.pi) == pytest.approx(10 + 0.5 * middle_s, abs=0.01)
+    edges, spectra = found.over_speed()
+    known = np.isfinite(spectra[:, 0])
+    slow_hz, fast_hz = edges[:-1][known] / (2 * np.pi), edges[1:][known] / (2 * np.pi)
+    strongest_hz = found.frequencies_hz[spectra[known].argmax(axis=1)]
+    assert (strongest_hz > slow_hz - 0.76).all()
+    assert (strongest_hz < fast_hz + 0.76).all()
+
+
+def test_a_speed_axis_needs_a_speed_that_changes(faulty: Path) -> None:
+    stream = recorded(faulty, seconds=(0, 20))
+    found = read_waterfall(stream, stream.displacements[0], 4.0, 0.5, "amplitude")
+    assert found.values.shape[0] == 5
+    with pytest.raises(RotorwatchError, match=r"the speed stays between 1320 and 1320 rpm"):
+        found.over_speed()
+    with pytest.raises(RotorwatchError, match="1 spectra of demo/lab over 20 s without a gap, expected at least 2"):
+        read_waterfall(stream, stream.displacements[0], 20.0, 0.5, "amplitude")
+
+
+@pytest.mark.parametrize("nth", [-1, 3])
+def test_correlation_panels_carry_the_figures_of_the_report(
+    faulty: Path, lines: list[dict[str, object]], nth: int
+) -> None:
+    report = [one for one in reports_of(lines) if one.equations][nth]
+    source = RecordingSource([faulty])
+    window = latest_window(Recorded(source, LAB.keys, source.span().start_ns, report.end_ns + S), LAB)
+    panels = correlations_of(window, LAB, load_bundle("lab", LAB))
+    assert (window.start_ns, window.end_ns) == (report.start_ns, report.end_ns)
+    by_number = {panel.reading.equation: panel for panel in panels}
+    assert list(by_number) == [equation.equation for equation in report.equations]
+    for panel, said in zip(panels, report.equations, strict=True):
+        if not said.evaluable:
+            assert (panel.curves, panel.reading.reason) == ((), said.reason)
+            continue
+        residual = np.concatenate([curve.residual for curve in panel.curves])
+        assert np.mean(residual**2) == pytest.approx(said.msd, rel=1e-12)
+        assert (panel.reading.msd, panel.reading.msd_healthy) == (said.msd, said.msd_healthy)
+        measured = np.concatenate([curve.measured for curve in panel.curves])
+        assert np.sqrt(np.mean(measured**2)) == pytest.approx(1.0)  # over the target's rms
+    assert by_number["30"].reading.reason.startswith("not measured: psi_dot")
+    assert [curve.label for curve in by_number["28"].curves] == ["y1", "y2", "z1", "z2"]
+    assert by_number["28"].x[[0, -1]] == pytest.approx([0.010, 0.125])
+    assert by_number["29"].x.size == 16
+
+
+def test_curves_are_labelled_with_their_references(faulty: Path) -> None:
+    """Each curve against the window's own correlation of that reference with the target."""
+    source = RecordingSource([faulty])
+    window = latest_window(Recorded(source, LAB.keys, source.span().start_ns, source.span().end_ns + 1), LAB)
+    panel = correlations_of(window, LAB, load_bundle("lab", LAB))[0]
+    lags = window.lags_s >= 0.0099
+    for curve in panel.curves:
+        i, j = window.states.index(f"{curve.label}_dot"), window.states.index("y1_dot")
+        estimated = window.correlation[lags, i, j]
+        assert np.corrcoef(curve.measured, estimated)[0, 1] == pytest.approx(1.0)
+
+
+def test_no_full_window_is_said(faulty: Path) -> None:
+    source = RecordingSource([faulty])
+    with pytest.raises(RotorwatchError, match=r"a window is 60 s, usable data are 30 s"):
+        latest_window(Recorded(source, LAB.keys, source.span().start_ns, START_NS + 30 * S), LAB)
+
+
+def test_a_computed_trend_is_that_of_the_reports(computed: TrendSeries, lines: list[dict[str, object]]) -> None:
+    found, reports = computed, reports_of(lines)
+    assert found.end_ns.tolist() == [report.end_ns for report in reports]
+    assert found.states == tuple(report.state for report in reports)
+    assert found.limits == LAB.alarms
+    for name, (field, _) in MEASURES.items():
+        known = [getattr(report, field) for report in reports]
+        np.testing.assert_array_equal(found.measures[name], np.array(known, dtype=np.float64))
+    alarms = [AlarmCloudEvent.model_validate(line["message"]) for line in lines if "alarm" in str(line["topic"])]
+    assert [alarm.time_ns for alarm in found.alarms] == [alarm.data.time_ns for alarm in alarms]
+    assert found.alarms[0].name == "c_bz"
+    for trend in found.parameters:
+        for number, report in enumerate(reports):
+            verdict = report.verdict
+            shown = report.parameters if verdict is None or verdict.settled else verdict.current
+            values = [reading for reading in shown if reading.name == trend.name and reading.interval_95]
+            if values and values[0].interval_95 is not None:
+                assert trend.change[number] == values[0].relative_change
+                assert (trend.low[number], trend.high[number]) == values[0].interval_95
+            else:
+                assert np.isnan(trend.change[number])
+    last = {trend.name: trend for trend in found.parameters}["c_bz"]
+    assert last.low[-1] < 0.5 < last.high[-1]
+
+
+def test_a_trend_of_a_publisher_that_was_started_again_earlier_shows_the_later_run(
+    lines: list[dict[str, object]],
+) -> None:
+    reports = reports_of(lines)
+    again = [one.model_copy(update={"end_ns": one.end_ns - 22 * S}) for one in reports]
+    before = [one.end_ns for one in reports if one.end_ns < again[0].end_ns]
+    found = trend_of([*reports, *again, again[-1]], (), None, "")
+    assert found.end_ns.tolist() == [*before, *(one.end_ns for one in again)]
+
+
+def test_a_trend_of_recorded_reports_needs_no_samples(
+    tmp_path: Path, computed: TrendSeries, lines: list[dict[str, object]]
+) -> None:
+    """Recorded reports are shown as they are; a machine file asks for new ones, and needs the samples."""
+    messages = []
+    for number, line in enumerate(lines):
+        text = json.dumps(line["message"]).encode()
+        messages.append(RecordedMessage(str(line["topic"]), text, b"", "application/json", START_NS + number, START_NS))
+    messages.append(RecordedMessage(LAB.keys.report, b"{}", b"", "application/json", START_NS + 1000, START_NS))
+    path = write(tmp_path / "reports.mcap", [*messages, *messages[:3]])
+    source = RecordingSource([path])
+    keys = source.machine(reports=True)
+    assert keys == LAB.keys
+    recorded = read_trend(Recorded(source, keys, source.span().start_ns, source.span().end_ns + 1))
+    assert (recorded.origin, recorded.limits) == ("as recorded", LAB.alarms)
+    assert recorded.end_ns.tolist() == computed.end_ns.tolist()
+    assert [alarm.time_ns for alarm in recorded.alarms] == [alarm.time_ns for alarm in computed.alarms]
+    for one, other in zip(recorded.parameters, computed.parameters, strict=True):
+        np.testing.assert_array_equal(one.change, other.change)
+        np.testing.assert_array_equal(one.high, other.high)
+    levels = read_trend(Recorded(source, keys, source.span().start_ns, source.span().end_ns + 1), levels=True)
+    assert (levels.parameters, levels.levels[0].title) == ((), "y1   um pp")  # instead of parameters
+    assert all(np.isfinite(one.level).all() and np.isnan(one.danger).all() for one in levels.levels)
+    with pytest.raises(RotorwatchError, match="no sample blocks to compute them from"):
+        read_trend(Recorded(source, keys, source.span().start_ns, source.span().end_ns + 1), "lab")
+    with pytest.raises(MachineFileError, match="machines with reports or sample blocks: demo/lab"):
+        source.machine("demo/fan", reports=True)
+
+
+def test_a_trend_of_nothing_says_what_was_looked_for(faulty: Path) -> None:
+    source = RecordingSource([faulty])
+    filling = read_trend(Recorded(source, LAB.keys, source.span().start_ns, START_NS + 30 * S))
+    assert (filling.parameters, len(filling.levels)) == ((), 8)
+    bare = [Report.model_validate(example(Report) | {"levels": [], "parameters": [], "verdict": None, "reason": ""})]
+    with pytest.raises(RotorwatchError, match=r"neither parameter nor level was read .*: 1 reports, while the window"):
+        trend_of(bare, (), None, "as recorded")

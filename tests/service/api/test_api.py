@@ -1,0 +1,436 @@
+"""The HTTP API of a running service that has seen a fault: real server, real session, real evaluation."""
+
+import re
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from time import sleep
+
+import httpx
+import pytest
+
+from models.alarm_names import ALARMS
+from models.machine import Machine, load_machine
+from models.physics.rotor import PARAMETERS
+from rotorwatch.records.alarms import Alarm, AlarmStates
+from rotorwatch.records.health import MEASURES, Health
+from rotorwatch.records.history import AlarmEventList, AuditList, ReadingList, ReportList
+from rotorwatch.records.machines import DetectableChanges, MachineConfiguration, MachineDescription, MachineList
+from rotorwatch.records.monitor import Alive, CallerRights, Readiness
+from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
+from service.access.scopes import Scope
+from service.api.description import DescribedApp
+from service.api.routes.page import page_files
+from service.history.records import Step, StoredReading
+from service.runtime.runtime import Runtime
+from service.stream.worker import MachineWorker
+from tests.service.rig.live import ROOT, START_NS
+from tests.service.rig.monitored import GUARDED, PLACE, answered, client, faulty, fed, problem, token
+
+HOP_NS = 5_000_000_000
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Runtime, MachineWorker]]:
+    with faulty(tmp_path_factory.mktemp("machine")) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def http(seen: tuple[Runtime, MachineWorker]) -> Iterator[httpx.Client]:
+    with client(seen[0]) as found:
+        yield found
+
+
+def test_callers_learn_what_they_may_do(http: httpx.Client, tmp_path: Path) -> None:
+    assert answered(http.get("/api/v1/caller"), CallerRights).scopes == ("read", "operate", "configure")
+    with fed(tmp_path, GUARDED) as (runtime, _):
+        text = token(runtime, Scope.READ, Scope.OPERATE)
+        with client(runtime, text) as sent, client(runtime) as typed:
+            rights = answered(sent.get("/api/v1/caller"), CallerRights)
+            assert rights == CallerRights(name="anna", scopes=("read", "operate"))
+            typed.auth = ("anybody", text)  # nothing can be done with a password
+            assert answered(typed.get("/api/v1/caller"), CallerRights).scopes == ("read",)
+
+
+def test_machines_are_listed(http: httpx.Client, seen: tuple[Runtime, MachineWorker]) -> None:
+    (machine,) = answered(http.get("/api/v1/machines"), MachineList).machines
+    assert machine == answered(http.get(PLACE), MachineDescription)
+    assert (machine.site, machine.machine, machine.state) == ("demo", "lab", "alert")
+    assert machine.keys["health"] == "rotorwatch/demo/lab/health"
+    assert len(machine.channels) == 9
+    assert machine.bundle == seen[1].identity["bundle"] is not None
+
+
+def test_configuration_is_the_machine_file(http: httpx.Client, seen: tuple[Runtime, MachineWorker]) -> None:
+    found = answered(http.get(f"{PLACE}/configuration"), MachineConfiguration)
+    assert (file := Machine.model_validate(found.file)) == seen[1].machine
+    assert file.alarms.on_delay_s == 10.0
+    assert file.rotor.k_by_N_per_m == load_machine("lab").rotor.k_by_N_per_m
+    assert found.machine_hash == seen[1].identity["machine_hash"]
+
+
+def test_health_names_the_fault_with_its_interval(http: httpx.Client) -> None:
+    health = answered(http.get(f"{PLACE}/health"), Health)
+    assert health.state == "alert"
+    assert health.filled == 1.0
+    report = health.report
+    assert report is not None
+    assert report == next(iter(answered(http.get(f"{PLACE}/reports?limit=1"), ReportList).reports))
+    assert report.start_ns == report.end_ns - 12 * HOP_NS
+    assert [parameter.name for parameter in report.parameters] == list(PARAMETERS)
+    k_by = report.parameters[0]
+    assert k_by.text == "bearing stiffness, horizontal"
+    assert k_by.interval_95 is not None
+    assert k_by.interval_95[0] < -0.33 < k_by.interval_95[1] + 0.02
+    assert [equation.equation for equation in report.equations] == ["28", "29", "30", "31"]
+    for equation in report.equations:
+        assert equation.evaluable == (equation.msd is not None)
+        assert equation.evaluable != bool(equation.reason)
+    assert any(equation.evaluable for equation in report.equations)
+    assert [alarm.name for alarm in health.alarms if alarm.raised] == ["k_by"]
+    assert health.quality.accepted_blocks == 780
+    assert health.quality.gaps == health.quality.queue_dropped_blocks == health.quality.link_missed_blocks == 0
+    assert health.stream.descriptor_mismatch == ()
+
+
+def test_reports_are_cut_by_time_and_number(http: httpx.Client) -> None:
+    every = answered(http.get(f"{PLACE}/reports"), ReportList)
+    ends = [report.end_ns for report in every.reports]
+    assert ends == sorted(ends, reverse=True)
+    # The first hop ends after its own history (half a segment) and its own five seconds.
+    assert ends[-1] == START_NS + 7_500_000_000
+    assert len(ends) == 15
+    assert every.next_before is None
+    assert [report.state for report in reversed(every.reports)] == ["warming"] * 11 + ["healthy"] * 2 + ["alert"] * 2
+    some = answered(http.get(f"{PLACE}/reports?since_ns={ends[10]}&until_ns={ends[3]}"), ReportList)
+    assert [report.end_ns for report in some.reports] == ends[4:11]
+    first = answered(http.get(f"{PLACE}/reports?limit=10"), ReportList)
+    assert [report.end_ns for report in first.reports] == ends[:10]
+    second = answered(http.get(f"{PLACE}/reports?limit=10&before={first.next_before}"), ReportList)
+    assert [report.end_ns for report in second.reports] == ends[10:]
+    assert second.next_before is None
+
+
+def test_measures_of_the_window_are_in_history_and_on_the_page(http: httpx.Client) -> None:
+    report = answered(http.get(f"{PLACE}/health"), Health).report
+    assert report is not None
+    page = (ROOT / "service/api/page/machine/data-quality.js").read_text(encoding="utf-8")
+    for name, (field, measure) in MEASURES.items():
+        value = getattr(report, field)
+        assert answered(http.get(f"{PLACE}/readings?quantity={name}"), ReadingList).readings[-1].value == value
+        assert f"report?.{field}" in page, measure
+    assert problem(http.get(f"{PLACE}/readings?quantity=nose"), 422).detail.startswith("quantity: ")
+
+
+def test_readings_over_time(http: httpx.Client) -> None:
+    every = answered(http.get(f"{PLACE}/readings?name=k_by"), ReadingList)
+    assert (len(every.readings), every.buckets, every.next_after) == (4, (), None)
+    health = answered(http.get(f"{PLACE}/health"), Health)
+    assert health.report is not None
+    k_by = health.report.parameters[0]
+    assert (every.readings[-1].value, every.readings[-1].standard_error) == (k_by.relative_change, k_by.standard_error)
+    first = answered(http.get(f"{PLACE}/readings?name=k_by&limit=4"), ReadingList)
+    second = answered(http.get(f"{PLACE}/readings?name=k_by&limit=4&after={first.next_after}"), ReadingList)
+    assert first.readings + second.readings == every.readings
+    assert second.next_after is None
+    since_ns = every.readings[2].end_ns
+    later = answered(http.get(f"{PLACE}/readings?name=k_by&since_ns={since_ns}"), ReadingList)
+    assert later.readings == every.readings[2:]
+    speed = answered(http.get(f"{PLACE}/readings?quantity=speed"), ReadingList)
+    assert all(abs(one.value - 138.23) < 0.1 for one in speed.readings)
+
+
+def test_readings_are_reduced_to_a_plot(http: httpx.Client) -> None:
+    every = [one.value for one in answered(http.get(f"{PLACE}/readings?name=k_by"), ReadingList).readings]
+    (whole,) = answered(http.get(f"{PLACE}/readings?name=k_by&points=1"), ReadingList).buckets
+    assert (whole.name, whole.count, whole.minimum, whole.maximum) == ("k_by", 4, min(every), max(every))
+    assert whole.mean == pytest.approx(sum(every) / 4)
+    told = http.get(f"{PLACE}/readings?name=k_by&name=e&points=3")
+    two = answered(told, ReadingList)
+    assert told.text == two.model_dump_json()
+    assert two.readings == ()
+    assert {one.name for one in two.buckets} == {"k_by", "e"}
+    assert sum(one.count for one in two.buckets) == 8
+    assert all(sum(one.name == name for one in two.buckets) <= 3 for name in ("k_by", "e"))
+    assert {one.name for one in answered(http.get(f"{PLACE}/readings?points=2"), ReadingList).buckets} == {*PARAMETERS}
+
+
+@pytest.mark.parametrize(
+    ("query", "text"),
+    [
+        ("readings", "name: 0 are given, expected one; several go with points"),
+        ("readings?name=k_by&name=e", "name: 2 are given, expected one; several go with points"),
+        ("readings?points=5&after=3", "after: goes with single readings, not with points"),
+        ("spectra?from_hz=50&to_hz=40", "to_hz: 40 is not above from_hz 50"),
+        ("spectra?channel=nose", "demo/lab: channel is 'nose', which is not a channel of it; expected one of"),
+        ("correlations?first=y1&first=y2&second=y1", "demo/lab: 2 values of first and 1 of second, expected"),
+        ("spectra?from_hz=200", "demo/lab: band is 200 to"),
+        ("readings?name=k_bx", "demo/lab: name is 'k_bx', which is no parameter of it; expected one of k_by, c_by"),
+        ("readings?quantity=equation&name=32&points=9", "demo/lab: name is '32', which is no equation of it"),
+        ("readings?quantity=speed&name=misfit", "demo/lab: name is 'misfit', which is no speed of it; expected one of"),
+        (
+            "readings?quantity=level&name=y9:overall",
+            "demo/lab: name is 'y9:overall', which is no level of it; expected CHANNEL:MEASURE of the channels y1, z1",
+        ),
+        ("alarms?name=k_by&name=level:y9", "demo/lab: no alarm level:y9; there are: k_by"),
+        ("alarms/events?name=level:y9", "demo/lab: no alarm level:y9; there are: k_by"),
+        ("../../../trends?of=demo/lab/level/y9:overall", "demo/lab: of is 'y9:overall', which is no level of it"),
+    ],
+)
+def test_arguments_that_do_not_fit_together_are_explained(http: httpx.Client, query: str, text: str) -> None:
+    assert problem(http.get(f"{PLACE}/{query}"), 422).detail.startswith(text)
+
+
+def test_what_is_in_the_history_alone_is_still_to_be_had(seen: tuple[Runtime, MachineWorker]) -> None:
+    """A channel that the machine file no longer has."""
+    history = seen[1].history
+    history.commit(Step(readings=(StoredReading(START_NS, "level", "gone:overall", 2.5, None),)))
+    with client(seen[0]) as http:
+        found = answered(http.get(f"{PLACE}/readings?quantity=level&name=gone:overall"), ReadingList)
+        assert [one.value for one in found.readings] == [2.5]
+
+
+def test_alarms_and_their_events(http: httpx.Client) -> None:
+    (active,) = answered(http.get(f"{PLACE}/alarms"), AlarmStates).alarms
+    assert (active.name, active.state, active.severity, active.occurrence) == ("k_by", "unacknowledged", "alert", 1)
+    everything = answered(http.get(f"{PLACE}/alarms?all=true"), AlarmStates).alarms
+    assert {*PARAMETERS} <= {alarm.name for alarm in everything} <= set(ALARMS)
+    assert [alarm.name for alarm in everything if alarm.state != "normal"] == ["k_by"]
+    (event,) = answered(http.get(f"{PLACE}/alarms/events"), AlarmEventList).events
+    assert event.type == "org.rotorwatch.alarm.raised"
+    assert event.source == "/rotorwatch/demo/lab"
+    assert event.subject == event.data.name == "k_by"
+    assert int(event.sequence) == event.data.sequence == 0
+    assert event.data.time_ns == active.raised_ns == START_NS + 72_500_000_000
+    assert event.time == "2026-01-01T00:01:12.500000Z"
+    assert event.data.text.startswith("ALERT: bearing stiffness, horizontal (k_by) changed by -3")
+    later = answered(http.get(f"{PLACE}/alarms/events?since_ns={event.data.time_ns + 1}"), AlarmEventList)
+    assert later.events == ()
+
+
+@pytest.mark.parametrize(
+    ("query", "names"),
+    [
+        ("state=unacknowledged", ["k_by"]),
+        ("state=normal&name=e", ["e"]),
+        ("state=shelved", []),
+        ("name=k_by&name=e", ["k_by", "e"]),
+        ("raised=true&all=true", ["k_by"]),
+        ("raised=true&name=e", []),
+    ],
+)
+def test_alarms_are_filtered(http: httpx.Client, query: str, names: list[str]) -> None:
+    assert [one.name for one in answered(http.get(f"{PLACE}/alarms?{query}"), AlarmStates).alarms] == names
+
+
+def test_one_alarm_and_its_version(http: httpx.Client) -> None:
+    answer = http.get(f"{PLACE}/alarms/k_by")
+    assert answer.headers["etag"] == '"0"'
+    assert answered(answer, Alarm) == answered(http.get(f"{PLACE}/alarms"), AlarmStates).alarms[0]
+    never = http.get(f"{PLACE}/alarms/data-clock")
+    assert never.headers["etag"] == '"-1"'
+    assert answered(never, Alarm).state == "normal"
+    assert problem(http.get(f"{PLACE}/alarms/nose"), 404).detail.startswith(
+        "demo/lab: no alarm nose; there are: k_by, c_by"
+    )
+
+
+def test_health_says_what_changed_since_when_and_who_agrees(http: httpx.Client) -> None:
+    health = answered(http.get(f"{PLACE}/health"), Health)
+    assert health.report is not None
+    verdict = health.report.verdict
+    assert verdict is not None
+    (found,) = verdict.changed
+    assert (found.name, found.text) == ("k_by", "bearing stiffness, horizontal")
+    assert found.since_ns < found.found_ns
+    assert verdict.detected
+    assert not verdict.outside_model
+    assert verdict.confidence > 0.99
+    assert verdict.text.startswith("changed: bearing stiffness, horizontal (k_by) since 00:00:")
+    assert health.report.opinions
+    for opinion in health.report.opinions:
+        k_by = next(one for one in opinion.agreement if one.name == "k_by")
+        assert k_by.between == ("likelihood", opinion.by)
+        assert k_by.verdict == "agree"
+        assert abs(k_by.difference_z or 9.0) < 4
+
+
+def test_detectable_changes(http: httpx.Client) -> None:
+    plain = answered(http.get(f"{PLACE}/detectable"), DetectableChanges)
+    assert [parameter.name for parameter in plain.parameters] == list(PARAMETERS)
+    assert {parameter.length_s for parameter in plain.parameters} == {None}
+    sizes = {parameter.name: parameter.gain for parameter in plain.parameters}
+    assert 0.01 < sizes["k_by"] < 0.1 < sizes["c_by"] + 0.05 < 0.3
+    asked = answered(http.get(f"{PLACE}/detectable?change=-0.1"), DetectableChanges)
+    assert asked.change == -0.1
+    for parameter in asked.parameters:
+        assert parameter.length_s is not None
+        assert (parameter.length_s < 60.0) == (parameter.loss > -0.1)
+
+
+def test_correlations_beside_theory(http: httpx.Client) -> None:
+    found = answered(http.get(f"{PLACE}/correlations?first=y2&second=y2"), CorrelationSnapshot)
+    (pair,) = found.pairs
+    assert pair.estimated is not None
+    assert len(pair.measured) == len(pair.estimated) == len(found.lags_s) > 10
+    assert pair.nominal_z is not None
+    assert pair.estimated_z is not None
+    # A third of a bearing's stiffness is missing: only theory with the estimated parameters fits.
+    assert pair.estimated_z < 3 < pair.nominal_z
+    health = answered(http.get(f"{PLACE}/health"), Health)
+    assert health.report is not None
+    assert (found.start_ns, found.end_ns) == (health.report.start_ns, health.report.end_ns)
+    changes = {one.name: one.relative_change for one in found.theory.changes}
+    assert changes["k_by"] == pytest.approx(health.report.parameters[0].relative_change, rel=1e-5)
+
+
+def test_spectra_and_orbits(http: httpx.Client) -> None:
+    spectra = answered(
+        http.get(f"{PLACE}/spectra?channel=y1&first=y1&second=y2&from_hz=10&to_hz=40&units=SI"), SpectrumSnapshot
+    )
+    assert [one.channel for one in spectra.densities] == ["y1"]
+    assert [(one.first, one.second) for one in spectra.cross] == [("y1", "y2")]
+    assert 10 <= min(spectra.frequencies_hz) < max(spectra.frequencies_hz) <= 40
+    assert spectra.densities[0].unit == "m^2/Hz"
+    orbits = answered(http.get(f"{PLACE}/orbits?revolutions=3"), OrbitSnapshot)
+    assert {one.location for one in orbits.orbits} == {"bearing", "disc"}
+    assert orbits.revolutions == 3
+    assert orbits.path_reason == ""
+    assert all(one.path is not None for one in orbits.orbits)
+    assert len(orbits.pulses_s) == 4
+    # The samples are the newest: the last whole revolution ends less than another one before the end of the stream.
+    assert orbits.path_start_ns is not None
+    left_s = START_NS / 1e9 + 78.0 - (orbits.path_start_ns / 1e9 + orbits.pulses_s[-1])
+    assert left_s == pytest.approx(60 / 1320, abs=0.001) or 0 <= left_s < 60 / 1320
+
+
+def test_the_description_is_made_once_and_seen_whole_by_all_who_ask_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def finish(made: dict[str, object]) -> None:
+        sleep(0.05)  # for as long as it is not whole, others ask
+        made["times finished"] = int(str(made.get("times finished", 0))) + 1
+
+    monkeypatch.setattr("service.api.description.share_problems", finish)
+    app = DescribedApp(title="described")
+    with ThreadPoolExecutor(8) as callers:
+        seen = list(callers.map(lambda _: dict(app.openapi()), range(8)))
+    assert [one.get("times finished") for one in seen] == [1] * 8
+
+
+def test_service_routes(http: httpx.Client) -> None:
+    assert answered(http.get("/healthz"), Alive).alive
+    readiness = answered(http.get("/readyz"), Readiness)
+    assert readiness.ready
+    assert [(machine.machine, machine.worker_alive) for machine in readiness.machines] == [("lab", True)]
+    assert answered(http.get("/api/v1/audit"), AuditList).next_before is None
+
+
+def test_page_for_people_is_kept_by_its_content(http: httpx.Client) -> None:
+    answer = http.get("/")
+    assert answer.headers["content-type"] == "text/html; charset=utf-8"
+    assert answer.headers["cache-control"] == "no-cache"
+    assert "unsafe" not in answer.headers["content-security-policy"]
+    assert "//" not in answer.text
+    assert not re.search(r"<script(?! type=\"module\" src=)|<style|style=|\bon\w+=", answer.text)
+    paths = re.findall(r'(?:src|href)="(/page/[^"]+)"', answer.text)
+    sheets = {name for name in page_files() if name.endswith(".css")} - {"uPlot.min.css"}  # which charts load
+    assert {path.split("/", 3)[3] for path in paths} == sheets | {"rotorwatch-page.js"}
+    _, _, version, _ = paths[0].split("/")
+    for path in (*paths, *(f"/page/{version}/{name}" for name in ("uPlot.iife.js", "plots/orbit-plot.js"))):
+        loaded = http.get(path)
+        assert loaded.status_code == 200
+        assert "immutable" in loaded.headers["cache-control"]
+        assert loaded.headers["content-type"].startswith(("text/css", "text/javascript"))
+        problem(http.get(path.replace(version, version[::-1])), 404)
+    for name in ("index.html", "../routes/page.py", "%2e%2e/routes/page.py"):
+        problem(http.get(f"/page/{version}/{name}"), 404)
+    problem(http.get("/redoc"), 404)
+
+
+@pytest.mark.parametrize(
+    ("path", "near"),
+    [
+        (f"{PLACE}/heath", f"{PLACE}/health"),
+        ("/api/v1/machine/demo/lab", PLACE),
+        ("/api/v1/alarms", None),
+        ("/machines", "/api/v1/machines"),
+        ("/heathz", "/healthz"),
+        ("/favicon.ico", None),
+        ("/" + 5000 * "x", None),
+    ],
+)
+def test_an_unknown_path_is_named_with_the_nearest_there_is(http: httpx.Client, path: str, near: str | None) -> None:
+    found = problem(http.get(path), 404)
+    assert path[:64] in found.detail
+    assert len(found.detail) < 400
+    if near is None:
+        assert "did you mean" not in found.detail
+    else:
+        assert found.detail.endswith(f"did you mean {near}?")
+
+
+def test_a_wrong_method_is_named_with_those_there_are(http: httpx.Client) -> None:
+    answer = http.delete("/api/v1/replays")
+    found = problem(answer, 405)
+    assert answer.headers["allow"] == "GET, POST"
+    assert "DELETE" in found.detail
+    assert "GET, POST" in found.detail
+
+
+@pytest.mark.parametrize(
+    ("query", "field"),
+    [
+        ("reports?limit=0", "limit"),
+        ("reports?limit=1001", "limit"),
+        ("reports?since_ns=yesterday", "since_ns"),
+        ("reports?before=9223372036854775808", "before"),
+        ("alarms?all=perhaps", "all"),
+        ("alarms?state=angry", "state"),
+        ("alarms/events?kind=forgotten", "kind"),
+        ("alarms/events?after=-2", "after"),
+        ("readings?quantity=colour", "quantity"),
+        ("readings?points=0", "points"),
+        ("orbits?revolutions=65", "revolutions"),
+        ("correlations?units=imperial", "units"),
+        ("detectable?change=-1", "change"),
+        ("detectable?change=nan", "change"),
+        ("alarms/events?until_ns=-1", "until_ns"),
+    ],
+)
+def test_wrong_argument_is_a_problem_that_names_it(http: httpx.Client, query: str, field: str) -> None:
+    found = problem(http.get(f"{PLACE}/{query}"), 422)
+    assert found.detail.startswith(f"{field}: Input should be")
+
+
+def test_a_change_too_small_to_be_one_is_refused(http: httpx.Client) -> None:
+    for change in ("0", "1e-300", "-9e-7"):
+        found = problem(http.get(f"{PLACE}/detectable?change={change}"), 422)
+        assert found.detail.endswith("is no change that could be found, expected at least 0.000001 up or down")
+    tiny = answered(http.get(f"{PLACE}/detectable?change=1e-6"), DetectableChanges)
+    assert all(one.length_s is not None and one.length_s > 1e6 for one in tiny.parameters)
+
+
+def test_a_misspelt_argument_is_not_passed_over(http: httpx.Client) -> None:
+    found = problem(http.get(f"{PLACE}/reports?sinse_ns=5&limit=3"), 422)
+    assert found.detail == ("sinse_ns: no argument of this route, expected one of before, limit, since_ns, until_ns")
+    assert problem(http.get("/api/v1/machines?a=1"), 422).detail == "a: no argument of this route, expected none"
+    for path in ("/healthz?a=1", "/readyz?a=1", "/?a=1"):
+        assert http.get(path).status_code == 200
+
+
+def test_unknown_alarm_in_a_filter_is_named(http: httpx.Client) -> None:
+    assert "no alarm 'nose'; there are: k_by" in problem(http.get(f"{PLACE}/alarms?name=nose"), 422).detail
+    assert "no alarm 'nose'" in problem(http.get(f"{PLACE}/alarms/events?name=nose"), 422).detail
+
+
+def test_error_inside_is_a_problem_that_tells_nothing(
+    seen: tuple[Runtime, MachineWorker], http: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("secret of the inside")
+
+    monkeypatch.setattr(seen[1], "health", fail)
+    answer = http.get(f"{PLACE}/health")
+    assert "secret" not in problem(answer, 500).model_dump_json()
+    monkeypatch.undo()
+    assert http.get(f"{PLACE}/health").status_code == 200

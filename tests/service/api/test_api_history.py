@@ -1,0 +1,264 @@
+"""The log of alarms page by page and for followers, records in JSON, and snapshots that follow the stream."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from models.commissioning.commissioned import Installed
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmState, AlarmStates, EventKind
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Health, HealthState, Quality, Report, StreamStatus
+from rotorwatch.records.history import AlarmEventList, AuditList
+from rotorwatch.records.machines import MachineDescription
+from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
+from rotorwatch.records.windows import Equation, Parameter
+from service.monitor import conversion
+from service.monitor.alarm_conversion import alarm_cloud_event
+from service.monitor.alarms.alarm import Alarm, AlarmEvent
+from service.monitor.reports import MachineHealth, identity_of, machine_hash
+from service.runtime.runtime import Runtime
+from tests.service.rig.live import LAB, START_NS, Feed, until
+from tests.service.rig.monitored import PLACE, answered, client, fed
+
+IDENTITY = identity_of(Installed(LAB))
+NAMES = ("k_by", "e", "model")
+
+
+@pytest.fixture(scope="module")
+def busy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Runtime, httpx.Client]]:
+    """A service with twelve events: three alarms are shelved and unshelved, twice."""
+    with fed(tmp_path_factory.mktemp("machine")) as (runtime, _), client(runtime) as http:
+        for _ in range(2):
+            for name in NAMES:
+                for kind in ("shelve", "unshelve"):
+                    body = {"reason": f"{kind} it", "expected_state": "normal" if kind == "shelve" else "shelved"}
+                    assert http.post(f"{PLACE}/alarms/{name}/{kind}", json=body).status_code == 200
+        yield runtime, http
+
+
+def page(http: httpx.Client, query: str) -> AlarmEventList:
+    return answered(http.get(f"{PLACE}/alarms/events?{query}"), AlarmEventList)
+
+
+def sequences(found: AlarmEventList) -> list[int]:
+    return [event.data.sequence for event in found.events]
+
+
+def test_pages_back_give_the_whole_log(busy: tuple[Runtime, httpx.Client]) -> None:
+    found, before = [], ""
+    for _ in range(3):
+        one = page(busy[1], f"limit=5{before}")
+        assert one.next_after is None
+        found += sequences(one)
+        before = f"&before={one.next_before}"
+    assert found == list(reversed(range(12)))
+    assert one.next_before is None
+
+
+def test_a_follower_gets_each_event_once(busy: tuple[Runtime, httpx.Client]) -> None:
+    found, after = [], -1
+    while (one := page(busy[1], f"limit=5&after={after}")).events:
+        assert one.next_before is None
+        found += sequences(one)
+        assert one.next_after is not None
+        after = one.next_after
+    assert found == list(range(12))
+    assert one.next_after == 11
+    # What follows is asked for with the same number.
+    assert page(busy[1], "after=11") == one
+    assert sequences(page(busy[1], "after=3&before=6")) == [4, 5]
+
+
+@pytest.mark.parametrize(
+    ("query", "expected"),
+    [
+        ("name=e", [9, 8, 3, 2]),
+        ("kind=unshelved", [11, 9, 7, 5, 3, 1]),
+        ("kind=shelved&name=model&after=-1", [4, 10]),
+        ("severity=danger", []),
+        ("severity=alert&limit=1", [11]),
+    ],
+)
+def test_events_are_filtered(busy: tuple[Runtime, httpx.Client], query: str, expected: list[int]) -> None:
+    assert sequences(page(busy[1], query)) == expected
+
+
+def test_events_are_cut_by_data_time(busy: tuple[Runtime, httpx.Client]) -> None:
+    times = [event.data.time_ns for event in page(busy[1], "after=-1").events]
+    assert times == sorted(times)
+    assert sequences(page(busy[1], f"since_ns={times[3]}&until_ns={times[7]}")) == [6, 5, 4, 3]
+
+
+def test_events_are_served_as_they_were_published(busy: tuple[Runtime, httpx.Client]) -> None:
+    runtime, http = busy
+    stored = runtime.machines()[0].history.events(after=-1)
+    assert http.get(f"{PLACE}/alarms/events?after=-1").text == (
+        f'{{"events":[{",".join(one.text for one in stored)}],"next_before":null,"next_after":11}}'
+    )
+
+
+def test_audit_log_tells_who_did_what(busy: tuple[Runtime, httpx.Client]) -> None:
+    http = busy[1]
+    newest = answered(http.get("/api/v1/audit?limit=2"), AuditList)
+    done, begun = newest.entries
+    assert (done.actor, done.method, done.status) == ("anonymous", "POST", 200)
+    assert (done.action, done.machine, done.alarm, done.reason) == ("unshelve", "demo/lab", "model", "unshelve it")
+    assert (begun.action, begun.status, begun.at_ns, begun.path) == ("started", 0, done.at_ns, done.path)
+    older = answered(http.get(f"/api/v1/audit?limit=1000&before={newest.next_before}"), AuditList)
+    assert len(older.entries) == 2 * 12 - 2
+    assert older.next_before is None
+    assert {one.alarm for one in older.entries} == {*NAMES, ""}
+    assert len(answered(http.get("/api/v1/audit?machine=demo/lab"), AuditList).entries) == 12
+    assert answered(http.get("/api/v1/audit?actor=nobody"), AuditList).entries == ()
+
+
+@pytest.mark.parametrize("model", [AlarmCloudEvent, AlarmStates, Health, MachineDescription, Report])
+def test_every_field_is_described_and_has_an_example(
+    model: type[AlarmCloudEvent] | type[AlarmStates] | type[Health] | type[MachineDescription] | type[Report],
+) -> None:
+    for name, field in model.model_fields.items():
+        assert field.description, f"{model.__name__}.{name} has no description"
+    assert model.model_validate(example(model)).model_dump(mode="json") == example(model)
+
+
+def test_infinite_and_undefined_numbers_become_null() -> None:
+    readings: list[dict[str, Any]] = [
+        {"relative_change": float("nan"), "standard_error": 0.1},
+        {"relative_change": 0.1, "standard_error": float("inf")},
+        {"reason": "no phase reference"},
+    ]
+    read = tuple(Parameter(name="k_by", text="", by="likelihood", **one) for one in readings)
+    equation = Equation(
+        equation="28", title="", evaluable=True, msd=float("inf"), msd_healthy=float("nan"), parameters=read
+    )
+    latest = Report.model_validate(
+        {
+            **example(Report),
+            "speed_rad_s": float("nan"),
+            "misfit_z": float("inf"),
+            "equations": (equation,),
+            "parameters": read,
+        }
+    )
+    health = conversion.health(
+        IDENTITY,
+        MachineHealth(HealthState.HEALTHY, 1.0, latest, (Alarm("k_by", beyond_ns=1),), Quality(), -1),
+        StreamStatus(
+            publisher_alive=False,
+            silent=False,
+            silent_since_ns=None,
+            data_age_s=None,
+            replay_announced=False,
+            descriptor_mismatch=(),
+        ),
+    )
+    text = health.model_dump_json()
+
+    def refuse(constant: str) -> None:
+        pytest.fail(f"{constant} in JSON")
+
+    fields = json.loads(text, parse_constant=refuse)
+    report = fields["report"]
+    assert report["speed_rad_s"] is None
+    assert report["misfit_z"] is None
+    assert report["equations"][0]["msd"] is None
+    assert fields["alarms"][0]["standard_error"] is None
+    assert [entry["relative_change"] for entry in report["parameters"]] == [None, 0.1, None]
+    assert [entry["standard_error"] for entry in report["parameters"]] == [0.1, None, None]
+    assert Health.model_validate_json(text) == health
+
+
+def test_no_data_is_said_beside_a_raised_alarm_and_hides_it_not() -> None:
+    state = AlarmState.UNACKNOWLEDGED
+    alarm = Alarm("k_by", state, present=True, raised_ns=5, occurrence=1, change=-0.3, standard_error=0.01)
+    latest = Report.model_validate(example(Report))
+    record = MachineHealth(HealthState.ALERT, 1.0, latest, (alarm, Alarm("e")), Quality(), 0)
+    lost = StreamStatus(
+        publisher_alive=True,
+        data_age_s=9.0,
+        silent=True,
+        silent_since_ns=1_767_225_600 * 10**9,
+        replay_announced=False,
+        descriptor_mismatch=(),
+    )
+    health = conversion.health(IDENTITY, record, lost)
+    assert health.state == "alert"
+    assert health.reason == "no data since 2026-01-01T00:00:00Z"
+    assert [(entry.name, entry.raised) for entry in health.alarms] == [("k_by", True)]
+    calm = replace(record, state=HealthState.HEALTHY, alarms=())
+    assert conversion.health(IDENTITY, calm, lost).state == "no-data"
+    flowing = lost.model_copy(update={"silent": False, "silent_since_ns": None})
+    assert conversion.health(IDENTITY, calm, flowing).state == "healthy"
+
+
+def test_event_identity_is_stable_and_differs_between_events() -> None:
+    alarm = Alarm("k_by", AlarmState.UNACKNOWLEDGED, occurrence=2)
+    same = {alarm_cloud_event(IDENTITY, AlarmEvent(EventKind.RAISED, 77, 3, alarm)).id for _ in range(2)}
+    other = alarm_cloud_event(IDENTITY, AlarmEvent(EventKind.ESCALATED, 77, 4, alarm))
+    assert len(same) == 1
+    assert other.id not in same
+    assert other.sequence > "00000000000000000003"
+    assert other.time == "1970-01-01T00:00:00.000000Z"
+
+
+def test_machine_hash_follows_the_content() -> None:
+    changed = LAB.model_copy(update={"description": "another"})
+    assert machine_hash(LAB) == IDENTITY["machine_hash"]
+    assert machine_hash(changed) != IDENTITY["machine_hash"]
+    assert len(IDENTITY["machine_hash"]) == 12
+
+
+def feed_on(runtime: Runtime, feed: Feed, blocks: int) -> None:
+    """Put blocks of 0.1 s in which the shaft turns at 22 Hz, and wait until they are taken."""
+    accepted = runtime.machines()[0].health().quality.accepted_blocks
+    theta = [one.name for one in feed.machine.sensors].index("theta")
+    for _ in range(blocks):
+        block = feed.block()
+        samples = block.samples.copy()
+        for row in range(samples.shape[0]):
+            turns = 22.0 * ((block.start_ns - START_NS) / 1e9 + row / block.rate_hz)
+            samples[row, theta] = 6.283185307 * (turns % 1.0)
+        feed.put(feed.block(samples=samples))
+        feed.sequence += 1
+        feed.start_ns = block.end_ns
+    until(lambda: runtime.machines()[0].health().quality.accepted_blocks == accepted + blocks, "blocks")
+
+
+def test_before_a_window_there_is_a_reason_instead(tmp_path: Path) -> None:
+    with fed(tmp_path) as (runtime, _), client(runtime) as http:
+        for found in (
+            answered(http.get(f"{PLACE}/correlations"), CorrelationSnapshot),
+            answered(http.get(f"{PLACE}/spectra"), SpectrumSnapshot),
+            answered(http.get(f"{PLACE}/orbits"), OrbitSnapshot),
+        ):
+            assert found.reason == "demo/lab: no window of 60 s is full yet, 0% of one is there"
+            assert found.end_ns is None
+
+
+def test_a_path_has_no_samples_from_before_a_gap(tmp_path: Path) -> None:
+    with fed(tmp_path) as (runtime, feed), client(runtime) as http:
+        feed_on(runtime, feed, 20)
+        before = answered(http.get(f"{PLACE}/orbits?revolutions=30"), OrbitSnapshot)
+        assert (before.revolutions, before.path_reason) == (30, "")
+        feed.skip()
+        begin_ns = feed.start_ns
+        feed_on(runtime, feed, 5)
+        after = answered(http.get(f"{PLACE}/orbits?revolutions=30"), OrbitSnapshot)
+        assert after.path_start_ns is not None
+        assert after.path_start_ns >= begin_ns
+        assert 9 <= after.revolutions <= 11
+        assert after.path_reason.startswith(f"{after.revolutions} of 30 revolutions: there are 0.5 s of samples")
+
+
+def test_samples_are_held_for_a_bounded_time(tmp_path: Path) -> None:
+    """20 000 samples and no more, however long the machine runs."""
+    with fed(tmp_path) as (runtime, feed):
+        feed_on(runtime, feed, 130)
+        held = runtime.machines()[0].latest.blocks
+        assert sum(block.samples.shape[0] for block in held) == 20_000
+        assert held[-1].end_ns == feed.start_ns

@@ -1,0 +1,247 @@
+"""What operators do to alarms over HTTP, and what is refused: a real service with tokens."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from rotorwatch.records.alarms import Alarm, AlarmStates
+from rotorwatch.records.history import AlarmEventList, AuditList
+from rotorwatch.records.operations import OperationDone
+from service.access.scopes import Scope
+from service.runtime.runtime import Runtime
+from tests.service.rig.live import Feed, until, worker_of
+from tests.service.rig.monitored import GUARDED, PLACE, answered, client, fed, problem, token
+
+READ, OPERATE, CONFIGURE = Scope
+GAP = f"{PLACE}/alarms/data-gap"
+
+
+@contextmanager
+def gap(folder: Path) -> Iterator[tuple[Runtime, Feed, httpx.Client]]:
+    """A gap in the stream has just raised an alarm that latches; Anna may do everything."""
+    latching = ("[alarms]", '[alarms]\nlatching = ["data-gap"]\nlongest_shelf_s = 3600.0')
+    with fed(folder, GUARDED, latching, ("off_delay_s = 60.0", "off_delay_s = 0.0")) as (runtime, feed):
+        feed.put_good()
+        feed.skip()
+        feed.put_good()
+        with client(runtime, token(runtime)) as http:
+            until(lambda: state(http) == "unacknowledged", "alarm")
+            yield runtime, feed, http
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Iterator[tuple[Runtime, Feed, httpx.Client]]:
+    with gap(tmp_path) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def untouched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """The same, for requests after which it is as it was."""
+    with gap(tmp_path_factory.mktemp("machine")) as (_, _, http):
+        yield http
+
+
+def state(http: httpx.Client) -> str:
+    return answered(http.get(GAP), Alarm).state.value
+
+
+def test_acknowledge_with_the_etag(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
+    _, _, http = plant
+    seen = http.get(GAP)
+    assert seen.headers["etag"] == f'"{answered(seen, Alarm).version}"' == '"0"'
+    answer = http.post(
+        f"{GAP}/acknowledge", json={"reason": " cable was moved "}, headers={"If-Match": seen.headers["etag"]}
+    )
+    done = answered(answer, OperationDone)
+    assert (done.alarm.state, done.alarm.version) == ("acknowledged", 1)
+    assert answer.headers["etag"] == '"1"'
+    (event,) = done.events
+    assert (event.data.kind, event.data.before, event.data.state) == ("acknowledged", "unacknowledged", "acknowledged")
+    assert (event.data.actor, event.data.reason) == ("anna", "cable was moved")
+    # What is answered is committed, and is what everybody else hears.
+    assert answered(http.get(f"{PLACE}/alarms/events?limit=1"), AlarmEventList).events == (event,)
+    assert http.get(GAP).headers["etag"] == '"1"'
+
+
+@pytest.mark.parametrize(
+    ("headers", "body"),
+    [
+        ({"If-Match": '"17"'}, {}),
+        ({"If-Match": '"-1"'}, {}),
+        ({}, {"expected_state": "normal"}),
+        ({"If-Match": '"0"'}, {"expected_state": "shelved"}),
+        ({"If-Match": '"17"'}, {"expected_state": "unacknowledged"}),
+        ({"If-Match": "*"}, {"expected_state": "acknowledged"}),
+    ],
+)
+def test_an_alarm_that_is_not_as_it_was_seen_is_left_alone(
+    untouched: httpx.Client, headers: dict[str, str], body: dict[str, str]
+) -> None:
+    http = untouched
+    found = problem(http.post(f"{GAP}/acknowledge", json=body, headers=headers), 409)
+    assert found.detail.startswith("data-gap is unacknowledged (version 0), not as it was seen (")
+    assert found.detail.endswith("): look again")
+    assert state(http) == "unacknowledged"
+
+
+def test_each_way_of_saying_how_it_was_seen(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
+    _, _, http = plant
+    by_state = {"expected_state": "unacknowledged"}
+    for match, body in (('"{}"', {}), ('W/"{}"', {}), ("*", {}), ("", by_state), ('"{}"', by_state)):
+        seen = answered(http.get(GAP), Alarm)
+        headers = {"If-Match": match.format(seen.version)} if match else {}
+        done = answered(http.post(f"{GAP}/acknowledge", json=body, headers=headers), OperationDone)
+        assert (seen.state, done.alarm.state, state(http)) == ("unacknowledged", "acknowledged", "acknowledged")
+        for order in ("remove-from-service", "return-to-service"):  # after which nobody has acknowledged it
+            again = {"reason": "x", "expected_state": answered(http.get(GAP), Alarm).state}
+            answered(http.post(f"{GAP}/{order}", json=again), OperationDone)
+
+
+def test_of_two_operators_at_once_one_is_told_to_look_again(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
+    runtime, _, http = plant
+    names = [f"operator {number}" for number in range(8)]
+    both = threading.Barrier(len(names))
+    statuses: list[int] = []
+
+    def acknowledge(text: str) -> None:
+        with client(runtime, text) as own:
+            both.wait()
+            statuses.append(own.post(f"{GAP}/acknowledge", json={}, headers={"If-Match": '"0"'}).status_code)
+
+    threads = [threading.Thread(target=acknowledge, args=(token(runtime, READ, OPERATE, name=name),)) for name in names]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(statuses) == [200] + [409] * 7
+    assert answered(http.get(f"{PLACE}/alarms"), AlarmStates).sequence == 1
+
+
+def test_shelving_and_its_end(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
+    _, _, http = plant
+    body = {"reason": "sensor is being replaced", "duration_s": 600, "one_shot": True}
+    done = answered(http.post(f"{GAP}/shelve", json=body, headers={"If-Match": '"0"'}), OperationDone)
+    assert done.alarm.state == "shelved"
+    assert done.alarm.shelf is not None
+    assert (done.alarm.shelf.by, done.alarm.shelf.reason, done.alarm.shelf.one_shot) == ("anna", body["reason"], True)
+    assert done.alarm.shelf.until_ns - done.events[0].data.time_ns == 600e9
+    refused = problem(http.post(f"{GAP}/acknowledge", json={"expected_state": "shelved"}), 409)
+    assert refused.detail.startswith("data-gap is shelved: acknowledge is not possible")
+    done = answered(http.post(f"{GAP}/unshelve", json={"expected_state": "shelved"}), OperationDone)
+    assert (done.alarm.state, done.alarm.shelf) == ("unacknowledged", None)
+
+
+def test_latched_alarms_are_reset_and_out_of_service_is_for_who_configures(
+    plant: tuple[Runtime, Feed, httpx.Client],
+) -> None:
+    runtime, feed, http = plant
+    for _ in range(130):  # until a hop is complete: then the data are without gaps again
+        feed.put_good()
+    until(lambda: state(http) == "latched-unacknowledged", "end of the gap")
+    answered(http.post(f"{GAP}/acknowledge", json={"expected_state": "latched-unacknowledged"}), OperationDone)
+    done = answered(http.post(f"{GAP}/reset", json={"expected_state": "latched-acknowledged"}), OperationDone)
+    assert done.alarm.state == "normal"
+    body = {"reason": "no phase reference is fitted", "expected_state": "normal"}
+    place = f"{PLACE}/alarms/data-phase-reference"
+    with client(runtime, token(runtime, READ, OPERATE, name="ben")) as operator:
+        assert (
+            "needs the scope configure" in problem(operator.post(f"{place}/remove-from-service", json=body), 403).detail
+        )
+        assert (
+            "needs the scope configure" in problem(operator.post(f"{place}/return-to-service", json=body), 403).detail
+        )
+    done = answered(http.post(f"{place}/remove-from-service", json=body), OperationDone)
+    assert (done.alarm.state, done.alarm.out_of_service_by) == ("out-of-service", "anna")
+    assert done.alarm.out_of_service_reason == body["reason"]
+    done = answered(http.post(f"{place}/return-to-service", json={"expected_state": "out-of-service"}), OperationDone)
+    assert done.alarm.state == "normal"
+
+
+def test_an_alarm_that_never_was_can_be_shelved(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
+    _, _, http = plant
+    seen = http.get(f"{PLACE}/alarms/c_bz")
+    done = answered(
+        http.post(f"{PLACE}/alarms/c_bz/shelve", json={"reason": "x"}, headers={"If-Match": seen.headers["etag"]}),
+        OperationDone,
+    )
+    assert done.alarm.shelf is not None
+    assert done.alarm.shelf.until_ns - done.events[0].data.time_ns == 3600e9
+
+
+@pytest.mark.parametrize(
+    ("path", "headers", "body", "status", "text"),
+    [
+        ("data-gap/acknowledge", {}, {}, 428, "say how you saw the alarm"),
+        ("data-gap/acknowledge", {}, {"expected_state": "angry"}, 422, "expected_state: Input should be"),
+        ("data-gap/acknowledge", {"If-Match": "0"}, {}, 422, "If-Match: String should match"),
+        ("data-gap/acknowledge", {"If-Match": '"0", "1"'}, {}, 422, "If-Match: String should match"),
+        ("data-gap/acknowledge", {"If-Match": "*"}, {"duration_s": 5}, 422, "duration_s: Extra inputs"),
+        ("data-gap/acknowledge", {"If-Match": "*"}, {"reason": "a\u0000b"}, 422, "reason: String should match"),
+        ("data-gap/acknowledge", {"If-Match": "*"}, {"reason": "x" * 501}, 422, "reason: String should have at most"),
+        ("data-gap/acknowledge", {"If-Match": "*"}, [], 422, "body: Input should be"),
+        ("data-gap/shelve", {"If-Match": "*"}, {}, 422, "reason: Field required"),
+        ("data-gap/shelve", {"If-Match": "*"}, {"reason": "  "}, 422, "reason: String should match"),
+        ("data-gap/shelve", {"If-Match": "*"}, {"reason": "x", "duration_s": 0}, 422, "duration_s: Input should be"),
+        (
+            "data-gap/shelve",
+            {"If-Match": "*"},
+            {"reason": "x", "duration_s": 3601},
+            409,
+            "shelve of data-gap: duration_s is 3601, expected more than 0 and at most 3600",
+        ),
+        ("data-gap/unshelve", {"If-Match": "*"}, {}, 409, "data-gap is unacknowledged: unshelve is not possible"),
+        ("data-gap/reset", {"If-Match": "*"}, {}, 409, "data-gap is unacknowledged: reset is not possible"),
+        ("k_by/acknowledge", {"If-Match": "*"}, {}, 409, "k_by is normal: acknowledge is not possible"),
+        ("nose/acknowledge", {"If-Match": "*"}, {}, 404, "no alarm nose; there are: k_by, c_by"),
+        ("events/acknowledge", {"If-Match": "*"}, {}, 404, "no alarm events; there are:"),
+    ],
+)
+def test_orders_that_cannot_be_followed_are_explained(
+    untouched: httpx.Client, path: str, headers: dict[str, str], body: Any, status: int, text: str
+) -> None:
+    http = untouched
+    assert problem(http.post(f"{PLACE}/alarms/{path}", json=body, headers=headers), status).detail.startswith(text)
+    assert answered(http.get(f"{PLACE}/alarms"), AlarmStates).sequence == 0
+
+
+def test_bodies_that_are_none_are_problems(untouched: httpx.Client) -> None:
+    http = untouched
+    json = {"content-type": "application/json", "if-match": "*"}
+    problem(http.post(f"{GAP}/acknowledge", content=b"{", headers=json), 422)
+    problem(http.post(f"{GAP}/acknowledge", content=b"\xff{}", headers=json), 400)
+    problem(http.post(f"{GAP}/acknowledge", content=b"", headers=json), 422)
+    problem(http.post(f"{GAP}/acknowledge", content=b'{"reason":"\\ud800"}', headers=json), 422)
+    problem(http.post(f"{GAP}/acknowledge", content=b"{}", headers={"if-match": "*"}), 415)
+    problem(http.post(f"{GAP}/acknowledge", content=b" " * 1_000_001, headers=json), 413)
+    assert state(http) == "unacknowledged"
+
+
+def test_what_was_done_and_what_was_refused_is_in_the_audit_log(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
+    runtime, _, http = plant
+    with client(runtime, token(runtime, READ, name="screen")) as screen:
+        problem(screen.post(f"{GAP}/acknowledge", json={}, headers={"If-Match": "*"}), 403)
+    problem(http.post(f"{GAP}/acknowledge", json={"reason": "late"}, headers={"If-Match": '"9"'}), 409)
+    answered(http.post(f"{GAP}/acknowledge", json={"reason": "seen"}, headers={"If-Match": '"0"'}), OperationDone)
+    entries = answered(http.get("/api/v1/audit"), AuditList).entries
+    assert [(one.actor, one.status, one.action, one.machine, one.alarm, one.reason) for one in entries] == [
+        ("anna", 200, "acknowledge", "demo/lab", "data-gap", "seen"),
+        ("anna", 0, "started", "", "", ""),
+        ("anna", 409, "acknowledge", "demo/lab", "data-gap", "late"),
+        ("anna", 0, "started", "", "", ""),
+        ("screen", 403, "", "", "", "this needs the scope operate; screen has read"),
+    ]
+
+
+def test_a_monitor_that_is_being_stopped_says_so(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
+    runtime, _, http = plant
+    worker_of(runtime).stop()
+    found = problem(http.post(f"{GAP}/acknowledge", json={}, headers={"If-Match": "*"}), 503)
+    assert found.detail == "demo/lab: the monitor is being stopped"
+    found = problem(http.get("/readyz"), 503)
+    assert (found.model_extra or {})["machines"][0]["worker_alive"] is False

@@ -1,0 +1,409 @@
+"""The client against a running service with tokens: what it reads, what it does, and how it goes on after a loss.
+
+One that a generator of others makes out of the description works too; by hand the same was done with
+``openapi-typescript``.
+"""
+
+import importlib
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import trustme
+
+from rotorwatch import (
+    AccessRefused,
+    Client,
+    ClientError,
+    Conflict,
+    LogReplaced,
+    NoAnswer,
+    NotFound,
+    RequestRefused,
+    ServiceEvent,
+)
+from rotorwatch.client import errors
+from service.access.scopes import Scope
+from service.monitor.conversion import machine_description
+from service.runtime.runtime import Runtime, running
+from service.settings.access import AccessSettings, HttpTlsSettings
+from service.settings.service import HistorySettings, HttpSettings, ServiceSettings
+from service.stream.worker import MachineWorker
+from tests.service.rig.live import IN_ORDER, ROOT, Feed, endpoint, machine_file, open_session, settings, until
+from tests.service.rig.monitored import GUARDED, OPEN, client, faulty, fed, token
+
+PLACE = "demo/lab"
+PAGE = (ROOT / "docs" / "client.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Runtime, MachineWorker]]:
+    with faulty(tmp_path_factory.mktemp("machine"), GUARDED) as found:
+        yield found
+
+
+@pytest.fixture
+def plant(seen: tuple[Runtime, MachineWorker]) -> Iterator[Client]:
+    with Client(seen[0].http_url, _token(seen[0])) as client:
+        yield client
+
+
+_TOKENS: dict[int, str] = {}
+
+
+def _token(runtime: Runtime) -> str:
+    """One token for all tests of a service: names are taken only once."""
+    if id(runtime) not in _TOKENS:
+        _TOKENS[id(runtime)] = token(runtime)
+    return _TOKENS[id(runtime)]
+
+
+def test_what_there_is(plant: Client, seen: tuple[Runtime, MachineWorker]) -> None:
+    _, worker = seen
+    (machine,) = plant.machines()
+    assert machine == plant.machine(PLACE)
+    assert machine == machine_description(worker.identity, worker.machine, worker.health().state)
+    assert plant.configuration(PLACE).machine_hash == worker.identity["machine_hash"]
+    assert plant.health(PLACE).report == worker.health().report is not None
+    assert plant.detectable(PLACE, -0.05) == worker.detectable(-0.05)
+
+
+def test_alarms_and_their_log(plant: Client, seen: tuple[Runtime, MachineWorker]) -> None:
+    _, worker = seen
+    assert plant.alarms(PLACE) == worker.alarms()
+    everything = plant.alarms(PLACE, everything=True)
+    assert everything == worker.alarms(include_normal=True)
+    raised = plant.alarm(PLACE, "k_by")
+    assert raised in everything.alarms
+    assert plant.alarms(PLACE, states=[raised.state], names=["k_by", "e"]).alarms == (raised,)
+    assert plant.alarm(PLACE, "level:y1_dot").name == "level:y1_dot"
+    assert plant.alarms(PLACE, names=["e"]).alarms == tuple(one for one in everything.alarms if one.name == "e")
+    forwards = list(plant.alarm_events(PLACE, after=-1))
+    assert [event.data.sequence for event in forwards] == list(range(everything.sequence + 1))
+    assert list(plant.alarm_events(PLACE)) == forwards[::-1]
+    assert list(plant.alarm_events(PLACE, after=0)) == forwards[1:]
+    assert list(plant.alarm_events(PLACE, name="c_by")) == [e for e in forwards[::-1] if e.data.name == "c_by"]
+
+
+def test_pages_are_put_together(
+    plant: Client, seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reports, forwards = list(plant.reports(PLACE)), list(plant.alarm_events(PLACE, after=-1))
+    assert len(reports) == seen[1].tally.windows > 10
+    monkeypatch.setattr("rotorwatch.client.client._PAGE", 3)
+    assert list(plant.reports(PLACE)) == reports
+    end_ns = [report.end_ns for report in reports]
+    assert [r.end_ns for r in plant.reports(PLACE, since_ns=end_ns[8], until_ns=end_ns[1])] == end_ns[2:9]
+    monkeypatch.setattr("rotorwatch.client.client._PAGE", 1)
+    assert list(plant.alarm_events(PLACE, after=-1)) == forwards
+    assert list(plant.alarm_events(PLACE)) == forwards[::-1]
+    entries = list(plant.audit())
+    assert [entry.number for entry in entries] == sorted((entry.number for entry in entries), reverse=True)
+
+
+def test_readings_over_time(plant: Client) -> None:
+    readings = list(plant.readings(PLACE, "parameter", "k_by"))
+    shown = [r.parameters[0].relative_change for r in plant.reports(PLACE) if r.parameters]
+    assert [reading.value for reading in readings] == shown[::-1]
+    (bucket,) = plant.trend(PLACE, "parameter", ["k_by"], points=1)
+    assert bucket.count == len(readings)
+    assert bucket.minimum == min(reading.value for reading in readings)
+    assert {one.name for one in plant.trend(PLACE, "parameter", points=2)} >= {"k_by", "e", "EI"}
+    assert len(list(plant.readings(PLACE, "speed"))) == len(readings)
+
+
+def test_snapshots(plant: Client) -> None:
+    (pair,) = plant.correlations(PLACE, [("y1", "z1")]).pairs
+    assert (pair.first, pair.second) == ("y1", "z1")
+    spectra = plant.spectra(PLACE, ["y1", "y2"], from_hz=10.0, to_hz=50.0)
+    assert [density.channel for density in spectra.densities] == ["y1", "y2"]
+    orbits = plant.orbits(PLACE, revolutions=2)
+    assert len(orbits.orbits) == 2
+
+
+@pytest.mark.parametrize(
+    ("ask", "kind", "told"),
+    [
+        (lambda plant: plant.health("demo/pump"), NotFound, "no machine demo/pump; there are: demo/lab"),
+        (lambda plant: plant.alarm(PLACE, "level:a.b"), NotFound, "no alarm level:a.b; there are: k_by"),
+        (lambda plant: plant.alarm(PLACE, "k_bx"), NotFound, "no alarm k_bx; there are: k_by"),
+        (lambda plant: plant.detectable(PLACE, -2.0), RequestRefused, "change: Input should be greater than -1"),
+        (lambda plant: plant.health("demo/../../audit"), ClientError, "expected a machine as site/machine"),
+        (lambda plant: plant.alarm(PLACE, "../health"), ClientError, "expected a name of letters"),
+        (lambda plant: plant.health("lab"), ClientError, "expected a machine as site/machine"),
+        (lambda plant: next(plant.events("demo/pump")), NotFound, "no machine demo/pump; there are: demo/lab"),
+        (lambda plant: next(plant.events(after="x")), RequestRefused, "is not site/machine=sequence"),
+        (lambda plant: next(plant.events(after="demo/lab=900")), LogReplaced, "the log of demo/lab ends at"),
+    ],
+)
+def test_refusals_are_exceptions_with_the_services_words(
+    plant: Client, ask: Any, kind: type[Exception], told: str
+) -> None:
+    with pytest.raises(ClientError) as caught:
+        ask(plant)
+    assert type(caught.value) is kind
+    assert told in str(caught.value)
+
+
+def test_tokens(seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyPatch) -> None:
+    runtime, _ = seen
+    monkeypatch.delenv("ROTORWATCH_TOKEN", raising=False)
+    with Client(runtime.http_url) as stranger:
+        with pytest.raises(AccessRefused) as caught:
+            stranger.machines()
+        assert caught.value.status == 401
+        with pytest.raises(AccessRefused, match="an access token is needed"):
+            next(stranger.events())
+    with Client(runtime.http_url, "rw_000000000000_" + 43 * "0") as mistaken:
+        with pytest.raises(AccessRefused, match="not valid") as caught:
+            mistaken.machines()
+        assert caught.value.status == 401
+    monkeypatch.setenv("ROTORWATCH_TOKEN", _token(runtime) + "\n")
+    with Client(runtime.http_url) as known:
+        assert len(known.machines()) == 1
+        alarm = known.alarm(PLACE, "k_by")
+    with pytest.raises(ClientError, match="on one line") as refused:
+        Client(runtime.http_url, "rw_1\nrw_2")
+    assert "rw_1" not in str(refused.value)
+    with Client(runtime.http_url, token(runtime, Scope.READ, name="screen")) as screen:
+        with pytest.raises(AccessRefused) as caught:
+            screen.acknowledge(PLACE, alarm)
+        assert caught.value.status == 403
+        assert "screen has read" in str(caught.value)
+
+
+def test_nobody_there() -> None:
+    url = endpoint().replace("tcp/", "http://")
+    with Client(url, "rw_x") as plant:
+        with pytest.raises(NoAnswer, match=url):
+            plant.machines()
+        with pytest.raises(NoAnswer, match=url):
+            next(plant.events())
+
+
+# Services that are fed by hand
+
+
+@contextmanager
+def gapped(plan: ServiceSettings, *, feed_it: bool = True) -> Iterator[Runtime]:
+    """A service with a gap in its stream, which is an alarm at once."""
+    with running(plan) as runtime:
+        if feed_it:
+            with open_session(plan.link.listen[0]) as session:
+                feed = Feed(session)
+                feed.put_good()
+                feed.skip()
+                feed.put_good()
+                until(lambda: runtime.machines()[0].alarms().sequence >= 0, "alarm")
+        yield runtime
+
+
+def plan(folder: Path, **changes: object) -> ServiceSettings:
+    latching = ("[alarms]", '[alarms]\nlatching = ["data-gap"]')
+    made = settings(endpoint(), machine_file(folder, IN_ORDER, latching), when_full="wait")
+    return made.model_copy(update=changes)
+
+
+def test_operators_work(tmp_path: Path) -> None:
+    with gapped(plan(tmp_path)) as runtime, Client(runtime.http_url, "") as plant:
+        first = plant.alarm(PLACE, "data-gap")
+        done = plant.acknowledge(PLACE, first, "cable was moved")
+        assert (done.alarm.state, done.events[0].data.reason) == ("acknowledged", "cable was moved")
+        with pytest.raises(Conflict, match="not as it was seen"):
+            plant.shelve(PLACE, first, "by somebody who saw it earlier")
+        done = plant.shelve(PLACE, done.alarm, "is being repaired", duration_s=60.0, one_shot=True)
+        assert done.alarm.shelf is not None
+        assert (done.alarm.shelf.one_shot, done.alarm.shelf.reason) == (True, "is being repaired")
+        done = plant.unshelve(PLACE, done.alarm)
+        with pytest.raises(Conflict, match="data-gap"):  # not latched: the condition is there
+            plant.reset(PLACE, done.alarm, "too early")
+        done = plant.remove_from_service(PLACE, done.alarm, "for good")
+        done = plant.return_to_service(PLACE, done.alarm, "after all")
+        kinds = [event.data.kind for event in plant.alarm_events(PLACE, after=first.version)]
+        assert kinds == ["acknowledged", "shelved", "unshelved", "removed-from-service", "returned-to-service"]
+
+
+def test_events_go_on_after_a_restart(tmp_path: Path) -> None:
+    """The service stops, comes back on the same port with its history, and goes on: each event once, in order."""
+    port = int(endpoint().rsplit(":", 1)[1])
+    history = HistorySettings(url=f"sqlite:///{tmp_path / 'history.sqlite'}")
+    kept = plan(tmp_path, history=history, http=HttpSettings(port=port), access=OPEN)
+    heard: list[ServiceEvent] = []
+    errors: list[Exception] = []
+
+    def listen(plant: Client) -> None:
+        try:
+            for event in plant.events(PLACE, from_beginning=True):
+                if event.alarm is not None:
+                    heard.append(event)
+        except ClientError as error:
+            errors.append(error)
+
+    def work(plant: Client) -> None:
+        alarm = plant.alarm(PLACE, "data-gap")
+        for _ in range(3):
+            alarm = plant.remove_from_service(PLACE, alarm, "away").alarm
+            alarm = plant.return_to_service(PLACE, alarm, "back").alarm
+
+    with Client(f"http://127.0.0.1:{port}", "") as plant, Client(f"http://127.0.0.1:{port}", "") as other:
+        listener = threading.Thread(target=listen, args=(plant,), daemon=True)
+        with gapped(kept):
+            listener.start()
+            until(lambda: len(heard) >= 1, "the first event")
+            work(other)
+        with gapped(kept, feed_it=False) as runtime:
+            work(other)
+            latest = runtime.machines()[0].alarms().sequence
+            until(lambda: errors != [] or heard[-1].cursor == f"{PLACE}={latest}", "all events")
+            # Another listener, with the cursor of one of them.
+            later = plant_events_after(other, heard[4].cursor, latest - 4)
+        with gapped(plan(tmp_path, http=HttpSettings(port=port), access=OPEN), feed_it=False):
+            listener.join(180.0)  # a history without these events
+    assert [event.alarm.data.sequence for event in heard if event.alarm] == list(range(latest + 1))
+    assert later == heard[5:]
+    assert [type(error) for error in errors] == [LogReplaced]
+
+
+def plant_events_after(plant: Client, cursor: str, count: int) -> list[ServiceEvent]:
+    stream = (event for event in plant.events(PLACE, after=cursor) if event.alarm is not None)
+    return [next(stream) for _ in range(count)]
+
+
+def test_encrypted(tmp_path: Path) -> None:
+    authority = trustme.CA()
+    issued = authority.issue_cert("127.0.0.1")
+    certificate, key, ca = (tmp_path / name for name in ("service.pem", "service.key", "ca.pem"))
+    certificate.write_bytes(b"".join(blob.bytes() for blob in issued.cert_chain_pems))
+    key.write_bytes(issued.private_key_pem.bytes())
+    key.chmod(0o600)
+    authority.cert_pem.write_to_path(str(ca))
+    tls = HttpTlsSettings(certificate=certificate, key=key)
+    with running(plan(tmp_path, access=AccessSettings(tls=tls))) as runtime:
+        text = token(runtime)
+        with Client(runtime.http_url, text, ca=ca) as plant:
+            assert plant.health(PLACE).state == "warming"
+        with Client(runtime.http_url, text) as plant, pytest.raises(NoAnswer, match="certificate"):
+            plant.health(PLACE)
+    with pytest.raises(ClientError, match=r"nowhere\.pem"):
+        Client("https://127.0.0.1", ca=tmp_path / "nowhere.pem")
+
+
+# The page
+
+
+def code(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGE, flags=re.DOTALL)
+
+
+def test_examples_in_the_page_run(
+    seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any
+) -> None:
+    """In the order of the page, Python and shell mixed, as a reader would try them."""
+    runtime, worker = seen
+    assert shutil.which("curl")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ROTORWATCH_TOKEN", _token(runtime))
+    known: dict[str, Any] = {}
+    link = runtime.settings.link.listen[0]
+    for language, text in re.findall(r"```(python|sh)\n(.*?)```", PAGE, flags=re.DOTALL):
+        here = text.replace("http://127.0.0.1:8080", runtime.http_url).replace("tcp/127.0.0.1:7447", link)
+        if language == "python":
+            exec(compile(here, "docs/client.md", "exec"), known)  # noqa: S102  # our own page
+            continue
+        done = subprocess.run(["bash", "-c", here], env={**os.environ}, capture_output=True, text=True, check=False)
+        streams = "--max-time" in here
+        assert done.returncode == (28 if streams else 0), done.stderr
+        assert ("event: alarm" in done.stdout) if streams else done.stdout.startswith("{")
+    printed = capsys.readouterr().out
+    assert "demo lab alert" in printed
+    assert "shelved" in printed
+    assert known["cursor"] == f"{PLACE}=0"
+    (line,) = (tmp_path / "alarms.jsonl").read_text().splitlines()
+    assert worker.history.events(limit=1)[0].text == line
+    known["plant"].close()
+
+
+def test_the_page_names_every_method_and_error() -> None:
+    methods = [name for name in vars(Client) if not name.startswith("_")]
+    for name in methods:
+        assert name == "close" or f"`{name}(" in PAGE or f"`{name}`" in PAGE, f"docs/client.md does not mention {name}"
+    for name in (name for name, found in vars(errors).items() if isinstance(found, type)):
+        assert f"| `{name}` |" in PAGE
+
+
+PACKAGE = "generated_rotorwatch"
+
+
+@pytest.fixture(scope="module")
+def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
+    with fed(tmp_path_factory.mktemp("machine"), GUARDED) as (running, _):
+        yield running
+
+
+@pytest.fixture(scope="module")
+def generated(runtime: Runtime, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ModuleType]:
+    """The generated package; a warning of the generator is a failure."""
+    folder = tmp_path_factory.mktemp("generated")
+    with client(runtime, token(runtime, Scope.READ, name="generator")) as http:
+        (folder / "openapi.json").write_bytes(http.get("/openapi.json").raise_for_status().content)
+    (folder / "config.json").write_text(json.dumps({"post_hooks": []}), encoding="utf-8")  # nobody reads it
+    options = ["--path", "openapi.json", "--config", "config.json", "--output-path", PACKAGE, "--meta", "none"]
+    done = subprocess.run(
+        [sys.executable, "-m", "openapi_python_client", "generate", *options, "--fail-on-warning"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "WARNING" not in done.stdout + done.stderr
+    sys.path.insert(0, str(folder))
+    try:
+        yield importlib.import_module(PACKAGE)
+    finally:
+        sys.path.remove(str(folder))
+        for name in [one for one in sys.modules if one.startswith(PACKAGE)]:
+            del sys.modules[name]
+
+
+def test_a_generated_client_asks_orders_and_understands_refusals(generated: ModuleType, runtime: Runtime) -> None:
+    def operation(name: str) -> ModuleType:
+        return importlib.import_module(f"{PACKAGE}.api.{name}")
+
+    models = importlib.import_module(f"{PACKAGE}.models")
+    own = {"base_url": runtime.http_url, "httpx_args": {"trust_env": False}}
+    with generated.AuthenticatedClient(token=token(runtime, name="integrator"), **own) as plant:
+        (found,) = operation("machines.machines").sync(client=plant).machines
+        assert (found.site, found.machine) == ("demo", "lab")
+        health = operation("machines.health").sync("demo", "lab", client=plant)
+        assert isinstance(health, models.Health)
+        assert health.state == models.HealthState.WARMING
+        ready = operation("service.readyz").sync(client=plant)
+        assert isinstance(ready, models.Readiness)
+        assert ready.ready
+
+        order = models.ShelveOrder(reason="sensor is replaced", expected_state=models.AlarmState.NORMAL)
+        done = operation("alarms.shelve").sync("demo", "lab", "k_by", client=plant, body=order)
+        assert isinstance(done, models.OperationDone)
+        assert done.alarm.state == models.AlarmState.SHELVED
+        again = operation("alarms.shelve").sync_detailed("demo", "lab", "k_by", client=plant, body=order)
+        assert (again.status_code, again.parsed.status) == (409, 409)
+
+        unknown = operation("machines.health").sync("demo", "pump", client=plant)
+        assert isinstance(unknown, models.Problem)
+        assert (unknown.status, unknown.title) == (404, "Not Found")
+        assert "demo/lab" in unknown.detail
+    with generated.AuthenticatedClient(token="rw_000000000000_" + 43 * "0", **own) as stranger:
+        refused = operation("machines.machines").sync(client=stranger)
+        assert isinstance(refused, models.Problem)
+        assert refused.status == 401

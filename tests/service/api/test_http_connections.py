@@ -1,0 +1,238 @@
+"""Connections that keep the HTTP server waiting are ended and keep nobody away: a real monitor, real sockets."""
+
+import json
+import os
+import resource
+import select
+import socket
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+import httpx
+import pytest
+import trustme
+from fastapi import FastAPI
+from structlog.testing import capture_logs
+
+from service.api.server import HttpServer, http_connections
+from service.runtime.runtime import Runtime, running
+from service.settings.access import AccessSettings, LimitSettings
+from service.settings.service import HttpSettings
+from tests.service.access.test_access_tokens import files, trusting
+from tests.service.rig.live import OPEN, endpoint, program, settings, until
+
+HEAD = b"GET /healthz HTTP/1.1\r\nhost: 127.0.0.1\r\n"
+SHELVE = (
+    b"POST /api/v1/machines/demo/lab/alarms/k_by/shelve HTTP/1.1\r\nhost: 127.0.0.1\r\n"
+    b"content-type: application/json\r\ncontent-length: 500\r\n\r\n"
+)
+DESCRIPTION = b"GET /openapi.json HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n"
+EVENTS = b"GET /api/v1/events HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n"
+
+
+@contextmanager
+def monitor(access: AccessSettings = OPEN, **http: float) -> Iterator[Runtime]:
+    plan = settings(endpoint())
+    http_settings = HttpSettings.model_validate({"port": 0, **http})
+    with running(plan.model_copy(update={"access": access, "http": http_settings})) as runtime:
+        yield runtime
+
+
+@contextmanager
+def connections(url: str, count: int, sends: bytes = b"") -> Iterator[list[socket.socket]]:
+    """So many connections that have sent something and wait."""
+    place = httpx.URL(url)
+    with ExitStack() as opened:
+        found = []
+        for _ in range(count):
+            one = opened.enter_context(socket.create_connection((place.host, place.port or 0), timeout=180))
+            one.sendall(sends)
+            found.append(one)
+        yield found
+
+
+def over(connection: socket.socket) -> bool:
+    """Whether the server has ended a connection; reads what has arrived."""
+    try:
+        while select.select([connection], [], [], 0)[0]:
+            if not connection.recv(65536):
+                return True
+    except ConnectionError:
+        return True
+    return False
+
+
+def healthy(url: str) -> bool:
+    return httpx.get(f"{url}/healthz", trust_env=False, timeout=180.0).status_code == 200
+
+
+def trickle(slow: Sequence[socket.socket]) -> bool:
+    """Send one byte more on each that is open; whether all are over."""
+    for one in slow:
+        with suppress(OSError):
+            one.send(b"x")
+    return all(over(one) for one in slow)
+
+
+def test_requests_whose_head_never_ends_are_ended() -> None:
+    with monitor(head_timeout_s=0.5) as runtime, ExitStack() as opened:
+        url = runtime.http_url
+        silent = opened.enter_context(connections(url, 10))
+        slow = [opened.enter_context(connections(url, 10, sends)) for sends in (b"GET / HT", HEAD, HEAD + b"x-slow: ")]
+        until(lambda: all(map(over, silent)), "end of those who said nothing")
+        until(lambda: all(map(trickle, slow)), "end of all half-open requests")
+        assert healthy(url)
+
+
+@pytest.mark.parametrize("access", [OPEN, AccessSettings()], ids=["awaited", "refused before"])
+def test_requests_whose_body_never_ends_are_ended(access: AccessSettings) -> None:
+    with monitor(access, body_timeout_s=0.5) as runtime, connections(runtime.http_url, 20, SHELVE) as waiting:
+        until(lambda: trickle(waiting), "end of all slow bodies")
+        assert runtime.machines()[0].history.last_sequence() == -1
+
+
+def test_streams_and_regular_callers_go_on() -> None:
+    """While others are ended, whoever is being answered stays, and so does whoever asks now and then."""
+    with (
+        monitor(head_timeout_s=1, body_timeout_s=1, send_timeout_s=1) as runtime,
+        connections(runtime.http_url, 3, EVENTS) as streams,
+        httpx.Client(base_url=runtime.http_url, trust_env=False, timeout=180.0) as client,
+    ):
+        for _ in range(2):
+            with connections(runtime.http_url, 5, HEAD) as waiting:
+                until(lambda: client.get("/healthz").is_success and all(map(over, waiting)), "end of the half-open")
+        assert not any(map(over, streams))
+
+
+def test_whoever_takes_nothing_of_an_answer_is_cut_off() -> None:
+    with monitor(send_timeout_s=0.5) as runtime:
+        place = httpx.URL(runtime.http_url)
+        with socket.socket() as reader, socket.socket() as steady:
+            for one in (reader, steady):
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+                one.connect((place.host, place.port))
+                one.sendall(DESCRIPTION * 40)
+            taken = 0
+
+            def cut_off() -> bool:
+                nonlocal taken
+                steady.setblocking(False)
+                with suppress(BlockingIOError):
+                    taken += len(steady.recv(65536))
+                # What is sent into a connection that was reset fails; nothing is taken from it meanwhile.
+                return reader.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) != 0
+
+            until(cut_off, "end of the reader that stopped")
+            assert steady.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) == 0
+            assert taken
+
+
+def test_half_open_requests_make_room_for_others() -> None:
+    """Nobody waits for them to run out of time: the one that has waited longest goes when somebody else comes."""
+    with (
+        monitor(connections_per_address=8, head_timeout_s=600) as runtime,
+        connections(runtime.http_url, 60, HEAD) as waiting,
+    ):
+        assert healthy(runtime.http_url)
+        until(lambda: sum(not over(one) for one in waiting) <= 8, "all but the latest to be ended")
+        assert not over(waiting[-1])
+
+
+def test_no_more_connections_than_the_settings_say() -> None:
+    with monitor(connections=3) as runtime, connections(runtime.http_url, 3, EVENTS) as streams:
+        for one in streams:
+            assert one.recv(15) == b"HTTP/1.1 200 OK"
+        with capture_logs() as lines:
+            for _ in range(5):
+                refused = httpx.get(f"{runtime.http_url}/healthz", trust_env=False, timeout=180.0)
+                assert refused.status_code == 503
+                assert refused.headers["content-type"] == "application/problem+json"
+                assert int(refused.headers["retry-after"]) >= 1
+                assert refused.json()["status"] == 503
+        assert len([line for line in lines if line["log_level"] == "warning"]) == 1
+        streams[0].close()
+        until(lambda: httpx.get(f"{runtime.http_url}/healthz", trust_env=False).status_code == 200, "room")
+        assert not any(map(over, streams[1:]))
+
+
+def test_readers_that_stop_make_room_for_others() -> None:
+    """Not at once, but long before their time is over."""
+    with monitor(connections=3, send_timeout_s=3600) as runtime, ExitStack() as opened:
+        place = httpx.URL(runtime.http_url)
+        for _ in range(3):
+            one = opened.enter_context(socket.socket())
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            one.connect((place.host, place.port))
+            one.sendall(DESCRIPTION * 40)
+        until(lambda: httpx.get(f"{runtime.http_url}/healthz", trust_env=False).status_code == 200, "room")
+
+
+def test_a_proxy_may_have_more_connections_than_others() -> None:
+    access = AccessSettings(proxies=("127.0.0.0/24",), limits=LimitSettings())
+    with (
+        monitor(access, connections_per_address=2, head_timeout_s=600) as runtime,
+        connections(runtime.http_url, 10, HEAD) as waiting,
+    ):
+        assert healthy(runtime.http_url)
+        assert not any(map(over, waiting))
+
+
+def test_handshakes_that_never_end_make_room_for_others(tmp_path: Path) -> None:
+    authority = trustme.CA()
+    access = AccessSettings(tls=files(tmp_path, authority))
+    with (
+        monitor(access, connections_per_address=8, head_timeout_s=0.5) as runtime,
+        connections(runtime.http_url, 30) as waiting,
+    ):
+        url = f"{runtime.http_url}/healthz"
+        assert httpx.get(url, verify=trusting(authority), trust_env=False, timeout=180.0).status_code == 200
+        until(lambda: all(map(over, waiting)), "end of the handshakes")
+
+
+def test_a_full_table_of_files_is_said_once_a_minute() -> None:
+    app = FastAPI()
+    app.get("/healthz")(lambda: True)
+    server = HttpServer(HttpSettings(port=0), AccessSettings())
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with ExitStack() as undo, capture_logs() as lines:
+        undo.callback(server.stop)
+        server.start(app)
+        assert healthy(server.url)
+        place = httpx.URL(server.url)
+        late = [undo.enter_context(socket.socket()) for _ in range(20)]
+        undo.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+        lowest_free = os.dup(0)
+        os.close(lowest_free)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free, hard))
+        for one in late:
+            one.connect((place.host, place.port))
+            one.sendall(HEAD + b"\r\n")
+        until(lambda: server.exhausted >= 2, "attempts at accepting")
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        for one in late:
+            one.settimeout(180)
+            assert one.recv(15) == b"HTTP/1.1 200 OK"
+    assert len([line for line in lines if line["log_level"] == "error"]) == 1
+
+
+@pytest.mark.parametrize(("soft", "expected"), [(1024, 300), (256, 85), (20_000, 300), (2, 1)])
+def test_the_monitor_keeps_most_files_for_itself(soft: int, expected: int) -> None:
+    assert http_connections(HttpSettings(), soft) == expected
+
+
+def test_the_monitor_may_open_as_many_files_as_the_system_allows(tmp_path: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with ExitStack() as undo:
+        undo.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
+        started = undo.enter_context(
+            program(tmp_path, "service.rotorwatch", "run", ROTORWATCH_HTTP__PORT="0", ROTORWATCH_LINK=listening())
+        )
+        text = httpx.get(f"{started.url()}/metrics", trust_env=False, timeout=180.0).text
+    found = next(line for line in text.splitlines() if line.startswith("process_max_fds "))
+    assert float(found.split()[1]) == min(hard, 65_536)
+
+
+def listening() -> str:
+    return json.dumps({"listen": [endpoint()]})

@@ -1,0 +1,374 @@
+"""The whole description of the API against a running service with data, tokens on.
+
+Every route of the application is asked without a token, with a wrong one, and with one that lacks nothing but the
+scope. Then requests of all kinds are made up out of the description, valid and invalid ones, and every answer must be
+as it says. In the ordinary run there are few, the same every time; for a long search with others::
+
+    ROTORWATCH_API_CASES=2000 python -m pytest tests/service/api/test_openapi.py -k made_up -s
+"""
+
+import json
+import os
+import re
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import hypothesis
+import jsonschema_rs
+import pytest
+import schemathesis
+from fastapi import FastAPI
+from fastapi.routing import iter_route_contexts
+from schemathesis.core.result import Ok
+from schemathesis.specs.openapi import checks
+
+from rotorwatch import __version__
+from service.access.guard import Guard
+from service.access.scopes import Scope
+from service.api.app import create_app
+from service.runtime.runtime import Runtime
+from tests.service.rig.monitored import GUARDED, client, faulty, problem, token
+
+READ, OPERATE, CONFIGURE = Scope
+POSITIVE, NEGATIVE = schemathesis.GenerationMode.POSITIVE, schemathesis.GenerationMode.NEGATIVE
+STREAMS = {"/api/v1/events", "/api/v1/replays/{replay_id}/events"}
+PUBLIC = {("GET", "/"), ("GET", "/healthz"), ("GET", "/page/{version}/{name:path}")}
+#: What is there and in no description of an interface for programs.
+UNDESCRIBED = {
+    ("GET", "/"),
+    ("GET", "/openapi.json"),
+    ("GET", "/docs"),
+    ("GET", "/docs/{name}"),
+    ("GET", "/page/{version}/{name:path}"),
+}
+#: What there is not: whoever has no token does not even learn that.
+STRAY = {("GET", "/nowhere"), ("PATCH", "/api/v1/machines"), ("POST", "/healthz")}
+VALUES = {
+    "site": "demo",
+    "version": "0",
+    "machine": "lab",
+    "name": "k_by",
+    "replay_id": "0123456789ab",
+    "token_id": "0123456789ab",
+}
+CASES = int(os.environ.get("ROTORWATCH_API_CASES", "0"))
+#: Routes of whose arguments more must hold than a schema can say, such as that one is above another.
+DEPENDENT = {
+    "GET /api/v1/events",
+    "GET /api/v1/machines/{site}/{machine}/alarms",
+    "GET /api/v1/machines/{site}/{machine}/alarms/events",
+    "GET /api/v1/machines/{site}/{machine}/correlations",
+    "GET /api/v1/machines/{site}/{machine}/full-spectra",
+    "GET /api/v1/machines/{site}/{machine}/orbits",
+    "GET /api/v1/machines/{site}/{machine}/readings",
+    "GET /api/v1/machines/{site}/{machine}/spectra",
+    "GET /api/v1/machines/{site}/{machine}/vectors",
+    "GET /api/v1/machines/{site}/{machine}/waterfalls",
+    "GET /api/v1/machines/{site}/{machine}/waveforms",
+    "GET /api/v1/trends",
+    "POST /api/v1/replays",
+    "POST /api/v1/tokens",
+}
+#: What a request that is as described may be answered with: there is no such thing, not now, or not unseen.
+STATE = {404, 409, 428}
+#: Of the checks there are, those that a description can be held to.
+CHECKS = [
+    schemathesis.checks.not_a_server_error,
+    checks.status_code_conformance,
+    checks.content_type_conformance,
+    checks.response_headers_conformance,
+    checks.response_schema_conformance,
+    checks.negative_data_rejection,
+]
+
+
+@pytest.fixture(scope="module")
+def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
+    with faulty(tmp_path_factory.mktemp("machine"), GUARDED) as (running, _):
+        yield running
+
+
+@pytest.fixture(scope="module")
+def http(runtime: Runtime) -> Iterator[httpx.Client]:
+    with client(runtime, token(runtime)) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def description(http: httpx.Client) -> dict[str, Any]:
+    found: dict[str, Any] = http.get("/openapi.json").json()
+    return found
+
+
+def application(runtime: Runtime) -> FastAPI:
+    """The application as it is served."""
+    store = runtime.store
+    return create_app(runtime, Guard(store.tokens, store.audit, runtime.settings.access, runtime.settings.http.host))
+
+
+def routes(app: FastAPI) -> set[tuple[str, str]]:
+    """Method and path of every route."""
+    return {
+        (method, context.path or "") for context in iter_route_contexts(app.routes) for method in context.methods or ()
+    }
+
+
+def needed(method: str, path: str) -> Scope:
+    """Which scope a route must ask for."""
+    if path.startswith(("/api/v1/audit", "/api/v1/history", "/api/v1/tokens")) or path.endswith(
+        ("/remove-from-service", "/return-to-service")
+    ):
+        return CONFIGURE
+    return READ if method == "GET" or path == "/api/v1/session" else OPERATE
+
+
+def ask(http: httpx.Client, method: str, path: str) -> httpx.Response:
+    """Send a request that would be understood; of streams only the beginning is read."""
+    body = {"reason": "x", "expected_state": "shelved"} if "/alarms/" in path else {"recordings": ["a/b/c.mcap"]}
+    address = path.replace(":path", "").format(**VALUES)
+    with http.stream(method, address, json=body if method == "POST" else None) as answer:
+        if not answer.headers["content-type"].startswith("text/event-stream"):
+            answer.read()
+    return answer
+
+
+def test_every_route_is_described(runtime: Runtime, description: dict[str, Any]) -> None:
+    described = {(method.upper(), path) for path, methods in description["paths"].items() for method in methods}
+    assert routes(application(runtime)) <= described | UNDESCRIBED
+    assert len(described) >= 30
+
+
+def test_no_route_answers_without_a_valid_token(runtime: Runtime, description: dict[str, Any]) -> None:
+    asked = 0
+    described = {(method.upper(), path) for path, methods in description["paths"].items() for method in methods}
+    for text in ("", "rw_000000000000_" + 43 * "0", "secret"):
+        with client(runtime, text) as nobody:
+            for method, path in sorted(described | UNDESCRIBED | STRAY):
+                if (method, path) in PUBLIC:
+                    assert ask(nobody, method, path).status_code == (404 if "{" in path else 200)
+                    continue
+                answer = ask(nobody, method, path)
+                assert answer.headers["www-authenticate"].startswith("Bearer"), path
+                problem(answer, 401)
+                asked += 1
+    assert asked >= 3 * 30
+
+
+def test_a_method_that_a_path_does_not_take_is_no_matter_of_its_body(
+    http: httpx.Client, description: dict[str, Any]
+) -> None:
+    for path, methods in description["paths"].items():
+        for method in {"get", "post", "put", "patch", "delete"} - methods.keys():
+            answer = http.request(method, path.format(**VALUES))
+            problem(answer, 405)
+            assert answer.headers["allow"] == ", ".join(sorted(methods)).upper()
+
+
+def test_every_route_asks_for_its_scope(runtime: Runtime, http: httpx.Client, description: dict[str, Any]) -> None:
+    """With all scopes but the one a route is refused, with that one alone it is not."""
+    with_scope = {scope: token(runtime, scope, name=f"only {scope}") for scope in Scope}
+    without = {scope: token(runtime, *(one for one in Scope if one != scope), name=f"no {scope}") for scope in Scope}
+    described = {(method.upper(), path) for path, methods in description["paths"].items() for method in methods}
+    for method, path in sorted(described | UNDESCRIBED):
+        if (method, path) in PUBLIC:
+            continue
+        scope = needed(method, path)
+        with client(runtime, without[scope]) as wrong, client(runtime, with_scope[scope]) as right:
+            found = problem(ask(wrong, method, path), 403)
+            assert found.detail.startswith(f"this needs the scope {scope}; no {scope} has "), path
+            assert ask(right, method, path).status_code not in (401, 403), path
+    for path, methods in description["paths"].items():
+        for method, route in methods.items():
+            declared = [part.get("token") for part in route.get("security", []) if "token" in part]
+            public = (method.upper(), path) in PUBLIC
+            assert declared == ([] if public else [[needed(method.upper(), path)]]), path
+            in_browsers = any("browser" in part for part in route.get("security", []))
+            assert in_browsers == (declared == [[READ]]), path
+    assert http.get("/openapi.json").status_code == 200
+
+
+def test_an_unknown_machine_is_a_problem_that_names_the_known_ones(
+    http: httpx.Client, description: dict[str, Any]
+) -> None:
+    for path, methods in description["paths"].items():
+        for method in methods if path.startswith("/api/v1/machines/{site}") else ():
+            found = problem(ask(http, method.upper(), path.replace("{machine}", "pump")), 404)
+            assert found.detail == "no machine demo/pump; there are: demo/lab", path
+
+
+def test_the_page_of_the_api_loads_nothing_from_elsewhere(http: httpx.Client) -> None:
+    page = http.get("/docs")
+    assert page.headers["content-type"] == "text/html; charset=utf-8"
+    loaded = re.findall(r'(?:src|href|url)(?:=|: )"([^"]*)"', page.text)
+    assert len(loaded) == 4
+    for one in loaded:
+        if one != "data:,":
+            assert one.startswith("/")
+            assert http.get(one).status_code == 200, one
+    assert "http" not in page.headers["content-security-policy"]
+    problem(http.get("/docs/core.py"), 422)
+
+
+def test_everything_is_described_with_examples(description: dict[str, Any]) -> None:
+    """Every argument in words, every body and answer with an example that its own schema accepts."""
+    schemas = description["components"]["schemas"]
+    for path, methods in description["paths"].items():
+        for method, route in methods.items():
+            place = f"{method.upper()} {path}"
+            assert route["summary"], place
+            assert route["description"], place
+            assert len(route["tags"]) == 1, place
+            for argument in route.get("parameters", []):
+                if argument["in"] != "path":
+                    assert argument.get("description"), f"{place}: {argument['name']}"
+            for part in route.get("requestBody", {}).get("content", {}).values():
+                shown = [one["value"] for one in part.get("examples", {}).values()] or [part["example"]]
+                for one in shown:
+                    check(schemas, part["schema"], one, place)
+            for status, described in route["responses"].items():
+                answer = described
+                if not status.startswith("2"):  # each problem is described once
+                    answer = description["components"]["responses"][described["$ref"].rpartition("/")[2]]
+                assert answer["description"], f"{place}: {status}"
+                ((kind, part),) = answer["content"].items()
+                assert (kind == "application/problem+json") == (not status.startswith("2")), place
+                if kind in ("application/json", "application/problem+json"):
+                    check(schemas, part["schema"], part["example"], f"{place}: {status}")
+                else:
+                    assert kind in ("text/event-stream", "application/octet-stream", "text/plain")
+                if not status.startswith("2"):
+                    assert part["example"]["status"] == int(status), place
+
+
+def inner(value: object) -> Iterator[dict[str, Any]]:
+    """Every object in a JSON value."""
+    if isinstance(value, dict):
+        yield value
+        value = list(value.values())
+    if isinstance(value, list):
+        for one in value:
+            yield from inner(one)
+
+
+def test_generators_find_names_and_forms_that_they_understand(description: dict[str, Any]) -> None:
+    assert description["info"]["version"] == __version__
+    names = [route["operationId"] for methods in description["paths"].values() for route in methods.values()]
+    assert len(set(names)) == len(names)
+    for name in names:
+        assert re.fullmatch("[a-z]+(_[a-z]+){0,3}", name), name
+    for kind in ("schemas", "responses"):
+        for name in description["components"][kind]:
+            assert re.fullmatch("([A-Z][a-z]+)+", name), name
+    tuples = [one for one in inner(description) if isinstance(one.get("prefixItems"), list)]
+    assert tuples
+    assert all("items" in one for one in tuples)
+    # With every problem written out at every operation it was half a megabyte.
+    assert len(json.dumps(description, ensure_ascii=False)) < 5_000 * len(names)
+
+
+def check(schemas: dict[str, Any], schema: dict[str, Any], shown: object, place: str) -> None:
+    whole = {**schema, "components": {"schemas": schemas}}
+    error = next(iter(jsonschema_rs.validator_for(whole).iter_errors(shown)), None)
+    assert error is None, f"{place}: {error}"
+
+
+def test_tags_are_described(description: dict[str, Any]) -> None:
+    there = {one["name"] for one in description["tags"]}
+    used = {tag for methods in description["paths"].values() for route in methods.values() for tag in route["tags"]}
+    assert used == there
+    assert set(description["components"]["securitySchemes"]) == {"token", "browser"}
+
+
+def validated(case: schemathesis.Case[Any], url: str, text: str) -> Any:
+    """Send a request that was made up, and hold the answer to the description."""
+    headers = {"Authorization": f"Bearer {text}"}
+    if case.operation.path in STREAMS:
+        arguments = case.as_transport_kwargs(base_url=url, headers=headers)
+        try:
+            request = httpx.Request(
+                arguments["method"],
+                arguments["url"],
+                params=arguments.get("params"),
+                headers={name: value for name, value in arguments["headers"].items() if value is not None},
+            )
+        except httpx.InvalidURL:  # so long that nobody could send it
+            hypothesis.reject()
+        with httpx.Client(trust_env=False, timeout=180.0) as reader:
+            streamed = reader.send(request, stream=True)
+            body = b"" if streamed.status_code == 200 else streamed.read()
+            streamed.close()
+        whole = httpx.Response(streamed.status_code, headers=streamed.headers, content=body, request=streamed.request)
+        whole.elapsed = streamed.elapsed
+        case.validate_response(whole, checks=CHECKS, headers=headers)
+        return whole
+    response = case.call(base_url=url, headers=headers)
+    case.validate_response(response, checks=CHECKS, headers=headers)
+    return response
+
+
+def made_up(
+    operation: Any, mode: schemathesis.GenerationMode, path: dict[str, str] | None, cases: int, url: str, text: str
+) -> list[tuple[str, int]]:
+    """Send requests to one route; what they were answered with."""
+    found: list[tuple[str, int]] = []
+    there = {one.name for one in operation.query}
+
+    @hypothesis.settings(
+        max_examples=cases,
+        derandomize=not CASES,
+        database=None,
+        phases=[hypothesis.Phase.generate],
+        suppress_health_check=list(hypothesis.HealthCheck),
+    )
+    @hypothesis.given(case=operation.as_strategy(mode, path_parameters=path))
+    def run(case: schemathesis.Case[Any]) -> None:
+        if mode is POSITIVE:  # by the letter of OpenAPI other arguments may be given as well
+            case.query = {name: value for name, value in (case.query or {}).items() if name in there}
+        answer = validated(case, url, text)
+        found.append((operation.label, answer.status_code))
+        if mode is POSITIVE and not 200 <= answer.status_code < 300 and answer.status_code not in STATE:
+            refusal = answer.json()
+            # What is wrong with one argument alone, the description would have said.
+            assert answer.status_code == 422, refusal
+            assert operation.label in DEPENDENT, refusal
+            assert "errors" not in refusal, refusal
+
+    try:
+        run()
+    except hypothesis.errors.Unsatisfiable:  # nothing about it can be invalid
+        assert mode is NEGATIVE
+    return found
+
+
+@pytest.mark.slow
+def test_requests_made_up_out_of_the_description(runtime: Runtime, description: dict[str, Any]) -> None:
+    # Tokens are the affair of the tests above; here they are always there.
+    plain = json.loads(json.dumps(description))
+    del plain["components"]["securitySchemes"]
+    for methods in plain["paths"].values():
+        for route in methods.values():
+            route.pop("security", None)
+    schema = schemathesis.openapi.from_dict(plain)
+    text = token(runtime, name="made up")
+    seen: Counter[tuple[str, int]] = Counter()
+    looked_at = 0
+    for found in schema.get_all_operations():
+        assert isinstance(found, Ok)
+        operation = found.ok()
+        known = {one.name: VALUES[one.name] for one in operation.path_parameters if one.name in VALUES} or None
+        # What is unknown is a text like any other: a name that is none is hardly found.
+        for mode, fixed, cases in ((POSITIVE, known, 2), (POSITIVE, None, 1), (NEGATIVE, known, 3)):
+            for label, status in made_up(operation, mode, fixed, CASES or cases, runtime.http_url, text):
+                seen[label, status] += 1
+        looked_at += 1
+    statuses = Counter[int]()
+    for (_, status), count in seen.items():
+        statuses[status] += count
+    print(f"{sum(statuses.values())} requests to {looked_at} routes: {dict(sorted(statuses.items()))}")  # noqa: T201  # what a long search is for
+    assert looked_at == sum(len(methods) for methods in description["paths"].values())
+    # Each was answered as asked, or would have been if there were such a machine, recording or replay.
+    assert {label for label, status in seen if status in (200, 201, 404)} == {label for label, _ in seen}
+    # 503 would be documented, but nothing was wrong with the service.
+    assert set(statuses) == {200, 201, 400, 404, 409, 422, 428}

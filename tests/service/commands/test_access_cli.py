@@ -1,0 +1,199 @@
+"""``rotorwatch token`` and ``rotorwatch audit`` beside a running service, on the same database."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import httpx
+import pytest
+import typer
+from typer.testing import CliRunner, Result
+
+from service.access.scopes import Scope
+from service.commands import access as access_commands
+from service.commands.running import Commands
+from service.settings.service import HistorySettings
+from tests.service.rig.guarded import Guarded, guarded
+from tests.service.rig.live import ROOT, endpoint, program
+from tests.service.rig.preloaded import ran
+
+
+@pytest.fixture
+def commands(monkeypatch: pytest.MonkeyPatch) -> typer.Typer:
+    monkeypatch.setenv("COLUMNS", "300")
+    app = typer.Typer(cls=Commands)
+    app.add_typer(access_commands.commands)
+    app.add_typer(access_commands.tokens)
+    return app
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> str:
+    path = tmp_path / "plant.toml"
+    path.write_text('[history]\nurl = "sqlite:///history.sqlite"\n', encoding="utf-8")
+    return str(path)
+
+
+def run(app: typer.Typer, *arguments: str) -> Result:
+    return CliRunner().invoke(app, arguments)
+
+
+def status(monitor: Guarded, token: str, method: str = "GET", path: str = "/health") -> int:
+    with monitor.client(token) as client:
+        return client.request(method, path).status_code
+
+
+def test_a_token_works_at_once_and_not_a_request_longer(tmp_path: Path, commands: typer.Typer, config: str) -> None:
+    with guarded(tmp_path) as monitor:
+        created = run(
+            commands, "token", "create", "control room", "--scope", "read", "--days", "90", "--config", config
+        )
+        assert created.exit_code == 0, created.output
+        token = created.stdout.strip()
+        assert "shown this once" in created.stderr
+        assert token not in created.stderr
+        assert status(monitor, token) == 200
+        assert status(monitor, token, "DELETE", "/machine") == 403
+
+        listed = run(commands, "token", "list", "--config", config).stdout
+        token_id, secret = token.split("_")[1:]
+        assert token_id in listed
+        assert "control room" in listed
+        assert "valid" in listed
+        assert secret not in listed
+
+        again = run(commands, "token", "create", "control room", "--scope", "read", "--config", config)
+        assert again.exit_code == 2
+        assert "valid already" in again.stderr
+
+        revoked = run(commands, "token", "revoke", token_id, "--config", config)
+        assert revoked.exit_code == 0
+        assert status(monitor, token) == 401
+        assert "was revoked at" in run(commands, "token", "revoke", token_id, "--config", config).stdout
+        assert "revoked" in run(commands, "token", "list", "--config", config).stdout
+
+        written = run(commands, "audit", "--config", config).stdout
+        assert "create-token" in written
+        assert "revoke-token" in written
+        assert secret not in written
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("create", "x"), "scope: none is given, expected one or more of read, operate, configure"),
+        (("create", "x", "--scope", "admin"), "--scope is admin, expected read, operate, configure"),
+        (("create", "x", "--scope", "read", "--days", "0"), "days is 0, expected 1 to 3650"),
+        (("create", " ", "--scope", "read"), "name is ' '"),
+        (("create", "", "--scope", "read"), "name is ''"),
+        (("create", 65 * "x", "--scope", "read"), "expected 1 to 64 printable characters"),
+        (("revoke", "000000000000"), "there is no token '000000000000'"),
+    ],
+)
+def test_mistakes_exit_2_with_a_sentence(
+    commands: typer.Typer, config: str, arguments: tuple[str, ...], expected: str
+) -> None:
+    result = run(commands, "token", *arguments, "--config", config)
+    assert result.exit_code == 2
+    assert expected in result.stderr
+
+
+def test_lists_lose_nothing_on_a_narrow_terminal(
+    commands: typer.Typer, config: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    scopes = [word for scope in Scope for word in ("--scope", scope)]
+    token = run(commands, "token", "create", "a dashboard beside the door", *scopes, "--config", config).stdout
+    token_id = token.split("_")[1]
+    assert token_id in run(commands, "token", "list", "--config", config).stdout
+    (line,) = run(commands, "audit", "--config", config).stdout.splitlines()
+    assert line.endswith(f"create-token: {token_id}, a dashboard beside the door, {' '.join(Scope)}")
+
+
+def test_tokens_in_memory_make_no_sense(tmp_path: Path, commands: typer.Typer) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text('[history]\nurl = "sqlite:///:memory:"\n', encoding="utf-8")
+    result = run(commands, "token", "list", "--config", str(path))
+    assert result.exit_code == 2
+    assert "in memory" in result.stderr
+
+
+def test_the_audit_log_shows_each_action_once(tmp_path: Path, commands: typer.Typer, config: str) -> None:
+    with guarded(tmp_path) as monitor:
+        token = monitor.token(*Scope, name="control room")
+        with monitor.client(token) as client:
+            client.post("/alarms/k_by/shelve", json={"reason": "[bold]bolt[/bold] replaced"})
+            client.delete("/machine")
+        with monitor.client() as nobody:
+            nobody.get("/health")
+        visit = monitor.guard.trail.visit("10.0.0.1", "POST", "/cut/short")
+        monitor.guard.trail.start(visit)
+        lines = run(commands, "audit", "--config", config).stdout.splitlines()
+        assert len(lines) == 4
+        wanted = (
+            "POST /cut/short",
+            "GET /health",
+            "DELETE /machine",
+            "shelve demo/lab k_by: [bold]bolt[/bold] replaced",
+        )
+        for line, what in zip(lines, wanted, strict=True):
+            assert what in line
+        assert "not known" in lines[0]
+        assert "control room" in lines[-1]
+        chosen = run(commands, "audit", "--machine", "demo/lab", "--config", config).stdout
+        assert "k_by" in chosen
+        assert "DELETE" not in chosen
+        assert "DELETE" not in run(commands, "audit", "--limit", "2", "--config", config).stdout
+        assert "GET /health" not in run(commands, "audit", "--actor", "control room", "--config", config).stdout
+
+
+def test_the_command_that_a_monitor_prints_creates_a_token_that_it_takes(tmp_path: Path) -> None:
+    """Where its history is, is said by its environment, over the settings file."""
+    folder = tmp_path / "a plant"
+    folder.mkdir()
+    (folder / "plant.toml").write_text('[history]\nurl = "sqlite:///other.sqlite"\n', encoding="utf-8")
+    arguments = ["--listen", endpoint(), "--http-port", "0", "--config", "plant.toml"]
+    plain = {name: value for name, value in os.environ.items() if not name.startswith(("ROTORWATCH_", "XDG_"))}
+    plain |= {"PYTHONPATH": str(ROOT), "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    plain |= {"HOME": str(tmp_path)}
+    alone = plain | {"ROTORWATCH_HISTORY__URL": "sqlite:///its own.sqlite"}
+    with program(tmp_path, "service.rotorwatch", "run", *arguments, cwd=folder, alone=alone) as monitor:
+        url = monitor.url()
+        monitor.wait_for("token create")
+        hint = next(line for line in monitor.output().splitlines() if "token create" in line)
+        command = hint.split(": ", 1)[1]
+        # In another terminal: another folder, and nothing of the monitor's environment.
+        created = subprocess.run(
+            ["sh", "-c", command], cwd=tmp_path, env=plain, capture_output=True, text=True, check=True
+        )
+        headers = {"authorization": f"Bearer {created.stdout.strip()}"}
+        assert httpx.get(f"{url}/api/v1/machines", headers=headers, trust_env=False, timeout=180.0).status_code == 200
+
+
+def test_the_hint_knows_where_the_history_is_and_shows_no_password(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert f"ROTORWATCH_HISTORY__URL=sqlite:///{tmp_path}/" in access_commands.creation_hint(None, HistorySettings())
+    url = "postgresql://watch:secret@db/plant"
+    monkeypatch.setenv("ROTORWATCH_HISTORY__URL", url)
+    told = access_commands.creation_hint(None, HistorySettings(url=url))
+    assert "secret" not in told
+    assert "ROTORWATCH_HISTORY__URL" in told
+    in_memory = access_commands.creation_hint(None, HistorySettings(url="sqlite:///:memory:"))
+    assert "token create" not in in_memory
+
+
+def test_status_says_why_a_token_is_refused(tmp_path: Path) -> None:
+    with guarded(tmp_path) as monitor, monitor.client() as client:
+        wanted = client.get("/docs").json()["detail"]
+        wrong = "rw_000000000000_" + 43 * "0"
+        plain = {name: value for name, value in os.environ.items() if name != "ROTORWATCH_TOKEN"}
+        without, mistaken = (
+            ran("service.rotorwatch", "status", "--url", monitor.url, environment=plain | more)
+            for more in ({}, {"ROTORWATCH_TOKEN": wrong})
+        )
+    assert (without.returncode, mistaken.returncode) == (4, 4)
+    assert wanted in without.stderr
+    assert "not valid" in mistaken.stderr

@@ -1,0 +1,174 @@
+"""The main job as a stranger runs it: separate programs on loopback, faults and seeds that training never saw."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from service.commands.demo import FAULTS, Outcome
+from simulator.scenario import load_scenario
+from tests.service.rig.live import ROOT, Program, program, until
+from tests.service.rig.preloaded import ran
+
+WHOLE, QUICK = ("service.rotorwatch", "demo"), ("tests.service.commands.quick_demo",)
+
+
+def children_of(pid: int) -> list[int]:
+    """Processes whose parent is `pid`."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue  # it ended meanwhile
+        if int(fields[1]) == pid and fields[0] != "Z":
+            found.append(int(stat.parent.name))
+    return found
+
+
+@contextmanager
+def demo(folder: Path, *arguments: str) -> Iterator[Program]:
+    """A demo, which leaves no temporary file."""
+    (folder / "tmp").mkdir()
+    paced = ("--http-port", "0", "--pace", "20")
+    with program(folder, *arguments, *paced, TMPDIR=str(folder / "tmp"), COLUMNS="100") as one:
+        yield one
+    assert list((folder / "tmp").iterdir()) == []
+
+
+def none_is_left(processes: list[int]) -> None:
+    until(lambda: not any(Path(f"/proc/{process}").exists() for process in processes), "the end of all", 120)
+
+
+def check_lines(output: str) -> None:
+    """What holds for every line of a demo."""
+    for line in output.splitlines():
+        assert len(line.rstrip()) <= 100
+        assert not ("healthy" in line and "changed" in line)
+        assert not re.search(r"(?<!\S)-\d", line)  # the true minus sign is another one
+        assert "stream lost" not in line
+
+
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.parametrize(("seed", "fault"), list(enumerate(FAULTS, 101)))
+def test_the_demo_names_exactly_the_injected_fault(fault: str, seed: int, tmp_path: Path) -> None:
+    with demo(tmp_path, *WHOLE, "--fault", fault, "--seed", str(seed), "--once") as one:
+        assert one.process.wait(600) == 0, one.output()
+    output = one.output()
+    assert re.search(rf"ALERT: .*\({fault}\) changed by", output)
+    assert f"/alarms: {fault} raised" in output
+    assert "demo passed" in output
+    assert output.count("  healthy\n") >= 10  # one line per window, the healthy stretch among them
+    check_lines(output)
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_nothing_is_raised_where_nothing_breaks(tmp_path: Path) -> None:
+    with demo(tmp_path, *WHOLE, "--fault", "none", "--once") as one:
+        assert one.process.wait(600) == 0, one.output()
+    assert "injected nothing; named nothing" in one.output()
+    assert "ALERT" not in one.output()
+    check_lines(one.output())
+
+
+@pytest.mark.slow
+def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path: Path) -> None:
+    with demo(tmp_path, *QUICK, "--fault", "c_bz") as one:
+        one.wait_for("found")
+        lines = one.output().splitlines()
+        printed = [line.split()[1:] for line in lines if re.match(r"  \S*rotorwatch.* (watch|status) --", line)]
+        assert [command[0] for command in printed] == ["watch", "status"]
+        with program(tmp_path, "service.rotorwatch", *printed[0]) as watch:
+            one.wait_for("c_bz raised")
+            status = ran("service.rotorwatch", *printed[1], "--json")
+            alarms = {one["name"]: one["raised"] for one in json.loads(status.stdout)["machines"][0]["alarms"]}
+            assert "c_bz" in alarms
+            # The demo goes on meanwhile: on a busy computer the machine is repaired before the answer comes.
+            assert status.returncode == int(any(alarms.values())), status.stdout
+            one.wait_for("(e) changed by")
+            watch.stop(signal.SIGINT)
+        assert "(c_bz) changed by" in watch.output()
+        children = children_of(one.process.pid)
+        os.kill(min(children), signal.SIGKILL)
+        assert one.process.wait(300) == 1
+        assert "the monitor was killed (SIGKILL)" in one.errors()
+        none_is_left(children)
+    output = one.output()
+    check_lines(output)
+    assert output.index("c_bz by −30%") < output.index("demo passed") < output.index("repaired") < output.index("e by")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "code", "running"),
+    [
+        (signal.SIGINT, 130, 1),
+        *(
+            pytest.param(number, code, 2, marks=pytest.mark.long)
+            for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL))
+        ),
+    ],
+)
+def test_however_the_demo_ends_it_leaves_nothing_behind(
+    number: signal.Signals, code: int, running: int, tmp_path: Path
+) -> None:
+    """While the monitor starts, and later beside the simulator."""
+    with demo(tmp_path, *WHOLE) as one:
+        until(lambda: len(children_of(one.process.pid)) == running, "programs")
+        children = children_of(one.process.pid)
+        one.process.send_signal(number)
+        assert one.process.wait(300) == code, one.output()
+        none_is_left(children)
+
+
+def test_the_first_line_comes_before_anything_heavy_is_imported() -> None:
+    code = (
+        "import sys\nfrom service.rotorwatch import app\n"
+        "class Told:\n"
+        "    def write(self, text):\n"
+        "        if not text.strip():\n            return\n"
+        "        heavy = {'numpy', 'zenoh', 'pydantic_core'} & set(sys.modules)\n"
+        "        sys.__stdout__.write(f'{text.strip()} {sorted(heavy)}')\n"
+        "        sys.__stdout__.flush()\n"
+        "        sys.exit(0)\n"
+        "    def flush(self): pass\n"
+        "sys.stdout = Told()\napp(['demo'])"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=60, check=True
+    )
+    assert "starting" in found.stdout
+    assert "numpy" not in found.stdout
+    assert "zenoh" not in found.stdout
+
+
+def test_the_demo_breaks_what_the_shipped_scenarios_break() -> None:
+    for name, change in FAULTS.items():
+        events = load_scenario(name)[0].events
+        assert [(event.parameter, event.relative_change) for event in events] == [(name, change)]
+
+
+@pytest.mark.parametrize(
+    ("outcome", "reason"),
+    [
+        (Outcome({"e": 0.3}, {"e": 0.28}, {"e"}, 9), ""),
+        (Outcome({}, {}, set(), 9), ""),
+        (Outcome({"e": 0.3}, {"e": 0.28}, {"e"}, 0), "no window"),
+        (Outcome({"e": 0.3}, {}, set(), 9), "no alarm named e"),
+        (Outcome({"e": 0.3}, {"e": 0.3, "k_by": 0.1}, {"e", "k_by"}, 9), "named k_by, which did not change"),
+        (Outcome({"e": 0.3}, {"e": 0.15}, {"e"}, 9), "says +15.0%, injected was +30.0%"),
+        (Outcome({"e": 0.3}, {"e": -0.3}, {"e"}, 9), "says -30.0%"),
+        (Outcome({"e": 0.3}, {"e": 0.3}, set(), 9), "HTTP API did not show the alarm on e"),
+    ],
+)
+def test_the_verdict_fails_for_the_right_reason(outcome: Outcome, reason: str) -> None:
+    assert (reason in outcome.verdict()) if reason else outcome.verdict() == ""

@@ -1,0 +1,197 @@
+"""From nothing to the first trend: `rotorwatch init`, `doctor`, `run` and `plot trend` on a stranger's two sensors."""
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.machine import load_machine_file
+from models.signals.block import SampleBlock
+from models.signals.link import LinkSettings
+from models.signals.recording import RecordedMessage
+from models.signals.wire import encode_block
+from service.access.scopes import Scope
+from service.analysis.arrival import examined
+from service.runtime.runtime import running
+from service.settings.service import load_settings
+from simulator.publisher import PublishSettings, publish
+from tests.loopback import endpoint
+from tests.service.rig.live import ROOT, until
+from tests.service.rig.monitored import client, token
+from tests.service.rig.preloaded import rotorwatch as run
+
+RATE_HZ, START_NS = 2560.0, 1_767_225_600_000_000_000
+FAN = (
+    "init", "--site", "plant", "--name", "fan", "--rate-hz", "2560", "--zones", "ISO 20816-3 group 2 rigid",
+    "--sensor", "DE-H acceleration g DE horizontal", "--sensor", "NDE-V velocity mm/s NDE vertical",
+)  # fmt: skip
+
+
+def blocks(seconds: float, rate_hz: float = RATE_HZ, every_s: float = 0.5) -> Iterator[tuple[SampleBlock, tuple[()]]]:
+    rng, size = np.random.default_rng(95), round(0.5 * rate_hz)
+    for number in range(round(seconds / every_s)):
+        t = number * every_s + np.arange(size) / rate_hz
+        drive = 0.04 * np.sin(2 * np.pi * 24.8 * t) + 0.05 * rng.standard_normal(size)
+        samples = np.column_stack([drive, 1.1 * np.sin(2 * np.pi * 24.8 * t)]).astype(np.float32)
+        start_ns = START_NS + round(number * every_s * 1e9)
+        yield SampleBlock(run=3, sequence=number, start_ns=start_ns, rate_hz=rate_hz, samples=samples), ()
+
+
+@contextmanager
+def publishing(folder: Path, address: str, seconds: float, pace: float, rate_hz: float = RATE_HZ) -> Iterator[None]:
+    """Somebody's sensors: they wait for a subscriber and send until the end."""
+    stop = threading.Event()
+    machine = load_machine_file(folder / "fan.toml").model_copy(update={"rate_hz": rate_hz})
+    every_s = 0.5 if machine.schedule is None else machine.schedule.every_s
+    settings = PublishSettings(
+        link=LinkSettings(connect=(address,)), pace=pace, wait_for_subscriber_s=60.0, linger_s=5.0
+    )
+    sender = threading.Thread(target=lambda: publish(machine, blocks(seconds, rate_hz, every_s), settings, stop=stop))
+    sender.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        sender.join()
+
+
+def test_init_writes_files_that_the_other_commands_take(tmp_path: Path) -> None:
+    done = run(*FAN, "--folder", str(tmp_path), "--speed-rpm", "1488")
+    assert done.returncode == 0, done.stderr
+    assert "rotorwatch doctor --machine" in done.stdout
+    machine = load_machine_file(tmp_path / "fan.toml")
+    assert [channel.name for channel in machine.sensors] == ["DE-H", "NDE-V"]
+    assert machine.operation is not None
+    assert machine.operation.speed_rpm == 1488
+    assert run("check-config", str(tmp_path / "rotorwatch.toml")).returncode == 0
+    again = run(*FAN, "--folder", str(tmp_path))
+    assert again.returncode == 2
+    assert "--overwrite" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("init", "--site", "plant", "--name", "fan", "--sensor", "a b c d e"), "--rate-hz is missing"),
+        ((*FAN, "--sensor", "DE-A acceleration"), "has 2 words, expected 5"),
+        ((*FAN, "--sensor", "DE-A acceleration G DE axial"), "did you mean g"),
+        ((*FAN, "--snapshots", "10"), "--snapshots '10' has 1 words, expected two, such as '0.1 10'"),
+        ((*FAN, "--snapshots", "10 5"), "on_s 10 must be below every_s 5"),
+        ((*FAN, "--zones", "ISO 20816-3 group 2 stiff"), "is not one of"),
+        (("init", "--site", "a plant", *FAN[3:]), "a plant"),
+    ],
+)
+def test_init_says_what_is_wrong_and_writes_nothing(tmp_path: Path, arguments: tuple[str, ...], says: str) -> None:
+    done = run(*arguments, "--folder", str(tmp_path))
+    assert done.returncode == 2
+    assert says in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_doctor_says_what_arrives(tmp_path: Path) -> None:
+    run(*FAN, "--folder", str(tmp_path))
+    address = endpoint()
+    with publishing(tmp_path, address, 120, 2.0):
+        done = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", address, "--seconds", "2")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "sampling rate 2560 Hz, expected 2560" in done.stdout
+    # Of however many blocks arrived: a busy computer gives fewer, and noise does the rest.
+    said = float(done.stdout.split("DE-H ")[1].split()[0])
+    assert said == pytest.approx(np.hypot(0.04 / np.sqrt(2), 0.05), rel=0.05)
+    assert "zone" in done.stdout
+
+
+def test_the_doctor_waits_for_snapshots(tmp_path: Path) -> None:
+    run(*FAN, "--folder", str(tmp_path), "--snapshots", "0.5 2")
+    address = endpoint()
+    with publishing(tmp_path, address, 120, 2.0):
+        done = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", address)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "listening for 12.5 s" in done.stdout  # ten, and a period with its snapshot
+    assert "0.5 s in the latest snapshot, in blocks of 1280 samples" in done.stdout
+    assert "DE-H 0.05" in done.stdout
+
+
+def test_the_doctor_says_what_is_wrong(tmp_path: Path) -> None:
+    run(*FAN, "--folder", str(tmp_path))
+    address = endpoint()
+    with publishing(tmp_path, address, 120, 2.0, rate_hz=2000.0):
+        done = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", address, "--seconds", "2")
+    assert done.returncode == 1
+    assert "rate_hz" in done.stdout
+    assert "blocks would be refused" in done.stdout
+    silent = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", endpoint(), "--seconds", "1")
+    assert silent.returncode == 1
+    assert "nothing arrived under rotorwatch/plant/fan/stream" in silent.stdout
+
+
+def test_the_doctor_sums_up_gaps_that_are_many(tmp_path: Path) -> None:
+    run(*FAN, "--folder", str(tmp_path))
+    machine = load_machine_file(tmp_path / "fan.toml")
+    messages = [
+        RecordedMessage(machine.keys.stream, *encode_block(block, ""), block.start_ns, block.start_ns)
+        for block, _ in blocks(12.0, every_s=0.6)
+    ]
+    troubles = examined(machine, messages).troubles
+    assert "19 times a block does not follow the one before; 1.9 s of data are missing, such as here:" in troubles
+    assert sum("0.1 s" in one for one in troubles) == 3
+
+
+def test_a_strangers_two_sensors_have_a_trend_in_three_commands(tmp_path: Path) -> None:
+    run(*FAN, "--folder", str(tmp_path))
+    address, settings = endpoint(), tmp_path / "rotorwatch.toml"
+    text = settings.read_text(encoding="utf-8")
+    settings.write_text(text.replace("tcp/127.0.0.1:7447", address) + "\n[http]\nport = 0\n", encoding="utf-8")
+    with running(load_settings(settings)) as service, publishing(tmp_path, address, 100, 50.0):
+        (worker,) = service.machines()
+        until(lambda: worker.health().filled == 1, "a full window")
+        health = worker.health()
+        assert health.state == "watching"
+        assert health.report is not None
+        assert [one.channel for one in health.report.levels] == ["DE-H", "NDE-V"]
+        until(lambda: worker.history.downsampled(quantity="level", names=["NDE-V:overall"], points=10) != (), "a level")
+        (bucket, *_) = worker.history.downsampled(quantity="level", names=["NDE-V:overall"], points=1)
+        assert bucket.mean == pytest.approx(1.1 / np.sqrt(2), rel=0.01)
+        with client(service, token(service, Scope.READ)) as http:
+            exposed = http.get("/metrics").text
+        (line,) = [
+            one
+            for one in exposed.splitlines()
+            if one.startswith("rotorwatch_level{") and 'channel="NDE-V"' in one and 'measure="overall"' in one
+        ]
+        assert 'unit="mm/s"' in line
+        assert float(line.split()[-1]) == pytest.approx(1.1 / np.sqrt(2), rel=0.01)
+    recordings = [str(path) for path in (tmp_path / "recordings").rglob("*.mcap")]
+    done = run("plot", "trend", *recordings, "--out", str(tmp_path / "trend.svg"))
+    assert done.returncode == 0, done.stderr
+    assert "DE-H" in (tmp_path / "trend.svg").read_text(encoding="utf-8")
+
+
+def test_init_asks_until_a_channel_is_empty_and_again_for_what_cannot_be_used(tmp_path: Path) -> None:
+    keyboard, terminal = os.openpty()
+    wrong = "two thousand", "DE-H acceleration g DE", "DE-H acceleration furlong DE horizontal"
+    typed = ("plant", "fan", wrong[0], "2560", *wrong[1:], FAN[10], FAN[12], "")
+    os.write(keyboard, "".join(f"{line}\n" for line in typed).encode())
+    command = [sys.executable, "-m", "service.rotorwatch", "init", "--folder", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, stdin=terminal, capture_output=True, text=True, timeout=60, check=False)
+    for end in (keyboard, terminal):
+        os.close(end)
+    assert done.returncode == 0, done.stderr
+    assert "has 4 words, expected 5" in done.stdout
+    assert "unit 'furlong' is not one of" in done.stdout
+    assert [one.name for one in load_machine_file(tmp_path / "fan.toml").sensors] == ["DE-H", "NDE-V"]
+
+
+def test_init_asks_nobody_where_nobody_is(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "service.rotorwatch", "init", "--folder", str(tmp_path)],
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=ROOT, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "--site is missing, and there is nobody to ask" in done.stderr

@@ -1,0 +1,128 @@
+"""`rotorwatch replay` as a process: what it writes, where, and its exit codes; a namespace on the command line."""
+
+import hashlib
+import json
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from models.signals.recording import read_recording
+from simulator.scenario import parse_fault
+from tests.service.rig.live import LAB, endpoint, machine_file, program, scenario_blocks, until
+from tests.service.rig.preloaded import rotorwatch
+from tests.service.rig.replaying import recording, write
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recordings")
+    return recording(folder / "faulty.mcap", scenario_blocks(80.0, parse_fault("c_bz=0.5@0")))
+
+
+run = partial(rotorwatch, "replay")
+
+
+def test_lines_go_to_a_file_or_to_the_terminal_and_are_the_same(faulty: Path, tmp_path: Path) -> None:
+    out = tmp_path / "reports.jsonl"
+    to_file = run(faulty, "--offline", "--out", out)
+    to_terminal = run(faulty, "--offline")
+    assert to_file.returncode == to_terminal.returncode == 0, to_file.stderr
+    assert to_file.stdout == ""
+    text = out.read_text(encoding="utf-8")
+    assert to_terminal.stdout == text
+    topics = [json.loads(line)["topic"] for line in text.splitlines()]
+    assert set(topics) == {LAB.keys.report, LAB.keys.alarm_event}
+    assert f"SHA-256 of the lines {hashlib.sha256(text.encode()).hexdigest()}" in to_file.stderr
+    assert "800 blocks accepted, refused: none" in to_file.stderr
+    assert "1 alarm events, raised at the end: c_bz" in to_file.stderr
+    again = run(faulty, "--offline", "--out", out)
+    assert (again.returncode, "exists already" in again.stderr) == (2, True)
+    assert out.read_text(encoding="utf-8") == text
+
+
+def test_what_if_with_another_machine_file_and_another_limit(faulty: Path, tmp_path: Path) -> None:
+    """A machine of another name says so and is evaluated; with a higher limit the alarm is not raised."""
+    file = machine_file(tmp_path, ('name = "lab"', 'name = "lab2"'))
+    calm = "alarms.parameters.c_bz = {raise_above = 0.8, danger_above = 0.9}"
+    found = run(faulty, "--offline", "--machine", file, "--set", calm, "--out", tmp_path / "out.jsonl")
+    assert found.returncode == 0, found.stderr
+    assert "machine is 'lab', expected 'lab2'" in found.stderr
+    assert "demo/lab2" in found.stderr
+    assert "0 alarm events, raised at the end: none" in found.stderr
+    assert "800 blocks accepted, refused: none" in found.stderr
+
+
+def test_channels_that_do_not_fit_are_said(faulty: Path, tmp_path: Path) -> None:
+    file = machine_file(tmp_path, ('unit = "mm/s"', 'unit = "m/s"'))
+    found = run(faulty, "--offline", "--machine", file, "--to", "2")
+    assert found.returncode == 1
+    assert "channels.2.unit (y1_dot) is 'mm/s', expected 'm/s'" in found.stderr
+    assert "no block was accepted: demo/lab: the stream's channel descriptor has hash" in found.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--offline", "--from", "soon"), "--from is 'soon'"),
+        (("--offline", "--from", "500"), "nothing was recorded in between"),
+        (("--offline", "--key", "demo/fan"), "machines with sample blocks: demo/lab"),
+        (("--offline", "--prefix", "x"), "--prefix makes sense only without --offline"),
+        (("--offline", "--pace", "10"), "--pace makes sense only without --offline"),
+        (("--offline", "--progress", "json"), "--out"),
+        (("--offline", "--set", "alarms.on_delay_s="), "changes: "),
+        (("--offline", "--set", "alarms.on_delay_s=-1"), "alarms.on_delay_s"),
+        (("--offline", "--set", "alarms.delay_s=1"), "alarms.delay_s"),
+        (("--offline", "--set", "alarms.on_delay_s"), "--set 'alarms.on_delay_s': expected FIELD=VALUE"),
+        (("--machine", "lab"), "--machine makes sense only with --offline"),
+        (("--pace", "0"), "--pace is '0', expected 0.1 to 1000, or max"),
+        (("--pace", "nan"), "--pace is 'nan'"),
+        (("--loop", "0"), "--loop is '0'"),
+        (("--prefix", "a/*"), "--prefix is 'a/*'"),
+        (("--prefix", "", "--loop", "2"), "--loop needs a prefix"),
+    ],
+)
+def test_options_that_cannot_be_used(faulty: Path, arguments: tuple[str, ...], message: str) -> None:
+    from typer.testing import CliRunner  # noqa: PLC0415  # in this process: a dozen starts would take a minute
+
+    from service.rotorwatch import app  # noqa: PLC0415
+
+    found = CliRunner().invoke(app, ["replay", str(faulty), *arguments])
+    assert found.exit_code == 2, found.output
+    assert message in found.stderr
+
+
+def test_files_that_cannot_be_used(tmp_path: Path, faulty: Path) -> None:
+    (tmp_path / "text.mcap").write_text("no recording", encoding="utf-8")
+    found = run(tmp_path / "text.mcap", "--offline")
+    assert found.returncode == 2
+    assert "text.mcap: not a recording (MCAP)" in found.stderr
+    other = [message for message in read_recording(faulty) if message.key != LAB.keys.stream]
+    found = run(write(tmp_path / "empty.mcap", other), "--offline")
+    assert found.returncode == 2
+    assert "empty.mcap: no sample blocks in there" in found.stderr
+
+
+def test_a_monitor_in_the_namespace_of_a_replay(faulty: Path, tmp_path: Path) -> None:
+    """By the commands of the page: monitor, replay, alarm; and without a directory, nothing is recorded."""
+    address = endpoint()
+    text = '[recording]\ndirectory = "recordings"\n\n[queue]\nwhen_full = "wait"\n'
+    (tmp_path / "plant.toml").write_text(text, encoding="utf-8")
+    arguments = ("--config", str(tmp_path / "plant.toml"), "--listen", address, "--http-port", "0")
+    with program(tmp_path, "service.rotorwatch", "run", *arguments, "--namespace", "replay/x") as monitor:
+        monitor.wait_for("HTTP API")
+        assert "Zenoh namespace replay/x" in monitor.output()
+        options = ("--prefix", "replay/x", "--pace", "max", "--connect", address, "--wait-for-subscriber", "20")
+        found = run(faulty, *options)
+        assert found.returncode == 0, found.stderr
+        assert "801 messages replayed" in found.stderr
+        until(lambda: monitor.health().state == "danger", "alarm")
+        assert [alarm.name for alarm in monitor.health().alarms if alarm.raised] == ["c_bz"]
+        assert monitor.stop() == 0
+    assert not (tmp_path / "recordings").exists()
+
+
+def test_nobody_to_connect_to_is_exit_code_1(faulty: Path) -> None:
+    found = run(faulty, "--connect", endpoint())
+    assert found.returncode == 1
+    assert "nobody answers there" in found.stderr

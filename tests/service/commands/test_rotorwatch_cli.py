@@ -1,0 +1,255 @@
+"""The command `rotorwatch` as a process: what it prints, where, and its exit codes."""
+
+import ctypes
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import httpx
+import pytest
+
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Health, Report
+from service.terminal.lines import alarm_event_line, alarm_state_lines, health_line, report_line
+from simulator.scenario import parse_fault
+from tests.service.rig.live import (
+    PATIENT,
+    ROOT,
+    SHORT,
+    Feed,
+    endpoint,
+    machine_file,
+    open_session,
+    program,
+    scenario_blocks,
+    send,
+    service,
+    until,
+)
+from tests.service.rig.preloaded import rotorwatch as run
+
+
+def test_help_is_quick_because_nothing_heavy_is_imported() -> None:
+    code = (
+        "import sys\nfrom service.rotorwatch import app\n"
+        "try:\n    app(['--help'])\nexcept SystemExit:\n    pass\n"
+        "print('loaded', sorted({name.split('.')[0] for name in sys.modules}))"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=300, check=True
+    )
+    loaded = found.stdout.splitlines()[-1]
+    assert loaded.startswith("loaded")
+    for name in ("numpy", "scipy", "torch", "zenoh", "fastapi", "pyarrow"):
+        assert f"'{name}'" not in loaded
+    for command in ("run", "check-config", "watch", "status", "router"):
+        assert command in found.stdout
+
+
+def test_numpy_computes_in_one_thread() -> None:
+    code = (
+        "import os, sys\nfrom service import rotorwatch\n"
+        "assert not {'numpy', 'pydantic', 'sqlalchemy', 'zenoh'} & set(sys.modules)  # --help does not wait for them\n"
+        "rotorwatch.prepare_numerics()\nimport numpy as np\n"
+        "a = np.ones((800, 800))\na @ a\nprint(len(os.listdir('/proc/self/task')))"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env={"PATH": "/usr/bin"}, check=True
+    )
+    assert found.stdout.strip() == "1"
+
+
+@pytest.mark.parametrize("command", ["run", "check-config", "watch", "status", "router"])
+def test_every_command_has_an_example(command: str) -> None:
+    found = run(command, "--help")
+    assert found.returncode == 0
+    assert "Example" in found.stdout
+    assert f"rotorwatch {command}" in found.stdout
+    assert ("[link]" in found.stdout) == (command in ("run", "watch", "router"))  # names of tables are no markup
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_run_says_where_it_is_needs_no_torch_and_stops_cleanly(tmp_path: Path, number: signal.Signals) -> None:
+    address = endpoint()
+    with program(
+        tmp_path, "service.rotorwatch", "run", "--listen", address, "--http-port", "0", ROTORWATCH_LOG__FORMAT="json"
+    ) as started:
+        url = started.url()
+        assert f"Zenoh listening on {address}" in started.output()
+        assert "machine demo/lab, bundle " in started.output()
+        assert httpx.get(f"{url}/readyz", trust_env=False, timeout=180.0).json()["ready"]
+        libraries = Path(f"/proc/{started.process.pid}/maps").read_text(encoding="utf-8")
+        assert ("/numpy/" in libraries, "/torch/" in libraries) == (True, False)
+        assert started.stop(number) == 0
+        lines = [json.loads(line) for line in started.errors().splitlines()]
+        assert lines[-1]["event"] == "stopped"
+        assert {line["level"] for line in lines} == {"info"}
+
+
+@pytest.mark.parametrize("command", ["run", "router"])
+def test_signal_that_another_thread_receives_stops_the_program_too(tmp_path: Path, command: str) -> None:
+    more = ("--machine", "lab", "--http-port", "0") if command == "run" else ()
+    with program(tmp_path, "service.rotorwatch", command, "--listen", endpoint(), *more) as started:
+        started.wait_for("HTTP API" if command == "run" else "router listening")
+        number = started.process.pid
+        other = next(int(task.name) for task in Path(f"/proc/{number}/task").iterdir() if int(task.name) != number)
+        assert ctypes.CDLL(None).tgkill(number, other, signal.SIGTERM) == 0
+        assert started.process.wait(180) == 0
+
+
+def test_watch_and_status_without_a_monitor_say_so() -> None:
+    address = endpoint()
+    found = run("watch", "--connect", address)
+    assert found.returncode == 1
+    assert f"connect {address}" in found.stderr
+    assert "nobody answers" in found.stderr
+    url = f"http://{address.removeprefix('tcp/')}"
+    found = run("status", "--url", url, "--json")
+    assert found.returncode == 4
+    said = json.loads(found.stdout)
+    assert (said["summary"], said["machines"]) == ("no-answer", [])
+    assert f"{url}: the monitor's HTTP API does not answer" in said["reason"]
+    assert f"{url}: the monitor's HTTP API does not answer" in found.stderr
+
+
+def test_status_tells_data_that_have_stopped_from_an_alarm(tmp_path: Path) -> None:
+    silence = ("[operation]", "[ingest]\nblock_to_s = 0.2\nno_data_after_s = 0.5\n\n[operation]")
+    address = endpoint()
+    with service(address, machine_file(tmp_path, silence)) as (runtime, worker), open_session(address) as session:
+        Feed(session, worker.machine).put_good()
+        until(lambda: worker.health().quality.accepted_blocks == 1, "a block")
+        until(lambda: "stream-lost" in {one.name for one in worker.alarms().alarms if one.raised}, "the silence")
+        found = run("status", "--url", runtime.http_url, "--json")
+    assert found.returncode == 3
+    said = json.loads(found.stdout)
+    assert said["summary"] == "no-data"
+    assert said["machines"][0]["reason"].startswith("no data since 20")
+
+
+def test_status_names_a_certificate_it_cannot_use(tmp_path: Path) -> None:
+    url = f"https://{endpoint().removeprefix('tcp/')}"
+    found = run("status", "--url", url, "--ca", str(tmp_path / "ca.pem"))
+    assert found.returncode == 2
+    assert "--ca: " in found.stderr
+    assert f"{tmp_path / 'ca.pem'}: cannot be used" in found.stderr
+
+
+def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
+    address = endpoint()
+    file = machine_file(tmp_path, PATIENT, *SHORT)
+    watching = ("service.rotorwatch", "watch", "--connect", address, "--windows")
+    with (
+        service(address, file, when_full="wait") as (runtime, worker),
+        program(tmp_path, *watching, "--machine", "demo/*") as text,
+        program(tmp_path, *watching, "--json") as lines,
+    ):
+        calm = run("status", "--url", runtime.http_url)
+        assert calm.returncode == 0
+        assert "warming" in calm.stdout
+        until(lambda: "state is warming" in text.output() and "/health" in lines.output(), "watchers at work")
+        send(address, scenario_blocks(37.0, parse_fault("k_bz=-0.3@0")), worker.machine)
+        text.wait_for("ALERT: bearing stiffness, vertical (k_bz) changed by −")
+        until(lambda: "org.rotorwatch.alarm.raised" in lines.output(), "alarm event as JSON")
+        until(lambda: "00:00:32  demo/lab  alert" in text.output(), "line of the last window")
+        assert "00:00:22  demo/lab  " in text.output()
+        assert not [line for line in text.output().splitlines() if "healthy" in line and "changed: " in line]
+
+        late = program(tmp_path, "service.rotorwatch", "watch", "--connect", address)
+        with late as joined:
+            joined.wait_for("ALERT (unacknowledged): bearing stiffness, vertical")
+            assert joined.stop() == 0
+        found = run("status", "--url", runtime.http_url)
+        assert found.returncode == 1
+        assert "k_bz alert" in found.stdout
+        machine = json.loads(run("status", "--url", runtime.http_url, "--json").stdout)["machines"][0]
+        Health.model_validate(machine)
+        assert [(one["name"], one["raised"]) for one in machine["alarms"]] == [("k_bz", True)]
+        assert text.stop(signal.SIGINT) == 0
+        assert lines.stop() == 0
+        records = [json.loads(line) for line in lines.output().splitlines()]
+    topics = {record["topic"].removeprefix("rotorwatch/demo/lab/") for record in records}
+    assert topics == {"report", "health", "alarm/state", "alarm/event"}
+    for record in records:
+        if record["topic"].endswith("/report"):
+            Report.model_validate(record["message"])
+
+
+def test_watch_notices_a_monitor_that_goes_and_comes_back(tmp_path: Path) -> None:
+    address = endpoint()
+    with service(address):
+        started = program(tmp_path, "service.rotorwatch", "watch", "--connect", address)
+        watcher = started.__enter__()
+        try:
+            watcher.wait_for("state is ")
+        except BaseException:
+            started.__exit__(None, None, None)
+            raise
+    try:
+        until(lambda: "connection lost, trying again" in watcher.errors(), "loss noticed")
+        with service(address):
+            until(lambda: "connected again" in watcher.errors(), "return noticed")
+        assert watcher.stop() == 0
+    finally:
+        started.__exit__(None, None, None)
+
+
+def test_router_runs_until_it_is_told_to_stop(tmp_path: Path) -> None:
+    address = endpoint()
+    with program(tmp_path, "service.rotorwatch", "router", "--listen", address) as router:
+        router.wait_for(f"router listening on {address}")
+        second = run("router", "--listen", address)
+        assert second.returncode == 1
+        assert address in second.stderr
+        monitor = ("service.rotorwatch", "run", "--machine", "lab", "--connect", address, "--http-port", "0")
+        with program(tmp_path, *monitor) as watched:
+            watched.wait_for(f"Zenoh connecting to {address}")
+            watched.url()
+            with open_session(address, "client") as session:
+                Feed(session).put_good()
+                until(lambda: watched.health().quality.accepted_blocks == 1, "block through the router")
+        assert router.stop() == 0
+
+
+def test_lines_for_terminals() -> None:
+    report = Report.model_validate(example(Report))
+    start, tail = "00:03:25  demo/lab  alert          ", "  |  changed: k_by  |  relation agrees"
+    assert report_line(report) == f"{start}k_by −24.7±1.4 %{tail}"
+    assert report.verdict is not None
+    settled = report.model_copy(update={"verdict": report.verdict.model_copy(update={"settled": True})})
+    small = report.parameters[0].model_copy(update={"relative_change": 0.005})
+    assert report_line(settled.model_copy(update={"parameters": (small,)})) == f"{start}k_by  +0.5±1.4 %{tail}"
+    blind = report.parameters[0].model_copy(update={"relative_change": None})
+    assert report_line(settled.model_copy(update={"parameters": (blind,)})) == f"{start}k_by n/a{tail}"
+    just = report.model_copy(update={"verdict": report.verdict.model_copy(update={"current": (), "changed": ()})})
+    assert "too little data since the change  |  changed: ?" in report_line(just)
+    calm = report.verdict.model_copy(update={"changed": (), "detected": False, "outside_model": True})
+    (opinion,) = report.opinions
+    apart = opinion.model_copy(update={"agreement": (opinion.agreement[0].model_copy(update={"verdict": "disagree"}),)})
+    shown = report_line(report.model_copy(update={"verdict": calm, "opinions": (apart,)}))
+    assert shown.endswith("no change, outside the model  |  relation disagrees on k_by")
+    early = report.model_copy(update={"parameters": (), "filled": 0.25, "state": "warming"})
+    watching = report_line(early.model_copy(update={"state": "watching"}))
+    assert watching.endswith("watching       DE-H 1.93 m/s2 rms, velocity 2.1 mm/s rms, 1x 1.1, zone B")
+    assert report_line(early) == "00:03:25  demo/lab  warming        window 25% full"
+    assert report_line(early.model_copy(update={"reason": "too fast"})).endswith("too fast")
+    event = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
+    assert alarm_event_line(event).startswith("00:03:25  demo/lab  ALERT: bearing stiffness, horizontal (k_by)")
+    back = event.data.model_copy(update={"name": "stream-lost", "text": "cleared: data come again"})
+    assert alarm_event_line(event.model_copy(update={"data": back})) == (
+        "00:03:25  demo/lab  cleared: data come again (stream-lost)"
+    )
+    states = AlarmStates.model_validate(example(AlarmStates))
+    assert alarm_state_lines(states) == (
+        "00:03:25  demo/lab  ALERT (unacknowledged): bearing stiffness, horizontal  k_by −24.7±1.4 %",
+    )
+    lost = {"name": "stream-lost", "text": "stream lost", "relative_change": None, "note": "no usable data for 5 s"}
+    assert alarm_state_lines(states.model_copy(update={"alarms": (states.alarms[0].model_copy(update=lost),)})) == (
+        "00:03:25  demo/lab  ALERT (unacknowledged): stream lost: no usable data for 5 s",
+    )
+    health = Health.model_validate(example(Health))
+    assert health_line(health) == "00:03:25  demo/lab  state is alert"
+    unseen = health.model_copy(update={"report": None, "state": "no-data", "reason": "silence"})
+    assert health_line(unseen) == "--:--:--  demo/lab  state is no-data: silence"

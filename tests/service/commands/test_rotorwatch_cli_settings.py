@@ -1,0 +1,123 @@
+"""Settings: file, environment over it, and what is said about mistakes."""
+
+from pathlib import Path
+from types import UnionType
+from typing import get_args
+
+import pytest
+from pydantic import BaseModel
+
+from models.errors import MachineFileError
+from service.settings.service import DEFAULT_LISTEN, ServiceSettings, load_settings
+from tests.service.rig.live import ROOT, machine_file
+from tests.service.rig.preloaded import rotorwatch as run
+
+GOOD = """
+[link]
+listen = ["tcp/127.0.0.1:7001"]
+
+[http]
+port = 9000
+
+[[machines]]
+file = "machine.toml"
+bundle = "lab"
+
+[queue]
+blocks = 10
+when_full = "wait"
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    machine_file(folder)
+    path = folder / "service.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_defaults_watch_the_shipped_machine_on_loopback() -> None:
+    settings = load_settings()
+    assert [(entry.file, entry.bundle) for entry in settings.machines] == [("lab", "lab")]
+    assert settings.link.listen == (DEFAULT_LISTEN,)
+    assert settings.http.host == "127.0.0.1"
+    assert settings.queue.when_full == "drop"
+
+
+def test_file_is_read_and_paths_are_relative_to_it(tmp_path: Path) -> None:
+    settings = load_settings(written(tmp_path, GOOD))
+    assert settings.http.port == 9000
+    assert settings.queue.blocks == 10
+    assert settings.machines[0].file == str(tmp_path / "machine.toml")
+    assert settings.machines[0].bundle == "lab"
+    assert settings.machines[0].load().name == "lab"
+    (tmp_path / "lab").mkdir()
+    assert load_settings(tmp_path / "service.toml").machines[0].bundle == str(tmp_path / "lab")
+
+
+def test_environment_goes_over_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROTORWATCH_HTTP__PORT", "9001")
+    monkeypatch.setenv("ROTORWATCH_MACHINES", '[{"file": "heavy"}]')
+    settings = load_settings(written(tmp_path, GOOD))
+    assert settings.http.port == 9001
+    assert settings.queue.blocks == 10
+    assert [(entry.file, entry.bundle) for entry in settings.machines] == [("heavy", None)]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[history]\nurll = "postgresql://plant:bolt@db/rotorwatch"\n',
+        '[history]\nurl = ["postgresql://plant:bolt@db/rotorwatch"]\n',
+        'history = "postgresql://plant:bolt@db/rotorwatch"\n',
+        '[[webhooks]]\nname = "pager"\nulr = "https://pager.example/?key=bolt"\n',
+    ],
+)
+def test_a_mistake_shows_no_password(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(MachineFileError, match=r"plant.toml: (history|webhooks)") as caught:
+        load_settings(path)
+    assert "bolt" not in str(caught.value)
+
+
+def test_check_config_says_what_is_fine_and_what_is_not(tmp_path: Path) -> None:
+    good = written(tmp_path, GOOD)
+    wrong_machine = tmp_path / "wrong.toml"
+    wrong_machine.write_text(
+        (tmp_path / "machine.toml").read_text(encoding="utf-8").replace("rate_hz = 2000.0", "rate_hz = -1.0"),
+        encoding="utf-8",
+    )
+    wrong_bundle = tmp_path / "bundle.toml"
+    wrong_bundle.write_text('[[machines]]\nfile = "heavy"\nbundle = "lab"\n', encoding="utf-8")
+    fine = run("check-config", str(good), str(tmp_path / "machine.toml"))
+    assert (fine.returncode, fine.stderr) == (0, "")
+    assert f"{good}: ok, settings for demo/lab" in fine.stdout
+    assert f"{tmp_path / 'machine.toml'}: ok, machine demo/lab, 9 channels at 2000 Hz" in fine.stdout
+    mixed = run("check-config", str(good), str(wrong_machine), str(wrong_bundle))
+    assert mixed.returncode == 2
+    assert f"{good}: ok" in mixed.stdout
+    assert f"{wrong_machine}: rate_hz: expected above 0 and at most 1000000 (found -1.0)" in mixed.stderr
+    assert str(wrong_bundle) in mixed.stderr
+
+
+def fields_of(model: type[BaseModel], table: str = "") -> list[tuple[str, str, str | None]]:
+    found: list[tuple[str, str, str | None]] = []
+    for name, field in model.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, UnionType):  # a table that may be left out
+            inner = get_args(inner)[0]
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            found += fields_of(inner, name)
+        else:
+            found.append((table, name, field.description))
+    return found
+
+
+def test_every_setting_is_described_and_documented() -> None:
+    page = "".join(
+        (ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("service.md", "access.md", "zenoh-security.md")
+    )
+    for table, name, description in fields_of(ServiceSettings):
+        assert description, f"{table}.{name} has no description"
+        assert f"`{name}`" in page or f"[[{name}]]" in page, f"no page mentions {table}.{name}"

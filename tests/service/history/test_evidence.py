@@ -1,0 +1,115 @@
+"""What an alarm rests on is kept: before it, when it was raised, and once the change is all there is."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from rotorwatch.records.health import HealthState
+from rotorwatch.records.history import AlarmEvidence
+from service.history.records import Retention
+from service.history.store import Store
+from service.runtime.runtime import running
+from service.settings.service import HistorySettings, MachineEntry
+from simulator.scenario import parse_fault
+from tests.service.rig.live import (
+    LAB,
+    SHORT,
+    Feed,
+    endpoint,
+    machine_file,
+    open_session,
+    scenario_blocks,
+    settings,
+    until,
+)
+from tests.service.rig.monitored import PLACE, client, problem
+
+FAULT_S = 40.0
+CHANGED = -0.33
+HOP = 50
+"""Blocks of a hop."""
+
+
+def test_an_alarm_can_be_understood_long_after_its_window_is_gone(tmp_path: Path) -> None:
+    file = machine_file(tmp_path, *SHORT)
+    address = endpoint()
+    plan = settings(address, when_full="wait").model_copy(
+        update={
+            "machines": (MachineEntry(file=file),),
+            "history": HistorySettings(url=f"sqlite:///{tmp_path / 'history.sqlite'}"),
+        }
+    )
+    blocks = scenario_blocks(100.0, parse_fault(f"k_by={CHANGED}@{FAULT_S:g}"))
+    with running(plan) as runtime, open_session(address) as session, client(runtime) as http:
+        worker = runtime.machines()[0]
+        feed, sent = Feed(session, LAB), 0
+
+        def kept() -> AlarmEvidence | None:
+            text = worker.history.evidence("k_by")
+            return None if text is None else AlarmEvidence.model_validate_json(text)
+
+        def feed_on(count: int) -> None:
+            nonlocal sent
+            for block in blocks[sent : sent + count]:
+                feed.put(block)
+            sent += count
+            until(lambda: worker.health().quality.accepted_blocks == sent, f"{sent} blocks")
+            time.sleep(0.3)  # windows are looked at four times a second
+
+        def until_settled() -> bool:
+            feed_on(HOP)
+            found = kept()
+            return found is not None and found.settled is not None
+
+        feed_on(round(10 * FAULT_S))
+        until(lambda: worker.history.evidence("") is not None, "picture of the healthy machine")
+        assert problem(http.get(f"{PLACE}/alarms/k_by/evidence"), 404).detail.startswith("nothing was kept of k_by")
+        until(until_settled, "evidence of the whole change")
+        answer = http.get(f"{PLACE}/alarms/k_by/evidence")
+        found = AlarmEvidence.model_validate_json(answer.content)
+        problem(http.get(f"{PLACE}/alarms/k_by/evidence?occurrence=2"), 404)
+        assert http.get(f"{PLACE}/alarms/k_by/evidence?occurrence=1").content == answer.content
+    begin_ns = blocks[0].start_ns
+    before, raised, settled = found.before, found.raised, found.settled
+    assert before is not None
+    assert settled is not None
+    assert before.report.state is HealthState.HEALTHY
+    assert before.report.end_ns <= begin_ns + FAULT_S * 1e9 < raised.report.end_ns <= settled.report.end_ns
+    assert settled.report.start_ns >= begin_ns + (FAULT_S - 5.0) * 1e9
+    for picture in (before, settled):
+        assert {one.location for one in picture.orbits.orbits} == {"bearing", "disc"}
+        assert picture.correlations is not None
+        assert {len(one.measured) for one in picture.correlations.pairs} == {len(picture.correlations.lags_s)}
+        assert picture.correlations.pairs[0].nominal is None
+        assert len(picture.spectra.frequencies_hz) == len(picture.spectra.densities[0].measured) > 10
+    read = {one.name: one.relative_change for one in settled.report.parameters}["k_by"]
+    assert read is not None
+    assert abs(read - CHANGED) < 0.1
+    verdict = raised.report.verdict
+    assert verdict is not None
+    best, *others = verdict.alternatives
+    assert best.names == ("k_by",)
+    assert best.probability == pytest.approx(verdict.confidence)
+    assert best.explained > 0.9
+    assert {one.names for one in others} >= {(), ("c_by",), ("k_bz",), ("c_bz",), ("e",)}
+    assert all(one.probability <= best.probability for one in others)
+    # A monitor that is started again knows it.
+    with running(plan) as runtime:
+        assert runtime.machines()[0].history.evidence("k_by", 1) == answer.text
+
+
+def test_evidence_of_many_occurrences_does_not_grow_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.history.machine._MOST_EVIDENCE", 3)
+    clock = iter(range(1, 100))
+    store = Store("sqlite:///:memory:", Retention(), now_ns=lambda: next(clock))
+    store.open()
+    lab, other = store.machine("demo", "lab"), store.machine("demo", "other")
+    other.keep_evidence("e", 1, "other")
+    for occurrence in range(1, 8):
+        lab.keep_evidence("e", occurrence, f"{occurrence}")
+    lab.keep_evidence("e", 7, "seven")
+    assert [lab.evidence("e", occurrence) for occurrence in range(4, 8)] == [None, "5", "6", "seven"]
+    assert lab.evidence("e") == "seven"
+    assert other.evidence("e") == "other"
+    store.close()

@@ -1,0 +1,210 @@
+"""A history that is locked at the end, deleted, replaced or damaged: it is said, and monitoring goes on."""
+
+import sqlite3
+import stat
+from dataclasses import astuple
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from models.alarm_names import FAULT
+from service.history.records import Retention, StoredEvent, TokenRecord
+from service.history.store import Store
+from service.rotorwatch import app
+from service.runtime.runtime import running as running_here
+from service.settings.service import HistorySettings
+from tests.service.history.test_store import AUDIT, T0, alarm_event
+from tests.service.monitor.test_alarm_trouble import Bench, bench, block
+from tests.service.rig.live import PATIENT, endpoint, machine_file, settings, until
+from tests.service.rig.monitored import client
+from tests.service.runtime.test_survives import do, running
+
+TOKEN = TokenRecord("aaaa", "control room", ("read",), b"hash", T0, None, None)
+
+
+def test_a_monitor_that_could_not_write_the_last_of_it_says_what_is_lost(tmp_path: Path) -> None:
+    with running(tmp_path, endpoint(), machine_file(tmp_path, PATIENT)) as at:
+        at.url()
+        blocker = sqlite3.connect(tmp_path / "history.sqlite", isolation_level=None)  # does not let go of the file
+        blocker.execute("BEGIN IMMEDIATE")
+        assert at.stop() == 1
+        blocker.close()
+        (said,) = [line for line in at.errors().splitlines() if line.startswith("could not be written")]
+        assert "demo/lab: the state to go on from" in said
+        assert "database is locked" in said
+
+
+def test_a_monitor_whose_latest_step_was_refused_does_not_end_as_if_all_were_well(tmp_path: Path) -> None:
+    with running(tmp_path, endpoint(), machine_file(tmp_path, PATIENT)) as at:
+        at.url()
+        with sqlite3.connect(history_of(tmp_path)) as connection:  # another program took the number of the next event
+            columns = ", ".join(StoredEvent.__dataclass_fields__)
+            marks = ", ".join("?" * len(StoredEvent.__dataclass_fields__))
+            connection.execute(
+                f"INSERT INTO alarm_events (machine_id, {columns}) SELECT machine_id, {marks} FROM machines",  # noqa: S608
+                astuple(alarm_event(0)),
+            )
+        connection.close()
+        do(at, "shelve", "model", "normal", duration_s=3600)
+        assert at.stop() == 1
+        (said,) = [line for line in at.errors().splitlines() if line.startswith("the history refused the latest step")]
+        assert "demo/lab" in said
+
+
+def history_of(folder: Path) -> Path:
+    return folder / "history.sqlite"
+
+
+def in_file(folder: Path, query: str) -> list[tuple[object, ...]]:
+    """What is found at the path, by whoever opens it."""
+    with sqlite3.connect(history_of(folder)) as connection:
+        found = connection.execute(query).fetchall()
+    connection.close()
+    return found
+
+
+def ticked(at: Bench) -> bool:
+    """Let time pass for the monitor, as the supervisor does."""
+    at.tick()
+    return True
+
+
+def test_a_deleted_history_is_written_again_with_all_it_held(tmp_path: Path) -> None:
+    with bench(tmp_path) as at:
+        at.put(*map(block, range(12)), block(40, run=2, sequence=0))
+        at.store.tokens.add(TOKEN)
+        at.store.audit.append(AUDIT)
+        before = at.log()
+        assert before
+        history_of(tmp_path).unlink()
+        assert "the file was deleted" in at.store.unreachable()
+        until(lambda: history_of(tmp_path).exists() and at.store.unreachable() == at.store.trouble == "", "a new file")
+        until(lambda: ticked(at) and len(at.log()) > len(before), "the alarm")
+        at.put(*(block(40 + n, run=2, sequence=n) for n in range(1, 15)))
+        log = at.log()
+        assert log[: len(before) + 1] == [*before, (len(before), "raised", FAULT)]
+        assert at.store.lost == ""
+        assert at.history.waiting == 0
+    assert in_file(tmp_path, "SELECT sequence, kind, alarm FROM alarm_events ORDER BY sequence")[: len(log)] == log
+    assert in_file(tmp_path, "SELECT token_id FROM tokens") == [("aaaa",)]
+    assert in_file(tmp_path, "SELECT count(*) FROM audit_log") == [(1,)]
+    with bench(tmp_path) as at:
+        assert at.worker.restart.startswith("went on where it stood")
+        assert at.log()[: len(log)] == log
+
+
+@pytest.mark.parametrize("damaged", [False, True], ids=["another", "damaged"])
+def test_a_history_that_was_replaced_goes_on_with_the_numbers_of_the_alarms(tmp_path: Path, damaged: bool) -> None:
+    other = tmp_path / "other"
+    if damaged:
+        other.write_bytes(b"no database " * 1000)
+    else:
+        store = Store(f"sqlite:///{other}", Retention())
+        store.open()
+        store.close()
+    with bench(tmp_path) as at:
+        at.put(*map(block, range(12)), block(40, run=2, sequence=0))
+        at.put(*(block(40 + n, run=2, sequence=n) for n in range(1, 35)))
+        last = at.history.last_sequence()
+        state = in_file(tmp_path, "SELECT count(*) FROM checkpoints")
+        assert last >= 0
+        other.rename(history_of(tmp_path))
+        until(lambda: at.store.lost != "", "the notice")
+        until(lambda: ticked(at) and at.history.last_sequence() > last, "the alarm")
+        until(lambda: at.history.waiting == 0, "the state in the new file")
+        assert at.log() == [(last + 1, "raised", FAULT)]
+        assert in_file(tmp_path, "SELECT count(*) FROM checkpoints") == state == [(1,)]
+        # Nobody else gets the machine meanwhile.
+        second = Store(f"sqlite:///{history_of(tmp_path)}", Retention())
+        second.open()
+        with pytest.raises(Exception, match="another monitor writes the history of demo/lab"):
+            second.machine("demo", "lab")
+        second.close()
+    assert len(list(tmp_path.glob("history.sqlite.damaged-*"))) == damaged
+    with bench(tmp_path) as at:
+        assert at.worker.restart.startswith("went on where it stood")
+        at.put(block(90, run=3, sequence=0))
+        assert [number for number, _, _ in at.log()][:2] == [last + 1, last + 2]
+
+
+def test_a_machine_without_a_new_alarm_keeps_its_numbers_in_a_file_begun_anew(tmp_path: Path) -> None:
+    with bench(tmp_path) as at:
+        at.put(*map(block, range(12)), block(40, run=2, sequence=0))
+        last = at.history.last_sequence()
+    with sqlite3.connect(history_of(tmp_path)) as connection:
+        connection.executescript("DROP TRIGGER alarm_events_no_delete; DELETE FROM alarm_events;")
+    connection.close()
+    with bench(tmp_path) as at:
+        assert at.history.last_sequence() == last
+        at.put(block(90, run=3, sequence=0))
+        assert at.log()[0][0] == last + 1
+
+
+@pytest.mark.parametrize("where", ["head", "tables"])
+def test_a_monitor_starts_with_a_damaged_history_and_keeps_it_aside(tmp_path: Path, where: str) -> None:
+    file = history_of(tmp_path)
+    plan = settings(endpoint(), machine_file(tmp_path, PATIENT))
+    plan = plan.model_copy(update={"history": HistorySettings(url=f"sqlite:///{file}")})
+    with running_here(plan):
+        pass
+    data = bytearray(file.read_bytes())
+    start = 0 if where == "head" else 8192
+    data[start:] = b"\xa5" * (len(data) - start)
+    file.write_bytes(data)
+    with running_here(plan) as runtime, client(runtime) as http:
+        (kept,) = tmp_path.glob("history.sqlite.damaged-*Z")
+        assert kept.read_bytes() == data
+        answer = http.get("/readyz")
+        assert answer.status_code == 503
+        (reason,) = answer.json()["reasons"]
+        assert str(kept) in reason
+        worker = runtime.machines()[0]
+        until(lambda: FAULT in {alarm.name for alarm in worker.alarms().alarms}, "the alarm")
+        assert runtime.store.unreachable() == ""
+    with running_here(plan) as runtime:
+        assert runtime.readiness().ready
+
+
+def history(folder: Path, *arguments: str) -> tuple[int, str]:
+    done = CliRunner().invoke(
+        app, ["history", *arguments], env={"ROTORWATCH_HISTORY__URL": f"sqlite:///{history_of(folder)}"}
+    )
+    return done.exit_code, done.output
+
+
+def test_a_backup_is_taken_from_a_running_monitor_and_restored_without_one(tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    with bench(tmp_path) as at:
+        at.put(*map(block, range(12)), block(40, run=2, sequence=0))
+        before = at.log()
+        assert history(tmp_path, "check")[0] == 0
+        assert history(tmp_path, "backup", str(copy))[0] == 0
+        assert stat.S_IMODE(copy.stat().st_mode) == 0o600
+        assert list(tmp_path.glob("copy*")) == [copy]
+        code, said = history(tmp_path, "backup", str(copy))
+        assert (code, "expected a new file" in said) == (1, True)
+        at.put(block(90, run=3, sequence=0))
+        assert len(at.log()) > len(before)
+        code, said = history(tmp_path, "restore", str(copy))
+        assert (code, "history.sqlite.demo.lab.lock is locked" in said) == (1, True)
+    data = bytearray(copy.read_bytes())
+    data[8192:] = b"\xa5" * (len(data) - 8192)
+    (tmp_path / "damaged").write_bytes(data)
+    assert history(tmp_path, "restore", str(tmp_path / "damaged"))[0] == 1
+    code, said = history(tmp_path, "restore", str(copy))
+    (kept,) = tmp_path.glob("history.sqlite.replaced-*Z")
+    assert (code, str(kept) in said) == (0, True)
+    assert not list(tmp_path.glob("*.restored*"))
+    with bench(tmp_path) as at:
+        assert at.log()[: len(before)] == before
+    history_of(tmp_path).write_bytes(data)
+    for end in ("-wal", "-shm"):
+        Path(f"{history_of(tmp_path)}{end}").unlink(missing_ok=True)
+    assert history(tmp_path, "check")[0] == 1
+
+
+def test_a_server_has_its_own_programs_for_backups() -> None:
+    address = {"ROTORWATCH_HISTORY__URL": "postgresql://anna:secret@host/db"}
+    done = CliRunner().invoke(app, ["history", "check"], env=address)
+    assert (done.exit_code, "pg_dump" in done.output, "secret" in done.output) == (2, True, False)

@@ -1,0 +1,488 @@
+"""What goes into the history comes out again, on SQLite and PostgreSQL alike."""
+
+import sqlite3
+import stat
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from itertools import count
+from pathlib import Path
+
+import pytest
+from sqlalchemy import create_engine, event, make_url, text
+from sqlalchemy.exc import DBAPIError
+
+from service.history.machine import MachineStore
+from service.history.records import (
+    AuditEntry,
+    Checkpoint,
+    CheckpointHead,
+    CheckpointStep,
+    Retention,
+    Step,
+    StoredEvent,
+    StoredReading,
+    StoredReport,
+    StoreError,
+    TokenRecord,
+)
+from service.history.store import Store
+from tests.service.rig.postgres import KINDS, database_url, opened
+
+NS = 1_000_000_000
+T0 = 1_767_225_600 * NS
+NUMBERS = count()
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def shared(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    with opened(database_url(request.param, tmp_path_factory.mktemp("shared"))) as made:
+        yield made
+
+
+@pytest.fixture
+def lab(shared: Store) -> MachineStore:
+    """A machine of one's own, beside those of other tests."""
+    return shared.machine("demo", f"lab-{next(NUMBERS)}")
+
+
+def alarm_event(sequence: int, **changes: object) -> StoredEvent:
+    fields: dict[str, object] = {
+        "sequence": sequence,
+        "id": f"event-{sequence}",
+        "time_ns": T0 + sequence * NS,
+        "recorded_ns": T0 + sequence * NS + 7,
+        "kind": "raised",
+        "alarm": "k_by",
+        "severity": "alert",
+        "state": "unacknowledged",
+        "occurrence": sequence // 2,
+        "actor": "",
+        "text": f'{{"sequence": {sequence}, "note": "ü → ✓"}}',
+    }
+    return StoredEvent(**(fields | changes))  # type: ignore[arg-type]  # fields of any kind
+
+
+def head(end_ns: int, **changes: object) -> CheckpointHead:
+    fields: dict[str, object] = {
+        "format": 1,
+        "bundle": None,
+        "machine_hash": "ab12",
+        "code_version": "0.1.0",
+        "end_ns": end_ns,
+        "recorded_ns": end_ns + 1,
+        "alarms": "{}",
+        "state": bytes(range(256)),
+    }
+    return CheckpointHead(**(fields | changes))  # type: ignore[arg-type]  # fields of any kind
+
+
+def hop_step(number: int, ring: int = 3, **parts: object) -> Step:
+    """The step of a hop: a report, readings and a checkpoint with so many parts, one of which is new."""
+    end_ns = T0 + number * 5 * NS
+    keep = tuple(f"part {each:06}" for each in range(max(0, number - ring + 1), number))
+    fields: dict[str, object] = {
+        "reports": (StoredReport(end_ns - 60 * NS, end_ns, "healthy", 0.5, f'{{"number": {number}}}'),),
+        "readings": (
+            StoredReading(end_ns, "parameter", "k_by", 0.1 * number, 0.01),
+            StoredReading(end_ns, "parameter", "e", -0.1 * number, None),
+            StoredReading(end_ns, "misfit", "z", 1.5, None),
+        ),
+        "checkpoint": CheckpointStep(head(end_ns), ((f"part {number:06}", b"part %d" % number),), keep),
+    }
+    return Step(**(fields | parts))  # type: ignore[arg-type]  # fields of any kind
+
+
+def executed(url: str, statement: str, **values: object) -> None:
+    """Change the database behind the store's back."""
+    made = make_url(url)
+    drivers = {"sqlite": "sqlite", "postgresql": "postgresql+psycopg"}
+    engine = create_engine(made.set(drivername=drivers[made.drivername]))
+    try:
+        with engine.begin() as connection:
+            connection.execute(text(statement), values)
+    finally:
+        engine.dispose()
+
+
+def test_a_new_machine_has_nothing(lab: MachineStore) -> None:
+    assert lab.last_sequence() == -1
+    assert lab.restore() is None
+    assert lab.events() == ()
+    assert lab.reports() == ()
+    assert lab.readings(quantity="parameter", name="k_by") == ()
+    assert lab.downsampled(quantity="parameter") == ()
+    assert lab.waiting == 0
+
+
+def test_everything_comes_back_as_it_went_in(store: Store, url: str) -> None:
+    lab = store.machine("demo", "lab")
+    steps = [hop_step(number, events=(alarm_event(number),)) for number in range(6)]
+    for step in steps:
+        assert lab.commit(step) is True
+    store.close()
+
+    with opened(url) as again:
+        lab = again.machine("demo", "lab")
+        assert lab.last_sequence() == 5
+        assert lab.events() == tuple(step.events[0] for step in steps)
+        assert [report for _, report in lab.reports()] == [step.reports[0] for step in reversed(steps)]
+        for place, (quantity, name) in enumerate((("parameter", "k_by"), ("parameter", "e"), ("misfit", "z"))):
+            found = [(one.end_ns, one.value, one.standard_error) for one in lab.readings(quantity=quantity, name=name)]
+            kept = [step.readings[place] for step in steps]
+            assert found == [(one.end_ns, one.value, one.standard_error) for one in kept]
+        newest = [(f"part {number:06}", b"part %d" % number) for number in (3, 4, 5)]
+        assert lab.restore() == Checkpoint(head(T0 + 25 * NS), tuple(newest))
+
+
+def test_machines_do_not_see_each_other(store: Store) -> None:
+    lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
+    lab.commit(hop_step(0, events=(alarm_event(0),)))
+    assert pump.last_sequence() == -1
+    assert pump.restore() is None
+    assert not pump.events()
+    assert not pump.reports()
+    assert not pump.readings(quantity="parameter", name="k_by")
+    assert not pump.downsampled(quantity="parameter")
+    pump.commit(Step(events=(alarm_event(0),)))  # the same id in another machine is another event
+    assert pump.last_sequence() == 0
+
+
+def test_events_are_found_by_everything_they_are_asked_by(lab: MachineStore) -> None:
+    events = tuple(
+        alarm_event(
+            number,
+            alarm=("k_by", "model", "data-gap")[number % 3],
+            kind=("raised", "cleared")[number % 2],
+            severity=("alert", "danger")[number // 6],
+        )
+        for number in range(12)
+    )
+    lab.commit(Step(events=events))
+    assert lab.events(after=9) == events[10:]
+    assert lab.events(before=2) == events[:2]
+    assert lab.events(after=3, before=6) == events[4:6]
+    assert lab.events(since_ns=T0 + 3 * NS, until_ns=T0 + 5 * NS) == events[3:5]
+    assert lab.events(alarm="model") == events[1::3]
+    assert lab.events(kind="cleared") == events[1::2]
+    assert lab.events(severity="danger") == events[6:]
+    assert lab.events(alarm="model", kind="cleared", severity="danger") == (events[7],)
+    assert lab.events(limit=2) == events[:2]
+    assert lab.events(limit=2, newest_first=True) == events[:-3:-1]
+    assert lab.events(limit=2, newest_first=True, before=5) == (events[4], events[3])
+    with pytest.raises(StoreError, match="0 entries were asked for"):
+        lab.events(limit=0)
+
+
+def test_reports_stand_in_the_order_of_arrival_when_a_clock_was_set_back(lab: MachineStore) -> None:
+    for number in (10, 11, 3, 4):
+        lab.commit(hop_step(number))
+    found = lab.reports()
+    assert [report.end_ns for _, report in found] == [T0 + number * 5 * NS for number in (4, 3, 11, 10)]
+    first_page = lab.reports(limit=2)
+    assert first_page == found[:2]
+    assert lab.reports(before=first_page[-1][0]) == found[2:]
+    assert lab.reports(since_ns=T0 + 15 * NS, until_ns=T0 + 55 * NS) == (found[0], found[1], found[3])
+    readings = lab.readings(quantity="parameter", name="k_by", since_ns=T0 + 15 * NS, until_ns=T0 + 55 * NS)
+    assert [round(reading.value / 0.1) for reading in readings] == [10, 3, 4]
+
+
+def test_the_parts_of_a_checkpoint_are_those_that_are_to_remain(lab: MachineStore) -> None:
+    for number in range(4):
+        lab.commit(hop_step(number))
+    cleared = head(T0, bundle="lab", alarms='{"k_by": 1}', state=b"")
+    lab.commit(Step(checkpoint=CheckpointStep(cleared, (), ())))
+    assert lab.restore() == Checkpoint(cleared, ())
+    lab.commit(Step(checkpoint=CheckpointStep(cleared, (("e", b"a"), ("c", b"b")), ())))
+    lab.commit(Step(checkpoint=CheckpointStep(cleared, (("e", b"c"),), ("c",))))
+    assert lab.restore() == Checkpoint(cleared, (("c", b"b"), ("e", b"c")))
+    lab.commit(Step(events=(alarm_event(0),)))  # a step without a checkpoint leaves it alone
+    assert lab.restore() == Checkpoint(cleared, (("c", b"b"), ("e", b"c")))
+
+
+def test_a_step_that_is_written_twice_leaves_its_events_once(lab: MachineStore) -> None:
+    events = tuple(alarm_event(number) for number in range(3))
+    assert lab.commit(Step(events=events[:2]))
+    assert lab.commit(Step(events=events))
+    assert lab.commit(Step(events=events[1:2]))
+    assert lab.events() == events
+    assert lab.last_sequence() == 2
+
+
+def test_events_that_contradict_the_log_are_refused_with_their_step(lab: MachineStore) -> None:
+    assert lab.commit(Step(events=(alarm_event(0), alarm_event(1))))
+    for events, message in (
+        ((alarm_event(1, id="other"),), "alarm event 1 has the id other, but the history has it with the id event-1"),
+        ((alarm_event(2, id="event-0"),), "alarm event 2 has the id event-0, which alarm event 0 has already"),
+        ((alarm_event(3),), r"demo/lab-\d+: alarm event 3 comes after 1, expected 2"),
+        ((alarm_event(2), alarm_event(3, id="event-2")), "two alarm events of one step have the same id"),
+    ):
+        with pytest.raises(StoreError, match=message):
+            lab.commit(hop_step(1, events=events))
+        assert lab.last_sequence() == 1
+    assert lab.reports() == ()
+    assert lab.restore() is None
+    assert lab.commit(hop_step(1, events=(alarm_event(2),)))
+    assert len(lab.events()) == 3
+
+
+@pytest.mark.parametrize(
+    ("step", "message"),
+    [
+        (Step(events=(alarm_event(0, text="a\0b"),)), "alarm event 0: .* holds a NUL character"),
+        (Step(events=(alarm_event(0, actor="\ud800"),)), "alarm event 0: .* is no valid text"),
+        (Step(events=(alarm_event(0, time_ns=-1),)), "alarm event 0: time_ns is -1, expected 0 or more"),
+        (Step(readings=(StoredReading(T0, "misfit", "z", float("nan"), None),)), "misfit z: value is nan"),
+        (Step(readings=(StoredReading(2**63, "misfit", "z", 0.0, None),)), "end_ns is 9223372036854775808"),
+        (Step(reports=(StoredReport(0, 0, "healthy", float("nan"), "{}"),)), "report: filled is nan"),
+        (Step(checkpoint=CheckpointStep(head(-5), (), ())), "checkpoint: end_ns is -5"),
+    ],
+)
+def test_what_no_database_takes_is_refused_by_name(lab: MachineStore, step: Step, message: str) -> None:
+    with pytest.raises(StoreError, match=rf"demo/lab-\d+: .*{message}"):
+        lab.commit(step)
+    assert lab.waiting == 0
+    assert lab.commit(hop_step(1, events=(alarm_event(0),)))
+
+
+def test_infinity_and_the_smallest_numbers_come_back(lab: MachineStore) -> None:
+    values = (float("inf"), float("-inf"), 5e-324, 0.1 + 0.2, -0.0)
+    for number, value in enumerate(values):
+        lab.commit(Step(readings=(StoredReading(T0 + number, "equation", "29", value, value),)))
+    found = lab.readings(quantity="equation", name="29")
+    assert [(reading.value, reading.standard_error) for reading in found] == [(value, value) for value in values]
+
+
+def test_steps_that_wait_together_are_committed_together(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    machines = [store.machine("demo", f"m{number}") for number in range(12)]
+    commits: list[int] = []
+    event.listen(store._database.engine, "commit", lambda connection: commits.append(1))
+    ready = threading.Barrier(len(machines))
+
+    def feed(machine: MachineStore) -> None:
+        ready.wait()
+        for number in range(10):
+            assert machine.commit(hop_step(number, events=(alarm_event(number),)))
+
+    with ThreadPoolExecutor(len(machines)) as pool:
+        list(pool.map(feed, machines))
+    for machine in machines:
+        assert [each.sequence for each in machine.events()] == list(range(10))
+        assert [report.text for _, report in machine.reports()] == [f'{{"number": {n}}}' for n in range(9, -1, -1)]
+    assert 10 <= len(commits) < 120 // 2  # 120 steps
+
+
+def test_who_reads_does_not_hold_up_who_writes(store: Store) -> None:
+    lab = store.machine("demo", "lab")
+    with store._database.reading() as connection:
+        assert connection.scalar(text("SELECT count(*) FROM alarm_events")) == 0
+        for number in range(3):
+            assert lab.commit(hop_step(number, events=(alarm_event(number),)))
+        store.audit.append(AUDIT)
+        assert len(lab.events()) == 3
+
+
+@pytest.mark.parametrize("table", ["alarm_events", "audit_log"])
+def test_what_is_kept_for_ever_cannot_be_changed(store: Store, url: str, table: str) -> None:
+    lab = store.machine("demo", "lab")
+    lab.commit(Step(events=(alarm_event(0),)))
+    store.audit.append(AUDIT)
+    before = lab.events(), store.audit.entries()
+    changes = ["UPDATE {0} SET actor = 'nobody'", "DELETE FROM {0}"]
+    if url.startswith("sqlite"):
+        changes.append("INSERT OR REPLACE INTO {0} SELECT * FROM {0}")
+    else:
+        changes.append("TRUNCATE {0}")
+    for change in changes:
+        with pytest.raises(DBAPIError, match=f"{table} is append-only"):
+            executed(url, change.format(table))
+    assert (lab.events(), store.audit.entries()) == before
+
+
+def test_one_monitor_writes_a_machine(store: Store, url: str) -> None:
+    store.machine("demo", "lab").commit(Step(events=(alarm_event(0),)))
+    with pytest.raises(StoreError, match="another monitor writes the history of demo/lab"):
+        store.machine("demo", "lab")
+    with opened(url) as other:
+        with pytest.raises(StoreError, match="another monitor writes the history of demo/lab"):
+            other.machine("demo", "lab")
+        other.machine("demo", "pump").commit(Step(events=(alarm_event(0),)))
+        store.close()
+        assert other.machine("demo", "lab").last_sequence() == 0
+
+
+@pytest.mark.parametrize("url", ["postgresql"], indirect=True)
+def test_a_server_may_take_its_time_to_notice_that_a_monitor_was_killed(store: Store, url: str) -> None:
+    store.machine("demo", "lab").commit(Step(events=(alarm_event(0),)))
+    with opened(url) as other:
+        ending = threading.Timer(0.3, store.close)
+        ending.start()
+        assert other.machine("demo", "lab").last_sequence() == 0
+        ending.join()
+
+
+def test_a_monitor_that_was_replaced_writes_nothing_more(store: Store, url: str) -> None:
+    lab = store.machine("demo", "lab")
+    assert lab.commit(hop_step(0))
+    executed(url, "UPDATE machines SET owner = 'other'")
+    for _ in range(2):
+        with pytest.raises(StoreError, match="another monitor has taken over the history of demo/lab"):
+            lab.commit(hop_step(1, events=(alarm_event(0),)))
+    assert len(lab.reports()) == 1
+    assert store.trouble == ""
+
+
+AUDIT = AuditEntry(
+    number=0, at_ns=T0, actor="anna", address="127.0.0.1", method="POST", path="/api/v1/x", status=200,
+    action="acknowledge", machine="demo/lab", alarm="k_by", reason="seen",
+)  # fmt: skip
+
+
+def test_audit_log_is_numbered_and_found(store: Store) -> None:
+    entries = [
+        AuditEntry(
+            0, T0 + n, f"actor {n % 2}", "::1", "PUT", "/", 409, "shelve", f"demo/m{n % 3}", "e", f"{n} \0 \ud800"
+        )
+        for n in range(7)
+    ]
+    numbers = [store.audit.append(entry) for entry in entries]
+    assert numbers == sorted(set(numbers))
+    found = store.audit.entries()
+    assert [entry.number for entry in found] == numbers[::-1]
+    assert found[-1].reason == "0 \\0 \\ud800"
+    assert store.audit.entries(limit=3) == found[:3]
+    assert store.audit.entries(found[2].number, 2) == found[3:5]
+    assert {entry.machine for entry in store.audit.entries(machine="demo/m1")} == {"demo/m1"}
+    assert {entry.actor for entry in store.audit.entries(actor="actor 0")} == {"actor 0"}
+    with pytest.raises(StoreError, match="-1 entries were asked for"):
+        store.audit.entries(limit=-1)
+
+
+def test_tokens_are_kept_and_revoked_once(store: Store) -> None:
+    first = TokenRecord("aaaa", "control room", ("read", "operate"), b"\0hash", T0, None, None)
+    second = TokenRecord("bbbb", "script", (), b"other", T0 + 1, T0 + 5, None)
+    store.tokens.add(second)
+    store.tokens.add(first)
+    assert store.tokens.all() == (first, second)
+    assert store.tokens.find("bbbb") == second
+    assert store.tokens.find("cccc") is None
+    with pytest.raises(StoreError, match="aaaa: there is one with this identifier already"):
+        store.tokens.add(first)
+    with pytest.raises(StoreError, match="expected words without blanks"):
+        store.tokens.add(TokenRecord("dddd", "bad", ("read operate",), b"", T0, None, None))
+    assert store.tokens.revoke("aaaa", T0 + 9) is True
+    assert store.tokens.revoke("aaaa", T0 + 10) is False
+    assert store.tokens.revoke("cccc", T0) is False
+    revoked = store.tokens.find("aaaa")
+    assert revoked is not None
+    assert revoked.revoked_ns == T0 + 9
+
+
+def test_webhook_cursors(store: Store) -> None:
+    assert store.webhooks.get("mail", "demo/lab") == -1
+    store.webhooks.set("mail", "demo/lab", 4)
+    store.webhooks.set("mail", "demo/lab", 6)
+    store.webhooks.set("pager", "demo/lab", 1)
+    assert store.webhooks.get("mail", "demo/lab") == 6
+    assert store.webhooks.get("pager", "demo/lab") == 1
+    assert store.webhooks.get("mail", "demo/pump") == -1
+
+
+def test_a_closed_history_says_so(url: str) -> None:
+    store = Store(url, Retention())
+    with pytest.raises(StoreError, match="the history is closed"):
+        store.tokens.all()
+    store.open()
+    lab = store.machine("demo", "lab")
+    with pytest.raises(StoreError, match="open already"):
+        store.open()
+    store.close()
+    store.close()
+    with pytest.raises(StoreError, match="the history is closed"):
+        lab.commit(Step())
+    with pytest.raises(StoreError, match="the history is closed"):
+        lab.events()
+
+
+def test_history_in_memory_serves_readers_and_writers_at_once() -> None:
+    with opened("sqlite:///:memory:") as store:
+        machines = [store.machine("demo", f"m{number}") for number in range(4)]
+
+        def feed(machine: MachineStore) -> None:
+            for number in range(30):
+                assert machine.commit(hop_step(number, events=(alarm_event(number),)))
+                assert len(machine.events(limit=1000)) == number + 1
+                store.audit.append(AUDIT)
+
+        with ThreadPoolExecutor(len(machines)) as pool:
+            list(pool.map(feed, machines))
+        assert len(store.audit.entries(limit=1000)) == 120
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("mysql://root:secret@host/db", "the URL begins with mysql; expected sqlite"),
+        ("history.sqlite", "the URL cannot be read; expected sqlite"),
+        ("postgresql://anna:secret@host", "names no database"),
+        ("postgresql+asyncpg://anna:secret@host/db", "begins with postgresql.asyncpg"),
+        ("postgresql://anna:secret@host:port/db", "the URL cannot be read"),
+    ],
+)
+def test_addresses_of_no_known_form_are_refused(url: str, message: str) -> None:
+    with pytest.raises(StoreError, match=message) as caught:
+        Store(url, Retention())
+    assert "secret" not in str(caught.value)
+
+
+def test_a_server_that_is_not_there_is_named_without_the_password(tmp_path: Path) -> None:
+    store = Store(f"postgresql://anna:s%65cret@/db?host={tmp_path}", Retention(), timeout_s=1.0)
+    with pytest.raises(StoreError, match=r"postgresql://anna:\*\*\*@/db") as caught:
+        store.open()
+    assert "secret" not in str(caught.value)
+    assert "secret" not in store.shown
+    store.close()
+
+
+def test_a_file_that_is_no_database_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "history.sqlite"
+    file.write_bytes(b"no database " * 100)
+    store = Store(f"sqlite:///{file}", Retention())
+    with pytest.raises(StoreError, match=r"history\.sqlite: file is not a database"):
+        store.open()
+    (tmp_path / "file").touch()
+    store = Store(f"sqlite:///{tmp_path}/file/history.sqlite", Retention())
+    with pytest.raises(StoreError, match=r"file/history\.sqlite: "):
+        store.open()
+
+
+def test_sqlite_is_set_up_to_survive_a_power_failure(tmp_path: Path) -> None:
+    file = tmp_path / "deep" / "history.sqlite"
+    with opened(f"sqlite:///{file}") as store:
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600
+        names = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout", "page_size", "wal_autocheckpoint")
+        with store._database.reading() as reader:
+            found = [reader.scalar(text(f"PRAGMA {name}")) for name in names]
+        assert found == ["wal", 2, 1, 5000, 512, 32000]
+    with sqlite3.connect(file) as connection:
+        assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    connection.close()
+
+
+def write_for_ever(url: str) -> None:
+    """Go on from what is there; say what has become durable. What the test of a killed process starts."""
+    store = Store(url, Retention())
+    store.open()
+    lab = store.machine("demo", "lab")
+    number = lab.last_sequence() // 2 + 1
+    while True:
+        events = (alarm_event(2 * number), alarm_event(2 * number + 1))
+        assert lab.commit(hop_step(number, events=events))
+        sys.stdout.write(f"{number}\n")
+        sys.stdout.flush()
+        number += 1
+
+
+if __name__ == "__main__":
+    write_for_ever(sys.argv[1])

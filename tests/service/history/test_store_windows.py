@@ -1,0 +1,166 @@
+"""Readings of a window in one value, and when they are added to buckets."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from structlog.testing import capture_logs
+
+from service.history.machine import MachineStore
+from service.history.records import Retention, Step, StoredReading
+from service.history.store import Store
+from service.history.tables import buckets, machines
+from service.history.windows import READING, add_up, packed, singles, unpacked
+from tests.service.history.test_store import T0, executed
+
+NS = 1_000_000_000
+BUCKET = 600 * NS
+NUMBER = st.floats(allow_nan=False, width=64)
+WINDOW = st.lists(
+    st.tuples(st.integers(0, 2**31 - 1), NUMBER, NUMBER | st.just(math.nan)), max_size=5, unique_by=lambda each: each[0]
+)
+
+
+def commit(lab: MachineStore, *times_s: float, value: float = 1.0) -> None:
+    """One step with a window at each time, of two series."""
+    ends = [T0 + round(time_s * NS) for time_s in times_s]
+    readings = tuple(StoredReading(end, "parameter", name, value, None) for end in ends for name in ("e", "k_by"))
+    assert lab.commit(Step(readings=readings))
+
+
+def stored(store: Store) -> tuple[list[int], int]:
+    """Starts of the buckets there are, in buckets since the first, and up to which window readings are in them."""
+    with store._database.reading() as connection:
+        starts = connection.scalars(buckets.select().with_only_columns(buckets.c.start_ns).order_by(buckets.c.start_ns))
+        numbers = connection.scalars(machines.select().with_only_columns(machines.c.bucketed))
+        return [(start - T0) // BUCKET for start in starts], numbers.one()
+
+
+def counts(lab: MachineStore, points: int = 100) -> list[int]:
+    return [each.count for each in lab.downsampled(quantity="parameter", names=["e"], points=points)]
+
+
+@given(st.lists(WINDOW, max_size=4))
+def test_readings_come_out_of_their_value_as_they_went_in(windows: list[list[tuple[int, float, float]]]) -> None:
+    arrays = [np.array(each, READING) for each in windows]
+    places, found = unpacked([packed(each) for each in arrays], READING)
+    assert found.tobytes() == b"".join(each.tobytes() for each in arrays)
+    assert places.tolist() == [place for place, each in enumerate(windows) for _ in each]
+
+
+@pytest.mark.parametrize(("first", "apart"), [(-3, 1), (0, 1), (0, 1_000_000)])
+def test_what_is_added_up_is_what_numpy_says(first: int, apart: int) -> None:
+    rng = np.random.default_rng(3)
+    readings = np.zeros(1000, READING)
+    readings["series_id"], readings["value"] = apart * rng.integers(5, 9, 1000), rng.standard_normal(1000)
+    readings["standard_error"] = np.where(rng.random(1000) < 0.3, np.nan, rng.random(1000))
+    at = rng.integers(first, first + 7, 1000)
+    places, made = add_up(singles(readings), at)
+    keys = list(zip(places.tolist(), made["series_id"].tolist(), strict=True))
+    assert keys == [(place, apart * series_id) for place in range(first, first + 7) for series_id in range(5, 9)]
+    for place, one in zip(places, made, strict=True):
+        own = readings[(at == place) & (readings["series_id"] == one["series_id"])]
+        errors = own["standard_error"][~np.isnan(own["standard_error"])]
+        assert (one["count"], one["errors"]) == (len(own), len(errors))
+        assert (one["minimum"], one["maximum"]) == (own["value"].min(), own["value"].max())
+        assert (one["total"], one["errors_total"]) == pytest.approx((own["value"].sum(), errors.sum()), rel=1e-12)
+
+
+def test_windows_are_added_to_their_bucket_when_one_of_another_time_comes(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.history.trend._SINGLE", 0)
+    lab = store.machine("demo", "lab")
+    commit(lab, 10)
+    commit(lab, 20)
+    assert stored(store) == ([], 0)
+    assert counts(lab) == [2]
+    commit(lab, 599, 600)
+    assert stored(store) == ([0], 3)
+    commit(lab, 605)
+    assert counts(lab) == [3, 2]
+    commit(lab, 30)  # a clock that was set back
+    assert stored(store) == ([0, 1], 5)
+    commit(lab, 40, 1800, 1900, 3000)
+    assert stored(store) == ([0, 1, 3], 9)
+    assert counts(lab) == [5, 2, 2, 1]
+    commit(lab, 3001, value=math.inf)
+    commit(lab, 3600)
+    assert stored(store) == ([0, 1, 3, 5], 11)
+    assert counts(lab) == [5, 2, 2, 1, 1]
+    assert counts(lab, points=1) == [11]
+
+
+def test_a_trend_begins_with_the_first_reading_and_ends_with_the_newest_window(store: Store) -> None:
+    lab = store.machine("demo", "lab")
+    for time_s in range(0, 100, 10):
+        commit(lab, time_s)
+    found = lab.downsampled(quantity="parameter", names=["e"], since_ns=T0 - 3600 * NS, points=10)
+    assert [one.count for one in found] == [1] * 10
+    assert found[0].start_ns == T0
+    latest = lab.latest("parameter", "e", span_ns=30 * NS, points=4)
+    assert [round((one.start_ns - T0) / NS) for one in latest] == [60, 68, 75, 83]
+    assert sum(one.count for one in latest) == 4
+    assert lab.latest("parameter", "nothing", span_ns=30 * NS, points=4) == ()
+    assert store.machine("demo", "none").latest("parameter", "e", span_ns=30 * NS, points=4) == ()
+
+
+def test_what_is_asked_coarsely_of_many_windows_is_made_of_buckets(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.history.trend._SINGLE_FOR_COARSE", 100)
+    lab = store.machine("demo", "lab")
+    commit(lab, *range(0, 7200, 60))
+    commit(lab, 7260)
+    lengths = {
+        points: {one.length_ns // NS for one in lab.downsampled(quantity="parameter", names=["e"], points=points)}
+        for points in (6, 24, 25)
+    }
+    assert lengths == {6: {1800}, 24: {600}, 25: {290}}
+    assert [sum(counts(lab, points)) for points in (6, 24, 25)] == [121] * 3
+    monkeypatch.setattr("service.history.trend._SINGLE_FOR_COARSE", 121)
+    assert lab.downsampled(quantity="parameter", names=["e"], points=24)[0].length_ns == 7260 * NS // 24 + 1
+
+
+def test_readings_count_once_when_the_length_of_buckets_is_another_after_a_restart(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.history.trend._SINGLE", 0)
+    for number, bucket_s in enumerate((600, 60, 600)):
+        store = Store(url, Retention(bucket_s=bucket_s))
+        store.open()
+        try:
+            lab = store.machine("demo", "lab")
+            for time_s in range(5, 300, 50):
+                commit(lab, 300 * number + time_s)
+            assert sum(counts(lab)) == 6 * (number + 1)
+        finally:
+            store.close()
+
+
+def test_a_window_whose_readings_are_damaged_is_passed_over(store: Store, url: str) -> None:
+    lab = store.machine("demo", "lab")
+    for time_s in (10, 20, 30):
+        commit(lab, time_s)
+    executed(url, "UPDATE windows SET readings = :damaged WHERE number = 2", damaged=b"(\xb5/\xfd no such frame")
+    with capture_logs() as lines:
+        commit(lab, 700)
+    assert ["the readings of a window are damaged" in line["event"] for line in lines] == [True]
+    assert stored(store) == ([0], 3)
+    assert [one.number for one in lab.readings(quantity="parameter", name="e")] == [1, 3, 4]
+    assert sum(counts(lab)) == 3
+
+
+def test_a_series_that_is_seldom_read_is_found_page_by_page(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.history.machine._AT_ONCE", 2)
+    lab = store.machine("demo", "lab")
+    for number in range(12):
+        commit(lab, number)
+        if number % 5 == 1:
+            assert lab.commit(Step(readings=(StoredReading(T0 + number, "misfit", "z", float(number), None),)))
+    first = lab.readings(quantity="misfit", name="z", limit=2)
+    assert [one.value for one in first] == [1.0, 6.0]
+    assert [one.value for one in lab.readings(quantity="misfit", name="z", after=first[-1].number)] == [11.0]
+    assert lab.readings(quantity="misfit", name="y") == ()

@@ -1,0 +1,450 @@
+"""What must not cost an alarm: defects, a history that refuses, clocks that are set, programs that stand still."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.alarm_names import CLOCK, FAULT, GAP, STREAM_LOST
+from models.checkpoint import from_bytes, to_bytes
+from models.commissioning.commissioned import Installed, install
+from models.errors import CheckpointError
+from models.ingest import Reason
+from models.machine import AlarmSettings, IngestSettings, Machine
+from models.signals.block import SampleBlock
+from models.signals.keys import Topic
+from models.signals.wire import encode_block
+from rotorwatch.records.alarms import AlarmState
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Report
+from service.history.machine import MachineStore
+from service.history.records import Checkpoint, Retention, Step, StoreError
+from service.history.store import Store
+from service.monitor.alarms.alarm import Alarm, AlarmEvent
+from service.monitor.alarms.book import AlarmBook
+from service.monitor.alarms.operation import OperatorAction
+from service.monitor.monitor import MachineMonitor
+from service.monitor.reports import Identity, identity_of
+from service.settings.service import QueueSettings
+from service.stream.checkpoints import checkpoint_step, restored, stored_readings
+from service.stream.inbox import RawBlock
+from service.stream.liveness import Clocks
+from service.stream.worker import MachineWorker
+from simulator.scenario import load_scenario
+from tests.service.rig.live import START_NS, until
+
+S = 10**9
+BLOCK_NS = S // 2
+HOUR_S = 3600.0
+REAL = Clocks()
+YEAR_NS = 365 * 86400 * S
+
+
+def machine(**alarms: object) -> Machine:
+    """The rotor kit; a data path that waits for up to 8 blocks."""
+    fields = load_scenario("healthy")[1].model_dump()
+    fields["ingest"] |= {"reorder_blocks": 8}
+    fields["alarms"] |= alarms
+    return Machine.model_validate(fields)
+
+
+def block(number: int, start_ns: int = START_NS, run: int = 1, sequence: int | None = None) -> SampleBlock:
+    """Half a second of noise, so many blocks after `start_ns`."""
+    lab = load_scenario("healthy")[1]
+    samples = np.random.default_rng(number).normal(0, 1e-6, (round(lab.rate_hz / 2), len(lab.sensors)))
+    place = number if sequence is None else sequence
+    return SampleBlock(start_ns + number * BLOCK_NS, place, run, lab.rate_hz, samples.astype(np.float32))
+
+
+def order(kind: str, name: str, **more: object) -> OperatorAction:
+    return OperatorAction(kind, name, "anna", **{"reason": "told so", **more})  # type: ignore[arg-type]
+
+
+def named(events: tuple[AlarmEvent, ...]) -> list[tuple[str, str]]:
+    return [(event.kind.value, event.alarm.name) for event in events]
+
+
+def found(monitor: MachineMonitor, name: str) -> Alarm:
+    return next(one for one in monitor.health().alarms if one.name == name)
+
+
+class Outlet:
+    """Takes what is published; if told so, the network is gone."""
+
+    def __init__(self) -> None:
+        self.events: list[str] = []
+        self.is_gone = False
+
+    def __call__(self, topic: Topic, text: str) -> None:
+        if topic == "alarm_event":
+            if self.is_gone:
+                raise OSError("no route")
+            self.events.append(text)
+
+
+class Bench:
+    """A worker without a network, with a history in a file."""
+
+    def __init__(self, folder: Path, installed: Installed, clocks: Clocks) -> None:
+        self.store = Store(f"sqlite:///{folder / 'history.sqlite'}", Retention())
+        self.store.open()
+        self.history = self.store.machine("demo", "lab")
+        self.worker = MachineWorker(installed, QueueSettings(blocks=1000), self.history, clocks)
+        self.outlet = Outlet()
+
+    def put(self, *blocks: SampleBlock) -> None:
+        for one in blocks:
+            self.worker.inbox.put(RawBlock(*encode_block(one, self.worker.machine.descriptor.schema_hash)))
+        until(lambda: len(self.worker.inbox) == 0, "empty queue")
+        self.settle()
+
+    def settle(self) -> None:
+        done: list[bool] = []
+        self.worker.inbox.call(lambda: done.append(True))
+        until(lambda: bool(done), "idle monitor")
+
+    def tick(self) -> None:
+        self.worker.tick()
+        self.settle()
+
+    def log(self) -> list[tuple[int, str, str]]:
+        return [(one.sequence, one.kind, one.alarm) for one in self.history.events(limit=1000)]
+
+    def shelf_s(self, name: str) -> float:
+        """How long an alarm stays shelved, from the end of the newest data."""
+        alarm = next(one for one in self.worker.alarms().alarms if one.name == name)
+        end_ns = self.worker._monitor.end_ns
+        assert alarm.shelf is not None
+        assert end_ns is not None
+        return (alarm.shelf.until_ns - end_ns) / S
+
+
+@contextmanager
+def bench(folder: Path, clocks: Clocks = REAL, **alarms: object) -> Iterator[Bench]:
+    made = Bench(folder, install(machine(**alarms), None), clocks)
+    made.worker.start(made.outlet)
+    try:
+        yield made
+    finally:
+        made.worker.stop()
+        made.store.close()
+
+
+def watched(monkeypatch: pytest.MonkeyPatch, look: Callable[[Step], None]) -> None:
+    """Look at every step before it is committed."""
+    commit = MachineStore.commit
+
+    def looked_at(history: MachineStore, step: Step) -> bool:
+        look(step)
+        return commit(history, step)
+
+    monkeypatch.setattr(MachineStore, "commit", looked_at)
+
+
+TWO_HOLES = (*range(21), *range(25, 29), *range(41, 44))
+"""Block numbers that arrive: a hole of 2 s, and one of 6 s, longer than a silence may last."""
+TOLD = [(0, "raised", GAP), (1, "raised", STREAM_LOST), (2, "cleared", STREAM_LOST)]
+
+
+def test_log_and_state_agree_in_every_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Several blocks that are due at once: a crash between two commits must not leave alarms without their events."""
+    committed = [0]
+
+    def agree(step: Step) -> None:
+        committed[0] += len(step.events)
+        assert step.checkpoint is not None
+        book = AlarmBook(AlarmSettings())
+        book.restore(step.checkpoint.head.alarms)
+        assert book.next_sequence == committed[0]
+
+    watched(monkeypatch, agree)
+    with bench(tmp_path) as at:
+        at.put(*map(block, TWO_HOLES))
+        assert at.log() == []  # what leaves a hole waits
+        at.put(block(44, run=2, sequence=0))
+        assert at.worker.errors == 0, at.worker.last_error
+        assert at.log() == TOLD
+
+
+def test_a_defect_after_an_alarm_loses_no_event(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with bench(tmp_path) as at:
+        window = at.worker._monitor._window
+        feed = window.feed
+
+        def defective(samples: np.ndarray, start_ns: int) -> Iterator[int]:
+            if start_ns == block(41).start_ns:
+                raise ZeroDivisionError("defect")
+            return feed(samples, start_ns)
+
+        monkeypatch.setattr(window, "feed", defective)
+        at.put(*map(block, TWO_HOLES), block(44, run=2, sequence=0))
+        assert at.worker.errors == 1
+        at.put(block(45, run=2, sequence=1))
+        at.worker.operate(order("acknowledge", GAP))
+        assert at.log() == [*TOLD, (3, "raised", FAULT), (4, "acknowledged", GAP)]
+        assert len(at.outlet.events) == 5
+
+
+def test_what_the_history_refused_goes_with_the_next_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    refusals = [True]
+
+    def refuse(step: Step) -> None:
+        if step.events and refusals:
+            refusals.clear()
+            raise StoreError("demo/lab: refused")
+
+    watched(monkeypatch, refuse)
+    with bench(tmp_path) as at:
+        at.put(block(0), block(30, run=2, sequence=0))
+        # Operators hear of it all the same, and what was refused goes into the log before the alarm on that.
+        assert [len(at.outlet.events), at.worker.errors] == [4, 1]
+        at.worker.operate(order("acknowledge", GAP))
+        assert [kind for _, kind, _ in at.log()] == ["raised", "cleared", "raised", "raised", "acknowledged"]
+        assert len(at.outlet.events) == 5  # and once
+    with bench(tmp_path) as at:
+        assert at.worker.restart.startswith("went on where it stood")
+
+
+def test_a_network_that_is_gone_fails_no_operation(tmp_path: Path) -> None:
+    with bench(tmp_path) as at:
+        at.put(block(0))
+        at.outlet.is_gone = True
+        (event,) = at.worker.operate(order("shelve", "k_by"))
+        assert event.data.kind == "shelved"
+        assert at.log() == [(0, "shelved", "k_by")]
+        assert at.worker.last_error == "OSError: no route"
+
+
+@pytest.mark.parametrize(("by_the_log", "expected"), [(5, 5), (1, 3)], ids=["log ahead", "log begun anew"])
+def test_no_number_of_an_event_is_given_twice(by_the_log: int, expected: int) -> None:
+    book = AlarmBook(AlarmSettings())
+    for _ in range(3):
+        book.operate(order("shelve", "k_by"), 0)
+    again = AlarmBook(AlarmSettings())
+    again.restore(book.checkpoint(), next_sequence=by_the_log)
+    (event,) = again.operate(order("unshelve", "k_by"), 1)
+    assert event.sequence == expected
+
+
+def test_alarms_of_another_version_are_left_aside() -> None:
+    book = AlarmBook(AlarmSettings())
+    book.operate(order("shelve", "k_by"), 0)
+    book.operate(order("shelve", "model"), 0)
+    again = AlarmBook(AlarmSettings())
+    again.restore(book.checkpoint().replace("k_by", "k_bx"))
+    assert [one.name for one in again.alarms] == ["model"]
+
+
+def test_a_state_of_unknown_health_is_damaged() -> None:
+    monitor = MachineMonitor(install(machine(), None))
+    arrays = from_bytes(monitor.state().state) | {"calm": np.array(["splendid"])}
+    with pytest.raises(CheckpointError, match=r"calm is .*splendid.*, expected one of warming, healthy"):
+        MachineMonitor(install(machine(), None)).restore(to_bytes(arrays), ())
+
+
+# Clocks
+
+
+def test_shelving_after_a_wrong_clock_was_set_right_is_as_long_as_it_says(tmp_path: Path) -> None:
+    with bench(tmp_path) as at:
+        at.put(*(block(number, START_NS + YEAR_NS) for number in range(3)))
+        at.worker.operate(order("shelve", "k_by", duration_s=HOUR_S))
+        at.put(*(block(number) for number in range(3, 20)))
+        assert (1, "raised", CLOCK) in at.log()
+        at.worker.operate(order("shelve", "model", duration_s=HOUR_S))
+        assert at.shelf_s("model") == pytest.approx(HOUR_S, abs=60)
+        assert at.shelf_s("k_by") == pytest.approx(HOUR_S, abs=60)
+
+
+def test_shelving_before_any_data_is_as_long_as_it_says(tmp_path: Path) -> None:
+    with bench(tmp_path) as at:
+        at.worker.operate(order("shelve", "k_by", duration_s=HOUR_S))
+    with bench(tmp_path) as at:  # and over a restart
+        at.worker.operate(order("remove-from-service", "e"))
+        at.put(block(0))  # the data's clock is months from the time of day
+        at.worker.operate(order("shelve", "model", duration_s=HOUR_S))
+        assert at.shelf_s("k_by") == pytest.approx(HOUR_S, abs=60)
+        assert at.shelf_s("model") == pytest.approx(HOUR_S, abs=60)
+
+
+def test_shelving_ends_without_data_too(tmp_path: Path) -> None:
+    now_ns = [START_NS]
+    with bench(tmp_path, Clocks(utc_ns=lambda: now_ns[0])) as at:
+        at.worker.operate(order("shelve", "k_by", duration_s=HOUR_S))
+        now_ns[0] += 3601 * S
+        at.tick()
+        assert at.log() == [(0, "shelved", "k_by"), (1, "unshelved", "k_by")]
+
+
+def test_shelving_ends_while_blocks_come_in() -> None:
+    monitor = MachineMonitor(install(machine(), None))
+    monitor.step(block(0))
+    monitor.operate(order("shelve", "k_by", duration_s=1.5), START_NS + S)
+    told = [event for number in range(1, 8) for event in monitor.step(block(number)).events]
+    assert [(event.kind.value, event.time_ns - START_NS) for event in told] == [("unshelved", 2_500_000_000)]
+
+
+@pytest.mark.parametrize(
+    ("later_ns", "expected"),
+    [
+        (30 * S, [("raised", STREAM_LOST), ("cleared", STREAM_LOST), ("raised", GAP)]),
+        (2 * S, [("raised", GAP)]),
+        (0, []),
+        (-10 * S, []),  # a publisher's cache
+        (-YEAR_NS, [("raised", CLOCK)]),
+        (YEAR_NS, [("raised", CLOCK)]),
+    ],
+)
+def test_another_machine_file_keeps_the_time_of_the_alarms(later_ns: int, expected: list[tuple[str, str]]) -> None:
+    before = MachineMonitor(install(machine(), None))
+    before.step(block(0))
+    end_ns = block(0).end_ns
+    before.operate(order("shelve", "k_by", duration_s=HOUR_S), end_ns)
+    identity = Identity(site="demo", machine="lab", bundle=None, machine_hash="old")
+    step = checkpoint_step(identity, before.state(), 1)
+    then = Checkpoint(step.head, step.new_parts)
+    changed = install(machine(on_delay_s=77.0), None)
+    now = identity_of(changed)
+    after, text = restored(lambda: MachineMonitor(changed), now, then, 1)
+    assert "the window fills anew: machine file was old" in text
+    assert after.end_ns == end_ns
+    report = after.step(block(1, end_ns + later_ns - BLOCK_NS))
+    assert named(report.events) == expected
+    shelf = found(after, "k_by").shelf
+    assert shelf is not None
+    moved_ns = later_ns if abs(later_ns) == YEAR_NS else 0
+    assert shelf.until_ns == end_ns + 3600 * S + moved_ns
+
+
+def test_a_lost_stream_is_noticed_after_the_machine_file_has_changed() -> None:
+    monitor = MachineMonitor(install(machine(), None))
+    monitor.restore_alarms(AlarmBook(AlarmSettings()).checkpoint(), 0, START_NS)
+    assert monitor.passed(START_NS + 4 * S) == ()
+    (event,) = monitor.passed(START_NS + 9 * S)
+    assert (event.kind, event.alarm.name, event.time_ns) == ("raised", STREAM_LOST, START_NS + 5 * S)
+
+
+@pytest.mark.parametrize("start_ns", [-1, 2**63 - 1, 10**30])
+def test_times_that_fit_nowhere_are_refused(start_ns: int) -> None:
+    monitor = MachineMonitor(install(machine(), None))
+    verdict = monitor.step(replace(block(0), start_ns=start_ns)).verdict
+    assert verdict.reason is Reason.MALFORMED
+    assert f"start_ns of block 0 is {start_ns}, expected a time from 1970 to 2199" in verdict.text
+    assert monitor.step(block(0)).verdict.accepted
+
+
+def test_a_program_that_stood_still_calls_nobody_silent(tmp_path: Path) -> None:
+    now_s = [0.0]
+    with bench(tmp_path, Clocks(monotonic_s=lambda: now_s[0])) as at:
+        at.put(block(0))
+        now_s[0] += 60.0  # stopped by the system: what came meanwhile is still on its way
+        at.tick()
+        assert not at.worker.health().stream.silent
+        at.put(block(1))
+        assert at.log() == []
+        for _ in range(6):
+            now_s[0] += 1.0
+            at.tick()
+        assert at.worker.health().stream.silent
+        assert at.log() == [(0, "raised", STREAM_LOST)]
+        for _ in range(3):  # and goes on being silent, however often the program stands still
+            now_s[0] += 2.5
+            at.tick()
+            assert at.worker.health().stream.silent
+        assert at.log() == [(0, "raised", STREAM_LOST)]
+
+
+def test_a_silence_is_longer_than_a_block() -> None:
+    with pytest.raises(ValueError, match="no_data_after_s is 5, expected more than block_to_s, 30"):
+        IngestSettings(block_to_s=30.0)
+
+
+def test_data_that_come_late_without_a_gap_end_the_silence_not_before_it_began() -> None:
+    monitor = MachineMonitor(install(machine(), None))
+    monitor.step(block(0))
+    (lost,) = monitor.passed(START_NS + 20 * S)
+    (again,) = monitor.step(block(1)).events
+    assert (lost.kind, again.kind) == ("raised", "cleared")
+    assert again.time_ns == lost.time_ns == block(0).end_ns + 5 * S
+
+
+# Suppression, severity, evidence
+
+
+def test_an_alarm_comes_back_when_its_rule_is_taken_out_of_the_machine_file() -> None:
+    rules = [{"alarms": ["k_by"], "while_alarm": "data-stuck", "because": "a sensor is stuck"}]
+    book = AlarmBook(AlarmSettings.model_validate({"suppress": rules}))
+    book.update_state("data-stuck", True, 0, at_once=True)
+    book.update_state("k_by", True, 0, at_once=True)
+    assert named(book.suppress(None, 1)) == [("suppressed", "k_by")]
+    without = AlarmBook(AlarmSettings())
+    without.restore(book.checkpoint())
+    assert named(without.suppress(None, 2)) == [("unsuppressed", "k_by")]
+    assert {one.name: one.state for one in without.alarms}["k_by"] is AlarmState.UNACKNOWLEDGED
+
+
+def test_an_unknown_speed_keeps_only_what_depends_on_it() -> None:
+    rules = [
+        {"alarms": ["model"], "while_alarm": "data-stuck", "because": "stuck; see the sensor"},
+        {"alarms": ["model"], "below_rpm": 600, "because": "slow; coasting"},
+    ]
+    book = AlarmBook(AlarmSettings.model_validate({"suppress": rules}))
+    book.update_state("data-stuck", True, 0, at_once=True)
+    book.suppress(1320.0, 1)
+    book.update_state("data-stuck", False, 2, at_once=True)
+    assert named(book.suppress(None, 2)) == [("unsuppressed", "model")]
+    book.suppress(500.0, 3)
+    assert book.suppress(None, 4) == ()
+    assert next(one.suppressed_by for one in book.alarms if one.name == "model") == "slow; coasting"
+
+
+def test_rules_with_the_same_words_are_told_apart() -> None:
+    rules = [
+        {"alarms": ["model"], "while_alarm": "data-stuck", "because": "known"},
+        {"alarms": ["model"], "below_rpm": 600, "because": "known"},
+    ]
+    book = AlarmBook(AlarmSettings.model_validate({"suppress": rules}))
+    book.update_state("data-stuck", True, 0, at_once=True)
+    book.suppress(1320.0, 1)  # the machine turns fast: only the stuck sensor suppresses
+    book.update_state("data-stuck", False, 2, at_once=True)
+    again = AlarmBook(AlarmSettings.model_validate({"suppress": rules}))
+    again.restore(book.checkpoint())
+    for one in (book, again):
+        assert named(one.suppress(None, 2)) == [("unsuppressed", "model")]
+
+
+def test_a_rule_on_a_lost_stream_holds_while_it_is_lost() -> None:
+    rules = [{"alarms": ["data-gap"], "while_alarm": "stream-lost", "because": "said already"}]
+    monitor = MachineMonitor(install(machine(suppress=rules), None))
+    monitor.step(block(0))
+    assert named(monitor.passed(START_NS + 9 * S)) == [("raised", STREAM_LOST), ("suppressed", GAP)]
+
+
+def test_danger_too_must_have_been_found() -> None:
+    book = AlarmBook(AlarmSettings(on_delay_s=0))
+    assert book.update("k_by", -0.2, 0.01, 0, named=True)
+    assert not book.update("k_by", -0.9, 0.5, S, named=False)
+    assert [event.kind for event in book.update("k_by", -0.9, 0.5, 2 * S, named=True)] == ["escalated"]
+
+
+def test_a_gap_and_a_silence_name_the_time_without_data() -> None:
+    monitor = MachineMonitor(install(machine(), None))
+    monitor.step(block(0))
+    lost, again, gap = monitor.step(block(21, sequence=21, run=2)).events
+    assert named((lost, again, gap)) == [("raised", STREAM_LOST), ("cleared", STREAM_LOST), ("raised", GAP)]
+    end_ns = block(0).end_ns
+    assert [lost.alarm.evidence and (lost.alarm.evidence.start_ns, lost.alarm.evidence.end_ns)] == [
+        (end_ns, end_ns + 5 * S)
+    ]
+    assert [gap.alarm.evidence and (gap.alarm.evidence.start_ns, gap.alarm.evidence.end_ns)] == [
+        (end_ns, block(21).start_ns)
+    ]
+
+
+def test_a_reading_that_is_no_number_is_left_out_and_holds_nothing_up() -> None:
+    said = {"speed_rad_s": float("nan"), "misfit_z": 2.0, "parameters": (), "equations": (), "levels": ()}
+    window = Report.model_validate(example(Report) | said)
+    assert [one.quantity for one in stored_readings([window])] == ["misfit"]

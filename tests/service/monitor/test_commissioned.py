@@ -1,0 +1,265 @@
+"""The monitor of a machine that was commissioned without its parameters, from block to alarm."""
+
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from models.alarm_names import LEVEL, MODEL
+from models.commissioning.commissioned import Installed
+from models.levels.settings import LevelSettings
+from models.machine import AlarmSettings
+from models.physics.rotor import PARAMETERS
+from models.signals.block import SampleBlock
+from models.signals.channels import Quantity
+from rotorwatch.records.alarms import Severity
+from rotorwatch.records.health import HealthState, Report
+from service.monitor.monitor import MachineMonitor
+from simulator.scenario import Event, Rub, load_scenario
+from simulator.stream import blocks
+from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, samples_of, stream, with_samples
+from tests.service.monitor.test_monitor import feed
+
+SEED = 71
+_FULL = 625
+"""Blocks of a full window."""
+MACHINE = NOTHING.model_copy(update={"alarms": AlarmSettings(on_delay_s=0.0)})
+
+
+def before() -> Sequence[SampleBlock]:
+    """The healthy machine: where equations can be evaluated 150 s are enough to commission it."""
+    return stream(250.0, SEED)
+
+
+@cache
+def installed() -> Installed:
+    made = commissioned(MACHINE, recording(MACHINE, before()[:1500]))
+    assert made.commissioned is not None
+    return Installed(MACHINE, None, made.commissioned)
+
+
+def full(windows: Sequence[Report]) -> list[Report]:
+    return [window for window in windows if window.filled == 1.0]
+
+
+def test_the_healthy_machine_stays_healthy() -> None:
+    windows, events = feed(MachineMonitor(installed()), stream(85.0, SEED + 1))
+    assert len(full(windows)) >= 5
+    assert {window.state for window in full(windows)} == {HealthState.HEALTHY}
+    assert not events
+    readings = {reading.name: reading for reading in full(windows)[-1].parameters}
+    assert readings["EI"].reason
+    assert all(readings[name].relative_change is not None for name in ("k_by", "c_by", "k_bz", "c_bz", "e"))
+    rows = {row.equation: row for row in full(windows)[-1].equations}
+    assert [reading.name for reading in rows["28 + 29"].parameters] == ["k_by", "c_by"]
+
+
+@pytest.mark.parametrize(
+    ("name", "change"), [pytest.param("k_by", -0.2, marks=pytest.mark.long), ("c_bz", -0.4), ("e", 0.5)]
+)
+def test_a_change_is_named_alone(name: str, change: float) -> None:
+    blocks = stream(65.0, SEED + 2, Event(at_s=0.0, parameter=name, relative_change=change))
+    windows, events = feed(MachineMonitor(installed()), blocks)
+    verdict = full(windows)[-1].verdict
+    assert verdict is not None
+    assert [finding.name for finding in verdict.changed] == [name]
+    assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {name}
+    (reading,) = (one for one in verdict.current if one.name == name)
+    assert reading.interval_95 is not None
+    low, high = reading.interval_95
+    assert low - 0.05 < change < high + 0.05
+
+
+def test_another_speed_is_not_evaluable_here_and_raises_nothing_but_levels() -> None:
+    faster = Event(at_s=0.0, speed_rpm=1.15 * LAB.operation.speed_rpm)
+    windows, events = feed(MachineMonitor(installed()), stream(65.0, SEED + 3, faster))
+    assert {window.state for window in full(windows)} <= {HealthState.NOT_EVALUABLE, HealthState.ALERT}
+    assert all("not evaluable here: speed is 1518 rpm" in window.reason for window in full(windows))
+    # Louder than it was at the commissioned speed is said, and what that is worth.
+    assert all("commissioned at another speed" in event.alarm.note for event in events)
+
+
+@pytest.mark.parametrize(
+    ("clearance_m", "size", "of"),
+    [
+        pytest.param(4e-5, 2.0, installed, id="heavy"),
+        pytest.param(8e-5, 0.5, installed, marks=pytest.mark.long, id="light"),
+        pytest.param(
+            8e-5,
+            0.5,
+            lambda: Installed(LAB.model_copy(update={"alarms": MACHINE.alarms})),
+            id="light, not commissioned",
+        ),
+    ],
+)
+def test_a_rub_is_told_and_what_it_is_taken_for_is_named_with_reserve(
+    clearance_m: float, size: float, of: Callable[[], Installed]
+) -> None:
+    scenario, machine = load_scenario("healthy")
+    rubbing = scenario.model_copy(
+        update={"rub": Rub(clearance_m=clearance_m), "events": (Event(at_s=0.0, anomaly="rub", size=size),)}
+    ).overridden(duration_s=66.0, seed=SEED + 7)
+    windows, events = feed(MachineMonitor(of()), [block for block, _ in blocks(rubbing, machine)])
+    assert "(disc) that is pushed back where it is far out, as by a rub" in full(windows)[-1].suspect
+    raised = {event.alarm.name: event.alarm for event in events}
+    assert "as by a rub" in raised[MODEL].note
+    named = [alarm for name, alarm in raised.items() if name in PARAMETERS]
+    assert all(alarm.low_confidence for alarm in named)
+    # Its size would be a danger, were it one of that parameter.
+    assert {alarm.severity for alarm in named} <= {Severity.ALERT}
+
+
+def test_what_grows_beside_a_name_is_heard_where_the_name_does_not_explain_it() -> None:
+    """An unbalance has been named when a 2x comes, from which on the machine is outside the model."""
+    begins = 700
+    after = stream(110.0, SEED + 2, Event(at_s=0.0, parameter="e", relative_change=0.5))
+    samples = samples_of(after)
+    names = [channel.name for channel in LAB.sensors]
+    theta, once = samples[:, names.index("theta")], len(samples) * begins // len(after)
+    for state in ("y1", "y2", "z1", "z2"):
+        line = 3.5 * np.cos(2 * theta[once:])
+        samples[once:, names.index(state)] += line
+        samples[once:, names.index(f"{state}_dot")] += 2 * LAB.operation.speed_rad_s * 1e-3 * line
+    monitor = MachineMonitor(installed())
+    _, first = feed(monitor, with_samples(after, samples)[:begins])
+    assert {event.alarm.name for event in first} == {"e"}
+    _, events = feed(monitor, with_samples(after, samples)[begins:])
+    assert "y2 (disc y) 2x" in next(event.alarm.note for event in events if event.alarm.name == f"{LEVEL}y2")
+
+
+@pytest.mark.parametrize("place", ["1", "2"])
+def test_a_wrong_gain_of_a_place_is_told_and_what_it_is_taken_for_is_named_with_reserve(place: str) -> None:
+    names = [channel.name for channel in LAB.sensors]
+    wrong = [names.index(f"y{place}"), names.index(f"y{place}_dot")]
+    healthy = stream(70.0, SEED + 8)
+    samples = samples_of(healthy)
+    samples[:, wrong] *= 0.8
+    windows, events = feed(MachineMonitor(installed()), with_samples(healthy, samples))
+    raised = {event.alarm.name: event.alarm for event in events}
+    assert f"gain of y{place} and y{place}_dot: 0.8" in raised[MODEL].note
+    assert f"gain of y{place} and y{place}_dot: 0.8" in full(windows)[-1].suspect
+    assert all(alarm.low_confidence for name, alarm in raised.items() if name in PARAMETERS)
+
+
+@pytest.mark.parametrize(
+    ("hz", "told"),
+    [
+        (37.0, ("a line at 37 Hz (1.68 times running speed, ", "% of the random vibration of ", ") that the healthy")),
+        (
+            22.1,
+            ("a line at 22.1 Hz (1.00", " times running speed, ", ", beats with the 1x every 10 s) that the healthy"),
+        ),
+    ],
+)
+def test_a_line_that_the_healthy_machine_did_not_have_is_told(hz: float, told: tuple[str, ...]) -> None:
+    healthy = stream(70.0, SEED + 9)
+    samples = samples_of(healthy)
+    turned = 2 * np.pi * hz * np.arange(len(samples)) / LAB.rate_hz
+    for column, one in enumerate(LAB.sensors):
+        if one.quantity is Quantity.DISPLACEMENT:
+            samples[:, column] += 2e-5 / one.to_si * np.sin(turned)
+        elif one.quantity is Quantity.VELOCITY:
+            samples[:, column] += 2e-5 / one.to_si * 2 * np.pi * hz * np.cos(turned)
+    windows, events = feed(MachineMonitor(installed()), with_samples(healthy, samples))
+    raised = {event.alarm.name: event.alarm for event in events}
+    assert all(part in raised[MODEL].note for part in told), raised[MODEL].note
+    assert all(window.suspect for window in full(windows))
+    assert all(alarm.low_confidence for name, alarm in raised.items() if name in PARAMETERS)
+
+
+def test_a_2x_beyond_a_limit_of_ones_own_has_not_grown_and_doubts_nothing() -> None:
+    own = LevelSettings.model_validate({"limits": [{"channel": "y1", "measure": "x2", "alert": 1e-3, "danger": 1e3}]})
+    machine = MACHINE.model_copy(update={"levels": own})
+    monitor = MachineMonitor(Installed(machine, None, installed().commissioned))
+    windows, events = feed(monitor, stream(85.0, SEED + 1)[:650])
+    assert {event.alarm.name for event in events} == {f"{LEVEL}y1"}
+    assert not any(window.suspect for window in windows)
+
+
+def _faulty(kind: str) -> list[SampleBlock]:
+    """What follows on a healthy full window: a sensor at fault."""
+    blocks = stream(125.0, SEED + 4)[_FULL : 1250 if kind == "swapped" else 830 if kind == "gain drift" else 730]
+    samples = samples_of(blocks)
+    names = [channel.name for channel in LAB.sensors]
+    y1, y2, z1 = (names.index(name) for name in ("y1", "y2", "z1"))
+    match kind:
+        case "gain drift":
+            samples[:, y2] *= np.linspace(1.0, 0.7, samples.shape[0])
+        case "offset":
+            samples[:, y1] += 8 * samples[:, y1].std()
+        case "swapped":
+            samples[:, [y1, z1]] = samples[:, [z1, y1]]
+        case "delayed":
+            samples[6:, y1] = samples[:-6, y1]
+    return with_samples(blocks, samples)
+
+
+@cache
+def _watching() -> MachineMonitor:
+    target = MachineMonitor(installed())
+    feed(target, stream(125.0, SEED + 4)[:_FULL])
+    return target
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        ("gain drift", "gain"),
+        ("offset", "offset"),
+        ("swapped", "swapped"),  # as long as the window holds both, it is only incoherent
+        ("delayed", "delay"),
+    ],
+)
+def test_a_sensor_at_fault_is_told_from_the_machine(kind: str, told: str) -> None:
+    windows, events = feed(deepcopy(_watching()), _faulty(kind))
+    last = full(windows)[-1]
+    assert last.state is HealthState.DATA_HEALTH
+    assert last.sensors
+    assert last.sensors[0].text in last.reason
+    assert all(event.alarm.name.startswith("data-") for event in events)
+    assert events[-1].alarm.name == f"data-{told}"
+
+
+def of_sensors(columns: list[int], blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
+    return [replace(block, samples=block.samples[:, columns]) for block in blocks]
+
+
+def with_sensors(columns: list[int], duration_s: float) -> Installed:
+    """The machine with some of its sensors, commissioned for as long."""
+    machine = MACHINE.model_copy(update={"sensors": tuple(MACHINE.sensors[n] for n in columns)})
+    made = commissioned(machine, recording(machine, of_sensors(columns, before()[: round(10 * duration_s)])))
+    assert made.commissioned is not None
+    return Installed(machine, None, made.commissioned)
+
+
+def test_with_too_few_sensors_only_changed_or_not_changed_is_said() -> None:
+    bearing = [n for n, channel in enumerate(MACHINE.sensors) if channel.location != "disc"]
+    few = with_sensors(bearing, 250.0)
+    windows, events = feed(MachineMonitor(few), of_sensors(bearing, stream(85.0, SEED + 1)[:650]))
+    assert {window.state for window in full(windows)} == {HealthState.UNCHANGED}
+    assert not events
+    assert all("no equation can be evaluated" in window.reason for window in full(windows))
+    softer = Event(at_s=0.0, parameter="k_by", relative_change=-0.4)
+    windows, events = feed(MachineMonitor(few), of_sensors(bearing, stream(65.0, SEED + 5, softer)))
+    assert {event.alarm.name for event in events} == {"shape", "level:y1", "level:y1_dot"}
+    assert full(windows)[-1].state in {HealthState.ALERT, HealthState.DANGER}
+    assert "has changed shape" in full(windows)[-1].reason.partition("; ")[0]
+    assert all(reading.relative_change is None for reading in full(windows)[-1].parameters)
+
+
+def test_a_swap_that_no_pair_of_sensors_shows_is_not_called_healthy() -> None:
+    displacements = [n for n, channel in enumerate(MACHINE.sensors) if channel.quantity != "velocity"]
+    made = with_sensors(displacements, 150.0)
+    names = [channel.name for channel in made.machine.sensors]
+    blocks = of_sensors(displacements, stream(65.0, SEED + 6))
+    samples = samples_of(blocks)
+    bearing, disc = names.index("y1"), names.index("y2")
+    samples[:, [bearing, disc]] = samples[:, [disc, bearing]]
+    windows, events = feed(MachineMonitor(made), with_samples(blocks, samples))
+    assert HealthState.HEALTHY not in {window.state for window in full(windows)}
+    assert "model" in {event.alarm.name for event in events}
+    # A level is what a channel shows, whatever it is taken for.
+    assert all(event.alarm.low_confidence for event in events if not event.alarm.name.startswith(("model", LEVEL)))

@@ -1,0 +1,175 @@
+"""Whatever the network and the power supply do within reason, the log of alarms is the same."""
+
+import sqlite3
+import tempfile
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from models.commissioning.commissioned import Installed, install
+from models.machine import Machine
+from models.signals.block import SampleBlock
+from models.signals.keys import Topic
+from models.signals.wire import encode_block
+from service.history.records import Retention
+from service.history.store import Store
+from service.monitor.alarms.alarm import AlarmEvent
+from service.monitor.monitor import MachineMonitor
+from service.settings.service import QueueSettings
+from service.stream.checkpoints import stored_event
+from service.stream.inbox import RawBlock
+from service.stream.worker import MachineWorker
+from simulator.scenario import Scenario, load_scenario
+from simulator.stream import blocks
+from tests.service.rig.live import START_NS, until
+
+SEED = 7_700_501
+REORDERED = 8
+"""How far blocks are out of order, and how many the monitor waits for."""
+CACHED = 120
+"""Blocks a publisher sends again to a monitor that comes back; more than a window, the gap and what is out of order."""
+BEHIND = 20
+"""How far a monitor may be behind when it is struck down; with a hop and what is out of order, the cache covers it."""
+MISSING = range(136, 158)
+"""Blocks that are lost for good: 11 s, longer than a silence may last."""
+
+
+@cache
+def installed() -> Installed:
+    """The rotor kit with short windows, so that a story takes a second."""
+    machine = load_scenario("healthy")[1].model_dump()
+    machine["window"] |= {"length_s": 24.0, "hop_s": 6.0, "max_span_s": 60.0, "segment_s": 2.0}
+    machine["alarms"] |= {"on_delay_s": 0.0, "off_delay_s": 12.0}
+    machine["ingest"] |= {"reorder_blocks": REORDERED}
+    return install(Machine.model_validate(machine), None)
+
+
+@cache
+def stream() -> tuple[SampleBlock, ...]:
+    """Two minutes in blocks of half a second: a bearing loses stiffness, gains it back; a probe gets stuck."""
+    scenario, _ = load_scenario("healthy")
+    events = [
+        {"at_s": 27.0, "parameter": "k_by", "relative_change": -0.5},
+        {"at_s": 42.0, "parameter": "k_by", "relative_change": 0.0},
+    ]
+    fields = scenario.model_dump() | {"duration_s": 126.0, "seed": SEED, "events": events}
+    machine = installed().known
+    assert machine is not None
+    made = [one for one, _ in blocks(Scenario.model_validate(fields), machine, 0.5, START_NS)]
+    for block in made[208:226]:
+        block.samples[:, 0] = 7.0
+    return tuple(block for number, block in enumerate(made) if number not in MISSING)
+
+
+@cache
+def expected() -> tuple[AlarmEvent, ...]:
+    """The log without any of it."""
+    monitor = MachineMonitor(installed())
+    return tuple(event for block in stream() for event in monitor.step(block).events)
+
+
+def test_the_story_is_worth_telling() -> None:
+    told = [(event.kind.value, event.alarm.name) for event in expected()]
+    assert {("raised", "k_by"), ("cleared", "k_by"), ("raised", "stream-lost"), ("raised", "data-gap")} <= set(told)
+    assert ("raised", "data-stuck") in told
+    assert len(told) == 7
+
+
+def raw(block: SampleBlock) -> RawBlock:
+    return RawBlock(*encode_block(block, installed().machine.descriptor.schema_hash))
+
+
+@dataclass
+class Heard:
+    """What was published, by whichever monitor."""
+
+    events: list[str] = field(default_factory=list)
+
+    def __call__(self, topic: Topic, text: str) -> None:
+        if topic == "alarm_event":
+            self.events.append(text)
+
+
+class Plant:
+    """A monitor that can be struck down, and the database it left."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._number = 0
+        self.heard = Heard()
+        self._start()
+
+    def _start(self) -> None:
+        self.store = Store(f"sqlite:///{self._folder / str(self._number)}", Retention())
+        self.store.open()
+        history = self.store.machine("demo", "lab")
+        self.worker = MachineWorker(installed(), QueueSettings(blocks=10_000), history)
+        self.worker.start(self.heard)
+
+    def put(self, block: SampleBlock) -> None:
+        until(lambda: len(self.worker.inbox) <= BEHIND, "monitor that keeps up")
+        self.worker.inbox.put(raw(block))
+
+    def settle(self) -> None:
+        """Wait until everything that was put is done."""
+        done: list[bool] = []
+        until(lambda: len(self.worker.inbox) == 0, "empty queue")
+        self.worker.inbox.call(lambda: done.append(True))
+        until(lambda: bool(done), "idle monitor")
+
+    def strike(self) -> None:
+        """Go on from an image of the database as it is now, whatever the monitor is doing, and let the old one be."""
+        before = self._folder / str(self._number)
+        self._number += 1
+        with sqlite3.connect(before) as source, sqlite3.connect(self._folder / str(self._number)) as image:
+            source.backup(image)
+        source.close()
+        image.close()
+        self.stop()
+        self._start()
+
+    def stop(self) -> None:
+        self.worker.stop()
+        self.store.close()
+
+
+@pytest.mark.slow
+@settings(
+    max_examples=2,
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],  # the parts of a story are drawn from its seed
+)
+@given(seed=st.integers(0, 2**32 - 1), strikes=st.integers(0, 3), repeated=st.floats(0.0, 0.5))
+def test_repetitions_reordering_and_restarts_change_nothing(seed: int, strikes: int, repeated: float) -> None:
+    rng = np.random.default_rng(seed)
+    sent = stream()
+    jitter = rng.uniform(0, REORDERED, len(sent))
+    jitter[-2 * REORDERED :] = 0.0  # what comes last must not wait for ever
+    jitter[:1] = 0.0
+    order = np.argsort(np.arange(len(sent)) + jitter, kind="stable").tolist()
+    struck = set(rng.integers(1, len(sent), strikes).tolist())
+    with tempfile.TemporaryDirectory() as folder:
+        plant = Plant(Path(folder))
+        try:
+            newest = 0
+            for place, at in enumerate(order):
+                plant.put(sent[at])
+                newest = max(newest, at)
+                if rng.random() < repeated:
+                    plant.put(sent[int(rng.integers(max(0, newest - CACHED), newest + 1))])
+                if place in struck:
+                    plant.strike()
+                    for block in sent[max(0, newest + 1 - CACHED) : newest + 1]:
+                        plant.put(block)
+            plant.settle()
+            log = plant.worker.history.events(limit=1000)
+        finally:
+            plant.stop()
+        identity = plant.worker.identity
+        assert [one.text for one in log] == [stored_event(identity, event, 0).text for event in expected()]
+        # Whoever listened to all of it heard every event, some perhaps twice with the same id, in the end in order.
+        assert list(dict.fromkeys(plant.heard.events)) == [one.text for one in log]

@@ -1,0 +1,303 @@
+"""A defect in the monitor, a history that refuses, a computer that cannot keep up: each is said to be what it is."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from models.alarm_names import FAULT, GAP, OVERLOADED, STREAM_LOST
+from models.commissioning.commissioned import install
+from models.machine import Machine
+from models.signals.wire import ARROW_ENCODING, encode_block, write_arrow
+from rotorwatch.records.alarms import EventKind, Evidence
+from rotorwatch.records.health import HealthState
+from service.history.records import Checkpoint, Step, StoreError
+from service.monitor.alarms.alarm import AlarmEvent
+from service.monitor.evaluation import KnownMachineEvaluator
+from service.monitor.monitor import MachineMonitor
+from service.monitor.reports import identity_of
+from service.runtime.runtime import running
+from service.stream.checkpoints import checkpoint_step, restored
+from tests.service.monitor.test_alarm_trouble import bench, block, named, order, watched
+from tests.service.rig.live import (
+    IN_ORDER,
+    LAB,
+    PATIENT,
+    START_NS,
+    Feed,
+    endpoint,
+    machine_file,
+    open_session,
+    scenario_blocks,
+    send,
+    service,
+    until,
+    worker_of,
+)
+from tests.service.rig.live import settings as plan_for
+from tests.service.rig.monitored import client
+
+DEFECT = "a defect of the evaluation"
+
+
+def defective(*_: object, **__: object) -> None:
+    raise RuntimeError(DEFECT)
+
+
+def machine_in_order() -> Machine:
+    """The rotor kit without patience for late blocks."""
+    fields = LAB.model_dump()
+    fields["ingest"] |= {"reorder_blocks": 0}
+    return Machine.model_validate(fields)
+
+
+def soon_over(machine: Machine) -> Machine:
+    """The same machine, with alarms that clear after 10 s."""
+    return machine.model_copy(update={"alarms": machine.alarms.model_copy(update={"off_delay_s": 10.0})})
+
+
+def raised(monitor: MachineMonitor) -> set[str]:
+    return {alarm.name for alarm in monitor.health().alarms if alarm.raised}
+
+
+def test_a_defect_in_evaluation_is_an_alarm_and_no_health(monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor = MachineMonitor(install(soon_over(LAB), None))
+    stream = scenario_blocks(92.0)
+    for one in stream[:660]:
+        monitor.step(one)
+    assert monitor.health().state is HealthState.HEALTHY
+    with monkeypatch.context() as patch:
+        patch.setattr(KnownMachineEvaluator, "evaluate", defective)
+        reports = [monitor.step(one) for one in stream[660:710]]
+    (window,) = (window for report in reports for window in report.windows)
+    assert window.state is HealthState.NOT_EVALUABLE
+    assert DEFECT in window.reason
+    assert [str(report.fault) for report in reports if report.fault is not None] == [DEFECT]
+    assert [event for report in reports for event in named(report.events)] == [("raised", FAULT)]
+    health = monitor.health()
+    assert (health.state, raised(monitor)) == (HealthState.NOT_EVALUABLE, {FAULT})
+    assert DEFECT in health.reason
+    # And when it is over, that is said as well.
+    events = [event for one in stream[710:] for event in monitor.step(one).events]
+    assert named(tuple(events)) == [("cleared", FAULT)]
+    assert monitor.health().state is HealthState.HEALTHY
+    assert monitor.health().reason == ""
+
+
+def test_a_defect_before_the_evaluation_is_no_health_either(monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor = MachineMonitor(install(LAB, None))
+    stream = scenario_blocks(68.0)
+    for one in stream[:660]:
+        monitor.step(one)
+    monkeypatch.setattr(monitor._window, "feed", defective)
+    report = monitor.step(stream[660])
+    assert str(report.fault) == DEFECT
+    assert named(report.events) == [("raised", FAULT)]
+    assert monitor.health().state is HealthState.NOT_EVALUABLE
+    assert DEFECT in monitor.health().reason
+
+
+def test_a_service_with_a_defect_is_not_ready_and_says_of_which_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(KnownMachineEvaluator, "evaluate", defective)
+    address = endpoint()
+    with service(address, machine_file(tmp_path, PATIENT), when_full="wait") as (runtime, worker):
+        send(address, scenario_blocks(70.0), worker.machine)
+        until(lambda: worker.tally.windows >= 13, "all windows")
+        with client(runtime) as http:
+            health = http.get("/api/v1/machines/demo/lab/health").json()
+            assert health["state"] == "not-evaluable"
+            assert DEFECT in health["reason"]
+            assert [alarm["name"] for alarm in health["alarms"] if alarm["raised"]] == [FAULT]
+            answer = http.get("/readyz")
+        assert answer.status_code == 503
+        (reason,) = answer.json()["reasons"]
+        assert reason.startswith("demo/lab: ")
+        assert DEFECT in reason
+        until(lambda: worker.errors == worker.tally.windows - 11, "an error for each window that was full")
+
+
+def test_what_the_history_refuses_of_one_machine_is_that_machines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refusing = [True]
+
+    def refuse(step: Step) -> None:
+        if refusing and step.events:
+            raise StoreError("demo/lab: refused")
+
+    watched(monkeypatch, refuse)
+    with bench(tmp_path) as at:
+        at.put(block(0), block(30, run=2, sequence=0))
+        assert {FAULT, GAP} <= {alarm.name for alarm in at.worker.alarms().alarms if alarm.raised}
+        assert "refused" in at.worker.trouble
+        assert at.store.trouble == ""
+        refusing.clear()
+        at.worker.operate(order("acknowledge", GAP))
+        assert at.worker.trouble == ""
+        assert (3, "raised", FAULT) in at.log()
+
+
+# Overload
+
+
+@pytest.fixture
+def stuffed() -> tuple[MachineMonitor, Callable[[int, int], None]]:
+    """A monitor, and what gives it a block with so many dropped before it."""
+    monitor = MachineMonitor(install(machine_in_order(), None))
+    stream = scenario_blocks(60.0)
+
+    def give(number: int, dropped: int) -> None:
+        monitor.step_payload(*encode_block(stream[number], ""), dropped)
+
+    return monitor, give
+
+
+def test_what_the_monitor_dropped_itself_is_no_fault_of_the_stream(
+    stuffed: tuple[MachineMonitor, Callable[[int, int], None]],
+) -> None:
+    monitor, give = stuffed
+    for number in range(20):
+        give(number, 0)
+    give(120, 100)  # 10 s, longer than a silence may last
+    assert raised(monitor) == {OVERLOADED}
+    assert {alarm.name for alarm in monitor.health().alarms} & {GAP, STREAM_LOST} == set()
+    (alarm,) = monitor.health().alarms
+    assert "100 blocks" in alarm.note
+    assert "10 s" in alarm.note
+    for number in range(121, 130):
+        give(number, 0)
+    give(150, 20)
+    (alarm,) = monitor.health().alarms
+    assert "120 blocks" in alarm.note
+    assert "12 s" in alarm.note
+    # A hole in the stream itself is still one.
+    give(450, 0)
+    assert raised(monitor) == {OVERLOADED, GAP}
+
+
+def test_overload_clears_when_the_monitor_keeps_up() -> None:
+    monitor = MachineMonitor(install(soon_over(machine_in_order()), None))
+    stream = scenario_blocks(30.0)
+    events: list[AlarmEvent] = []
+    for number, one in enumerate(stream[:20] + stream[60:]):
+        (report,) = monitor.step_payload(*encode_block(one, ""), 40 if number == 20 else 0)
+        events += report.events
+    assert [(event.kind, event.alarm.name) for event in events] == [
+        (EventKind.RAISED, OVERLOADED),
+        (EventKind.CLEARED, OVERLOADED),
+    ]
+
+
+def test_a_full_queue_says_so_to_operators(tmp_path: Path) -> None:
+    address = endpoint()
+    plan = plan_for(address, machine_file(tmp_path, IN_ORDER), bound=30)
+    with running(plan) as runtime, open_session(address) as session:
+        worker = worker_of(runtime)
+        feed = Feed(session, worker.machine)
+        feed.put_good()
+        until(lambda: worker.health().quality.accepted_blocks == 1, "first block")
+        held = np.zeros(1, dtype=bool)
+        worker.inbox.call(lambda: until(lambda: bool(held[0]), "the end of the hold-up"))
+        for _ in range(40):
+            feed.put_good()
+        until(lambda: worker.inbox.dropped == 30, "a queue that was thrown away")
+        held[0] = True
+        until(lambda: worker.health().quality.gaps == 1, "what came after")
+        (alarm,) = worker.alarms().alarms
+        assert (alarm.name, alarm.raised) == (OVERLOADED, True)
+        assert "30 blocks" in alarm.note
+        assert "cannot keep up" in worker.health().quality.last_gap
+        (event,) = worker.history.events()
+        assert event.alarm == OVERLOADED
+
+
+# What cannot be remembered or put into words
+
+
+def test_a_state_that_cannot_be_built_keeps_no_alarm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with bench(tmp_path) as at:
+        at.put(block(0))
+        with monkeypatch.context() as patch:
+            patch.setattr(MachineMonitor, "state", defective)
+            at.put(block(30, run=2, sequence=0))
+            assert [(kind, alarm) for _, kind, alarm in at.log()] == [
+                ("raised", STREAM_LOST), ("cleared", STREAM_LOST), ("raised", GAP), ("raised", FAULT)
+            ]  # fmt: skip
+            assert len(at.outlet.events) == 4
+            assert DEFECT in at.worker.trouble
+        at.put(*(block(number, run=2, sequence=number - 30) for number in range(31, 45)))
+        at.worker.operate(order("acknowledge", GAP))
+        assert at.worker.trouble == ""
+    with bench(tmp_path) as at:
+        assert at.worker.restart.startswith("went on where it stood")
+        assert at.log()[-1][1:] == ("acknowledged", GAP)
+
+
+def test_the_last_step_at_a_stop_survives_a_defect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with bench(tmp_path) as at:
+        at.put(block(0))
+        monkeypatch.setattr(MachineMonitor, "state", defective)
+        at.worker.stop()
+        assert not at.worker.status().alive
+        assert DEFECT in at.worker.last_error
+
+
+@pytest.mark.parametrize("kind", ["unheard-of", "gap"])
+def test_an_event_without_words_goes_out_and_holds_up_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    told = []
+    with bench(tmp_path) as at:
+        at.put(block(0))
+        book = at.worker._monitor._alarms
+        poison = Evidence.model_construct(start_ns=0, end_ns=1, confidence="not a number") if kind == "gap" else None  # type: ignore[arg-type]
+        at.worker.inbox.call(
+            lambda: told.append(book.update_state(f"data-{kind}", True, START_NS, evidence=poison, at_once=True))
+        )
+        at.settle()
+        at.worker.operate(order("shelve", "k_by"))
+        assert [(kind, alarm) for _, kind, alarm in at.log()][:2] == [("raised", f"data-{kind}"), ("shelved", "k_by")]
+        assert len(at.outlet.events) == len(at.log())
+        assert (kind == "gap") == (FAULT in {alarm for _, _, alarm in at.log()})
+    assert told
+
+
+INTEGER = st.one_of(st.integers(-(2**70), 2**70), st.sampled_from([0, 2**16 - 1, 2**63 - 1, 2**64 - 1, 10**4300]))
+
+
+@settings(max_examples=40)
+@given(
+    headers=st.lists(
+        st.tuples(INTEGER, INTEGER, st.sampled_from([LAB.rate_hz, 1e-320, 1e6, 1e308, float("nan")]), INTEGER),
+        min_size=1,
+        max_size=4,
+    ),
+    start_ns=st.one_of(st.just(START_NS), INTEGER),
+)
+@example(headers=[(0, 0, LAB.rate_hz, 0), (0, 0, LAB.rate_hz, 1)], start_ns=START_NS)  # two versions of one block
+def test_whatever_is_accepted_can_be_remembered_and_restored(
+    headers: list[tuple[int, int, float, int]], start_ns: int
+) -> None:
+    installed = install(machine_in_order(), None)
+    monitor = MachineMonitor(installed)
+    good = block(0)
+    for number, (sequence, run, rate_hz, step_ns) in enumerate(headers):
+        whole = {"start_ns": start_ns + number * step_ns, "sequence": sequence, "run": run}
+        metadata = {"rate_hz": repr(rate_hz), **{name: decimal(value) for name, value in whole.items()}}
+        payload = write_arrow(good.samples, metadata)
+        monitor.step_payload(payload, b"", ARROW_ENCODING)
+    identity = identity_of(installed)
+    step = checkpoint_step(identity, monitor.state(), 1)
+    again, text = restored(lambda: MachineMonitor(installed), identity, Checkpoint(step.head, step.new_parts), 0)
+    assert again.state().state == monitor.state().state
+    assert text.startswith("went on where it stood")
+
+
+def decimal(value: int) -> str:
+    """A whole number in decimal, however many digits it has."""
+    return str(value) if abs(value) < 10**4000 else "1" + "0" * 4300

@@ -1,0 +1,304 @@
+"""Machines of which nothing is known but their sensors: levels are watched from the first hop on."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from models.commissioning.commission import commission
+from models.commissioning.commissioned import FILE, HealthyEntry, Installed, install
+from models.commissioning.healthy import healthy_from_blocks
+from models.diagnosis.moments import plan_for
+from models.machine import AlarmSettings, MachineFile, Operation
+from models.signals.block import SampleBlock
+from models.signals.channels import Channel
+from rotorwatch.records.alarms import EventKind
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Health, HealthState, Report
+from rotorwatch.records.levels import ChannelLevels, LevelGrowth
+from service.commands import watching
+from service.history.records import Checkpoint
+from service.monitor.alarms.book import AlarmBook
+from service.monitor.levels import LevelWatch
+from service.monitor.monitor import MachineMonitor
+from service.monitor.reports import identity_of
+from service.rotorwatch import app
+from service.stream.checkpoints import checkpoint_step, restored
+from simulator.scenario import Event
+from tests.commissioning.rotor_kit import NOTHING, commissioned, elsewhere, healthy, stream
+from tests.service.rig.live import LAB, scenario_blocks
+
+RATE_HZ, BLOCK_S, START_NS = 5120.0, 0.5, 1_767_225_600_000_000_000
+FAN = MachineFile.model_validate(
+    {
+        "site": "plant",
+        "name": "fan",
+        "rate_hz": RATE_HZ,
+        "sensors": [
+            {"name": "DE-H", "quantity": "acceleration", "location": "DE", "direction": "horizontal", "unit": "m/s2"},
+            {"name": "NDE-V", "quantity": "velocity", "location": "NDE", "direction": "vertical", "unit": "mm/s"},
+        ],
+        "window": {"length_s": 20.0, "max_span_s": 30.0},
+        "levels": {"reference_windows": 3},
+    }
+)
+
+
+def blocks(
+    seed: int, seconds: float, growth: tuple[float, float] = (1e9, 1.0), first: int = 0
+) -> Iterator[SampleBlock]:
+    """A fan whose drive end becomes louder from a time on, s from the start of all streams."""
+    rng = np.random.default_rng([91, seed, first])
+    size = round(BLOCK_S * RATE_HZ)
+    for number in range(first, first + round(seconds / BLOCK_S)):
+        t = number * BLOCK_S + np.arange(size) / RATE_HZ
+        gain = np.where(t >= growth[0], growth[1], 1.0)
+        drive = gain * (0.4 * np.sin(2 * np.pi * 24.8 * t) + 0.5 * rng.standard_normal(size))
+        other = 1.1 * np.sin(2 * np.pi * 24.8 * t) + 0.3 * rng.standard_normal(size)
+        yield SampleBlock(
+            run=1,
+            sequence=number,
+            start_ns=START_NS + round(number * BLOCK_S * 1e9),
+            rate_hz=RATE_HZ,
+            samples=np.column_stack([drive, other]).astype(np.float32),
+        )
+
+
+def run(monitor: MachineMonitor, stream: Iterator[SampleBlock]) -> tuple[list[str], list[tuple[EventKind, str, float]]]:
+    """Reports as JSON, and alarm events: what happened, to which alarm, when, s from the start of all streams."""
+    windows, events = [], []
+    for block in stream:
+        report = monitor.step(block)
+        assert report.verdict.accepted, report.verdict.text
+        assert report.fault is None
+        windows += [window.model_dump_json() for window in report.windows]
+        events += [(one.kind, one.alarm.name, (one.time_ns - START_NS) / 1e9) for one in report.events]
+    return windows, events
+
+
+def test_a_machine_file_with_nothing_but_sensors_is_watched_from_the_first_hop_on() -> None:
+    monitor = MachineMonitor(install(FAN, None))
+    windows, events = run(monitor, blocks(1, 30))
+    assert len(windows) == 5  # the first hop needs a second of history
+    assert '"levels":[{"channel":"DE-H"' in windows[0]
+    assert not events
+    health = monitor.health()
+    assert health.state is HealthState.WATCHING
+    assert "neither known nor commissioned" in health.reason
+    assert health.latest is not None
+    drive, other = health.latest.levels
+    assert drive.overall == pytest.approx(np.hypot(0.4 / np.sqrt(2), 0.5), rel=0.02)
+    assert other.overall == pytest.approx(np.hypot(1.1 / np.sqrt(2), 0.3 * np.sqrt(990 / 2560)), rel=0.02)
+    assert (drive.unit, other.unit, other.velocity) == ("m/s2", "mm/s", None)
+
+
+def test_a_running_speed_in_the_machine_file_is_followed_in_the_vibration() -> None:
+    monitor = MachineMonitor(install(FAN.model_copy(update={"operation": Operation(speed_rpm=1500.0)}), None))
+    run(monitor, blocks(1, 30))
+    health = monitor.health()
+    assert (health.state, health.filled) == (HealthState.WATCHING, 1.0)
+    assert health.latest is not None
+    assert [one.x1 for one in health.latest.levels] == pytest.approx([0.4 / np.sqrt(2), 1.1 / np.sqrt(2)], rel=0.02)
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
+def test_a_machine_that_doubles_after_its_first_windows_raises_the_alarm_of_its_channel(seed: int) -> None:
+    monitor = MachineMonitor(install(FAN, None))
+    _, events = run(monitor, blocks(seed, 140, growth=(90.0, 2.0)))
+    assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
+    assert 90 < events[0][2] <= 90 + 2 * FAN.window.length_s
+    alarm = next(one for one in monitor.health().alarms if one.name == "level:DE-H")
+    assert "alert from" in alarm.note
+    assert "the first windows" in alarm.note
+    assert monitor.health().state is HealthState.ALERT
+
+
+def test_a_growth_by_four_is_a_danger_and_clears_when_it_is_gone() -> None:
+    monitor = MachineMonitor(install(FAN, None))
+    _, events = run(monitor, blocks(4, 120, growth=(80.0, 4.0)))
+    kinds = [kind for kind, name, _ in events if name == "level:DE-H"]
+    assert kinds in ([EventKind.RAISED], [EventKind.RAISED, EventKind.ESCALATED])
+    assert monitor.health().state is HealthState.DANGER
+    _, events = run(monitor, blocks(4, 120, first=240))
+    assert [(kind, name) for kind, name, _ in events] == [(EventKind.CLEARED, "level:DE-H")]
+    assert monitor.health().state is HealthState.WATCHING
+
+
+def test_an_alarm_stays_in_the_deadband_and_clears_below_it() -> None:
+    machine = FAN.model_copy(update={"alarms": AlarmSettings(on_delay_s=0.0, off_delay_s=0.0)})
+    watch, book = LevelWatch(plan_for(machine, levels=True), machine, install(machine, None)), AlarmBook(machine.alarms)
+    healthy = ChannelLevels.model_validate(example(ChannelLevels))
+    (limit,) = healthy.limits
+    for second, (level, state, raised) in enumerate(
+        [(9.9, "normal", False), (10.1, "alert", True), (9.5, "normal", True), (8.9, "normal", False)]
+    ):
+        now = limit.model_copy(
+            update={"measure": "overall", "alert": 10.0, "danger": 20.0, "fall": None, "state": state}
+        )
+        watch.latest = (healthy.model_copy(update={"overall": level, "limits": (now,)}),)
+        watch.tell(book, START_NS + second * 10**9)
+        assert book.present("level:DE-H") == raised, level
+
+
+def test_a_monitor_that_is_restarted_goes_on_to_the_last_bit() -> None:
+    stream = list(blocks(5, 100, growth=(85.0, 3.0)))
+    expected = run(MachineMonitor(install(FAN, None)), iter(stream))
+    first = MachineMonitor(install(FAN, None))
+    before = run(first, iter(stream[:90]))
+    for whole in (True, False):
+        state = first.state(whole=whole)
+        second = MachineMonitor(install(FAN, None))
+        second.restore(state.state, tuple(data for _, data in state.new_parts))
+        second.restore_alarms(state.alarms)
+        for number, block in enumerate(() if whole else stream[:90]):
+            second._window.recall(block.samples, block.start_ns, newest=number == 89)
+        after = run(second, iter(stream[90:]))
+        assert (before[0] + after[0], before[1] + after[1]) == expected, whole
+
+
+@pytest.mark.parametrize(
+    ("changes", "kept"),
+    [
+        ({"description": "a fan"}, True),
+        ({"alarms": AlarmSettings(on_delay_s=20.0)}, True),
+        ({"levels": FAN.levels.model_copy(update={"reference_since": "2026-11-25, new bearing"})}, False),
+        ({"sensors": (FAN.sensors[0].model_copy(update={"unit": "g"}), FAN.sensors[1])}, False),
+    ],
+)
+def test_first_windows_outlast_whatever_they_do_not_depend_on(changes: dict[str, Any], kept: bool) -> None:
+    """Or a machine that has become louder would be healthy after an update of the program."""
+    before = install(FAN, None)
+    monitor = MachineMonitor(before)
+    run(monitor, blocks(8, 65))
+    step = checkpoint_step(identity_of(before), monitor.state(), 1)
+    now = install(FAN.model_copy(update=changes), None)
+    told = Checkpoint(replace(step.head, code_version="0.0.9"), step.new_parts)
+    after, text = restored(lambda: MachineMonitor(now), identity_of(now), told, 0)
+    assert ("they are taken anew (the levels are of other sensors or settings)" in text) == (not kept)
+    _, events = run(after, blocks(8, 60, growth=(0.0, 3.0), first=130))
+    assert [name for kind, name, _ in events if kind is EventKind.RAISED] == (["level:DE-H"] if kept else [])
+
+
+def test_commissioned_levels_are_the_reference_and_say_what_is_unchanged(tmp_path: Path) -> None:
+    healthy = healthy_from_blocks("healthy.mcap", FAN, [(block, "") for block in blocks(6, 150)])
+    entry = HealthyEntry(
+        name="healthy.mcap", sha256="0" * 64, start_ns=START_NS, end_ns=START_NS + 150 * 10**9, used_s=145.0, gaps=0
+    )
+    made = commission(FAN, [healthy], [entry])
+    assert made.commissioned is not None, made.report.summary
+    assert made.report.verdict == "limited"
+    (tmp_path / FILE).write_text(made.commissioned.model_dump_json())
+    installed: Installed = install(FAN, tmp_path)
+    monitor = MachineMonitor(installed)
+    _, events = run(monitor, blocks(7, 60))
+    assert (monitor.health().state, monitor.health().reason, events) == (HealthState.UNCHANGED, "", [])
+    _, events = run(monitor, blocks(7, 40, growth=(0.0, 2.2), first=120))
+    assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
+    assert monitor.health().state is HealthState.ALERT
+
+
+def test_levels_are_judged_at_a_speed_that_was_not_commissioned() -> None:
+    machine = elsewhere(NOTHING)
+    made = commissioned(machine, healthy(machine, 70.0, 60163)).commissioned
+    assert made is not None
+    faster = Event(at_s=0.0, speed_rpm=1.06 * LAB.operation.speed_rpm)
+    for size, state in ((1.0, HealthState.WATCHING), (4.0, HealthState.ALERT)):
+        monitor = MachineMonitor(Installed(machine, None, made))
+        for block in stream(66.0, 60164, faster, Event(at_s=0.0, excitation_level=size)):
+            monitor.step(block, machine.descriptor.schema_hash)
+        now = monitor.health()
+        assert now.state is state
+        assert "levels are judged by the nearest commissioned speed: speed is 1399 rpm" in now.reason
+
+
+def test_a_machine_that_is_watched_says_what_would_have_been_seen() -> None:
+    monitor = MachineMonitor(install(FAN, None))
+    run(monitor, blocks(1, 30))
+    before = monitor.health().latest
+    assert before is not None
+    assert before.level_growth is not None
+    assert before.level_growth.growth is None
+    assert "no limit yet" in before.level_growth.text
+    run(monitor, blocks(1, 70, first=60))
+    now = monitor.health().latest
+    assert now is not None
+    assert now.state == HealthState.WATCHING
+    assert now.level_growth is not None
+    assert now.level_growth.growth is not None
+    assert 0.5 < now.level_growth.growth < 0.9
+    _, events = run(monitor, blocks(1, 40, growth=(0.0, 1.05 * (1 + now.level_growth.growth)), first=200))
+    assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
+    later = monitor.health().latest
+    assert later is not None
+    assert later.level_growth is None  # an alert says more
+
+
+def test_status_says_what_would_have_been_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    growth = LevelGrowth.model_validate(example(LevelGrowth))
+    report = Report.model_validate(example(Report)).model_copy(update={"level_growth": growth})
+    health = Health.model_validate(example(Health)).model_copy(update={"report": report})
+    monkeypatch.setattr(watching, "_fetch_healths", lambda *_: [health])
+    said = CliRunner().invoke(app, ["status"]).stdout
+    assert f"demo/lab: {growth.text}" in said
+
+
+def held(stream: Iterator[SampleBlock], column: int, value: float) -> Iterator[SampleBlock]:
+    """The stream with a channel that gives nothing but one value."""
+    for block in stream:
+        samples = block.samples.copy()
+        samples[:, column] = value
+        yield replace(block, samples=samples)
+
+
+def test_a_dead_sensor_at_whatever_place_is_a_fault_of_that_sensor_and_no_quiet_machine() -> None:
+    monitor = MachineMonitor(install(FAN, None))
+    _, events = run(monitor, held(blocks(5, 60), 1, 0.25))
+    assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "data-stuck")]
+    health = monitor.health()
+    assert health.latest is not None
+    assert [(one.states, one.kind) for one in health.latest.sensors] == [(("@NDE-V",), "stuck")]
+    assert health.latest.sensors[0].text.startswith("NDE-V: repeated the value 0.25 mm/s")
+    assert health.state is HealthState.DATA_HEALTH
+
+
+def test_a_dead_sensor_elsewhere_is_told_and_the_rotor_is_diagnosed_as_before() -> None:
+    casing = Channel.model_validate(
+        {"name": "DE-H", "quantity": "acceleration", "location": "DE", "direction": "horizontal", "unit": "m/s2"}
+    )
+    rig = LAB.model_copy(update={"sensors": (*LAB.sensors, casing)})
+    monitor, alone = MachineMonitor(install(rig, None)), MachineMonitor(install(LAB, None))
+    for block in scenario_blocks(72.0):
+        wider = np.pad(block.samples.astype(np.float32), ((0, 0), (0, 1)))
+        monitor.step(replace(block, samples=wider))
+        alone.step(block)
+    told, plain = monitor.health().latest, alone.health().latest
+    assert told is not None
+    assert plain is not None
+    assert [one.states for one in told.sensors] == [("@DE-H",)]
+    assert (told.state, told.verdict) == (plain.state, plain.verdict)
+    assert [one.name for one in monitor.health().alarms if one.raised] == ["data-stuck"]
+
+
+MESH = 17.0
+"""Times running speed; twice the band that the likelihood looks at."""
+
+
+def test_a_machine_that_was_not_commissioned_shows_lines_that_theory_does_not_have() -> None:
+    monitor = MachineMonitor(install(LAB, "lab"))
+    fast = [n for n, one in enumerate(LAB.sensors) if (one.quantity, one.location) == ("velocity", "bearing")]
+    meshing: list[SampleBlock] = []
+    for block in scenario_blocks(95.0):
+        samples = block.samples.copy()
+        if len(meshing) >= 650:
+            turned = block.samples[:, [-1]]
+            samples[:, fast] += 0.7 * samples[:, fast].std(axis=0) * np.cos(MESH * turned)
+        meshing.append(replace(block, samples=samples))
+    _, ((kind, name, _),) = run(monitor, iter(meshing))
+    assert (kind, name) == (EventKind.RAISED, "model")
+    note = next(one for one in monitor.health().alarms if one.name == "model").note
+    assert "a line within 3" in note
+    assert "that no rotor of the machine file makes" in note

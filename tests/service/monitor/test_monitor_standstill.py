@@ -1,0 +1,133 @@
+"""A machine that stops and starts raises nothing on its sensors; a phase reference that is lost while it runs does."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from models.alarm_names import PHASE_REFERENCE
+from models.commissioning.commissioned import Installed
+from models.commissioning.healthy import healthy_from_blocks
+from models.machine import MachineFile
+from models.signals.block import SampleBlock
+from models.signals.channels import Quantity
+from rotorwatch.records.alarms import EventKind
+from rotorwatch.records.health import HealthState, Report
+from service.monitor.monitor import MachineMonitor
+from tests.service.rig.live import LAB, scenario_blocks
+
+STOPS_S, STANDS_S, STARTS_S, RUNS_S, END_S = 40.0, 50.0, 110.0, 120.0, 170.0
+NOISE = 0.01
+KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 20.0})})
+NEW = MachineFile.model_validate(
+    KIT.model_dump(exclude={"rotor", "condition"}, exclude_none=True) | {"levels": {"reference_windows": 2}}
+)
+WITHOUT_ANGLE = NEW.model_copy(update={"sensors": NEW.sensors[:-1]})
+
+
+def stopping(machine: MachineFile, what: str) -> Iterator[SampleBlock]:
+    """A machine that runs, slows down, stands and runs again; or whose ``angle``, or ``signals``, stand for that time.
+
+    The running machine's own samples, at times that pass as fast as it turns; forces go with the square of speed.
+    """
+    stream = scenario_blocks(END_S)
+    samples = np.concatenate([block.samples for block in stream]).astype(float)
+    t = np.arange(len(samples)) / LAB.rate_hz
+    speed = np.interp(t, [STOPS_S, STANDS_S, STARTS_S, RUNS_S], [1.0, 0.0, 0.0, 1.0])
+    turned = np.cumsum(speed) / LAB.rate_hz
+    rng = np.random.default_rng(93001)
+    for column, channel in enumerate(LAB.sensors):
+        own = samples[:, column].copy()
+        if channel.quantity is Quantity.SHAFT_ANGLE:
+            samples[:, column] = np.interp(t if what == "signals" else turned, t, np.unwrap(own)) % (2 * np.pi)
+            continue
+        if what == "machine":
+            size = speed ** (3 if channel.quantity is Quantity.VELOCITY else 2)
+            samples[:, column] = size * np.interp(turned, t, own) + NOISE * own.std() * rng.standard_normal(len(t))
+        elif what == "signals":
+            samples[(t > STOPS_S) & (t < RUNS_S), column] = 0.0
+    first = 0
+    for block in stream:
+        last = first + len(block.samples)
+        yield replace(block, samples=samples[first:last, : len(machine.sensors)].astype(np.float32))
+        first = last
+
+
+def watched(monitor: MachineMonitor, stream: list[SampleBlock]) -> tuple[list[Report], list[tuple[EventKind, str]]]:
+    """Reports, and what happened to alarms."""
+    done = [monitor.step(block) for block in stream]
+    return (
+        [report for one in done for report in one.windows],
+        [(event.kind, event.alarm.name) for one in done for event in one.events],
+    )
+
+
+def monitor_of(machine: MachineFile) -> MachineMonitor:
+    return MachineMonitor(Installed(machine))
+
+
+def test_a_machine_that_stops_and_starts_raises_nothing_and_is_healthy_again_after_a_restart_too() -> None:
+    stream = list(stopping(KIT, "machine"))
+    half = len(stream) // 2  # while it stands
+    monitor, after = monitor_of(KIT), monitor_of(KIT)
+    reports, events = watched(monitor, stream[:half])
+    state = monitor.state(whole=True)
+    after.restore(state.state, tuple(data for _, data in state.new_parts))
+    rest = watched(monitor, stream[half:])
+    assert watched(after, stream[half:]) == rest
+    reports += rest[0]
+    assert events + rest[1] == []
+    states = {round((one.end_ns - stream[0].start_ns) / 1e9): one.state for one in reports}
+    assert states[38] is states[168] is HealthState.HEALTHY
+    standing = [one for one in reports if "the machine stands" in one.reason]
+    assert {one.state for one in standing} == {HealthState.NOT_EVALUABLE}
+    assert standing[-1].end_ns - standing[0].end_ns >= (STARTS_S - STANDS_S) * 1e9
+    assert not any(one.sensors for one in standing)
+
+
+@pytest.mark.parametrize(("what", "alarm"), [("angle", PHASE_REFERENCE), ("signals", "data-stuck")])
+def test_what_is_lost_while_the_machine_runs_is_told(what: str, alarm: str) -> None:
+    _, events = watched(monitor_of(KIT), list(stopping(KIT, what)))
+    assert events == [(EventKind.RAISED, alarm)]
+
+
+def test_without_a_shaft_angle_no_sensor_is_blamed_but_levels_have_fallen() -> None:
+    reports, events = watched(monitor_of(WITHOUT_ANGLE), list(stopping(WITHOUT_ANGLE, "machine")))
+    assert any("all its sensors have lost their supply" in one.reason for one in reports)
+    assert {name for _, name in events} == {f"level:{one.name}" for one in WITHOUT_ANGLE.sensors}
+
+
+@pytest.mark.parametrize("machine", [NEW, WITHOUT_ANGLE])
+def test_levels_of_a_machine_that_stands_are_no_reference_for_it_when_it_runs(machine: MachineFile) -> None:
+    monitor = monitor_of(machine)
+    stream = list(stopping(machine, "machine"))[round(10 * STANDS_S) :]
+    starts, found = round(10 * (STARTS_S - STANDS_S)), []
+    for part in (stream[:starts], stream[starts:]):
+        _, events = watched(monitor, part)
+        reference = monitor._levels.reference
+        states = () if reference is None else reference.states
+        found.append(([one.speed_rad_s is None for one in states], [name for _, name in events if "level" in name]))
+    if machine is NEW:
+        assert found[0] == ([], [])
+        assert not any(found[1][0])
+        assert found[1][1] == []
+    else:  # it is told once that the machine has become louder
+        assert found[0] == ([True], [])
+        assert found[1][0] == [True, False]
+        assert set(found[1][1]) == {f"level:{one.name}" for one in machine.sensors}
+
+
+def test_a_stop_is_left_out_of_a_healthy_recording_with_its_run_down_and_run_up() -> None:
+    stream = [(block, "") for block in stopping(LAB, "machine")]
+    recorded = healthy_from_blocks("healthy.mcap", LAB, stream)
+    hop_s = LAB.window.hop_s
+    usual = LAB.operation.speed_rad_s * hop_s
+    assert len(recorded.stretches) == 2
+    assert all(abs(hop.turned_rad) == pytest.approx(usual, rel=0.01) for hop in recorded.hops)
+    assert (
+        STARTS_S - STOPS_S < recorded.stopped_s < RUNS_S - STOPS_S + 4 * hop_s
+    )  # an edge hop on either side, and the grid of hops
+    assert recorded.duration_s + recorded.stopped_s == pytest.approx(END_S, abs=hop_s)
+    standing = [one for one in stream if STANDS_S < (one[0].start_ns - stream[0][0].start_ns) / 1e9 < STARTS_S - 1]
+    assert healthy_from_blocks("standing.mcap", LAB, standing).stopped_s == 0

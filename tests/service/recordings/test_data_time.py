@@ -1,0 +1,209 @@
+"""Times are those of the data: streams that came faster than real time, publishers that were started again."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from models.signals.block import SampleBlock
+from models.signals.recording import RecordedMessage, read_recording
+from models.signals.wire import decode_block
+from rotorwatch.records.replays import ReplayLine, ReplayProgress
+from service.analysis.recorded import Recorded
+from service.analysis.spectrum import read_spectrum, read_waterfall
+from service.commands.replay import summary_lines
+from service.recordings.replay.control import Control
+from service.recordings.replay.data_time import data_start_ns
+from service.recordings.replay.player import PlayPlan, play
+from service.recordings.replay.source import RecordingSource
+from service.rotorwatch import app
+from tests.service.rig.live import LAB, START_NS, scenario_blocks
+from tests.service.rig.replaying import hurried, recording, split, write
+
+S = 10**9
+
+
+@pytest.fixture(scope="module")
+def blocks() -> list[SampleBlock]:
+    return scenario_blocks(40.0)
+
+
+@pytest.fixture(scope="module")
+def slow(tmp_path_factory: pytest.TempPathFactory, blocks: list[SampleBlock]) -> Path:
+    return recording(tmp_path_factory.mktemp("slow") / "same.mcap", blocks)
+
+
+@pytest.fixture(scope="module")
+def quick(slow: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recorded in 2 s, years later."""
+    return hurried(slow, tmp_path_factory.mktemp("quick") / "same.mcap")
+
+
+@pytest.fixture(scope="module")
+def twice(tmp_path_factory: pytest.TempPathFactory, blocks: list[SampleBlock]) -> Path:
+    """A run of 30 s, and after it one that begins 10 s after the beginning of the first."""
+    again = [replace(one, run=9, sequence=number) for number, one in enumerate(blocks[100:250])]
+    messages = [
+        message
+        for path in (
+            recording(tmp_path_factory.mktemp("first") / "a.mcap", blocks[:300]),
+            recording(tmp_path_factory.mktemp("second") / "b.mcap", again),
+        )
+        for message in read_recording(path)
+    ]
+    ordered = [replace(one, log_time_ns=START_NS + number * S // 10) for number, one in enumerate(messages)]
+    return write(tmp_path_factory.mktemp("twice") / "twice.mcap", ordered)
+
+
+def starts_s(source: RecordingSource, **limits: int) -> list[float]:
+    found = source.messages({LAB.keys.stream}, **limits)
+    return [(decode_block(one.payload, one.attachment, one.encoding)[0].start_ns - START_NS) / S for one in found]
+
+
+def stream_of(path: Path) -> Recorded:
+    source = RecordingSource([path])
+    return Recorded(source, LAB.keys, *source.between(None, None))
+
+
+def test_a_source_knows_the_times_of_the_data(quick: Path, tmp_path: Path) -> None:
+    for files in ([quick], split(quick, tmp_path, 150)):
+        source = RecordingSource(files)
+        assert (source.span().start_ns, source.span().end_ns) == (START_NS, START_NS + 40 * S)
+        assert starts_s(source, from_ns=START_NS + 12 * S, to_ns=START_NS + 15 * S) == [n / 10 for n in range(120, 150)]
+        assert source.between("12", "2026-01-01T00:00:15Z") == (START_NS + 12 * S, START_NS + 15 * S)
+
+
+def test_what_was_recorded_with_a_block_goes_with_it(quick: Path, tmp_path: Path) -> None:
+    """A descriptor before the first block, a report after one, and a message of nobody."""
+    messages = list(read_recording(quick))
+    late = messages[200].log_time_ns
+    report = RecordedMessage(LAB.keys.report, b"{}", b"", "application/json", late, late)
+    other = replace(report, key="weather")
+    source = RecordingSource([write(tmp_path / "more.mcap", [*messages[:201], report, other, *messages[201:]])])
+    timed = {message.key: time_ns for time_ns, message in source.timed() if message.key != LAB.keys.stream}
+    assert timed == {LAB.keys.descriptor: START_NS, LAB.keys.report: START_NS + round(19.9 * S), "weather": late}
+
+
+def test_reports_without_samples_have_times_of_the_data(tmp_path: Path) -> None:
+    said = [
+        RecordedMessage(LAB.keys.report, json.dumps({"end_ns": START_NS + at * S}).encode(), b"", "", at, at)
+        for at in (60, 65, 70)
+    ]
+    source = RecordingSource([write(tmp_path / "reports.mcap", said)])
+    assert list(source.messages(from_ns=START_NS + 60 * S, to_ns=START_NS + 70 * S)) == said[1:]
+    assert source.span().end_ns == START_NS + 70 * S
+
+
+def test_a_recording_of_two_runs_at_the_same_times(twice: Path) -> None:
+    source = RecordingSource([twice])
+    span = source.span(LAB.keys)
+    assert ((span.start_ns - START_NS) / S, (span.end_ns - START_NS) / S) == (0, 30)
+    assert ((span.first_ns - START_NS) / S, (span.newest_ns - START_NS) / S) == (0, 25)
+    assert starts_s(source, from_ns=START_NS + 24 * S, to_ns=START_NS + 26 * S) == pytest.approx(
+        [*(n / 10 for n in range(240, 260)), *(n / 10 for n in range(240, 250))]
+    )
+
+
+@pytest.mark.parametrize("name", ["slow", "quick"])
+def test_spectra_are_of_the_latest_seconds_of_the_data(name: str, request: pytest.FixtureRequest) -> None:
+    stream = stream_of(request.getfixturevalue(name))
+    found = read_spectrum(stream, stream.displacements, 20.0, 0.5, "amplitude")
+    assert ((found.start_ns - START_NS) / S, (found.end_ns - START_NS) / S, found.averages) == (20, 40, 19)
+    fall = read_waterfall(stream, stream.displacements[0], 4.0, 0.5, "amplitude")
+    assert ((fall.start_ns - START_NS) / S).tolist() == list(range(0, 40, 4))
+
+
+def test_of_two_runs_the_later_one_is_shown(twice: Path) -> None:
+    stream = stream_of(twice)
+    found = read_spectrum(stream, stream.displacements, 20.0, 0.5, "amplitude")
+    assert ((found.start_ns - START_NS) / S, (found.end_ns - START_NS) / S) == (10, 25)
+    fall = read_waterfall(stream, stream.displacements[0], 5.0, 0.5, "amplitude")
+    assert ((fall.start_ns - START_NS) / S).tolist() == [0, 5, 10, 15, 20]
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["orbit", pytest.param("spectrum", marks=pytest.mark.long), pytest.param("waterfall", marks=pytest.mark.long)],
+)
+def test_pictures_do_not_depend_on_how_fast_the_data_came(slow: Path, quick: Path, tmp_path: Path, kind: str) -> None:
+    where = ("--at", "31") if kind != "waterfall" else ("--from", "8", "--to", "31")
+    options = ("--size", "4x3") if kind == "orbit" else ("--window", "4")
+    for path, out in ((slow, tmp_path / "slow.svg"), (quick, tmp_path / "quick.svg")):
+        found = CliRunner().invoke(app, ["plot", kind, str(path), "--out", str(out), *where, *options])
+        assert found.exit_code == 0, found.output
+    assert (tmp_path / "slow.svg").read_bytes() == (tmp_path / "quick.svg").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [
+        (("--from", "12", "--to", "15"), 30),
+        (("--from", "2026-01-01T00:00:12Z", "--to", "2026-01-01T00:00:15Z"), 30),
+        (("--from", "39", "--to", "4000"), 10),
+    ],
+)
+def test_replays_from_and_to_times_of_the_data(
+    quick: Path, tmp_path: Path, options: tuple[str, ...], count: int
+) -> None:
+    out = tmp_path / "lines.jsonl"
+    found = CliRunner().invoke(
+        app, ["replay", str(quick), "--offline", *options, "--out", str(out), "--progress", "json"]
+    )
+    assert found.exit_code == 0, found.output
+    lines = [ReplayLine.model_validate_json(line) for line in found.stdout.splitlines()]
+    summary, progress = lines[-1].summary, lines[-2].progress
+    assert summary is not None
+    assert progress is not None
+    assert (summary.blocks, progress.fraction) == (count, 1.0), summary_lines(summary)
+    assert abs(progress.position_ns - START_NS - (15 if count == 30 else 40) * S) <= 1
+
+
+class Timed(Control):
+    """Waits for nothing, and notes how long it would have waited."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.due_s: list[float] = []
+
+    def wait_until(self, deadline_s: float | None, on_pause: Callable[[], None] | None = None) -> bool:
+        self.due_s.append(deadline_s or 0.0)
+        return super().wait_until(None, on_pause)
+
+    def now_s(self) -> float:
+        return 100.0
+
+
+def played(path: Path, **limits: int) -> tuple[list[float], list[ReplayProgress]]:
+    source, control, progress = RecordingSource([path]), Timed(), list[ReplayProgress]()
+    span = source.span()
+    where = {"from_ns": span.start_ns, "to_ns": span.end_ns + 1} | limits
+    play(source, lambda _: None, PlayPlan({LAB.keys.stream}, 2.0, **where), control, progress.append)
+    return [due_s - 100.0 for due_s in control.due_s], progress
+
+
+def test_a_paced_replay_goes_at_the_pace_of_the_data(quick: Path) -> None:
+    due_s, progress = played(quick, from_ns=START_NS + 10 * S, to_ns=START_NS + 100 * S)
+    assert due_s == pytest.approx([number / 20 for number in range(300)])
+    assert progress[0].fraction == 0.0
+    assert progress[-1].fraction == 1.0
+
+
+def test_a_paced_replay_goes_on_where_the_data_begin_again_or_pause_for_hours(
+    twice: Path, blocks: list[SampleBlock], tmp_path: Path
+) -> None:
+    due_s, _ = played(twice)
+    assert due_s[:300] == pytest.approx([number / 20 for number in range(300)])
+    assert due_s[299:310] == pytest.approx([due_s[299]] * 11)
+    assert due_s[-1] == pytest.approx((299 + 139) / 20)
+    day = [replace(one, start_ns=one.start_ns + 86_400 * S) for one in blocks[10:20]]
+    due_s, _ = played(recording(tmp_path / "night.mcap", [*blocks[:10], *day]))
+    assert due_s == pytest.approx([*(n / 20 for n in range(10)), *(n / 20 for n in range(9, 19))])
+
+
+@pytest.mark.parametrize("end", ["1e999", "NaN", "[" * 50_000, "9" * 4000, "-1", '"soon"'])
+def test_a_report_without_a_time_is_left_out(end: str) -> None:
+    odd = RecordedMessage(LAB.keys.report, f'{{"end_ns": {end}}}'.encode(), b"", "", 5, 5)
+    assert data_start_ns(odd) is None

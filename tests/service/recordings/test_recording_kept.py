@@ -1,0 +1,461 @@
+"""What is kept of the recordings, what is dropped, and what the catalogue finds and refuses to find."""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
+from models.signals.salvage import salvaged_messages
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.example import example
+from service.history.records import StoredEvent, StoreError
+from service.recordings.catalogue import (
+    PART,
+    Catalogue,
+    Recording,
+    kept_reasons,
+    name_of,
+    recent_messages,
+    recorded_files,
+)
+from service.recordings.recorder import MachineRecorder
+from service.recordings.retention import AlarmMark, alarm_mark, decide
+from service.runtime.runtime import Runtime, running
+from service.settings.service import RecordingSettings
+from tests.service.history.test_store import alarm_event
+from tests.service.rig.live import (
+    LAB,
+    PATIENT,
+    Feed,
+    Program,
+    endpoint,
+    machine_file,
+    open_session,
+    program,
+    scenario_blocks,
+    settings,
+    until,
+    worker_of,
+)
+from tests.service.rig.replaying import recording
+from tests.service.runtime.test_survives import do, log
+from tests.service.runtime.test_survives import running as monitor_running
+
+NS = 1_000_000_000
+NOW_NS = 1_795_271_130 * NS  # 2026-11-21 14:25:30 UTC
+DAY_NS = 86_400 * NS
+SAID = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
+ALARM = RecordedMessage(
+    LAB.keys.alarm_event, SAID.model_dump_json().encode(), b"", "application/cloudevents+json", NOW_NS, NOW_NS
+)
+EVENT = alarm_event(0, kind=SAID.data.kind.value, text=SAID.model_dump_json(), recorded_ns=NOW_NS)
+
+
+def stored(start_s: float, size_mb: float = 100.0, name: str = "", complete: bool = True) -> Recording:
+    """Five minutes that begin so many seconds before or after now."""
+    start_ns = NOW_NS + round(start_s * NS)
+    file = name or name_of(start_ns) + ("" if complete else ".part")
+    return Recording(
+        id=f"demo/lab/{file}", site="demo", machine="lab", path=Path("/recordings/demo/lab") / file, start_ns=start_ns,
+        end_ns=start_ns + 300 * NS, messages=9, size_bytes=round(size_mb * 1e6), complete=complete, kept_because="",
+        problem="",
+    )  # fmt: skip
+
+
+def limits(**fields: float) -> RecordingSettings:
+    return RecordingSettings.model_validate({"directory": "/recordings", "rotate_mb": 10, **fields})
+
+
+def names(recordings: list[Recording]) -> list[str]:
+    return [one.path.name for one in recordings]
+
+
+def test_the_oldest_beyond_the_size_go() -> None:
+    files = [stored(300.0 * n) for n in range(10)]
+    decision = decide(files, [], limits(keep_gb=0.45), NOW_NS)
+    assert [one for one, _ in decision.dropped] == files[:6]
+    assert {why for _, why in decision.dropped} == {"beyond keep_gb = 0.45"}
+    assert decision.kept == {}
+
+
+def test_what_is_too_old_goes_whatever_its_size() -> None:
+    files = [stored(-3 * 86_400, 0.001), stored(-86_400, 0.001)]
+    decision = decide(files, [], limits(keep_days=2), NOW_NS)
+    assert [(one.path.name, why) for one, why in decision.dropped] == [
+        (name_of(NOW_NS - 3 * DAY_NS), "older than keep_days = 2")
+    ]
+
+
+def test_files_around_an_alarm_stay_under_limits_of_their_own() -> None:
+    files = [stored(300.0 * n) for n in range(10)]
+    mark = AlarmMark(NOW_NS + 1650 * NS, "raised: k_by")  # in the middle of file 5
+    decision = decide(
+        files, [mark], limits(keep_gb=0.1, alarm_before_s=400, alarm_after_s=200, alarm_keep_gb=0.5), NOW_NS
+    )
+    # 1250 to 1850 s: from file 4 (1200 to 1500 s) to file 6 (1800 to 2100 s); of the others the newest fills 0.1 GB.
+    assert sorted(decision.kept) == names(files[4:7])
+    assert decision.kept[files[4].path.name] == "2026-11-21 14:53:00 UTC raised: k_by"
+    assert [one for one, _ in decision.dropped] == [*files[:4], *files[7:9]]
+
+
+def test_alarms_cannot_fill_the_disk_either() -> None:
+    files = [stored(300.0 * n) for n in range(10)]
+    marks = [AlarmMark(one.start_ns, "raised") for one in files]
+    decision = decide(files, marks, limits(alarm_keep_gb=0.35), NOW_NS)
+    assert sorted(decision.kept) == names(files[7:])
+    assert [why for _, why in decision.dropped] == ["beyond alarm_keep_gb = 0.35"] * 7
+    decision = decide(files, marks, limits(alarm_keep_days=1), NOW_NS + 2 * DAY_NS)
+    assert len(decision.dropped) == 10
+    assert decision.kept == {}
+
+
+def test_files_being_written_and_files_renamed_by_people_are_left_alone() -> None:
+    files = [stored(-9 * 86_400, complete=False), stored(-9 * 86_400, name="bearing-test.mcap"), stored(-9 * 86_400)]
+    decision = decide(files, [], limits(), NOW_NS)
+    assert [one for one, _ in decision.dropped] == files[2:]
+
+
+@given(
+    sizes=st.lists(st.floats(0.1, 300.0), max_size=30),
+    alarms=st.lists(st.integers(-2000, 10_000), max_size=5),
+    keep_gb=st.floats(0.1, 2.0),
+    alarm_keep_gb=st.floats(0.1, 2.0),
+)
+def test_limits_hold_and_nothing_goes_without_need(
+    sizes: list[float], alarms: list[int], keep_gb: float, alarm_keep_gb: float
+) -> None:
+    files = [stored(300.0 * n, size) for n, size in enumerate(sizes)]
+    marks = [AlarmMark(NOW_NS + s * NS, "raised") for s in alarms]
+    settings = limits(keep_gb=keep_gb, alarm_keep_gb=alarm_keep_gb)
+    decision = decide(files, marks, settings, NOW_NS)
+    gone = {one.id for one, _ in decision.dropped}
+
+    def near(one: Recording) -> bool:
+        return any(one.start_ns - 600 * NS <= mark.time_ns <= one.end_ns + 600 * NS for mark in marks)
+
+    assert set(decision.kept) == {one.path.name for one in files if near(one) and one.id not in gone}
+    for group, limit in (([f for f in files if near(f)], alarm_keep_gb), ([f for f in files if not near(f)], keep_gb)):
+        left = [one for one in group if one.id not in gone]
+        assert sum(one.size_bytes for one in left) <= limit * 1e9
+        assert left == group[len(group) - len(left) :]  # always the oldest first
+        if len(left) < len(group):
+            assert sum(one.size_bytes for one in [group[-len(left) - 1], *left]) > limit * 1e9
+
+
+def test_an_alarm_event_says_what_it_was_and_an_odd_one_counts_too() -> None:
+    assert alarm_mark(EVENT) == AlarmMark(EVENT.recorded_ns, f"{SAID.data.kind}: {SAID.data.text}")
+    for text in ("", "[]", '{"data": 1}', "null"):
+        assert alarm_mark(replace(EVENT, text=text)) == AlarmMark(EVENT.recorded_ns, f"{SAID.data.kind}: {EVENT.alarm}")
+
+
+FEW = {"rotate_mb": 0.1, "keep_gb": 0.0007, "alarm_keep_gb": 1.0, "alarm_before_s": 700, "alarm_after_s": 400}
+
+
+def record_files(
+    directory: Path, first: int, last: int, forged_at: int | None = None, events: tuple[StoredEvent, ...] = ()
+) -> Path:
+    """Record one file of 0.3 MB per five minutes, numbered from now on, with an alarm event off the wire in one."""
+    settings = RecordingSettings.model_validate({"directory": str(directory), **FEW})
+
+    def committed(since_ns: int) -> tuple[StoredEvent, ...]:
+        return tuple(event for event in events if event.recorded_ns >= since_ns)
+
+    recorder = MachineRecorder(LAB, settings, committed, now_ns=lambda: NOW_NS + 3600 * NS)
+    rng = np.random.default_rng(first)
+    for number in range(first, last):
+        time_ns = NOW_NS + 300 * number * NS
+        if number == forged_at:
+            recorder.put(RecordedMessage(ALARM.key, ALARM.payload, b"", ALARM.encoding, time_ns, time_ns))
+        recorder.put(RecordedMessage(LAB.keys.stream, rng.bytes(300_000), b"", "x", time_ns, time_ns))
+    recorder.start()
+    recorder.stop()
+    assert recorder.status().problem == ""
+    return recorder.folder
+
+
+def at_file(number: int) -> StoredEvent:
+    return replace(EVENT, recorded_ns=NOW_NS + 300 * number * NS)
+
+
+def numbers(folder: Path) -> list[int]:
+    """Which of the files of `record_files` are there."""
+    return [n for n in range(30) if (folder / name_of(NOW_NS + 300 * n * NS)).exists()]
+
+
+def test_the_recorder_keeps_what_lies_around_an_alarm_when_the_rest_is_thinned_out(tmp_path: Path) -> None:
+    events = (at_file(2),)
+    folder = record_files(tmp_path, 0, 3, events=events)
+    assert numbers(folder) == [0, 1, 2]
+    folder = record_files(tmp_path, 3, 12, events=events)
+    assert numbers(folder) == [0, 1, 2, 3, 10, 11]
+    stated = json.loads((folder / "kept.json").read_text(encoding="utf-8"))
+    assert sorted(stated["kept"]) == [name_of(NOW_NS + 300 * n * NS) for n in range(4)]
+    assert (stated["alarm_before_s"], stated["alarm_after_s"]) == (700, 400)
+    for one in Catalogue(tmp_path).recordings():
+        kept = one.path.name in stated["kept"]
+        assert ("2026-11-21 14:35:30 UTC raised: ALERT" in one.kept_because) == kept
+
+
+def test_alarm_events_off_the_wire_keep_nothing(tmp_path: Path) -> None:
+    folder = record_files(tmp_path, 0, 12, forged_at=2)
+    assert numbers(folder) == [10, 11]
+    assert kept_reasons(folder) == {}
+
+
+def test_what_is_kept_stays_when_the_history_is_lost(tmp_path: Path) -> None:
+    folder = record_files(tmp_path, 0, 3, events=(at_file(1),))
+    before = kept_reasons(folder)
+    assert len(before) == 3
+    record_files(tmp_path, 20, 29)
+    assert kept_reasons(folder) == before
+    assert numbers(folder)[:3] == [0, 1, 2]
+
+
+def test_what_kept_json_says_is_found_anew_when_it_is_lost(tmp_path: Path) -> None:
+    folder = record_files(tmp_path, 0, 3, events=(at_file(1),))
+    before = kept_reasons(folder)
+    assert len(before) == 3
+    (folder / "kept.json").write_text("[broken", encoding="utf-8")
+    assert kept_reasons(folder) == {}
+    record_files(tmp_path, 20, 21, events=(at_file(1),))
+    assert kept_reasons(folder) == before
+
+
+def test_a_history_that_cannot_be_read_takes_nothing_back(tmp_path: Path) -> None:
+    folder = record_files(tmp_path, 0, 3, events=(at_file(1),))
+    before = kept_reasons(folder)
+
+    def failing(_: int) -> tuple[StoredEvent, ...]:
+        raise StoreError("the database is away")
+
+    settings = RecordingSettings.model_validate({"directory": str(tmp_path), **FEW})
+    recorder = MachineRecorder(LAB, settings, failing, now_ns=lambda: NOW_NS + 3600 * NS)
+    for number in range(20, 29):
+        time_ns = NOW_NS + 300 * number * NS
+        recorder.put(RecordedMessage(LAB.keys.stream, bytes(300_000), b"", "x", time_ns, time_ns))
+    recorder.start()
+    recorder.stop()
+    assert recorder.status().problem == ""
+    assert kept_reasons(folder) == before
+
+
+@contextmanager
+def recorded(folder: Path) -> Iterator[tuple[Runtime, Feed]]:
+    """A monitor that records, and closes a file after a second."""
+    address = endpoint()
+    plan = settings(address, machine_file(folder, PATIENT))
+    recording = RecordingSettings(directory=str(folder / "kept"), rotate_s=1.0)
+    with running(plan.model_copy(update={"recording": recording})) as runtime, open_session(address) as session:
+        yield runtime, Feed(session)
+
+
+def test_a_monitor_keeps_recordings_for_its_own_alarms_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "kept" / "demo" / "lab"
+    with recorded(tmp_path) as (runtime, feed):
+        worker = worker_of(runtime)
+        recorder = worker.recorder
+        assert recorder is not None
+
+        def closed(count: int) -> bool:
+            feed.session.put(LAB.keys.alarm_event, ALARM.payload, encoding=ALARM.encoding)
+            feed.put_good()
+            return recorder.status().files >= count
+
+        until(lambda: closed(2), "two files with forged alarms in them")
+        assert worker.history.events() == ()
+        assert kept_reasons(folder) == {}
+        feed.sequence, feed.start_ns = feed.sequence + 50, feed.start_ns + 5 * NS  # a gap, which is an alarm
+
+        def raised() -> bool:
+            feed.put_good()
+            return worker.history.last_sequence() >= 0
+
+        until(raised, "an alarm of the monitor's own")
+    kept = kept_reasons(folder)
+    assert len(kept) == recorder.status().files
+    assert all("raised: " in why and SAID.data.text not in why for why in kept.values())
+
+
+def received(recorder: Program) -> int:
+    return int(json.loads(recorder.output().splitlines()[-1])["received"])
+
+
+@pytest.mark.slow
+def test_a_recorder_beside_a_monitor_keeps_recordings_for_what_is_in_its_history(tmp_path: Path) -> None:
+    address, folder = endpoint(), tmp_path / "kept" / "demo" / "lab"
+    with monitor_running(tmp_path, address, machine_file(tmp_path, PATIENT)) as monitor:
+        monitor.url()
+        plan = ["--config", str(tmp_path / "monitor.toml"), "--out", str(tmp_path / "kept"), "--connect", address]
+        history = f"sqlite:///{tmp_path / 'history.sqlite'}"
+
+        def record(kind: str) -> dict[str, str]:
+            """Record until an alarm event has come by; what is kept afterwards."""
+            command = ("service.rotorwatch", "record", *plan, "--json")
+            with (
+                program(tmp_path, *command, ROTORWATCH_HISTORY__URL=history) as recorder,
+                open_session(address, "client") as session,
+            ):
+                recorder.wait_for("{")
+                before = received(recorder)
+                if kind == "forged":
+                    session.put(LAB.keys.alarm_event, ALARM.payload, encoding=ALARM.encoding)
+                else:
+                    do(monitor, "shelve", "model", "normal", duration_s=3600)
+                until(lambda: received(recorder) > before, "the message")
+                assert recorder.stop() == 0
+            newest = max(folder.glob("*.mcap"))
+            assert any(read_recording(newest, keys=[LAB.keys.alarm_event]))
+            return kept_reasons(folder)
+
+        assert record("forged") == {}
+        assert log(monitor) == []
+        kept = record("own")
+        assert kept
+        assert all("shelved: " in why for why in kept.values())
+
+
+def write(path: Path, count: int = 3) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with RecordingWriter(path) as writer:
+        for number in range(count):
+            writer.write(RecordedMessage("k", b"data", b"", "x", NOW_NS + number, NOW_NS))
+    return path
+
+
+def test_the_catalogue_lists_what_is_there(tmp_path: Path) -> None:
+    assert Catalogue(tmp_path / "none").recordings() == ()
+    write(tmp_path / "a" / "m2" / name_of(NOW_NS))
+    write(tmp_path / "a" / "m1" / name_of(NOW_NS, 2))
+    write(tmp_path / "a" / "m1" / name_of(NOW_NS), 5)
+    write(tmp_path / "b" / "m1" / "import.mcap", 0)
+    part = tmp_path / "b" / "m1" / (name_of(NOW_NS) + ".part")
+    part.write_bytes(b"unfinished")
+    broken = tmp_path / "b" / "m2" / name_of(NOW_NS)
+    broken.parent.mkdir()
+    broken.write_bytes(b"not a recording")
+    for other in ("notes.txt", ".hidden.mcap", "x.mcap.damaged", "kept.json"):
+        (tmp_path / "b" / "m1" / other).write_text("x", encoding="utf-8")
+    catalogue = Catalogue(tmp_path)
+    found = {one.id: one for one in catalogue.recordings()}
+    stamp = "20261121T142530Z"
+    assert list(found) == [
+        f"a/m1/{stamp}.mcap",
+        f"a/m1/{stamp}_002.mcap",
+        f"a/m2/{stamp}.mcap",
+        f"b/m1/{stamp}.mcap.part",
+        "b/m1/import.mcap",
+        f"b/m2/{stamp}.mcap",
+    ]
+    first = found[f"a/m1/{stamp}.mcap"]
+    assert (first.start_ns, first.end_ns, first.messages, first.complete) == (NOW_NS, NOW_NS + 4, 5, True)
+    assert first.size_bytes == first.path.stat().st_size
+    unfinished = found[f"b/m1/{stamp}.mcap.part"]
+    assert (unfinished.start_ns, unfinished.messages, unfinished.complete) == (NOW_NS, None, False)
+    assert "not a recording (MCAP)" in found[f"b/m2/{stamp}.mcap"].problem
+    assert [one.id for one in catalogue.recordings(machine="m2")] == [f"a/m2/{stamp}.mcap", f"b/m2/{stamp}.mcap"]
+    assert [one.id for one in catalogue.recordings("a", "m2")] == [f"a/m2/{stamp}.mcap"]
+    assert catalogue.recordings("a", "..") == ()
+    assert all(catalogue.find(key) == one for key, one in found.items())
+
+
+def test_a_file_that_changes_is_read_anew(tmp_path: Path) -> None:
+    path = write(tmp_path / "s" / "m" / "x.mcap")
+    catalogue = Catalogue(tmp_path)
+    assert catalogue.recordings()[0].messages == 3
+    path.unlink()
+    assert catalogue.recordings() == ()
+    assert catalogue.find("s/m/x.mcap") is None
+    write(path, 50)
+    assert catalogue.recordings()[0].messages == 50
+
+
+@pytest.fixture
+def with_secret(tmp_path: Path) -> Catalogue:
+    """A directory with one recording, another one outside of it, and links to that from within."""
+    write(tmp_path / "recordings" / "s" / "m" / "good.mcap")
+    secret = write(tmp_path / "s" / "m" / "secret.mcap")
+    inside = tmp_path / "recordings"
+    (inside / "s" / "m" / "link.mcap").symlink_to(secret)
+    (inside / "s" / "linked").symlink_to(secret.parent, target_is_directory=True)
+    (inside / "linked").symlink_to(tmp_path / "s", target_is_directory=True)
+    (inside / "s" / "m" / "folder.mcap").mkdir()
+    os.mkfifo(inside / "s" / "m" / "pipe.mcap")
+    return Catalogue(inside)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../s/m/secret.mcap",
+        "s/m/../../../s/m/secret.mcap",
+        "s/../../s/m/secret.mcap",
+        "./s/m/good.mcap",
+        "s/m/./good.mcap",
+        "s//m/good.mcap",
+        "/s/m/good.mcap",
+        "s/m/good.mcap/",
+        "s/m/good.mcap\n",
+        "s/m/good.mcap\0",
+        "s\\m\\good.mcap",
+        "s/m/..",
+        "../m/good.mcap",
+        "s/m/link.mcap",
+        "s/linked/secret.mcap",
+        "linked/m/secret.mcap",
+        "s/m/folder.mcap",
+        "s/m/pipe.mcap",
+        "s/m/none.mcap",
+        "s/m/.lock",
+        "s/m/kept.json",
+        "%2e%2e/m/good.mcap",
+        "",
+    ],
+)
+def test_no_id_reaches_anything_but_the_directory_s_own_files(with_secret: Catalogue, name: str) -> None:
+    assert with_secret.find(name) is None
+
+
+PIECES = ["s", "m", "/", ".", "..", "../", "secret.mcap", "good.mcap", "link.mcap", "\x00"]
+
+
+@given(name=st.lists(st.sampled_from(PIECES), max_size=12).map("".join))
+def test_no_combination_does_either(tmp_path_factory: pytest.TempPathFactory, name: str) -> None:
+    inside = tmp_path_factory.getbasetemp() / "shared" / "recordings"
+    if not inside.exists():
+        write(inside / "s" / "m" / "good.mcap")
+        write(inside.parent / "s" / "m" / "secret.mcap")
+    found = Catalogue(inside).find(name)
+    assert (found is not None) == (name == "s/m/good.mcap")
+
+
+def test_links_are_not_listed(with_secret: Catalogue) -> None:
+    (good,) = with_secret.recordings()
+    assert with_secret.find("s/m/good.mcap") == good
+    assert len(list(read_recording(good.path))) == 3
+
+
+@pytest.mark.parametrize("when", ["before", "while"])
+def test_a_part_that_is_completed_meanwhile_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
+    complete = recording(tmp_path / "run.mcap", scenario_blocks(3.0))
+    expected = list(read_recording(complete, keys={LAB.keys.stream}))
+    part = complete.rename(complete.with_name(complete.name + PART))
+    files = recorded_files(tmp_path)
+    assert files == (part,)
+
+    def completed(path: Path) -> Iterator[RecordedMessage]:
+        part.rename(complete)
+        return salvaged_messages(path)
+
+    if when == "before":
+        part.rename(complete)
+    else:
+        monkeypatch.setattr("service.recordings.catalogue.salvaged_messages", completed)
+    assert list(recent_messages(files, LAB.keys.stream, 0)) == expected

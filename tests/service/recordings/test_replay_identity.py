@@ -1,0 +1,157 @@
+"""Live, replayed at any pace, and offline: the same reports and alarms; and what is live hears nothing of a replay."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from models.alarm_names import STREAM_LOST
+from models.commissioning.commissioned import install
+from models.signals.keys import MachineKeys
+from models.signals.link import LinkSettings
+from models.signals.recording import read_recording
+from rotorwatch.records.replays import OfflineSummary
+from service.monitor.monitor import MachineMonitor
+from service.recordings.replay.control import Control
+from service.recordings.replay.offline import OfflineReplay
+from service.recordings.replay.source import RecordingSource
+from service.runtime.runtime import running
+from service.stream.replay_link import NetworkPlan, replay_to_network
+from service.stream.transport import TopicMessage, follow
+from service.stream.worker import MachineWorker
+from simulator.scenario import parse_fault
+from tests.service.rig.live import LAB, endpoint, scenario_blocks, send, service, settings, until, worker_of
+from tests.service.rig.replaying import digest_of, lines_of, recording, split
+
+BLOCKS = 700
+FAULT = parse_fault("c_bz=0.5@0")
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The lab machine with too much damping, 70 s: one alarm."""
+    stream = scenario_blocks(BLOCKS / 10, FAULT)
+    return recording(tmp_path_factory.mktemp("recordings") / "faulty.mcap", stream)
+
+
+def offline(*files: Path) -> tuple[OfflineSummary, list[str]]:
+    lines: list[str] = []
+    source = RecordingSource(files)
+    run = OfflineReplay(source, source.machine(), install(LAB, "lab"), lines.append)
+    return run.run(), lines
+
+
+@pytest.fixture(scope="module")
+def expected(faulty: Path) -> OfflineSummary:
+    summary, _ = offline(faulty)
+    return summary
+
+
+def network(source: RecordingSource, address: str, prefix: str, pace: float | None) -> NetworkPlan:
+    return NetworkPlan(
+        link=LinkSettings(mode="client", connect=(address,)),
+        machines=source.machines,
+        everything=False,
+        prefix=prefix,
+        pace=pace,
+        passes=1,
+        from_ns=source.span().start_ns,
+        to_ns=source.span().end_ns + 1,
+        wait_for_subscriber_s=20.0,
+    )
+
+
+@contextmanager
+def monitor_in(namespace: str, link: LinkSettings, when_full: str = "drop") -> Iterator[MachineWorker]:
+    base = settings("tcp/127.0.0.1:0", bundle="lab", when_full=when_full, bound=2000)
+    with running(
+        base.model_copy(update={"link": link.model_copy(update={"namespace": namespace})})
+    ) as runtime:  # fmt: skip
+        yield worker_of(runtime)
+
+
+def test_offline_says_what_the_monitor_says(faulty: Path, expected: OfflineSummary) -> None:
+    monitor = MachineMonitor(install(LAB, "lab"))
+    reports = [
+        report
+        for message in read_recording(faulty, keys={LAB.keys.stream})
+        for report in monitor.step_payload(message.payload, message.attachment, message.encoding)
+    ]
+    assert expected.windows == sum(len(report.windows) for report in reports) > 10
+    assert expected.alarms == sum(len(report.events) for report in reports) == 1
+    assert expected.raised == ("c_bz",)
+    assert expected.blocks == BLOCKS
+    assert expected.refused_blocks == {}
+    assert expected.data_s == pytest.approx(BLOCKS / 10)
+    assert expected.descriptor_differences == ()
+    assert not expected.stopped
+
+
+def test_offline_in_two_files_is_the_same(faulty: Path, expected: OfflineSummary, tmp_path: Path) -> None:
+    summary, _ = offline(*split(faulty, tmp_path, 400))
+    assert (summary.sha256, summary.windows) == (expected.sha256, expected.windows)
+
+
+def test_one_sample_more_or_less_is_another_answer(tmp_path: Path) -> None:
+    """The digest notices what it is there to notice."""
+    stream = scenario_blocks(20.0, FAULT)
+    summary, _ = offline(recording(tmp_path / "as_it_was.mcap", stream))
+    samples = stream[100].samples.copy()
+    samples[7, 2] *= 1.001
+    stream[100] = replace(stream[100], samples=samples)
+    touched, _ = offline(recording(tmp_path / "touched.mcap", stream))
+    assert touched.windows == summary.windows
+    assert touched.sha256 != summary.sha256
+
+
+def test_replayed_onto_the_network_is_the_same(faulty: Path, expected: OfflineSummary) -> None:
+    address, source = endpoint(), RecordingSource([faulty])
+    with monitor_in("replay/x", LinkSettings(listen=(address,)), when_full="wait") as worker:
+        count = replay_to_network(source, network(source, address, "replay/x", None), Control())
+        until(lambda: worker.health().quality.accepted_blocks == BLOCKS, "all blocks")
+        health = worker.health()
+        found = digest_of(worker)
+    assert count == BLOCKS + 1  # and the descriptor
+    assert health.quality.refused_blocks == {}
+    assert health.stream.descriptor_mismatch == ()
+    assert found == expected.sha256
+
+
+def test_a_replay_disturbs_nothing_that_is_live(faulty: Path, expected: OfflineSummary, tmp_path: Path) -> None:
+    """A healthy machine, and on the same network the replay of its fault, with a monitor of its own."""
+    healthy = scenario_blocks(BLOCKS / 10)
+    undisturbed, lines = offline(recording(tmp_path / "healthy.mcap", healthy))
+    assert undisturbed.alarms == 0
+    address, source = endpoint(), RecordingSource([faulty])
+    heard: list[TopicMessage] = []
+    client = LinkSettings(mode="client", connect=(address,))
+    with (
+        service(address, bundle="lab", bound=2000) as (_, live),
+        monitor_in("replay/x", client) as replayed,
+        follow(client, "demo/lab", ("alarm_event", "report"), heard.append),
+    ):
+        plan = network(source, address, "replay/x", 30.0)
+        thread = threading.Thread(target=replay_to_network, args=(source, plan, Control()))
+        thread.start()
+        until(lambda: replayed.health().quality.accepted_blocks > 0, "replayed blocks")
+        assert not live.health().stream.publisher_alive
+        assert live.health().quality.accepted_blocks == 0
+        send(address, healthy)
+        thread.join()
+        until(lambda: live.health().quality.accepted_blocks == BLOCKS, "live blocks")
+        until(lambda: replayed.health().quality.accepted_blocks == BLOCKS, "replayed blocks")
+        until(lambda: len(heard) >= undisturbed.windows, "live reports")
+        health = live.health()
+        said, digests = lines_of(live), (digest_of(live), digest_of(replayed))
+    assert health.quality.refused_blocks == {}
+    assert health.quality.queue_dropped_blocks == health.quality.link_missed_blocks == 0
+    # While the replay goes on, nothing comes from the live machine any more; that is all there is to tell of it.
+    assert {alarm.name for alarm in health.alarms} <= {STREAM_LOST}
+    assert said == lines
+    assert digests == (undisturbed.sha256, expected.sha256)  # the other did raise its alarm, there
+    reports = [message for message in heard if message.key == MachineKeys("demo", "lab").report]
+    assert len(reports) == undisturbed.windows
+    assert all(STREAM_LOST in message.text for message in heard if message not in reports)

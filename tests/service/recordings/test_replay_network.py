@@ -1,0 +1,185 @@
+"""What a replay publishes, under which keys, and that it never meets a live machine."""
+
+import json
+import threading
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from models.signals.keys import MachineKeys
+from models.signals.link import LinkSettings
+from models.signals.recording import RecordedMessage, read_recording
+from service.recordings.replay.control import Control
+from service.recordings.replay.source import RecordingSource
+from service.stream.inbox import RawBlock
+from service.stream.replay_link import LiveMachineError, NetworkPlan, replay_to_network
+from service.stream.transport import Link, MachineCallbacks, MachineLink, route
+from tests.loopback import session_of
+from tests.service.rig.live import LAB, endpoint, scenario_blocks, service, until
+from tests.service.rig.replaying import recording, write
+
+Heard = list[tuple[str, bytes, bytes, str]]
+
+
+def session(listen: str, namespace: str = "") -> zenoh.Session:
+    return session_of(LinkSettings(listen=(listen,), namespace=namespace))
+
+
+def plan(source: RecordingSource, address: str, prefix: str, **changes: object) -> NetworkPlan:
+    fields: dict[str, object] = {
+        "link": LinkSettings(mode="client", connect=(address,)),
+        "machines": source.machines,
+        "everything": False,
+        "prefix": prefix,
+        "pace": None,
+        "passes": 1,
+        "from_ns": source.span().start_ns,
+        "to_ns": source.span().end_ns + 1,
+        "linger_s": 0.3,
+    }
+    return NetworkPlan(**(fields | changes))  # type: ignore[arg-type]  # fields of many types
+
+
+def collect(heard: Heard, sample: zenoh.Sample) -> None:
+    attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+    heard.append((str(sample.key_expr), sample.payload.to_bytes(), attachment, str(sample.encoding)))
+
+
+def as_heard(message: RecordedMessage, prefix: str) -> tuple[str, bytes, bytes, str]:
+    return (prefix + message.key, message.payload, message.attachment, message.encoding)
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> RecordingSource:
+    messages = list(read_recording(recording(tmp_path / "plain.mcap", scenario_blocks(3.0))))
+    report = RecordedMessage(LAB.keys.report, b"{}", b"", "application/json", messages[5].log_time_ns, 7)
+    return RecordingSource([write(tmp_path / "more.mcap", [*messages[:6], report, *messages[6:]])])
+
+
+@pytest.mark.parametrize("everything", [False, True])
+def test_messages_go_out_byte_for_byte(source: RecordingSource, everything: bool) -> None:
+    address, heard, alive = endpoint(), Heard(), list[str]()
+    with session(address) as listener:
+        subscriber = listener.declare_subscriber("**", lambda sample: collect(heard, sample))
+        tokens = listener.liveliness().declare_subscriber(
+            "x/rotorwatch/**", lambda sample: alive.append(f"{sample.kind} {sample.key_expr}"), history=True
+        )
+        replay_to_network(source, plan(source, address, "x", everything=everything), Control())
+        expected = [
+            as_heard(one, "x/") for one in source.messages() if everything or one.key != LAB.keys.report
+        ]  # fmt: skip
+        until(lambda: len(heard) >= len(expected), "everything")
+        until(lambda: len(alive) == 2, "the token's end")
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+        tokens.undeclare()  # type: ignore[no-untyped-call]
+    # Different keys may overtake each other.
+    for key in {entry[0] for entry in expected}:
+        assert [entry for entry in heard if entry[0] == key] == [entry for entry in expected if entry[0] == key]
+    assert len(heard) == len(expected)
+    assert alive == [f"SampleKind.{kind} x/{LAB.keys.publisher_alive}" for kind in ("PUT", "DELETE")]
+
+
+def test_a_stretch_begins_with_the_descriptor_that_held_then(source: RecordingSource) -> None:
+    address, heard = endpoint(), Heard()
+    begin_ns, end_ns = source.span().start_ns + 10**9, source.span().start_ns + 2 * 10**9
+    with session(address, "x") as listener:
+        subscriber = listener.declare_subscriber("rotorwatch/**", lambda sample: collect(heard, sample))
+        replay_to_network(source, plan(source, address, "x", from_ns=begin_ns, to_ns=end_ns), Control())
+        until(lambda: len(heard) >= 11, "everything")
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+    (descriptor,) = [entry for entry in heard if entry[0] == LAB.keys.descriptor]
+    assert json.loads(descriptor[1]) == LAB.descriptor.model_dump(mode="json")
+    blocks = [as_heard(one, "") for one in source.messages({LAB.keys.stream}, from_ns=begin_ns, to_ns=end_ns)]
+    assert [entry for entry in heard if entry[0] == LAB.keys.stream] == blocks
+    assert len(blocks) == 10
+
+
+def test_each_pass_has_a_prefix_of_its_own(source: RecordingSource) -> None:
+    address, heard = endpoint(), Heard()
+    with session(address) as listener:
+        subscriber = listener.declare_subscriber("**/stream", lambda sample: collect(heard, sample))
+        count = replay_to_network(source, plan(source, address, "r/x", passes=2), Control())
+        until(lambda: len(heard) == 60, "both passes")
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+    assert count == 62
+    assert [entry[0] for entry in heard] == [f"r/x/{number}/{LAB.keys.stream}" for number in (1, 2) for _ in range(30)]
+
+
+def test_original_keys_are_refused_while_a_monitor_is_alive(source: RecordingSource) -> None:
+    address = endpoint()
+    with service(address) as (_, worker):
+        with pytest.raises(LiveMachineError, match=f"a live monitor of demo/lab is there .{LAB.keys.monitor_alive}"):
+            replay_to_network(source, plan(source, address, ""), Control())
+        assert worker.health().quality.accepted_blocks == 0
+        assert worker.history.reports() == ()
+
+
+def test_original_keys_are_refused_while_a_publisher_is_alive(source: RecordingSource) -> None:
+    address, heard = endpoint(), Heard()
+    with session(address) as other:
+        subscriber = other.declare_subscriber("**", lambda sample: collect(heard, sample))
+        token = other.liveliness().declare_token(LAB.keys.publisher_alive)
+        with pytest.raises(LiveMachineError, match="a live publisher of demo/lab is there"):
+            replay_to_network(source, plan(source, address, ""), Control())
+        token.undeclare()  # type: ignore[no-untyped-call]
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+    assert heard == []
+
+
+@pytest.mark.parametrize("who", ["publisher", "monitor"])
+def test_original_keys_are_left_as_soon_as_somebody_live_appears(source: RecordingSource, who: str) -> None:
+    address, heard, errors = endpoint(), Heard(), list[str]()
+    keys = MachineKeys("demo", "lab")
+
+    def run() -> None:
+        try:
+            # Three seconds of recording at this pace would take half a minute.
+            replay_to_network(source, plan(source, address, "", pace=0.1), Control())
+        except LiveMachineError as error:
+            errors.append(str(error))
+
+    with session(address) as other:
+        subscriber = other.declare_subscriber(keys.stream, lambda sample: collect(heard, sample))
+        thread = threading.Thread(target=run)
+        thread.start()
+        until(lambda: bool(heard), "first block")
+        token = other.liveliness().declare_token(keys.publisher_alive if who == "publisher" else keys.monitor_alive)
+        thread.join()
+        token.undeclare()  # type: ignore[no-untyped-call]
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+    (error,) = errors
+    assert error.startswith(f"a live {who} of demo/lab is there")
+    assert error.endswith("the replay on the original keys was stopped")
+    assert 1 <= len(heard) < 30
+
+
+def test_a_monitor_that_starts_during_a_replay_on_the_original_keys_takes_none_of_it(source: RecordingSource) -> None:
+    address, taken, errors = endpoint(), list[RawBlock](), list[str]()
+
+    def nothing(_: object) -> None:
+        return None
+
+    def run() -> None:
+        try:
+            replay_to_network(source, plan(source, address, "", pace=0.5), Control())
+        except LiveMachineError as error:
+            errors.append(str(error))
+
+    callbacks = MachineCallbacks(taken.append, nothing, nothing, nothing, lambda: "{}", lambda: "{}", lambda *_: "[]")
+    with route(LinkSettings(listen=(address,))):
+        heard = Heard()
+        other = Link(LinkSettings(mode="client", connect=(address,)))
+        subscriber = other.session.declare_subscriber(LAB.keys.stream, lambda sample: collect(heard, sample))
+        thread = threading.Thread(target=run)
+        thread.start()
+        until(lambda: bool(heard), "first block")
+        late = Link(LinkSettings(mode="client", connect=(address,)))
+        monitor = MachineLink(late, LAB.keys, callbacks, wait_when_full=False)
+        thread.join()
+        assert errors  # it has seen the monitor
+        monitor.close()
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+        late.close()
+        other.close()
+    assert taken == []

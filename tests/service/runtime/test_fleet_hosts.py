@@ -1,0 +1,227 @@
+"""A fleet on hosts of their own, a cable cut and a host lost: all is evaluated again, and the alarm logs are whole."""
+
+import os
+import pwd
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import psycopg
+import pytest
+
+from models.commissioning.commissioned import Installed
+from models.machine import load_machine
+from rotorwatch.records.health import Health, HealthState
+from service.monitor.monitor import MachineMonitor
+from simulator.scenario import load_scenario, parse_fault
+from simulator.stream import blocks
+from tests.service.rig.hosts import MIDDLE, Hosts, hosts, why_not
+from tests.service.rig.live import PATIENT, ROOT, SHORT, machine_file, program, until
+from tests.service.rig.postgres import USER, postgres_server
+
+_WHY_NOT = why_not()
+# Hosts are network namespaces, which take an administrator to make.
+pytestmark = [pytest.mark.long, pytest.mark.skipif(bool(_WHY_NOT), reason=f"NO HOSTS: {_WHY_NOT}")]
+
+KITS = ("one", "two")
+CUT_S = 30.0
+AGAIN_S = 60.0
+"""PostgreSQL lets go of a silent host after 15 s, Ray notices it after about 5; a process starts, a hop comes."""
+FAULT = "k_by=-0.33@30"
+START_NS = 1_767_225_600 * 10**9
+CHECKS = '{"health_check_period_ms":1000,"health_check_timeout_ms":2000,"health_check_failure_threshold":5}'
+_VARIABLES = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_worker_niceness": "0",
+    "OPENBLAS_NUM_THREADS": "1",
+    "PYTHONPATH": str(ROOT),
+}
+
+
+@dataclass(slots=True)
+class Group:
+    """A program with all that it has started."""
+
+    process: subprocess.Popen[bytes]
+
+    def kill(self) -> None:
+        """kill -9."""
+        with suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+
+
+def ray_node(net: Hosts, host: str, log: Path, *options: str) -> Group:
+    """Start Ray on a host, and wait until it has."""
+    command = [
+        *net.within(host),
+        str(Path(sys.executable).with_name("ray")),
+        "start",
+        "--disable-usage-stats",
+        "--block",
+    ]
+    command += ["--node-ip-address", net.address(host), *options]
+    with log.open("wb") as out:
+        made = Group(
+            subprocess.Popen(
+                command, stdout=out, stderr=out, cwd=ROOT, env=os.environ | _VARIABLES, start_new_session=True
+            )
+        )
+    until(lambda: "Ray runtime started" in log.read_text(encoding="utf-8", errors="replace"), f"Ray on {host}", 120.0)
+    return made
+
+
+@contextmanager
+def database_on(net: Hosts, host: str) -> Iterator[tuple[str, str]]:
+    """PostgreSQL on a host: its address for all others, and for this test, which is on none."""
+    with postgres_server() as server:
+        server.new_database("fleet")
+        server.stop()
+        with (server.folder / "data" / "pg_hba.conf").open("a", encoding="utf-8") as rules:
+            rules.write("host all all 10.77.0.0/16 trust\n")
+        owner = pwd.getpwnam(server.account or "nobody")
+        user = ["setpriv", f"--reuid={owner.pw_uid}", f"--regid={owner.pw_gid}", "--clear-groups"]
+        run = [str(server.programs / "postgres"), "-D", str(server.folder / "data"), "-k", str(server.folder)]
+        process = subprocess.Popen(
+            [*net.within(host), *user, *run, "-c", "listen_addresses=*", "-c", "fsync=off"],
+            cwd=server.folder,
+            stderr=subprocess.DEVNULL,
+            env={"PATH": os.environ["PATH"], "LC_ALL": "C"},
+        )
+        try:
+            until(lambda: _answers(server.url("fleet")), "PostgreSQL")
+            yield f"postgresql://{USER}@{net.address(host)}/fleet", server.url("fleet")
+        finally:
+            process.send_signal(signal.SIGQUIT)  # at once
+            process.wait()
+            server.start()  # as it is to be found
+
+
+def _answers(url: str) -> bool:
+    try:
+        psycopg.connect(url).close()
+    except psycopg.OperationalError:
+        return False
+    return True
+
+
+def settings_of(folder: Path, net: Hosts, database: str) -> Path:
+    """Two machines, a shard each."""
+    lines = [f'[link]\nmode = "client"\nconnect = ["tcp/{net.middle_from("first")}:7447"]']
+    lines += [f'[fleet]\nlisten = "tcp/{net.address("first")}:7448"', f'[history]\nurl = "{database}"']
+    lines += ["[http]\nport = 0", "[access]\nopen_on_loopback = true", "[shards]\ncount = 2"]
+    for name in KITS:
+        (folder / name).mkdir()
+        file = machine_file(folder / name, *SHORT, PATIENT, ('name = "lab"', f'name = "{name}"'))
+        lines.append(f'[[machines]]\nfile = "{file}"')
+    (folder / "fleet.toml").write_text("\n\n".join(lines) + "\n", encoding="utf-8")
+    return folder / "fleet.toml"
+
+
+def undisturbed(file: Path, seed: int, length_s: float) -> list[tuple[int, str, str, int]]:
+    """Alarm log of a machine that is watched by one monitor from beginning to end."""
+    machine = load_machine(file)
+    scenario, _ = load_scenario("healthy")
+    given = scenario.overridden(seed=seed, duration_s=length_s, faults=(parse_fault(FAULT),))
+    monitor = MachineMonitor(Installed(machine))
+    stream = (monitor.step(block) for block, _ in blocks(given, machine, 0.1, START_NS))
+    events = [event for report in stream for event in report.events]
+    return [(one.sequence, one.kind.value, one.alarm.name, one.time_ns) for one in events]
+
+
+def logs_of(database: str) -> dict[str, list[tuple[int, str, str, int]]]:
+    """Alarm log of every machine."""
+    found: dict[str, list[tuple[int, str, str, int]]] = {name: [] for name in KITS}
+    query = "SELECT name, sequence, kind, alarm, time_ns FROM alarm_events JOIN machines USING (machine_id)"
+    with psycopg.connect(database) as connection:
+        for name, *event in connection.execute(f"{query} ORDER BY sequence").fetchall():
+            found[name].append(tuple(event))
+    return found
+
+
+def test_a_cut_cable_and_a_lost_host_leave_the_alarm_logs_of_a_fleet_as_they_would_be(tmp_path: Path) -> None:
+    with hosts("first", "left", "right", "machine", joined=True) as net, ExitStack() as running:
+        database, local = running.enter_context(database_on(net, "first"))
+        settings = settings_of(tmp_path, net, database)
+        # The path of a socket may have a hundred letters.
+        rays = Path(running.enter_context(tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True)))
+        listening = ("--listen", "tcp/0.0.0.0:7447", "--without-grants")
+        router = program(tmp_path, "service.rotorwatch", "router", *listening, network=net.network(MIDDLE))
+        running.enter_context(router).wait_for("router listening")
+
+        def node(host: str, *options: str) -> Group:
+            made = ray_node(net, host, tmp_path / f"ray-{host}-{time.monotonic_ns()}", *options)
+            running.callback(made.kill)
+            return made
+
+        def worker(host: str) -> Group:
+            return node(host, "--address", f"{net.address('first')}:6379", "--num-cpus", "2")
+
+        head = ("--head", "--port", "6379", "--num-cpus", "0", "--include-dashboard", "false", "--temp-dir", str(rays))
+        node("first", *head, "--system-config", CHECKS)
+        worker("left")
+        right = worker("right")
+        command = (
+            "service.rotorwatch",
+            "fleet",
+            "--address",
+            f"{net.address('first')}:6379",
+            "--config",
+            str(settings),
+        )
+        alone = {key: value for key, value in os.environ.items() if not key.startswith("ROTORWATCH_")} | _VARIABLES
+        served = running.enter_context(program(tmp_path, *command, network=net.network("first"), alone=alone))
+        url = served.url()
+
+        def health(name: str) -> Health:
+            return Health.model_validate_json(net.asked("first", f"{url}/api/v1/machines/demo/{name}/health"))
+
+        def evaluated_until(name: str) -> int:
+            report = health(name).report
+            return 0 if report is None or report.state is HealthState.WARMING else report.end_ns
+
+        def all_again(why: str) -> float:
+            """Wait until every machine is evaluated with data of now; seconds."""
+            begin_s, now_ns = time.monotonic(), START_NS + round(1e9 * (time.monotonic() - sent_s))
+            until(lambda: min(evaluated_until(name) for name in KITS) > now_ns, why)
+            return time.monotonic() - begin_s
+
+        start = str(np.datetime64(START_NS, "ns"))
+        for number, name in enumerate(KITS):
+            where = ("--mode", "client", "--connect", f"tcp/{net.middle_from('machine')}:7447")
+            what = ("--machine", str(tmp_path / name / "machine.toml"), "--seed", str(number + 1), "--fault", FAULT)
+            running.enter_context(
+                program(
+                    tmp_path,
+                    *("simulator.rotorsim", "publish", "healthy", "--duration", "900", "--start", start, *where, *what),
+                    network=net.network("machine"),
+                )
+            )
+        sent_s = time.monotonic()
+        all_again("first window")
+        until(lambda: all("k_by" in {one[2] for one in log} for log in logs_of(local).values()), "alarms")
+
+        net.cut("left")
+        cut_s = all_again("window while a cable is cut")
+        time.sleep(max(0.0, CUT_S - cut_s))
+        net.mend("left")
+        worker("left")  # Ray has given the former one up, which has ended
+        net.lose("right", right)
+        lost_s = all_again("window after a host was lost")
+        length_s = time.monotonic() - sent_s
+        assert max(cut_s, lost_s) < AGAIN_S
+        logs = logs_of(local)
+        for number, name in enumerate(KITS):
+            quality = health(name).quality
+            assert quality.missing_s == 0.0
+            assert [one[0] for one in logs[name]] == list(range(len(logs[name])))
+            expected = undisturbed(tmp_path / name / "machine.toml", number + 1, length_s + 60.0)
+            assert logs[name] == expected[: len(logs[name])]
+            assert ("raised", "k_by") in {one[1:3] for one in logs[name]}

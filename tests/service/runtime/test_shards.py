@@ -1,0 +1,296 @@
+"""Processes that share the machines of a monitor: the same answers, one that is killed, and what cannot be shared."""
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import httpx_sse
+import pytest
+
+from models.errors import BundleError, MachineFileError
+from models.machine import IngestSettings, load_machine
+from models.signals.link import LinkSettings
+from rotorwatch.records.alarms import AlarmStates
+from rotorwatch.records.health import Health, HealthState
+from rotorwatch.records.monitor import Readiness
+from rotorwatch.records.operations import OperationDone
+from service.analysis.snapshots.heading import LatestData
+from service.history.file import lock_file
+from service.runtime.runtime import Runtime, running
+from service.runtime.shards import Shards, shard_count
+from service.runtime.standing import latest_from_bytes, latest_to_bytes
+from service.settings.service import HistorySettings, MachineEntry, ServiceSettings, ShardSettings
+from service.stream.shard_link import relay_items
+from simulator.scenario import parse_fault
+from tests.service.commands.test_demo import children_of
+from tests.service.rig.live import (
+    PATIENT,
+    SHORT,
+    Feed,
+    endpoint,
+    machine_file,
+    open_session,
+    program,
+    scenario_blocks,
+    send,
+    settings,
+    until,
+    worker_of,
+)
+from tests.service.rig.monitored import OPEN, answered, client, problem
+from tests.service.rig.preloaded import CONTEXT
+
+SECONDS = 45.0
+NAMES = ("lab", "pump")
+PATHS = (
+    "", "/configuration", "/detectable", "/detectable?change=-0.2", "/alarms?all=true", "/alarms/events", "/spectra",
+    "/orbits?revolutions=4", "/correlations", "/waveforms", "/full-spectra", "/waterfalls",
+    "/readings?quantity=parameter&name=k_by",
+)  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes are forked off one that has imported everything; a monitor that is a program starts them as ever."""
+    monkeypatch.setattr("service.runtime.processes.multiprocessing.get_context", lambda _: CONTEXT)
+
+
+def plan_for(folder: Path, count: int | None, address: str | None = None) -> ServiceSettings:
+    """Two machines with short windows, and a history in a file."""
+    address = address or endpoint()
+    entries = []
+    for name in NAMES:
+        (folder / name).mkdir(exist_ok=True)
+        changes = (*SHORT, PATIENT, ('name = "lab"', f'name = "{name}"'), ("on_delay_s = 5.0", "on_delay_s = 10.0"))
+        entries.append(MachineEntry(file=machine_file(folder / name, *changes)))
+    plan = settings(address, when_full="wait")
+    changed = {
+        "access": OPEN,
+        "machines": tuple(entries),
+        "shards": ShardSettings(count=count),
+        "history": HistorySettings(url=f"sqlite:///{folder}/history.sqlite"),
+    }
+    return plan.model_copy(update=changed)
+
+
+@contextmanager
+def fed(folder: Path, count: int) -> Iterator[tuple[Runtime, httpx.Client]]:
+    """The machine lab loses a third of its bearing stiffness, pump is well; both have sent everything."""
+    plan = plan_for(folder, count)
+    with running(plan) as runtime, client(runtime) as http:
+        for entry, faults in zip(plan.machines, ((parse_fault("k_by=-0.33@10"),), ()), strict=True):
+            send(plan.link.listen[0], scenario_blocks(SECONDS, *faults), load_machine(entry.file))
+        for one in runtime.machines():
+            until(lambda: one.health().quality.accepted_blocks == 10 * SECONDS, f"all blocks of {one.machine.name}")  # noqa: B023
+        yield runtime, http
+
+
+def comparable(http: httpx.Client, path: str) -> str:
+    """An answer without the times of this computer."""
+    answer = http.get(path)
+    assert answer.status_code == 200, answer.text
+    found = answer.json()
+    if isinstance(found, dict):
+        for event in found.get("events", ()):
+            event.pop("recorded_ns", None)
+    return repr(found)
+
+
+def test_the_same_answers_whatever_the_number_of_processes(tmp_path: Path) -> None:
+    answers, reports = [], []
+    for count in (1, 2):
+        folder = tmp_path / str(count)
+        folder.mkdir()
+        with fed(folder, count) as (runtime, http):
+            places = [f"/api/v1/machines/demo/{name}" for name in NAMES]
+            answers.append([comparable(http, place + path) for place in places for path in PATHS])
+            reports.append([http.get(f"{place}/reports").json()["reports"] for place in places])
+            healths = [answered(http.get(f"{place}/health"), Health) for place in places]
+            assert [one.state for one in healths] == [HealthState.ALERT, HealthState.HEALTHY]
+            assert any(one.name == "k_by" and one.raised for one in healths[0].alarms)
+            readiness = answered(http.get("/readyz"), Readiness)
+            assert [one.machine for one in readiness.machines] == list(NAMES)
+            assert [one["machine"] for one in http.get("/api/v1/machines").json()["machines"]] == list(NAMES)
+            metrics = http.get("/metrics").text
+            for name, kept in zip(NAMES, reports[-1], strict=True):
+                assert f'rotorwatch_blocks_accepted_total{{machine="{name}",site="demo"}} {10 * SECONDS}' in metrics
+                assert f'rotorwatch_windows_total{{machine="{name}",site="demo"}} {float(len(kept))}' in metrics
+            own = {one.machine.name for one in runtime.machines() if hasattr(one, "inbox")}
+            assert own == (set(NAMES) if count == 1 else set())
+    assert answers[0] == answers[1]
+    assert reports[0] == reports[1]
+
+
+def test_operators_and_listeners_reach_a_machine_of_another_process(tmp_path: Path) -> None:
+    with fed(tmp_path, 2) as (_, http):
+        place = "/api/v1/machines/demo/lab/alarms"
+        with httpx_sse.connect_sse(http, "GET", "/api/v1/events") as source:
+            events = source.iter_sse()
+            assert next(events).event == "start"
+            seen = http.get(f"{place}/k_by")
+            done = http.post(f"{place}/k_by/acknowledge", json={}, headers={"If-Match": seen.headers["etag"]})
+            assert answered(done, OperationDone).alarm.state == "acknowledged"
+            told = next(event for event in events if event.event == "alarm")
+            assert '"acknowledged"' in told.data
+            assert '"acknowledged"' in http.get("/api/v1/machines/demo/lab/health").text  # who hears it finds it there
+            health = next(event for event in events if event.event == "health" and '"acknowledged"' in event.data)
+            assert Health.model_validate_json(health.data).machine == "lab"
+        again = http.post(f"{place}/k_by/acknowledge", json={}, headers={"If-Match": seen.headers["etag"]})
+        problem(again, 409)
+        assert (
+            "no alarm nothing"
+            in problem(http.post(f"{place}/nothing/acknowledge", json={}, headers={"If-Match": "*"}), 404).detail
+        )
+        states = answered(http.get(place), AlarmStates)
+        assert [one.state for one in states.alarms if one.name == "k_by"] == ["acknowledged"]
+
+
+def children(of: int) -> list[int]:
+    """Processes that a program has started to share its machines, and that run."""
+    return [one for one in children_of(of) if b"spawn_main" in Path(f"/proc/{one}/cmdline").read_bytes()]
+
+
+def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -> None:
+    plan = plan_for(tmp_path, 2)
+    blocks = scenario_blocks(SECONDS, parse_fault("k_by=-0.33@10"))
+    with running(plan) as runtime, client(runtime) as http, open_session(plan.link.listen[0]) as session:
+        lab, pump = runtime.machines()
+        feed = Feed(session, lab.machine)
+        for block in blocks[:440]:
+            feed.put(block)
+        until(lambda: lab.health().quality.accepted_blocks == 440, "the first blocks")
+        until(lambda: lab.health().state is HealthState.ALERT, "the alarm")
+        before = lab.history.events(after=-1)
+        assert isinstance(runtime._machines, Shards)
+        first, second = (shard.process.pid for shard in runtime._machines._shards)  # type: ignore[attr-defined]  # processes of this computer  # of lab and of pump
+        os.kill(second, signal.SIGSTOP)
+        until(lambda: not http.get("/readyz").is_success, "that it is told")
+        assert "demo/pump: the process that monitors it has said nothing" in problem(http.get("/readyz"), 503).detail
+        assert pump.health().state is HealthState.NOT_EVALUABLE
+        # Nobody waits for one that hangs until it does not answer.
+        assert "has said nothing" in problem(http.get("/api/v1/machines/demo/pump/orbits"), 503).detail
+        assert http.get("/api/v1/machines/demo/lab/orbits").status_code == 200
+        os.kill(second, signal.SIGCONT)
+        until(lambda: bool(http.get("/readyz").is_success), "that it is heard again")
+        assert pump.health().state is not HealthState.NOT_EVALUABLE
+        os.kill(first, signal.SIGKILL)
+        # The machine's history is held until all has been looked at: the next process waits for it.
+        lock = tmp_path / "history.sqlite.demo.lab.lock"
+        held: list[int] = []
+
+        def taken() -> bool:
+            if (found := lock_file(lock)) is not None:
+                held.append(found)
+            return bool(held)
+
+        until(taken, "the lock")
+        until(lambda: not http.get("/readyz").is_success, "that it is told")
+        assert "demo/lab: the process that monitored it ended (exit -9)" in problem(http.get("/readyz"), 503).detail
+        assert lab.health().state is HealthState.ALERT  # what was raised stays in sight
+        assert "is being started again" in lab.health().reason
+        for path in ("/orbits", "/alarms", "/detectable"):
+            assert "is being started again" in problem(http.get(f"/api/v1/machines/demo/lab{path}"), 503).detail
+            assert http.get(f"/api/v1/machines/demo/pump{path}").status_code == 200
+        assert lab.status().tally.blocks == 440  # what was counted is no less for that
+        os.close(held[0])
+        until(lambda: bool(http.get("/readyz").is_success), "a new process")
+        started = [one.pid for one in multiprocessing.active_children()]
+        assert second in started
+        assert len(started) == 2
+        until(lambda: lab.health().restart.startswith("went on"), "that it goes on from where it stood")
+        assert pump.health().restart == ""
+        for block in blocks[440:]:
+            feed.put(block)
+        until(lambda: lab.status().tally.blocks == 10, "the other blocks")
+        log = lab.history.events(after=-1)
+        assert log[: len(before)] == before
+        assert [event.sequence for event in log] == list(range(len(log)))
+        raised = [event.alarm for event in log if event.kind == "raised"]
+        assert raised.count("k_by") == 1
+
+
+def test_processes_end_with_the_monitor_that_started_them(tmp_path: Path) -> None:
+    plan = plan_for(tmp_path, 2)
+    machines = "[" + ",".join(one.model_dump_json() for one in plan.machines) + "]"
+    with program(
+        tmp_path,
+        *("service.rotorwatch", "run"),
+        ROTORWATCH_MACHINES=machines,
+        ROTORWATCH_SHARDS__COUNT="2",
+        ROTORWATCH_HTTP__PORT="0",
+        ROTORWATCH_LINK__LISTEN=f'["{endpoint()}"]',
+        ROTORWATCH_HISTORY__URL=plan.history.database,
+    ) as monitor:
+        monitor.wait_for("HTTP API")
+        started = children(monitor.process.pid)
+        assert len(started) == 2
+        monitor.kill()
+    until(lambda: not any(Path(f"/proc/{one}").exists() for one in started), "end of all processes")
+    with running(plan) as runtime:  # which has their machines at once
+        assert runtime.readiness().ready
+
+
+def test_what_a_monitor_holds_survives_the_way_to_another_process() -> None:
+    with fed_alone() as data:
+        again = latest_from_bytes(latest_to_bytes(data))
+        assert again.window is not None
+        assert data.window is not None
+        assert again.parameters == data.parameters
+        assert again.parameters
+        assert again.mark() == data.mark()
+        assert again.window.hop_correlation.tobytes() == data.window.hop_correlation.tobytes()
+        assert again.window.spectrum.tobytes() == data.window.spectrum.tobytes()
+        assert [one.start_ns for one in again.blocks] == [one.start_ns for one in data.blocks]
+        assert again.blocks[-1].samples.tobytes() == data.blocks[-1].samples.tobytes()
+    assert latest_from_bytes(latest_to_bytes(LatestData(lacking="nothing came"))) == LatestData(lacking="nothing came")
+
+
+@contextmanager
+def fed_alone() -> Iterator[LatestData]:
+    address = endpoint()
+    with running(settings(address, bundle="lab", when_full="wait")) as runtime:
+        worker = worker_of(runtime)
+        send(address, scenario_blocks(66.0))
+        until(lambda: worker.health().quality.accepted_blocks == 660, "all blocks")
+        yield worker.latest
+
+
+def test_how_many_processes(tmp_path: Path) -> None:
+    plan = plan_for(tmp_path, None)
+    assert shard_count(plan) == 1  # few machines
+    cores = len(os.sched_getaffinity(0))
+    assert shard_count(plan.model_copy(update={"machines": 30 * plan.machines})) == min(cores, 4)
+    assert shard_count(plan_for(tmp_path, 5)) == 2  # no more than machines
+    in_memory = plan_for(tmp_path, 2).model_copy(update={"history": HistorySettings(url="sqlite:///:memory:")})
+    with pytest.raises(MachineFileError, match=r"shards.count is 2, expected 1: a history in memory"):
+        shard_count(in_memory)
+    users = tmp_path / "users"
+    users.write_text("pump:secret\n", encoding="utf-8")
+    users.chmod(0o600)
+    listen = ("tcp/127.0.0.1:0",)
+    for named in (
+        LinkSettings(listen=listen, passwords_file=users),
+        LinkSettings(listen=listen, connect=listen, user="pump", password_file=users),
+    ):
+        with pytest.raises(MachineFileError, match=r"expected 1: where link.listen asks for names"):
+            shard_count(plan_for(tmp_path, 2).model_copy(update={"link": named}))
+
+
+def test_a_machine_that_cannot_be_monitored_is_named(tmp_path: Path) -> None:
+    plan = plan_for(tmp_path, 2)
+    broken = MachineEntry(file=plan.machines[1].file, bundle=str(tmp_path / "nothing"))
+    failed = Runtime(plan.model_copy(update={"machines": (plan.machines[0], broken)}))
+    with pytest.raises(BundleError, match="nothing: not a bundle"):
+        failed.start()
+    assert multiprocessing.active_children() == []
+
+
+def test_a_shard_that_takes_nothing_is_cut_off_before_machines_of_others_are_called_silent() -> None:
+    place = "transport/link/tx/queue/congestion_control/block/wait_before_close"
+    cut_off_s = int(relay_items(waits=False)[place]) / 1e6
+    assert cut_off_s < IngestSettings().no_data_after_s / 2
+    assert place not in relay_items(waits=True)  # there the source is to wait

@@ -1,0 +1,421 @@
+"""Following an alarm log: any order of arrival gives the log, what is not it is refused, and who may not write it."""
+
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import given
+
+from models.signals.keys import Grant, MachineKeys
+from models.signals.link import LinkSettings
+from rotorwatch.client.alarm_log import follow_alarms
+from rotorwatch.client.errors import ClientError, LogReplaced
+from rotorwatch.client.log_order import LogOrder
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage, AlarmStates
+from rotorwatch.records.example import example
+from service.history.records import Retention, Step, StoreError
+from service.history.shared import committed_events
+from service.history.store import Store
+from service.stream.transport import Link, MachineCallbacks, MachineLink, route
+from tests.service.history.test_store import alarm_event
+from tests.service.rig.live import endpoint, until
+from tests.service.rig.postgres import KINDS, database_url
+
+PLACE = "demo/lab"
+
+
+SHOWN = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
+
+
+def event(sequence: int, text: str = "", place: str = PLACE) -> AlarmCloudEvent:
+    site, _, machine = place.partition("/")
+    shown = SHOWN
+    data = shown.data.model_copy(update={"sequence": sequence, "text": text, "site": site, "machine": machine})
+    return shown.model_copy(update={"data": data, "sequence": f"{sequence:020d}", "id": f"{place}/{sequence}"})
+
+
+def page(events: list[AlarmCloudEvent], latest: int, place: str = PLACE) -> AlarmLogPage:
+    site, _, machine = place.partition("/")
+    return AlarmLogPage(site=site, machine=machine, events=tuple(events), latest=latest)
+
+
+LOG = [event(number) for number in range(30)]
+
+
+def take_all(order: LogOrder) -> list[int]:
+    taken = []
+    while (found := order.next()) is not None:
+        taken.append(found.data.sequence)
+        order.taken()
+    return taken
+
+
+@given(
+    st.integers(-1, 29),
+    st.lists(
+        st.one_of(
+            st.tuples(st.just("hear"), st.integers(0, 29)),
+            st.tuples(st.just("announce"), st.integers(-1, 29)),
+            st.tuples(st.just("ask"), st.integers(1, 10)),
+        ),
+        max_size=60,
+    ),
+)
+def test_any_order_of_arrival_gives_the_log_from_the_given_event_on(
+    after: int, happenings: list[tuple[str, int]]
+) -> None:
+    order = LogOrder(PLACE, after)
+    taken: list[int] = []
+
+    def ask(limit: int) -> None:
+        begin = order.ask_after + 1
+        order.read(page(LOG[begin : begin + limit], len(LOG) - 1))
+
+    for what, number in happenings:
+        if what == "hear":
+            order.hear(LOG[number])
+        elif what == "announce":
+            order.announce(number)
+        else:
+            ask(number)
+        taken += take_all(order)
+    ask(1)
+    taken += take_all(order)
+    while order.incomplete:
+        ask(2)
+        taken += take_all(order)
+    assert taken == list(range(after + 1, len(LOG)))
+
+
+def test_what_the_log_says_outranks_what_was_heard() -> None:
+    order = LogOrder(PLACE, 3)
+    order.hear(event(5, "heard, and lost in a crash"))
+    order.read(page([event(4), event(5, "of the log")], 5))
+    assert take_all_texts(order) == ["", "of the log"]
+
+
+def take_all_texts(order: LogOrder) -> list[str]:
+    taken = []
+    while (found := order.next()) is not None:
+        taken.append(found.data.text)
+        order.taken()
+    return taken
+
+
+def test_another_log_is_noticed() -> None:
+    with pytest.raises(LogReplaced) as caught:
+        LogOrder(PLACE, 17).read(page([], 12))
+    assert "demo/lab: event 17 was taken from the alarm log, which now ends at 12" in str(caught.value)
+    order = LogOrder(PLACE, -1)
+    order.read(page([event(0), event(1, "one")], 1))
+    take_all(order)
+    assert order.ask_after == 0
+    order.read(page([event(1, "one")], 1))
+    with pytest.raises(LogReplaced) as caught:
+        order.read(page([event(1, "another"), event(2)], 2))
+    assert "event 1 of the alarm log is not the one that was taken" in str(caught.value)
+
+
+def test_events_far_ahead_are_left_to_the_log() -> None:
+    order = LogOrder(PLACE, -1)
+    for number in range(10_000, 10_100):
+        order.hear(event(number))
+    assert order.incomplete
+    assert not order._waiting  # memory is bounded
+
+
+class Monitor:
+    """A machine's link with a log of its own, which it can fail to publish, or to read."""
+
+    def __init__(self, link: Link, place: str = PLACE) -> None:
+        self.place = place
+        self.log: list[AlarmCloudEvent] = []
+        self.asked: list[tuple[int, int]] = []
+        self.broken = ""
+
+        def nothing(_: object) -> None:
+            """Nobody sends anything."""
+
+        callbacks = MachineCallbacks(nothing, nothing, nothing, nothing, lambda: "{}", self.state, self._answer)
+        self.link = MachineLink(link, MachineKeys(*place.split("/")), callbacks, wait_when_full=False)
+
+    def happen(self, *, published: bool = True, text: str = "") -> None:
+        self.log.append(event(len(self.log), text, self.place))
+        if published:
+            self.link.publish("alarm_event", self.log[-1].model_dump_json())
+
+    def state(self) -> str:
+        shown = AlarmStates.model_validate(example(AlarmStates))
+        return shown.model_copy(update={"sequence": len(self.log) - 1}).model_dump_json()
+
+    def _answer(self, after: int, limit: int) -> str:
+        self.asked.append((after, limit))
+        if self.broken == "history":
+            raise StoreError("history: the disk is full")
+        if self.broken:
+            return self.broken
+        return page(self.log[after + 1 : after + 1 + limit], len(self.log) - 1, self.place).model_dump_json()
+
+
+@contextmanager
+def monitor(address: str, *places: str) -> Iterator[list[Monitor]]:
+    link = Link(LinkSettings(listen=(address,)))
+    found = [Monitor(link, place) for place in places or (PLACE,)]
+    try:
+        yield found
+    finally:
+        for one in found:
+            one.link.close()
+        link.close()
+
+
+class Following:
+    """`follow_alarms` in a thread."""
+
+    def __init__(
+        self,
+        where: str | LinkSettings,
+        machines: str = PLACE,
+        after: int = -1,
+        every_s: float = 30.0,
+        fail_at: int | None = None,
+    ) -> None:
+        self.taken: list[AlarmCloudEvent] = []
+        self.error: Exception | None = None
+        self._stop = threading.Event()
+
+        def take(one: AlarmCloudEvent) -> None:
+            if one.data.sequence == fail_at:
+                raise OSError("no space left")
+            self.taken.append(one)
+
+        def run() -> None:
+            link = Link(where if isinstance(where, LinkSettings) else LinkSettings(connect=(where,)))
+            try:
+                follow_alarms(link.session, [machines], {PLACE: after}, take, stop=self._stop, ask_every_s=every_s)
+            except (ClientError, OSError) as error:
+                self.error = error
+            finally:
+                link.close()
+
+        self._thread = threading.Thread(target=run)
+        self._thread.start()
+
+    def __enter__(self) -> "Following":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(180.0)
+        assert not self._thread.is_alive()
+
+    def sequences(self) -> list[int]:
+        return [one.data.sequence for one in self.taken]
+
+    def reaches(self, sequence: int) -> None:
+        until(lambda: self.error is not None or sequence in self.sequences(), f"event {sequence}")
+        assert self.error is None
+
+
+def test_follower_asks_for_the_past_and_hears_the_present() -> None:
+    address = endpoint()
+    with monitor(address) as (machine,):
+        for _ in range(1234):
+            machine.happen(published=False)
+        with Following(address, after=17) as following:
+            following.reaches(1233)
+            for _ in range(5):
+                machine.happen()
+            following.reaches(1238)
+    assert following.sequences() == list(range(18, 1239))
+    assert following.taken == machine.log[18:]
+
+
+def test_missed_events_are_asked_for_at_once_or_when_the_state_tells() -> None:
+    address = endpoint()
+    with monitor(address) as (machine,), Following(address) as following:
+        machine.happen()
+        following.reaches(0)
+        machine.happen(published=False)
+        machine.happen(published=False)
+        machine.happen()
+        following.reaches(3)  # long before the next regular question
+        machine.happen(published=False)
+        machine.link.publish("alarm_state", machine.state())
+        following.reaches(4)
+    assert following.sequences() == list(range(5))
+
+
+def test_missed_events_are_asked_for_every_now_and_then() -> None:
+    address = endpoint()
+    with monitor(address) as (machine,), Following(address, every_s=0.2) as following:
+        machine.happen()
+        following.reaches(0)
+        machine.happen(published=False)
+        following.reaches(1)
+
+
+def test_follower_waits_for_a_monitor_and_for_its_return() -> None:
+    address = endpoint()
+    with Following(address) as following:
+        with monitor(address) as (first,):
+            first.happen()
+            following.reaches(0)
+        with monitor(address) as (second,):
+            second.log = [*first.log]
+            second.happen(published=False)
+            second.happen()
+            following.reaches(2)
+    assert following.sequences() == [0, 1, 2]
+
+
+def test_machines_are_found_by_a_pattern() -> None:
+    address = endpoint()
+    with monitor(address, PLACE, "demo/pump", "other/fan") as (lab, pump, fan):
+        for machine, count in ((lab, 3), (pump, 2), (fan, 4)):
+            for _ in range(count):
+                machine.happen(published=False)
+        with Following(address, machines="demo/*", after=0) as following:
+            until(lambda: len(following.taken) == 4, "events of two machines")
+            pump.happen()
+            fan.happen()
+            until(lambda: len(following.taken) == 5, "a later event")
+    assert [one for one in following.taken if one.data.machine == "lab"] == lab.log[1:]
+    assert [one for one in following.taken if one.data.machine == "pump"] == pump.log
+
+
+def test_nonsense_on_the_topic_is_left_to_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    address = endpoint()
+    with monitor(address) as (machine,), Following(address) as following:
+        machine.happen()
+        following.reaches(0)
+        machine.link.publish("alarm_event", '{"specversion": "1.0"}')
+        machine.happen(published=False)
+        machine.happen()
+        following.reaches(2)
+    assert "is not what this version understands" in caplog.text
+
+
+def test_log_that_cannot_be_read_is_waited_for(caplog: pytest.LogCaptureFixture) -> None:
+    address = endpoint()
+    with monitor(address) as (machine,):
+        machine.happen(published=False)
+        machine.broken = "history"
+        with Following(address, every_s=0.1) as following:
+            until(lambda: len(machine.asked) > 2, "questions")
+            machine.broken = ""
+            following.reaches(0)
+    assert "demo/lab: the alarm log cannot be read at present: rotorwatch/demo/lab/alarm/event: history" in caplog.text
+    assert caplog.text.count("cannot be read at present") == 1
+
+
+def test_another_log_and_another_version_end_the_following() -> None:
+    address = endpoint()
+    with monitor(address) as (machine,):
+        machine.happen()
+        with Following(address, after=5) as following:
+            until(lambda: following.error is not None, "an error")
+        assert isinstance(following.error, LogReplaced)
+        machine.broken = json.dumps({"events": []})
+        with Following(address) as following:
+            until(lambda: following.error is not None, "an error")
+        assert "do versions differ?" in str(following.error)
+        assert not following.taken
+
+
+def test_event_that_could_not_be_kept_is_not_taken() -> None:
+    address = endpoint()
+    with monitor(address) as (machine,):
+        for _ in range(4):
+            machine.happen(published=False)
+        with Following(address, fail_at=2) as following:
+            until(lambda: following.error is not None, "an error")
+        assert isinstance(following.error, OSError)
+        assert following.sequences() == [0, 1]
+
+
+def test_viewer_with_a_grant_can_follow(tmp_path: Path) -> None:
+    """Through a router that lets a viewer read this machine and nothing else."""
+    address = endpoint()
+    passwords = tmp_path / "passwords"
+    passwords.write_text("monitor:m\nviewer:v\n", encoding="utf-8")
+    secrets = {}
+    for name, password in (("monitor", "m"), ("viewer", "v")):
+        secrets[name] = tmp_path / name
+        secrets[name].write_text(f"{password}\n", encoding="utf-8")
+    for file in (passwords, *secrets.values()):
+        file.chmod(0o600)
+    grants = (Grant(who=("monitor",), monitors=("*/*",)), Grant(who=("viewer",), views=(PLACE,)))
+    router = LinkSettings(mode="router", listen=(address,), passwords_file=passwords, grants=grants)
+
+    def user(name: str) -> LinkSettings:
+        return LinkSettings(mode="client", connect=(address,), user=name, password_file=secrets[name])
+
+    with route(router):
+        link = Link(user("monitor"))
+        lab, pump = Monitor(link), Monitor(link, "demo/pump")
+        for machine in (lab, pump):
+            machine.happen(published=False)
+        with Following(user("viewer")) as following, Following(user("viewer"), machines="demo/pump") as refused:
+            following.reaches(0)
+            for machine in (lab, pump):
+                machine.happen(published=False)
+                machine.happen()
+            following.reaches(2)
+        for machine in (lab, pump):
+            machine.link.close()
+        link.close()
+    assert following.sequences() == [0, 1, 2]
+    assert refused.taken == []
+
+
+@pytest.mark.slow
+def test_connection_that_was_cut_is_made_again() -> None:
+    """The router between monitor and follower goes and comes back; what happened meanwhile is asked for."""
+    address = endpoint()
+    through = LinkSettings(mode="client", connect=(address,))
+    with ExitStack() as stack:
+        with route(LinkSettings(listen=(address,))):
+            link = Link(through)
+            stack.callback(link.close)
+            machine = Monitor(link)
+            stack.callback(machine.link.close)
+            following = stack.enter_context(Following(through, every_s=0.5))
+            machine.happen()
+            following.reaches(0)
+        machine.happen()
+        machine.happen()
+        with route(LinkSettings(listen=(address,))):
+            following.reaches(2)
+            machine.happen()
+            following.reaches(3)
+            stack.close()
+    assert following.taken == machine.log
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_who_may_not_write_reads_what_was_committed(kind: str, tmp_path: Path) -> None:
+    url = database_url(kind, tmp_path)
+    store = Store(url, Retention())
+    store.open()
+    lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
+    events = tuple(alarm_event(number) for number in range(4))
+    lab.commit(Step(events=events))
+    pump.commit(Step(events=events[:1]))
+    for read in (store.alarms_since, partial(committed_events, url)):
+        assert read("demo", "lab", events[1].recorded_ns) == events[1:]
+        assert read("demo", "pump", 0) == events[:1]
+        assert read("demo", "fan", 0) == ()
+    store.close()
+
+
+def test_a_history_that_is_only_looked_into_is_not_made(tmp_path: Path) -> None:
+    file = tmp_path / "history.sqlite"
+    with pytest.raises(StoreError, match="unable to open"):
+        committed_events(f"sqlite:///{file}", "demo", "lab", 0)
+    assert not file.exists()

@@ -1,0 +1,51 @@
+"""What nobody should send or ask, a few thousand messages and some dozens of callers, against a monitor at work."""
+
+import importlib
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from tests.service.rig.live import ROOT
+from tests.service.rig.preloaded import Preloaded
+
+
+def started(arguments: list[str], out: Path, err: Path, environment: dict[str, str]) -> Preloaded:
+    out.touch()
+    err.touch()
+    return Preloaded(tuple(arguments), ROOT, out, err, environment)
+
+
+@pytest.fixture(autouse=True)
+def _programs_start_at_once_and_leave_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    monkeypatch.setattr(importlib.import_module("running_monitor"), "started", started)
+
+
+@pytest.mark.slow
+def test_a_monitor_at_work_bears_whatever_is_sent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = tmp_path / "result.json"
+    monkeypatch.setattr(sys, "argv", ["wire_fuzz", "--small", "--json", str(result)])
+    assert importlib.import_module("wire_fuzz").main() == 0, capsys.readouterr()
+    found = json.loads(result.read_text(encoding="utf-8"))
+    assert found["messages"] == 3000
+    assert len(found["kinds"]) == 10
+    assert found["unsendable"] == 0
+    assert found["others"]["demo/second"]["windows"] > 10
+    assert sum(found["refused"].values()) > 100
+
+
+@pytest.mark.slow
+def test_a_monitor_at_work_bears_callers_of_every_kind(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["http_campaign", "--small"])
+    code = importlib.import_module("http_campaign").main()
+    said = capsys.readouterr().out
+    assert code == 0, said
+    assert said.count("\n| ") == 6

@@ -1,0 +1,355 @@
+"""A computer that is too small for its machines: windows are skipped, samples and loud vibration are not."""
+
+import json
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.alarm_names import FAULT, LEVEL, OVERLOADED
+from models.commissioning.commissioned import Installed, install
+from models.errors import RecordingError
+from models.levels.settings import LevelSettings
+from models.machine import load_machine
+from models.physics.rotor import PARAMETERS
+from models.signals.block import SampleBlock
+from models.signals.recording import RecordedMessage, RecordingWriter
+from models.signals.wire import encode_block
+from rotorwatch.records.health import HealthState, Report
+from service.monitor.monitor import MachineMonitor
+from service.recordings.replay.offline import OfflineReplay
+from service.recordings.replay.source import RecordingSource
+from service.runtime.runtime import running
+from service.settings.service import RecordingSettings
+from service.stream import shedding
+from service.stream.inbox import Inbox, RawBlock
+from service.stream.shedding import LoadShedding
+from service.stream.worker import MachineWorker
+from simulator.scenario import parse_fault
+from tests.service.rig.live import (
+    PATIENT,
+    SHORT,
+    START_NS,
+    Feed,
+    endpoint,
+    machine_file,
+    open_session,
+    scenario_blocks,
+    until,
+    worker_of,
+)
+from tests.service.rig.live import settings as plan_for
+from tests.service.rig.monitored import client
+from tests.service.rig.replaying import lines_of
+
+S = 10**9
+LOUD_FROM_S, LOUD_TO_S = 60, 90
+LENGTH_S = 260.0  # long enough for the alarm to clear after what waits has been taken
+LIMIT = '\n[[levels.limits]]\nchannel = "y1"\nmeasure = "overall"\nalert = 220.0\ndanger = 1000.0\n'
+
+
+def short_machine(folder: Path) -> str:
+    """The rotor kit with windows of 20 s and a limit for what the channel y1 shows."""
+    file = Path(machine_file(folder, PATIENT, *SHORT))
+    file.write_text(file.read_text(encoding="utf-8") + LIMIT, encoding="utf-8")
+    return str(file)
+
+
+def loud_in_between(seconds: float) -> list[SampleBlock]:
+    """The rotor kit; from one time to another the whole of it vibrates twice as much."""
+    gain = np.array([2.0] * 8 + [1.0], np.float32)
+    return [
+        replace(one, samples=one.samples * gain) if LOUD_FROM_S <= (one.start_ns - START_NS) / S < LOUD_TO_S else one
+        for one in scenario_blocks(seconds)
+    ]
+
+
+# When windows are skipped
+
+
+def queue_of(
+    arrivals_s: Sequence[float], evaluated_s: float, skipped_s: float, held: Callable[[float], float] = lambda at: at
+) -> list[tuple[float, float, bool]]:
+    """A worker whose hops cost so much, with blocks that arrive at these times, 50 a hop.
+
+    Returns
+    -------
+    list of tuple
+        Of each hop: when its last block came, when it is done, whether it was skipped.
+    """
+    rule, now_s, found = LoadShedding(), 0.0, []
+    ends = arrivals_s[49::50]
+    for number, came_s in enumerate(ends):
+        now_s = held(max(now_s, came_s))
+        waiting = sum(one <= now_s for one in arrivals_s[50 * (number + 1) :])
+        skips = rule.skips(waiting, 50, now_s)
+        now_s += skipped_s if skips else evaluated_s
+        found.append((came_s, now_s, skips))
+    return found
+
+
+def steadily(seconds: float, begin_s: float = 0.0) -> list[float]:
+    return [begin_s + 0.1 * number for number in range(1, round(10 * seconds) + 1)]
+
+
+@pytest.mark.parametrize("load", [0.5, 0.8, 0.95])
+def test_what_a_stall_leaves_is_evaluated_to_the_last_window(load: float) -> None:
+    stood_still = queue_of(steadily(600), 5 * load, 1.0, lambda at: 70.0 if 60.0 < at < 70.0 else at)
+    assert max(done_s - came_s for came_s, done_s, _ in stood_still) > 7.0  # it was behind
+    assert not any(skipped for _, _, skipped in stood_still)
+
+
+@pytest.mark.parametrize("load", [0.5, 0.8])
+def test_what_a_restart_leaves_is_evaluated_to_the_last_window(load: float) -> None:
+    backlog = [0.0] * 1200  # a publisher's cache, all at once
+    restarted = queue_of(backlog + steadily(900), 5 * load, 1.0)
+    assert max(done_s - came_s for came_s, done_s, _ in restarted) > 50.0
+    assert not any(skipped for _, _, skipped in restarted)
+
+
+def test_a_computer_that_stays_too_small_evaluates_what_it_can_and_is_no_later_than_two_hops() -> None:
+    overloaded = queue_of(steadily(1200), 7.5, 2.5)
+    began_s = next(done_s for _, done_s, skipped in overloaded if skipped)
+    assert 30.0 < began_s < 120.0
+    later = [one for one in overloaded if one[0] > 300.0]
+    assert max(done_s - came_s for came_s, done_s, _ in later) < 1.25 + 7.5 + 2.5
+    # 7.5 s of every evaluated window and 2.5 s of the others are 5 s a hop: every second one.
+    assert np.mean([not skipped for *_, skipped in later]) == pytest.approx(0.5, abs=0.05)
+
+
+def test_once_it_keeps_up_again_a_short_delay_costs_no_window() -> None:
+    rule = LoadShedding()
+    for number in range(20):
+        rule.skips(60 + number, 50, 5.0 * number)
+    assert rule.skips(90, 50, 100.0)
+    assert not rule.skips(12, 50, 105.0)
+    assert rule.skips(13, 50, 110.0)  # it was behind a moment ago
+    assert not rule.skips(3, 50, 125.0)
+    assert not rule.skips(49, 50, 140.0)
+    assert not rule.skips(60, 50, 145.0)
+    assert not rule.skips(49, 50, 200.0)
+
+
+# What a monitor says of a window that it skips
+
+
+@pytest.fixture(scope="module")
+def kit(tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    return install(load_machine(short_machine(tmp_path_factory.mktemp("kit"))), None)
+
+
+def fed(monitor: MachineMonitor, stream: Sequence[SampleBlock]) -> Iterator[tuple[Report, list[str]]]:
+    """Each window with what happened to alarms in it."""
+    for block in stream:
+        for report in monitor.step_payload(*encode_block(block, "")):
+            told = [f"{event.kind.value} {event.alarm.name}" for event in report.events]
+            yield from ((window, told) for window in report.windows)
+
+
+def test_a_skipped_window_is_not_healthy_and_an_alarm_says_why(kit: Installed) -> None:
+    skipped = {START_NS + round(end_s * 1e9) for end_s in (42.5, 47.5)}
+    monitor, events, states = MachineMonitor(kit, skipped.__contains__), [], []
+    for window, told in fed(monitor, scenario_blocks(90.0)):
+        events += told
+        states.append((window.skipped, window.state))
+        if window.skipped:
+            assert (window.verdict, window.parameters, window.opinions, window.equations) == (None, (), (), ())
+            assert "cannot keep up" in window.reason
+            assert window.levels[0].overall
+        if window.end_ns == max(skipped):
+            (alarm,) = (one for one in monitor.health().alarms if one.raised)
+            assert alarm.name == OVERLOADED
+            assert alarm.note.endswith("windows skipped: 2")
+            assert monitor.health().quality.skipped_windows == 2
+    assert states[7:11] == [
+        (True, HealthState.NOT_EVALUABLE),
+        (True, HealthState.NOT_EVALUABLE),
+        (False, HealthState.HEALTHY),
+        (False, HealthState.HEALTHY),
+    ]
+    assert events == [f"raised {OVERLOADED}", f"cleared {OVERLOADED}"]
+
+
+def test_a_defect_is_not_over_for_a_window_that_was_not_evaluated(kit: Installed) -> None:
+    monitor = MachineMonitor(kit, lambda _: True)
+    list(fed(monitor, scenario_blocks(30.0)))
+    monitor.fault("a defect", START_NS + 30 * S)
+    list(fed(monitor, scenario_blocks(90.0)[300:]))
+    assert FAULT in {one.name for one in monitor.health().alarms if one.raised}
+
+
+def test_what_is_loud_is_heard_in_skipped_windows_as_soon_as_in_others(kit: Installed) -> None:
+    def alarms(skips: Callable[[int], bool]) -> list[tuple[str, float]]:
+        monitor = MachineMonitor(kit, skips)
+        told = [
+            (f"{event.kind.value} {event.alarm.name}", (event.time_ns - START_NS) / S)
+            for block in loud_in_between(LOUD_TO_S + 60.0)
+            for event in monitor.step(block).events
+        ]
+        return [one for one in told if LEVEL in one[0]]
+
+    skipped, evaluated = alarms(lambda _: True), alarms(lambda _: False)
+    assert [name for name, _ in skipped] == [f"raised {LEVEL}y1", f"cleared {LEVEL}y1"]
+    assert skipped == evaluated
+    assert LOUD_FROM_S < skipped[0][1] < LOUD_FROM_S + 20
+
+
+def test_a_change_is_named_although_every_other_window_is_skipped(kit: Installed) -> None:
+    stream = scenario_blocks(90.0, parse_fault("k_by=-0.33@50"))
+    hop_ns = round(kit.machine.window.hop_s * 1e9)
+    monitor = MachineMonitor(kit, lambda end_ns: (end_ns - START_NS) // hop_ns % 2 == 0)
+    events = [one for _, told in fed(monitor, stream) for one in told]
+    parameters = [one for one in events if one.removeprefix("raised ") in PARAMETERS]
+    assert parameters == ["raised k_by"]
+
+
+def test_a_monitor_goes_on_from_between_skipped_windows_as_if_nothing_had_happened(kit: Installed) -> None:
+    stream = scenario_blocks(90.0, parse_fault("k_by=-0.33@50"))
+    hop_ns = round(kit.machine.window.hop_s * 1e9)
+
+    def every_third(end_ns: int) -> bool:
+        return (end_ns - START_NS) // hop_ns % 3 == 0
+
+    first, at = MachineMonitor(kit, every_third), 637
+    list(fed(first, stream[:at]))
+    state, second = first.state(whole=True), MachineMonitor(kit, every_third)
+    second.restore(state.state, [data for _, data in state.new_parts])
+    second.restore_alarms(state.alarms)
+    assert list(fed(second, stream[at:])) == list(fed(first, stream[at:])) != []
+
+
+def test_what_grows_beside_a_named_change_is_heard_in_skipped_windows(kit: Installed) -> None:
+    """A skipped window does not know whether the change still explains the growth."""
+    levels = LevelSettings(reference="first windows", reference_windows=2)
+    monitor = MachineMonitor(
+        install(kit.machine.model_copy(update={"levels": levels}), None), lambda end_ns: end_ns > START_NS + 85 * S
+    )
+    gain = np.array([1.7] * 8 + [1.0], np.float32)
+    told = {}
+    for block in scenario_blocks(130.0, parse_fault("k_by=-0.15@40")):
+        louder = replace(block, samples=block.samples * gain) if block.start_ns >= START_NS + 95 * S else block
+        for event in monitor.step(louder).events:
+            told[f"{event.kind.value} {event.alarm.name}"] = (event.time_ns - START_NS) / S
+    assert told["raised k_by"] < 85
+    assert 95 < told[f"raised {LEVEL}y1"] < 125
+
+
+# Which blocks say that it is behind
+
+
+def message(number: int, source: str) -> RawBlock:
+    return RawBlock(*encode_block(scenario_blocks(10.0)[number], ""), source=source)
+
+
+def test_blocks_of_others_and_bursts_for_an_idle_worker_are_no_reason_to_skip() -> None:
+    inbox = Inbox(1000, "drop")
+    inbox.put(message(0, "own"))
+    first = inbox.get()
+    assert isinstance(first, RawBlock)
+    inbox.follow(first)
+    for number in range(1, 41):
+        inbox.put(message(number, "other"))
+    assert inbox.behind == 0
+    for number in range(1, 41):
+        inbox.put(message(number, "own"))
+    assert inbox.behind == 40
+    while len(inbox):
+        inbox.get()
+
+    def send() -> None:
+        for number in range(41, 81):
+            inbox.put(message(number, "own"))
+
+    burst = threading.Timer(0.1, send)
+    burst.start()
+    inbox.get(40)  # waits for them
+    burst.join()
+    assert inbox.behind == 0
+    assert inbox.behind == 39  # until all are taken again
+
+
+# A running service
+
+
+def hurry(feed: Feed, worker: MachineWorker, stream: list[SampleBlock], until_sent: int, ahead: int) -> None:
+    """Put blocks so that so many wait at the worker, whatever it does about it, until so many are sent."""
+    while feed.sequence < until_sent:
+        if len(worker.inbox) < ahead:
+            for block in stream[feed.sequence : feed.sequence + 50]:
+                feed.put(block)
+            feed.sequence += 50
+        time.sleep(0.002)  # a loop that never rests takes the processor from the worker
+
+
+def test_an_overloaded_service_loses_no_sample_says_so_and_is_replayed_to_the_same_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shedding, "_LASTING_S", 0.3)  # data come a hundred times as fast as from a machine
+    address, stream, file = endpoint(), loud_in_between(LENGTH_S), short_machine(tmp_path)
+    recording = RecordingSettings(directory=str(tmp_path / "recordings"))
+    plan = plan_for(address, file, bound=1500).model_copy(update={"recording": recording})
+    with running(plan) as runtime, open_session(address) as session:
+        worker = worker_of(runtime)
+        feed = Feed(session, worker.machine)
+        hurry(feed, worker, stream, 10 * (LOUD_TO_S + 50), 200)
+        # From now on a hop comes when the one before is done.
+        for end in (*range(feed.sequence + 25, len(stream), 50), len(stream)):
+            # nothing waits, and nothing but what follows the latest hop is on its way
+            known = feed.sequence - (0 if feed.sequence % 50 else 40)
+            until(
+                lambda known=known: len(worker.inbox) == 0 and worker.health().quality.accepted_blocks >= known,  # type: ignore[misc]  # bound now
+                "an idle worker",
+            )
+            for block in stream[feed.sequence : end]:
+                feed.put(block)
+            feed.sequence = end
+        until(lambda: worker.health().quality.accepted_blocks == len(stream), "all blocks")
+        with client(runtime) as http:
+            metrics = http.get("/metrics").text
+        said, quality = lines_of(worker), worker.health().quality
+        assert (quality.gaps, quality.queue_dropped_blocks, quality.refused_blocks) == (0, 0, {})
+        assert quality.skipped_windows >= 5
+        assert f'windows_skipped_total{{machine="lab",site="demo"}} {quality.skipped_windows}.0' in metrics
+        windows = [Report.model_validate_json(one.text) for _, one in worker.history.reports(limit=1000)]
+        skipped = {one.end_ns for one in windows if one.skipped}
+        assert len(skipped) == quality.skipped_windows
+        assert len(windows) == math.floor((LENGTH_S - 2.5) / 5)
+        assert worker.tally.windows == len(windows) - len(skipped)
+        events = worker.history.events()
+        told = [f"{one.kind} {one.alarm}" for one in events]
+        assert told.count(f"raised {OVERLOADED}") == told.count(f"cleared {OVERLOADED}") == 1
+        (loud,) = (one for one in events if (one.kind, one.alarm) == ("raised", f"{LEVEL}y1"))
+        assert LOUD_FROM_S < (loud.time_ns - START_NS) / S < LOUD_FROM_S + 20
+        assert loud.time_ns in skipped
+        assert worker.health().state is HealthState.HEALTHY
+    machine, found = load_machine(file), list[str]()
+    source = RecordingSource(sorted((tmp_path / "recordings" / machine.site / machine.name).glob("*.mcap")))
+    OfflineReplay(source, machine.keys, install(machine, None), found.append).run()
+    assert found == said
+    assert sum(json.loads(one)["message"].get("skipped", False) for one in found) >= 5
+
+
+def test_what_was_recorded_before_damage_is_replayed(tmp_path: Path) -> None:
+    machine, blocks, files = load_machine(short_machine(tmp_path)), scenario_blocks(60.0), []
+    keys, installed = machine.keys, install(machine, None)
+    for number, part in enumerate((blocks[:300], blocks[300:])):
+        files.append(tmp_path / f"{number}.mcap")
+        with RecordingWriter(files[-1]) as writer:
+            for block in part:
+                at_ns = block.start_ns
+                writer.write(RecordedMessage(keys.stream, *encode_block(block, ""), at_ns, at_ns))
+            writer.write(RecordedMessage(keys.report, b"{}", b"", "application/json", at_ns, at_ns))
+    data = files[1].read_bytes()
+    half = len(data) // 2
+    files[1].write_bytes(data[:half] + bytes(50) + data[half + 50 :])
+    found: list[str] = []
+    with pytest.raises(RecordingError):
+        OfflineReplay(RecordingSource(files), keys, installed, found.append).run()
+    assert len(found) > 5
+    first = OfflineReplay(RecordingSource(files), keys, installed, found.append, to_ns=START_NS + 25 * S)
+    assert first.run().blocks == 250

@@ -1,0 +1,425 @@
+"""Zenoh sessions, real ones on loopback: nothing lost without being counted, late joiners served, errors seen."""
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+import zenoh
+import zenoh.ext
+
+from models.signals.link import LinkSettings
+from rotorwatch.records.alarms import AlarmLogPage, AlarmStates
+from rotorwatch.records.health import Health
+from service.history.records import StoreError
+from service.stream.inbox import Inbox, RawBlock
+from service.stream.transport import Link, LinkError, MachineCallbacks, MachineLink, TopicMessage, follow, route
+from tests.service.rig.live import (
+    LAB,
+    Feed,
+    endpoint,
+    open_session,
+    scenario_blocks,
+    send,
+    service,
+    until,
+    until_subscribed,
+)
+
+KEYS = LAB.keys
+
+
+def ignore(*_: object) -> None:
+    """Take anything."""
+
+
+def no_events(after: int, limit: int) -> str:
+    """The log of a machine on which nothing has happened."""
+    return "[]"
+
+
+@contextmanager
+def machine_link(
+    address: str,
+    on_block: Callable[[RawBlock], None],
+    *,
+    wait: bool = False,
+    alarm_events: Callable[[int, int], str] | None = None,
+) -> Iterator[tuple[Link, MachineLink]]:
+    callbacks = MachineCallbacks(
+        on_block, ignore, ignore, ignore, lambda: '{"h": 1}', lambda: '{"a": 1}', alarm_events or no_events
+    )
+    link = Link(LinkSettings(listen=(address,)))
+    declared = MachineLink(link, KEYS, callbacks, wait_when_full=wait)
+    try:
+        yield link, declared
+    finally:
+        declared.close()
+        link.close()
+
+
+def test_full_inbox_drops_what_waits_and_counts_it() -> None:
+    inbox = Inbox(3, "drop")
+    for number in range(8):
+        inbox.put(RawBlock(bytes([number]), b"", ""))
+    # 0 1 2 | 3 4 5 | 6 7: twice full, twice emptied; what is left continues without a hole.
+    assert inbox.dropped == 6
+    taken = [(block.payload, block.dropped_before) for _ in range(2) if isinstance(block := inbox.get(), RawBlock)]
+    assert taken == [(bytes([6]), 6), (bytes([7]), 0)]  # what was dropped is told with the block that comes next
+    assert len(inbox) == 0
+
+
+def test_a_worker_that_waits_for_more_blocks_is_woken_by_enough_of_them_or_by_a_call(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("service.stream.inbox._PATIENCE_S", 600.0)
+    inbox, order = Inbox(100, "drop"), list[bytes]()
+
+    def work() -> None:
+        while (item := inbox.get(3)) is not None:
+            order.append(item.payload if isinstance(item, RawBlock) else b"call")
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    for number in range(3):
+        inbox.put(RawBlock(bytes([number]), b"", ""))
+    until(lambda: len(order) == 3, "blocks that were enough", 20.0)
+    inbox.put(RawBlock(b"\3", b"", ""))
+    time.sleep(0.05)  # that it would take to be woken by a single one
+    inbox.call(lambda: None)
+    until(lambda: len(order) == 5, "a block that a call let be taken", 20.0)
+    inbox.close()
+    thread.join()
+    assert order == [b"\0", b"\1", b"\2", b"call", b"\3"]
+
+
+@pytest.mark.parametrize(("bound", "odd"), [(2, False), (100, True)])
+def test_nobody_waits_for_more_where_there_is_no_room_or_something_is_wrong(
+    bound: int, odd: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.stream.inbox._PATIENCE_S", 600.0)
+    inbox, taken = Inbox(bound, "wait", may_be_block=lambda _: not odd), list[object]()
+    thread = threading.Thread(target=lambda: taken.append(inbox.get(50)), daemon=True)
+    thread.start()
+    inbox.put(RawBlock(b"", b"", ""))
+    until(lambda: bool(taken), "a block by itself")
+    thread.join()
+
+
+def test_a_block_by_itself_is_taken_before_long() -> None:
+    inbox, taken = Inbox(100, "drop"), list[object]()
+    thread = threading.Thread(target=lambda: taken.append(inbox.get(50)), daemon=True)
+    thread.start()
+    inbox.put(RawBlock(b"", b"", ""))
+    until(lambda: bool(taken), "a block by itself")
+    thread.join()
+
+
+def test_closed_inbox_frees_everybody_who_waits() -> None:
+    inbox = Inbox(1, "wait")
+    inbox.put(RawBlock(b"", b"", ""))
+    threads = [threading.Thread(target=inbox.put, args=(RawBlock(b"", b"", ""),)) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    inbox.close()
+    for thread in threads:
+        thread.join(180.0)
+        assert not thread.is_alive()
+    assert inbox.get() is None
+
+
+def test_a_monitor_that_does_not_keep_up_counts_every_block_it_drops() -> None:
+    inbox, address = Inbox(100, "drop"), endpoint()
+    with machine_link(address, inbox.put), open_session(address) as session:
+        feed = Feed(session)
+        for _ in range(1050):
+            feed.put_good()
+        until(lambda: inbox.dropped + len(inbox) == 1050, "all blocks queued or counted")
+        assert inbox.dropped == 1000
+
+
+def test_blocks_of_two_sessions_are_told_apart() -> None:
+    taken: list[RawBlock] = []
+    address = endpoint()
+    with machine_link(address, taken.append), open_session(address) as session, open_session(address) as other:
+        publishers = [
+            zenoh.ext.declare_advanced_publisher(
+                one,
+                KEYS.stream,
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.2, sporadic_heartbeat=None),
+            )
+            for one in (session, other)
+        ]
+        for number in range(6):
+            publishers[number % 2].put(bytes([number % 2]))
+        until(lambda: len(taken) == 6, "all blocks")
+        sources = [{block.source for block in taken if block.payload == bytes([number])} for number in (0, 1)]
+        assert [len(source) for source in sources] == [1, 1]
+        assert sources[0] != sources[1]
+
+
+def test_waiting_slows_the_publisher_down_and_loses_nothing() -> None:
+    address = endpoint()
+    stream = scenario_blocks(10.0)
+    with service(address, when_full="wait", bound=2) as (_, worker):
+        send(address, stream)
+        until(lambda: worker.health().quality.accepted_blocks == len(stream), "every block")
+        quality = worker.health().quality
+        assert quality.gaps == quality.queue_dropped_blocks == quality.link_missed_blocks == 0
+        assert quality.refused_blocks == {}
+
+
+def test_waiting_survives_a_long_stall() -> None:
+    """A publisher's heartbeat overtakes blocks that wait; with recovery Zenoh would then skip hundreds of them."""
+    address, gate = endpoint(), threading.Event()
+    inbox: Inbox = Inbox(10, "wait")
+    received: list[RawBlock] = []
+
+    def work() -> None:
+        gate.wait()
+        while (block := inbox.get()) is not None:
+            assert isinstance(block, RawBlock)
+            received.append(block)
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    with machine_link(address, inbox.put, wait=True), open_session(address) as session:
+        publisher = zenoh.ext.declare_advanced_publisher(
+            session,
+            KEYS.stream,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            cache=zenoh.ext.CacheConfig(max_samples=300),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.2, sporadic_heartbeat=None),
+        )
+        sender = threading.Thread(target=lambda: [publisher.put(bytes(7200)) for _ in range(10_000)])
+        sender.start()
+        # Longer than several heartbeats; a publisher blocked in a put shows nothing else to wait for.
+        threading.Event().wait(1.5)
+        gate.set()
+        sender.join()
+        until(lambda: len(received) == 10_000, "every block")
+        inbox.close()
+        worker.join()
+        publisher.undeclare()  # type: ignore[no-untyped-call]
+
+
+def test_exception_in_a_callback_is_counted_and_the_next_block_arrives() -> None:
+    address = endpoint()
+    received: list[RawBlock] = []
+
+    def take(block: RawBlock) -> None:
+        received.append(block)
+        if len(received) == 2:
+            raise RuntimeError("on a foreign thread")
+
+    with machine_link(address, take) as (link, _), open_session(address) as session:
+        feed = Feed(session)
+        for _ in range(3):
+            feed.put_good()
+        until(lambda: len(received) == 3, "third block")
+        assert link.errors == 1
+
+
+def test_nothing_is_delivered_or_published_after_close() -> None:
+    address = endpoint()
+    first: list[RawBlock] = []
+    second: list[RawBlock] = []
+    healths: list[str] = []
+    callbacks = MachineCallbacks(second.append, ignore, ignore, ignore, lambda: "{}", lambda: "{}", no_events)
+    with machine_link(address, first.append) as (link, declared), open_session(address) as session:
+        listening = session.declare_subscriber(KEYS.health, lambda sample: healths.append(sample.payload.to_string()))
+        feed = Feed(session)
+        feed.put_good()
+        until(lambda: len(first) == 1, "first block")
+        # Published again until the subscription has arrived, of which there is no other sign.
+        until(repeating(lambda: declared.publish("health", '"open"'), lambda: bool(healths)), "health")
+        declared.close()
+        declared.publish("health", '"closed"')
+        successor = MachineLink(link, KEYS, callbacks, wait_when_full=False)
+        until(
+            repeating(lambda: successor.publish("health", '"successor"'), lambda: '"successor"' in healths),
+            "later health",
+        )
+        until(repeating(feed.put_good, lambda: bool(second)), "later block")
+        successor.close()
+        listening.undeclare()  # type: ignore[no-untyped-call]
+    assert len(first) == 1
+    assert set(healths) == {'"open"', '"successor"'}
+    assert not link.is_open
+
+
+def repeating(action: Callable[[], None], condition: Callable[[], bool]) -> Callable[[], bool]:
+    """The condition, with the action before every look at it."""
+
+    def act_and_look() -> bool:
+        action()
+        return condition()
+
+    return act_and_look
+
+
+def test_late_joiner_asks_for_health_and_alarm_state() -> None:
+    address = endpoint()
+    with service(address) as (_, worker):
+        with open_session(address) as session:
+            feed = Feed(session)
+            for _ in range(5):
+                feed.put_good()
+            until(lambda: worker.health().quality.accepted_blocks == 5, "blocks")
+        with open_session(address) as session:
+            health = Health.model_validate_json(query(session, KEYS.health))
+            assert health.quality.accepted_blocks == 5
+            assert health.machine_hash == worker.identity["machine_hash"]
+            states = AlarmStates.model_validate_json(query(session, KEYS.alarm_state))
+            assert (states.site, states.machine, states.alarms) == ("demo", "lab", ())
+            alive = [reply.ok.key_expr for reply in session.liveliness().get("rotorwatch/**") if reply.ok is not None]
+            assert [str(key) for key in alive] == [KEYS.monitor_alive]
+
+
+def query(session: zenoh.Session, key: str) -> str:
+    """The answer to a query, asked again until the declaration of the queryable has arrived."""
+    found: list[str] = []
+
+    def ask() -> bool:
+        replies = session.get(key, timeout=60.0)
+        found.extend(reply.ok.payload.to_string() for reply in replies if reply.ok is not None)
+        return bool(found)
+
+    until(ask, f"answer on {key}")
+    return found[0]
+
+
+def test_follower_gets_the_latest_state_at_once_and_then_what_happens() -> None:
+    address = endpoint()
+    messages: list[TopicMessage] = []
+    with machine_link(address, ignore) as (opened, declared):
+        declared.publish("health", '{"number": 1}')
+        declared.publish("health", '{"number": 2}')
+        declared.publish("alarm_state", '{"number": 3}')
+        declared.publish("alarm_event", '{"number": 0}')
+        link = LinkSettings(mode="client", connect=(address,))
+        topics = ("health", "alarm_state", "alarm_event", "report")
+        with follow(link, "*/lab", topics, messages.append) as connected:
+            until(lambda: len(messages) >= 2, "cached messages")
+            assert {(m.key, m.text) for m in messages} == {
+                (KEYS.health, '{"number": 2}'),
+                (KEYS.alarm_state, '{"number": 3}'),
+            }
+            for key in (KEYS.alarm_event, KEYS.report):
+                until_subscribed(opened.session, key)
+            declared.publish("alarm_event", '{"number": 4}')
+            declared.publish("report", '{"number": 5}')
+            until(lambda: len(messages) == 4, "live messages")
+            assert {(m.key, m.text) for m in messages[2:]} == {
+                (KEYS.alarm_event, '{"number": 4}'),
+                (KEYS.report, '{"number": 5}'),
+            }
+            assert connected()
+
+
+def test_alarm_log_is_answered_from_a_number_on() -> None:
+    address = endpoint()
+
+    def alarm_events(after: int, limit: int) -> str:
+        if after == 99:
+            raise StoreError("history: the disk is full")
+        return json.dumps([after, limit])
+
+    with machine_link(address, ignore, alarm_events=alarm_events) as (link, _), open_session(address) as session:
+        assert query(session, KEYS.alarm_event) == "[-1, 100]"
+        assert query(session, f"{KEYS.alarm_event}?after=17;limit=5") == "[17, 5]"
+        assert query(session, f"{KEYS.alarm_event}?after=17;_time=[now(-1h)..]") == "[17, 100]"
+        for parameters, told in (
+            ("after=x", "after is 'x', expected a whole number from -1 to"),
+            ("after=-2", "after is '-2', expected a whole number from -1 to"),
+            ("limit=0", "limit is '0', expected a whole number from 1 to 1000"),
+            ("limit=1001", "limit is '1001', expected a whole number from 1 to 1000"),
+            ("since=4", "no parameter since, expected after or limit"),
+            ("after=99", "history: the disk is full"),
+        ):
+            (reply,) = session.get(f"{KEYS.alarm_event}?{parameters}", timeout=60.0)
+            assert reply.err is not None
+            assert told in json.loads(reply.err.payload.to_string())["error"]
+        assert link.errors == 0
+
+
+def test_alarm_log_is_answered_while_the_machine_is_busy() -> None:
+    """An operator's request waits for the machine's thread; the log, and health beside a slow log, do not."""
+    address, gate = endpoint(), threading.Event()
+    with service(address) as (_, worker), open_session(address) as session:
+        worker.inbox.call(lambda: ignore(gate.wait()))  # the thread is stuck in the middle of something
+        page = AlarmLogPage.model_validate_json(query(session, KEYS.alarm_event))
+        assert page == AlarmLogPage(site="demo", machine="lab", events=(), latest=-1)
+        gate.set()
+    address, gate = endpoint(), threading.Event()
+
+    def slow(after: int, limit: int) -> str:
+        gate.wait(600.0)
+        return "[]"
+
+    with machine_link(address, ignore, alarm_events=slow), open_session(address) as session:
+        waiting = session.get(KEYS.alarm_event, timeout=60.0)
+        assert query(session, KEYS.health) == '{"h": 1}'
+        gate.set()
+        assert [reply.ok.payload.to_string() for reply in waiting if reply.ok is not None] == ["[]"]
+
+
+def test_publisher_is_seen_to_come_and_go_and_its_descriptor_is_asked_for() -> None:
+    address = endpoint()
+    wrong = LAB.descriptor.model_copy(update={"rate_hz": 1000.0}).model_dump_json()
+    with service(address) as (_, worker), open_session(address) as session:
+        answer = session.declare_queryable(KEYS.descriptor, lambda q: q.reply(KEYS.descriptor, wrong))
+        token = session.liveliness().declare_token(KEYS.publisher_alive)
+        until(lambda: worker.health().stream.publisher_alive, "publisher")
+        until(lambda: bool(worker.health().stream.descriptor_mismatch), "descriptor by query")
+        assert worker.health().stream.descriptor_mismatch == ("rate_hz is 1000.0, expected 2000.0",)
+        token.undeclare()  # type: ignore[no-untyped-call]
+        until(lambda: not worker.health().stream.publisher_alive, "publisher gone")
+        assert worker.health().stream.descriptor_mismatch == ()
+        answer.undeclare()  # type: ignore[no-untyped-call]
+
+
+def test_router_joins_what_cannot_reach_each_other() -> None:
+    address = endpoint()
+    messages: list[TopicMessage] = []
+    with (
+        route(LinkSettings(listen=(address,))),
+        Linked(address) as declared,
+        follow(LinkSettings(mode="client", connect=(address,)), "demo/*", ("health",), messages.append),
+    ):
+        declared.publish("health", json.dumps({"number": 1}))
+        until(lambda: bool(messages), "message through the router")
+        assert messages[0] == TopicMessage(KEYS.health, '{"number": 1}')
+
+
+class Linked:
+    """A machine's link that connects instead of listening."""
+
+    def __init__(self, address: str) -> None:
+        self._link = Link(LinkSettings(connect=(address,)))
+        callbacks = MachineCallbacks(ignore, ignore, ignore, ignore, lambda: "{}", lambda: "{}", no_events)
+        self._declared = MachineLink(self._link, KEYS, callbacks, wait_when_full=False)
+
+    def __enter__(self) -> MachineLink:
+        return self._declared
+
+    def __exit__(self, *_: object) -> None:
+        self._declared.close()
+        self._link.close()
+
+
+def test_unusable_endpoint_is_named() -> None:
+    settings, named = LinkSettings(listen=("tcp/192.0.2.1:1",)), "listen tcp/192.0.2.1:1"  # not of this computer
+    with pytest.raises(LinkError) as caught:
+        Link(settings)
+    assert named in str(caught.value)
+    assert ".rs" not in str(caught.value)
+
+
+def test_an_address_that_is_in_use_is_named() -> None:
+    address = endpoint()
+    with machine_link(address, ignore), pytest.raises(LinkError) as caught:
+        Link(LinkSettings(listen=(address,)))
+    assert f"listen {address}) could not be opened: address already in use" in str(caught.value)
