@@ -22,7 +22,7 @@ DATED = NAMED.replace("rate_hz = 2000.0", 'column = "t"\nunit = "ns"\nstart = "u
 KEYPHASOR = f"{NAMED}\n[keyphasor]\n".replace("theta =", "# =")
 PULSE_TIMES = f'{KEYPHASOR}pulse_times = "p"\nunit = "s"\n'
 PULSES = f'{KEYPHASOR}column = "k"\nthreshold = 0.5\n'
-_TIME, *_COLUMNS = signals(COUNT * FILES)
+_COLUMNS = signals(COUNT * FILES)[1:]
 
 
 def by_date(number: int) -> str:

@@ -1,5 +1,6 @@
 """What is wrong with a mapping, a file or a command is named; acceleration is integrated right above its frequency."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,13 @@ from tests.interchange.material import CHANNELS, START, START_NS, imported, sign
 from tests.service.rig.preloaded import rotorwatch as run
 
 TIME = f'[time]\ncolumn = "t"\nstart = "{START}"\n'
+TEXT = TIME + CHANNELS
+HEADER = "t,x,v,a"
+IN_ORDER = CHANNELS.replace('"x"', "1").replace('"v"', "2").replace('"a"', "3")
+"""Channels by their number, of files without names."""
 
 
-def table(path: Path, rows: list[str], header: str = "t,x,v,a") -> Path:
+def table(path: Path, rows: list[str], header: str = HEADER) -> Path:
     path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
     return path
 
@@ -29,7 +34,16 @@ def good_rows(count: int = 1000, rate_hz: float = 2000.0) -> list[str]:
     return [",".join(repr(float(value)) for value in row) for row in zip(*signals(count, rate_hz), strict=True)]
 
 
-def fault(folder: Path, rows: list[str], mapping: str = TIME + CHANNELS, header: str = "t,x,v,a") -> str:
+GOOD = good_rows()
+
+
+def with_cell(cell: str) -> list[str]:
+    """Good rows, but for one cell of the velocity."""
+    t, x, _, a = GOOD[736].split(",")
+    return [*GOOD[:736], f"{t},{x},{cell},{a}", *GOOD[737:]]
+
+
+def fault(folder: Path, rows: list[str], mapping: str = TEXT, header: str = HEADER) -> str:
     source = table(folder / "run.csv", rows, header)
     with pytest.raises(MachineFileError) as raised:
         imported(folder, source, mapping)
@@ -38,13 +52,54 @@ def fault(folder: Path, rows: list[str], mapping: str = TIME + CHANNELS, header:
 
 
 def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
-    done, _ = imported(tmp_path, table(tmp_path / "run.csv", good_rows()), TIME + CHANNELS)
+    done, _ = imported(tmp_path, table(tmp_path / "run.csv", GOOD), TEXT)
     assert done.written.samples == 1000
 
 
-def test_a_missing_column_is_named_with_those_that_there_are(tmp_path: Path) -> None:
-    text = fault(tmp_path, good_rows(), header="t,x,speed,a")
-    assert "run.csv: no column 'v'; there are t, x, speed, a" in text
+@pytest.mark.parametrize(
+    ("rows", "mapping", "header", "said"),
+    [
+        (GOOD, TEXT, "t,x,speed,a", ("run.csv: no column 'v'; there are t, x, speed, a",)),
+        (GOOD, re.sub("y1_dot = .*", "", TEXT), HEADER, (
+            "channels.y1_dot: expected [channels.y1_dot] or [acceleration.channels.y1_dot], found nothing",
+        )),
+        *((with_cell(cell), TEXT, HEADER, (f"row 737, column 'v': found {cell!r}, expected a number",))
+          for cell in ("OVERLOAD", "1.2.3", "--")),
+        ([*GOOD[:500], "0.25,1.0", *GOOD[501:]], TEXT, HEADER, ("run.csv: ", "Expected 4 columns, got 2")),
+        ([row.replace(",", ";").replace(".", ",") for row in GOOD], TEXT, "t;x;v;a", (
+            "run.csv: damaged, or no CSV file",
+            "taken with ',' between cells and 0 lines before the table: [csv] in the mapping says otherwise",
+        )),
+        ([*GOOD[:600], GOOD[601], GOOD[600], *GOOD[602:]], TEXT, HEADER, (
+            "row 602, column t: goes back by 0.0005 s",
+        )),
+        # Times with too few decimals.
+        ([f"{number // 2 * 0.001:.3f},1.0,2.0,3.0" for number in range(1000)], TEXT, HEADER, (
+            "row 2, column t: repeats the time of the row before", "time.rate_hz",
+        )),
+        (good_rows(5000, 5000.0), TEXT, HEADER, (
+            "run.csv: has 5000 samples per second, the machine file says rate_hz = 2000", "time.resample = true",
+        )),
+        (GOOD, TIME + "rate_hz = 1000.0\n" + CHANNELS, HEADER, (
+            "column t has 2000 rows per second, but 1000 are declared",
+        )),
+        *((good_rows(count), TEXT, HEADER, (f"run.csv: has {count} rows, expected at least two",)) for count in (0, 1)),
+        (GOOD, TEXT.replace(f'start = "{START}"', ""), HEADER, ("give time.start in the mapping",)),
+        *((GOOD, TEXT.replace(START, f"{year}-01-01T00:00:00Z"), HEADER, (
+            f"run.csv: the first row is of about the year {year}, expected 1970 to 2261",
+        )) for year in (1900, 2300, 9999)),
+    ],
+    ids=[
+        *("missing column", "unmapped channel", "text", "two dots", "no number", "short row", "other signs"),
+        *("time goes back", "few decimals", "other rate", "rate contradicts times", "no row", "one row", "no start"),
+        *("1900", "2300", "9999"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_a_table_is_named(
+    tmp_path: Path, rows: list[str], mapping: str, header: str, said: tuple[str, ...]
+) -> None:
+    text = fault(tmp_path, rows, mapping, header)
+    assert all(part in text for part in said), text
 
 
 @pytest.mark.parametrize(
@@ -61,9 +116,8 @@ def test_a_missing_column_is_named_with_those_that_there_are(tmp_path: Path) -> 
     ],
 )
 def test_a_wrong_mapping_is_named_by_field(tmp_path: Path, old: str, new: str, said: str) -> None:
-    mapping = TIME + CHANNELS
-    assert old in mapping
-    text = fault(tmp_path, good_rows(), mapping.replace(old, new, 1))
+    assert old in TEXT
+    text = fault(tmp_path, GOOD, TEXT.replace(old, new, 1))
     assert "mapping.toml: " in text
     assert said in text
 
@@ -72,7 +126,7 @@ def test_a_wrong_mapping_is_named_by_field(tmp_path: Path, old: str, new: str, s
 def test_a_wav_file_that_was_cut_is_refused_with_what_is_there(tmp_path: Path, number: type) -> None:
     samples: np.ndarray = np.random.default_rng(60161).uniform(-100, 100, (1000, 3)).astype(number)
     wavfile.write(tmp_path / "run.wav", 2000, samples)
-    mapping = f'[time]\nstart = "{START}"\n' + CHANNELS.replace('"x"', "1").replace('"v"', "2").replace('"a"', "3")
+    mapping = f'[time]\nstart = "{START}"\n' + IN_ORDER
     done, _ = imported(tmp_path, tmp_path / "run.wav", mapping)
     assert done.written.samples == 1000
     whole = (tmp_path / "run.wav").read_bytes()
@@ -81,111 +135,38 @@ def test_a_wav_file_that_was_cut_is_refused_with_what_is_there(tmp_path: Path, n
         imported(tmp_path, tmp_path / "run.wav", mapping)
 
 
-def test_a_channel_that_is_not_mapped_is_named(tmp_path: Path) -> None:
-    lines = [line for line in (TIME + CHANNELS).splitlines() if not line.startswith("y1_dot")]
-    text = fault(tmp_path, good_rows(), "\n".join(lines))
-    assert "channels.y1_dot: expected [channels.y1_dot] or [acceleration.channels.y1_dot], found nothing" in text
-
-
 def test_a_unit_that_contradicts_the_file_is_refused(tmp_path: Path) -> None:
     time, x, v, a = signals(1000)
     fields = [pa.field("t", pa.float64()), pa.field("x", pa.float64(), metadata={"unit": "mil"})]
     schema = pa.schema([*fields, pa.field("v", pa.float64()), pa.field("a", pa.float64())])
     pa.parquet.write_table(pa.table([time, x, v, a], schema=schema), tmp_path / "run.parquet")
     with pytest.raises(MachineFileError, match="column x is in 'mil' according to the file, but in 'um'"):
-        imported(tmp_path, tmp_path / "run.parquet", TIME + CHANNELS)
-
-
-@pytest.mark.parametrize("cell", ["OVERLOAD", "1.2.3", "--"])
-def test_text_in_a_cell_is_named_by_row_and_column(tmp_path: Path, cell: str) -> None:
-    rows = good_rows()
-    t, x, _, a = rows[736].split(",")
-    rows[736] = f"{t},{x},{cell},{a}"
-    text = fault(tmp_path, rows)
-    assert f"row 737, column 'v': found {cell!r}, expected a number" in text
+        imported(tmp_path, tmp_path / "run.parquet", TEXT)
 
 
 @pytest.mark.parametrize("cell", ["", "NaN", "inf"])
 def test_a_number_that_is_not_finite_is_refused_or_a_gap(tmp_path: Path, cell: str) -> None:
-    rows = good_rows()
-    t, x, _, a = rows[736].split(",")
-    rows[736] = f"{t},{x},{cell},{a}"
-    assert "row 737, column v: found" in fault(tmp_path, rows)
+    assert "row 737, column v: found" in fault(tmp_path, with_cell(cell))
     mapping = TIME + 'not_finite = "gap"\n' + CHANNELS
-    done, _ = imported(tmp_path, table(tmp_path / "run.csv", rows), mapping)
+    done, _ = imported(tmp_path, table(tmp_path / "run.csv", with_cell(cell)), mapping)
     assert done.read.left_out == 1
     assert [gap.row for gap in done.read.gaps] == [737]
     assert done.written.samples == 999
 
 
-def test_a_row_that_is_too_short_is_named(tmp_path: Path) -> None:
-    rows = good_rows()
-    rows[500] = "0.25,1.0"
-    text = fault(tmp_path, rows)
-    assert "run.csv: " in text
-    assert "Expected 4 columns, got 2" in text
-
-
-def test_a_table_with_other_signs_than_said_is_told_where_to_say_them(tmp_path: Path) -> None:
-    text = fault(tmp_path, [row.replace(",", ";").replace(".", ",") for row in good_rows()], header="t;x;v;a")
-    assert "run.csv: damaged, or no CSV file" in text
-    assert "taken with ',' between cells and 0 lines before the table: [csv] in the mapping says otherwise" in text
-
-
-def test_a_time_that_goes_back_is_named(tmp_path: Path) -> None:
-    rows = good_rows()
-    rows[600], rows[601] = rows[601], rows[600]
-    assert "row 602, column t: goes back by 0.0005 s" in fault(tmp_path, rows)
-
-
-def test_times_with_too_few_decimals_are_explained(tmp_path: Path) -> None:
-    rows = [f"{number // 2 * 0.001:.3f},1.0,2.0,3.0" for number in range(1000)]
-    text = fault(tmp_path, rows)
-    assert "row 2, column t: repeats the time of the row before" in text
-    assert "time.rate_hz" in text
-
-
-def test_another_rate_is_refused_unless_it_is_resampled(tmp_path: Path) -> None:
-    text = fault(tmp_path, good_rows(5000, 5000.0))
-    assert "run.csv: has 5000 samples per second, the machine file says rate_hz = 2000" in text
-    assert "time.resample = true" in text
-
-
-def test_a_declared_rate_that_the_times_contradict_is_refused(tmp_path: Path) -> None:
-    text = fault(tmp_path, good_rows(), TIME + "rate_hz = 1000.0\n" + CHANNELS)
-    assert "column t has 2000 rows per second, but 1000 are declared" in text
-
-
-def test_a_declared_rate_that_the_header_contradicts_is_refused(tmp_path: Path) -> None:
-    wavfile.write(tmp_path / "run.wav", 48000, np.zeros((1000, 3), dtype=np.float32))
-    mapping = f'[time]\nrate_hz = 2000.0\nstart = "{START}"\n' + CHANNELS.replace('"x"', "1")
-    mapping = mapping.replace('"v"', "2").replace('"a"', "3")
-    with pytest.raises(MachineFileError, match="the file says 48000 samples per second, the mapping 2000"):
-        imported(tmp_path, tmp_path / "run.wav", mapping)
-
-
-def test_rates_without_a_ratio_of_small_numbers_are_not_resampled(tmp_path: Path) -> None:
-    wavfile.write(tmp_path / "run.wav", 19997, np.zeros((1000, 3), dtype=np.float32))
-    mapping = f'[time]\nresample = true\nstart = "{START}"\n' + CHANNELS.replace('"x"', "1")
-    mapping = mapping.replace('"v"', "2").replace('"a"', "3")
-    with pytest.raises(MachineFileError, match="19997 and 2000 samples per second are not in a ratio of whole numbers"):
-        imported(tmp_path, tmp_path / "run.wav", mapping)
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_a_file_that_is_too_short_is_refused(tmp_path: Path, count: int) -> None:
-    assert f"run.csv: has {count} rows, expected at least two" in fault(tmp_path, good_rows(count))
-
-
-def test_nothing_tells_the_start(tmp_path: Path) -> None:
-    text = fault(tmp_path, good_rows(), TIME.replace(f'start = "{START}"', "") + CHANNELS)
-    assert "give time.start in the mapping" in text
-
-
-@pytest.mark.parametrize("year", [1900, 2300, 9999])
-def test_a_year_that_nanoseconds_since_1970_do_not_reach_is_told(tmp_path: Path, year: int) -> None:
-    text = fault(tmp_path, good_rows(), TIME.replace(START, f"{year}-01-01T00:00:00Z") + CHANNELS)
-    assert f"run.csv: the first row is of about the year {year}, expected 1970 to 2261" in text
+@pytest.mark.parametrize(
+    ("rate_hz", "wish", "said"),
+    [
+        (48000, "rate_hz = 2000.0", "the file says 48000 samples per second, the mapping 2000"),
+        (19997, "resample = true", "19997 and 2000 samples per second are not in a ratio of whole numbers"),
+    ],
+)
+def test_a_rate_of_the_header_that_cannot_be_used_is_refused(
+    tmp_path: Path, rate_hz: int, wish: str, said: str
+) -> None:
+    wavfile.write(tmp_path / "run.wav", rate_hz, np.zeros((1000, 3), dtype=np.float32))
+    with pytest.raises(MachineFileError, match=said):
+        imported(tmp_path, tmp_path / "run.wav", f'[time]\n{wish}\nstart = "{START}"\n{IN_ORDER}')
 
 
 def test_an_index_outside_the_table_is_named(tmp_path: Path) -> None:
@@ -339,13 +320,11 @@ def test_a_limit_within_the_machines_band_is_said(tmp_path: Path) -> None:
     assert "window.band_hz = 3 Hz on, which is below 10 Hz" in "\n".join(summary_lines(done))
 
 
-def test_a_record_shorter_than_the_filter_settles_is_refused(tmp_path: Path) -> None:
+def test_a_record_shorter_than_the_filter_settles_and_a_velocity_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "run.npz", acc=np.sin(np.arange(10_000) * 0.1), a=np.zeros(10_000))
-    with pytest.raises(MachineFileError, match="10000 of them at the ends where filters settle"):
-        imported(tmp_path, tmp_path / "run.npz", MAPPING)
-
-
-def test_velocity_is_no_acceleration(tmp_path: Path) -> None:
-    np.savez(tmp_path / "run.npz", acc=np.zeros(10_000), a=np.zeros(10_000))
-    with pytest.raises(MachineFileError, match="'mm/s' is a unit of velocity, not of acceleration"):
-        imported(tmp_path, tmp_path / "run.npz", MAPPING.replace('"g"', '"mm/s"', 1))
+    for mapping, said in (
+        (MAPPING, "10000 of them at the ends where filters settle"),
+        (MAPPING.replace('"g"', '"mm/s"', 1), "'mm/s' is a unit of velocity, not of acceleration"),
+    ):
+        with pytest.raises(MachineFileError, match=said):
+            imported(tmp_path, tmp_path / "run.npz", mapping)

@@ -54,8 +54,9 @@ def test_messages_come_back_verbatim_and_in_order(
         assert (summary.start_ns, summary.end_ns) == (min(times), max(times))
 
 
-def test_several_chunks_keep_their_order(tmp_path: Path) -> None:
-    content = _some(400)
+def test_a_first_time_and_keys_can_be_chosen(tmp_path: Path) -> None:
+    truth = RecordedMessage("m/truth", b"{}", b"", "application/json", 150_000, 150_000)
+    content = [*_some(150), truth, *_some(400)[150:]]
     path = tmp_path / "run.mcap"
     _write(path, content)
     with path.open("rb") as file:
@@ -63,13 +64,6 @@ def test_several_chunks_keep_their_order(tmp_path: Path) -> None:
     assert summary is not None
     assert len(summary.chunk_indexes) > 5
     assert list(read_recording(path)) == content
-
-
-def test_a_first_time_and_keys_can_be_chosen(tmp_path: Path) -> None:
-    truth = RecordedMessage("m/truth", b"{}", b"", "application/json", 150_000, 150_000)
-    content = [*_some(150), truth, *_some(400)[150:]]
-    path = tmp_path / "run.mcap"
-    _write(path, content)
     chosen = list(read_recording(path, from_ns=100_000))
     assert chosen == [message for message in content if message.log_time_ns >= 100_000]
     assert list(read_recording(path, keys=["m/truth"])) == [truth]
@@ -188,16 +182,6 @@ def test_what_a_crash_left_is_kept_and_recovered_to_its_name(tmp_path: Path) -> 
         salvage_recording(tmp_path / "none.part", tmp_path / "none")
 
 
-def test_a_flipped_byte_is_noticed(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    _write(path, _some(400))
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0xFF  # in the middle of a chunk: indexes are a thousandth of the file
-    path.write_bytes(data)
-    with pytest.raises(RecordingError, match=r"run\.mcap"):
-        list(read_recording(path))
-
-
 def test_a_finished_chunk_is_safe_at_once(tmp_path: Path) -> None:
     """Without a write more, without closing: what a killed process leaves behind."""
     part, new = tmp_path / "run.mcap.part", tmp_path / "new.mcap"
@@ -222,8 +206,10 @@ def test_a_damaged_chunk_is_passed_over_and_counted(tmp_path: Path) -> None:
     assert (whole.count, whole.complete, whole.lost_bytes, whole.damaged_chunks) == (400, True, 0, 0)
     assert (whole.start_ns, whole.end_ns) == (0, 399_000)
     data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0xFF
+    data[len(data) // 2] ^= 0xFF  # in the middle of a chunk: indexes are a thousandth of the file
     path.write_bytes(data)
+    with pytest.raises(RecordingError, match=r"run\.mcap"):
+        list(read_recording(path))
     salvage = salvage_recording(path, new)
     assert (salvage.damaged_chunks, salvage.complete, salvage.unnamed_messages) == (1, False, 0)
     back = list(read_recording(new))

@@ -28,7 +28,6 @@ from hypothesis.extra.numpy import arrays
 from pydantic import ValidationError
 
 from models.errors import MachineFileError, WireError
-from models.machine import load_machine
 from models.physics.rotor import STATES
 from models.signals.block import SampleBlock
 from models.signals.channels import ACCELERATIONS, UNIT_TO_SI, Channel, ChannelDescriptor, Quantity, state_name
@@ -113,10 +112,6 @@ def test_an_encoding_without_hash_is_accepted() -> None:
     payload, header, _ = encode_block(_block(), "0123456789ab")
     _, schema_hash = decode_block(payload, header, BLOCK_ENCODING)
     assert schema_hash == ""
-
-
-def test_end_is_one_sample_after_the_last() -> None:
-    assert _block().end_ns - _block().start_ns == 2_000_000
 
 
 PAYLOAD = b"\0" * 48
@@ -392,14 +387,7 @@ def test_units_turn_into_si(quantity: str, unit: str, factor: float) -> None:
 
 @pytest.mark.parametrize(
     ("fields", "message"),
-    [
-        ({"unit": "mm/s"}, "unit 'mm/s' is not one of"),
-        ({"name": ""}, "at least 1 character"),
-        ({"name": "a b"}, "pattern"),
-        ({"name": "x" * 65}, "at most 64"),
-        ({"quantity": "noise"}, "Input should be"),
-        ({"gain": "1"}, "Extra inputs"),
-    ],
+    [({"unit": "mm/s"}, "unit 'mm/s' is not one of"), ({"name": "a b"}, "pattern"), ({"gain": "1"}, "Extra inputs")],
 )
 def test_unusable_channels_are_refused(fields: dict[str, str], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
@@ -446,12 +434,6 @@ def test_names_that_would_break_a_key_are_refused(name: str) -> None:
 @pytest.mark.parametrize("name", ["a", "7", "Z-", "0_x-9", "Pump_7-north", "q" * 64])
 def test_plain_names_are_accepted(name: str) -> None:
     assert MachineKeys(name, name).root == f"{PREFIX}/{name}/{name}"
-
-
-def test_shipped_machines_have_different_streams_under_different_keys() -> None:
-    lab, heavy = load_machine("lab"), load_machine("heavy")
-    assert lab.keys.stream != heavy.keys.stream
-    assert lab.descriptor.schema_hash != heavy.descriptor.schema_hash
 
 
 def test_a_link_stays_local_and_quiet_by_default() -> None:
