@@ -16,14 +16,13 @@ from structlog.testing import capture_logs
 
 from service.access.audit import STARTED
 from service.access.guard import Guard
-from service.access.scopes import Caller, Scope
+from service.access.scopes import Scope
 from service.history.records import TokenRecord
 from service.settings.access import AccessSettings, LimitSettings
 from tests.service.rig.guarded import JSON, Guarded, application, basic, guarded, problem
 from tests.service.rig.live import until
 
 READ, OPERATE, CONFIGURE = Scope
-DAY_NS = 86_400 * 10**9
 
 
 # How much
@@ -302,18 +301,6 @@ def test_what_strangers_send_does_not_spoil_the_log(monitor: Guarded) -> None:
     assert entry.path.isprintable()
     assert len(entry.path) == 500
     assert re.match(r"/..\[31mred..line./x", entry.path)
-
-
-def test_a_stream_can_ask_whether_its_token_still_holds(monitor: Guarded) -> None:
-    record, token = monitor.issue(READ)
-    with monitor.client(token) as client:
-        assert client.get("/health").status_code == 200
-    caller = Caller("ops", frozenset((READ,)), "127.0.0.1", record.token_id)
-    assert monitor.guard.still_valid(caller)
-    monitor.store.tokens.revoke(record.token_id, 1)
-    assert not monitor.guard.still_valid(caller)
-    assert not monitor.guard.still_valid(Caller("x", frozenset(), "", "unknown"))
-    assert monitor.guard.still_valid(Caller("anonymous"))
 
 
 def test_a_websocket_is_refused(monitor: Guarded) -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from models.errors import MachineFileError
 from models.mistakes import in_folder
 from service.access.credentials import network_of
-from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
+from service.access.rates import MovingWindow
 from service.access.scopes import Scope
 from service.access.tls import server_arguments, tls_context
 from service.access.tokens import masked, new_token, parse_token, token_is_valid
@@ -128,20 +128,6 @@ def test_what_is_over_is_forgotten() -> None:
     assert len(window) == 0
 
 
-def test_seats_come_back_after_an_error() -> None:
-    seats = StreamSeats(1, 2)
-    with pytest.raises(RuntimeError, match="broken"), seats.seat("a"):
-        raise RuntimeError("broken")
-    assert seats.taken == 0
-    with seats.seat("a"), seats.seat("b"):
-        with pytest.raises(TooManyStreamsError, match="of yours"), seats.seat("a"):
-            pass
-        with pytest.raises(TooManyStreamsError, match="this service has"), seats.seat("c"):
-            pass
-        assert seats.taken == 2
-    assert seats.taken == 0
-
-
 @pytest.mark.parametrize(
     ("address", "network"),
     [
@@ -238,12 +224,6 @@ def test_a_client_without_a_certificate_is_refused_where_one_is_asked_for(
         for context in (stranger, trusting(authority)):
             with monitor.client(token, verify=context) as client, pytest.raises(httpx.TransportError):
                 client.get("/health")
-
-
-def test_without_tls_plain_http_and_no_proxy_is_believed() -> None:
-    assert server_arguments(AccessSettings()) == {
-        "proxy_headers": False, "forwarded_allow_ips": [], "server_header": False
-    }  # fmt: skip
 
 
 def refused(tls: HttpTlsSettings) -> str:

@@ -268,8 +268,8 @@ def collected(
     subscriber = zenoh.ext.declare_advanced_subscriber(
         session,
         key,
-        lambda sample: texts.append(sample.payload.to_string()),
-        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=100) if history else None,
+        lambda sample: texts.append(sample.payload.to_bytes().decode(errors="replace")),
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=300) if history else None,
         recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True) if recovery else None,
         subscriber_detection=True,
     )
@@ -336,8 +336,8 @@ def matched(session: zenoh.Session, key: str) -> bool:
 def test_a_real_stream_reaches_only_whom_it_is_granted(router: Plant) -> None:
     """The simulator's publisher, with descriptor, liveliness and the question that says it was heard."""
     with router.client("monitor") as monitor, router.client("all") as viewer:
-        blocks, _ = collected_count(monitor, LAB.keys.stream)
-        nothing, _ = collected_count(viewer, LAB.keys.stream)
+        blocks, _ = collected(monitor, LAB.keys.stream, history=True, recovery=True)
+        nothing, _ = collected(viewer, LAB.keys.stream, history=True, recovery=True)
         asked: list[str] = []
 
         def fine(query: zenoh.Query) -> None:
@@ -359,18 +359,6 @@ def test_a_real_stream_reaches_only_whom_it_is_granted(router: Plant) -> None:
     assert asked == [LAB.keys.health]
     assert alive == [zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE]
     assert nothing == []
-
-
-def collected_count(session: zenoh.Session, key: str) -> tuple[list[int], zenoh.ext.AdvancedSubscriber[None]]:
-    sizes: list[int] = []
-    subscriber = zenoh.ext.declare_advanced_subscriber(
-        session,
-        key,
-        lambda sample: sizes.append(len(sample.payload.to_bytes())),
-        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=300),
-        recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-    )
-    return sizes, subscriber
 
 
 SHIPPED = ROOT / "deploy" / "zenoh"

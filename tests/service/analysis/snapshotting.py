@@ -4,18 +4,21 @@ from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
+import numpy.typing as npt
 
 from models.commissioning.commissioned import Installed
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import plan_for
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import MachineFile
+from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix
 from models.signals.block import FloatArray, SampleBlock
 from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot
 from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.machine import MachineSnapshots
 from service.monitor.reports import Identity
-from simulator.scenario import Event
+from simulator.scenario import Event, load_scenario
+from simulator.stream import blocks
 from tests.commissioning.rotor_kit import LAB, stream
 
 SEED = 7_700_011
@@ -49,6 +52,22 @@ def latest(*faults: Event, lagged: bool = True) -> LatestData:
     stream_ = stream(SECONDS, SEED, *faults)
     window = window_of(LAB, stream_, lagged=lagged)
     return LatestData(window, 1.0, LikelihoodFit(LAB).diagnose(window).parameters, "", stream_[-20:])
+
+
+@cache
+def quiet() -> tuple[SampleBlock, ...]:
+    """The rotor kit with nothing but its unbalance."""
+    scenario, machine = load_scenario("healthy")
+    still = {"sources": (), "sensors": type(scenario.sensors)(), "duration_s": SECONDS}
+    return tuple(block for block, _ in blocks(scenario.model_copy(update=still), machine))
+
+
+def unbalance_um() -> npt.NDArray[np.complex128]:
+    """What it does by the equations of motion: y1, y2, psi, z1, z2, phi."""
+    W, rotor = LAB.operation.speed_rad_s, LAB.rotor
+    H = H_matrix(rotor, W)
+    dynamic = -(W**2) * M_matrix(rotor) + 1j * W * P_matrix(rotor, W) + Q_matrix(rotor)
+    return np.asarray(1e6 * np.linalg.solve(dynamic, H[:, 0] - 1j * H[:, 1]))
 
 
 def numbers(series: Sequence[float | None] | None) -> FloatArray:

@@ -14,9 +14,9 @@ from service.analysis.orbit import recorded_pairs
 from service.analysis.past import Past
 from service.analysis.runup import read_centreline, read_run_up
 from service.analysis.trend import past_trend
-from service.history.records import Retention, Step, StoredReport
-from service.history.store import Store
+from service.history.records import Step, StoredReport
 from service.rotorwatch import app
+from tests.service.rig.postgres import opened
 
 START_NS, S = 1_767_225_600 * 10**9, 10**9
 COUNT = 40
@@ -46,15 +46,13 @@ def settings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a monitor whose history has reports, one of them of another version of the program."""
     folder = tmp_path_factory.mktemp("past")
     (folder / "plant.toml").write_text('[history]\nurl = "sqlite:///history.sqlite"\n', encoding="utf-8")
-    store = Store(f"sqlite:///{folder / 'history.sqlite'}", Retention())
-    store.open()
-    machine = store.machine("demo", "lab")
-    for number in range(COUNT):
-        one = report(number)
-        stored = StoredReport(one.start_ns, one.end_ns, one.state, one.filled, one.model_dump_json())
-        machine.commit(Step(reports=(stored,)))
-    machine.commit(Step(reports=(StoredReport(START_NS, START_NS + 61 * S, "healthy", 1.0, "{}"),)))
-    store.close()
+    with opened(f"sqlite:///{folder / 'history.sqlite'}") as store:
+        machine = store.machine("demo", "lab")
+        for number in range(COUNT):
+            one = report(number)
+            stored = StoredReport(one.start_ns, one.end_ns, one.state, one.filled, one.model_dump_json())
+            machine.commit(Step(reports=(stored,)))
+        machine.commit(Step(reports=(StoredReport(START_NS, START_NS + 61 * S, "healthy", 1.0, "{}"),)))
     return folder / "plant.toml"
 
 

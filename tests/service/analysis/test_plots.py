@@ -9,7 +9,6 @@ import pytest
 from models.commissioning.commissioned import install
 from models.diagnosis.networks.bundle import load_bundle
 from models.errors import MachineFileError, RotorwatchError
-from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix
 from models.signals.block import FloatArray
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent
@@ -24,10 +23,10 @@ from service.analysis.spectrum import read_spectrum, read_waterfall, shown_as
 from service.analysis.trend import TrendSeries, read_trend, trend_of
 from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.source import RecordingSource
-from simulator.scenario import load_scenario, parse_fault
-from simulator.stream import blocks
+from simulator.scenario import parse_fault
+from tests.service.analysis.snapshotting import quiet, unbalance_um
 from tests.service.rig.live import LAB, START_NS, scenario_blocks
-from tests.service.rig.replaying import S, machine_blocks, recorded, recording, write
+from tests.service.rig.replaying import S, made, recorded, recording, write
 
 
 @pytest.fixture(scope="module")
@@ -59,17 +58,8 @@ def reports_of(lines: list[dict[str, object]]) -> list[Report]:
 
 
 def test_the_orbit_of_a_simulated_unbalance_is_the_ellipse_of_the_equations_of_motion(tmp_path: Path) -> None:
-    scenario, machine = load_scenario("healthy")
-    quiet = scenario.model_copy(
-        update={"sources": (), "sensors": type(scenario.sensors)(), "duration_s": 12.0}
-    )  # nothing but unbalance
-    path = recording(tmp_path / "unbalance.mcap", [block for block, _ in blocks(quiet, machine, start_ns=START_NS)])
-    found = read_orbits(recorded(path), 8)
-
-    W, rotor = machine.operation.speed_rad_s, machine.rotor
-    H = H_matrix(rotor, W)
-    dynamic = -(W**2) * M_matrix(rotor) + 1j * W * P_matrix(rotor, W) + Q_matrix(rotor)
-    q_um = 1e6 * np.linalg.solve(dynamic, H[:, 0] - 1j * H[:, 1])  # rows y1, y2, psi, z1, z2, phi
+    found = read_orbits(recorded(recording(tmp_path / "unbalance.mcap", quiet()[:120])), 8)
+    W, q_um = LAB.operation.speed_rad_s, unbalance_um()
     assert [orbit.location for orbit in found.orbits] == ["bearing", "disc"]
     assert found.speed_rad_s == pytest.approx(W, rel=1e-4)
     assert found.end_ns - found.start_ns == pytest.approx(8 * 2e9 * np.pi / W, rel=1e-4)
@@ -89,18 +79,12 @@ def test_the_orbit_of_a_simulated_unbalance_is_the_ellipse_of_the_equations_of_m
 def test_a_shaft_that_turns_backwards(tmp_path: Path) -> None:
     """Angle falls; y peaks 90° after the pulse; the motion goes against the rotation."""
     turn = 2 * np.pi * 25.0
-    path = recording(
-        tmp_path / "back.mcap",
-        machine_blocks(
-            {
-                "theta": lambda t: (1.0 - turn * t) % (2 * np.pi),
-                "y1": lambda t: 30 * np.cos(turn * t - 1.0 - np.pi / 2) + 400,
-                "z1": lambda t: 10 * np.sin(turn * t - 1.0 - np.pi / 2) - 300,
-            },
-            3.0,
-        ),
-    )
-    found = read_orbits(recorded(path), 5)
+    signals = {
+        "theta": lambda t: (1.0 - turn * t) % (2 * np.pi),
+        "y1": lambda t: 30 * np.cos(turn * t - 1.0 - np.pi / 2) + 400,
+        "z1": lambda t: 10 * np.sin(turn * t - 1.0 - np.pi / 2) - 300,
+    }
+    found = read_orbits(made(tmp_path, signals, 3.0), 5)
     bearing = found.orbits[0]
     assert found.direction == -1
     assert found.speed_rad_s == pytest.approx(-turn, rel=1e-3)
@@ -114,15 +98,11 @@ def test_a_shaft_that_turns_backwards(tmp_path: Path) -> None:
 
 
 def test_orbits_need_so_many_revolutions_without_a_gap(tmp_path: Path) -> None:
-    path = recording(
-        tmp_path / "gap.mcap",
-        machine_blocks(
-            {"theta": lambda t: (2 * np.pi * 20.0 * t + 1) % (2 * np.pi), "y1": lambda t: t}, 4.0, without=[34]
-        ),
-    )
-    assert read_orbits(recorded(path), 9).revolutions == 9
+    signals = {"theta": lambda t: (2 * np.pi * 20.0 * t + 1) % (2 * np.pi), "y1": lambda t: t}
+    data = made(tmp_path, signals, 4.0, without=[34])
+    assert read_orbits(data, 9).revolutions == 9
     with pytest.raises(RotorwatchError, match=r"--revolutions is 10, but only 9 whole revolutions"):
-        read_orbits(recorded(path), 10)
+        read_orbits(data, 10)
 
 
 @pytest.mark.parametrize("off_line", [0.0, 0.25, 0.5])
@@ -132,10 +112,7 @@ def test_a_sine_reads_as_its_quantity_is_stated_within_the_scalloping_of_the_win
 ) -> None:
     """Displacement peak to peak, velocity rms."""
     hz, amplitude = 50.0 + 0.5 * off_line, 12.0
-    path = recording(
-        tmp_path / "sine.mcap", machine_blocks({name: lambda t: amplitude * np.sin(2 * np.pi * hz * t) + 900}, 21.0)
-    )
-    stream = recorded(path)
+    stream = made(tmp_path, {name: lambda t: amplitude * np.sin(2 * np.pi * hz * t) + 900}, 21.0)
     found = read_spectrum(stream, stream.channels([name]), 20.0, 0.5, "amplitude")
     scalloping = abs(np.sinc(off_line) / (1 - off_line**2))  # of the Hann window
     assert found.values[0].max() == pytest.approx(factor * amplitude * scalloping, rel=1e-3)
@@ -168,7 +145,7 @@ def test_frequencies_and_heights_that_are_shown(tmp_path: Path) -> None:
         "theta": lambda t: (2 * np.pi * 20.0 * t) % (2 * np.pi),
         "y1": lambda t: 3000 * np.sin(0.3 * t) + 10 * np.sin(2 * np.pi * 20.0 * t) + 4 * np.sin(2 * np.pi * 40.0 * t),
     }
-    stream = recorded(recording(tmp_path / "drift.mcap", machine_blocks(signals, 30.0)))
+    stream = made(tmp_path, signals, 30.0)
     found = read_spectrum(stream, stream.channels(["y1"]), 20.0, 0.5, "amplitude")
     fall = read_waterfall(stream, stream.channels(["y1"])[0], 4.0, 0.5, "amplitude")
     for log in (False, True):
@@ -187,10 +164,7 @@ def test_frequencies_and_heights_that_are_shown(tmp_path: Path) -> None:
 
 def test_spectra_do_not_reach_across_gaps(tmp_path: Path) -> None:
     """A step across the gap would be broadband; segments on either side do not see it."""
-    path = recording(
-        tmp_path / "step.mcap", machine_blocks({"y1": lambda t: np.where(t > 4.05, 1000.0, 0.0)}, 10.0, without=[40])
-    )
-    stream = recorded(path)
+    stream = made(tmp_path, {"y1": lambda t: np.where(t > 4.05, 1000.0, 0.0)}, 10.0, without=[40])
     found = read_spectrum(stream, stream.channels(["y1"]), 10.0, 1.0, "amplitude")
     assert found.values.max() < 1e-9
     assert found.averages == 7 + 10  # 4.0 s and 5.9 s in halves of a second
@@ -205,15 +179,11 @@ def test_a_waterfall_follows_a_run_up_over_time_and_speed(tmp_path: Path) -> Non
     def turns(t: FloatArray) -> FloatArray:  # 10 Hz to 40 Hz in 60 s
         return 10 * t + 0.25 * t**2
 
-    path = recording(
-        tmp_path / "runup.mcap",
-        machine_blocks(
-            {"theta": lambda t: (2 * np.pi * turns(t)) % (2 * np.pi), "y1": lambda t: 5 * np.cos(2 * np.pi * turns(t))},
-            60.0,
-            without=range(300, 330),
-        ),
-    )
-    stream = recorded(path)
+    signals = {
+        "theta": lambda t: (2 * np.pi * turns(t)) % (2 * np.pi),
+        "y1": lambda t: 5 * np.cos(2 * np.pi * turns(t)),
+    }
+    stream = made(tmp_path, signals, 60.0, without=range(300, 330))
     found = read_waterfall(stream, stream.channels(["y1"])[0], 2.0, 0.5, "amplitude")
     assert found.values.shape[0] == 15 + 13  # 3 s are missing, and what is left before the end is no segment
     strongest_hz = found.frequencies_hz[found.values.argmax(axis=1)]

@@ -99,7 +99,7 @@ def test_a_window_of_a_recording_is_that_of_the_monitor(folder: Path, file: str)
 @pytest.fixture(scope="module")
 def runtime(folder: Path, file: str) -> Iterator[Runtime]:
     kept = RecordingSettings(directory=str(folder), keep_days=36_500.0)
-    with running(settings(endpoint(), file).model_copy(update={"recording": kept})) as started:
+    with running(settings(endpoint(), file, recording=kept)) as started:
         yield started
 
 
@@ -157,13 +157,8 @@ def test_windows_before_and_after_a_fault(http: httpx.Client) -> None:
         assert one.orbits[0].y is not None
         assert 2 * one.orbits[0].y.amplitude == pytest.approx(x1, rel=0.05)  # that is of hops
     assert np.abs(numbers(last.densities[0].measured) / numbers(first.densities[0].measured) - 1).max() > 0.5
-    rows = answered(
-        http.get(
-            f"{PLACE}/waterfalls",
-            params={"recording": NAME, "since_ns": healthy.start_ns, **{"until_ns": healthy.end_ns}},
-        ),
-        WaterfallSnapshot,
-    )
+    within: dict[str, str | int] = {"recording": NAME, "since_ns": healthy.start_ns, "until_ns": healthy.end_ns}
+    rows = answered(http.get(f"{PLACE}/waterfalls", params=within), WaterfallSnapshot)
     assert rows.start_ns is not None
     assert rows.end_ns is not None
     assert healthy.start_ns <= rows.start_ns < rows.end_ns <= healthy.end_ns + S // 10
@@ -171,9 +166,8 @@ def test_windows_before_and_after_a_fault(http: httpx.Client) -> None:
 
 def test_windows_of_recordings_alone_and_of_a_paced_replay(http: httpx.Client, runtime: Runtime) -> None:
     def spectra(until_ns: int) -> SpectrumSnapshot:
-        return answered(
-            http.get(f"{PLACE}/spectra", params={"recording": NAME, "until_ns": until_ns}), SpectrumSnapshot
-        )
+        asked: dict[str, str | int] = {"recording": NAME, "until_ns": until_ns}
+        return answered(http.get(f"{PLACE}/spectra", params=asked), SpectrumSnapshot)
 
     at = START_NS + 24 * S
     read = spectra(at)
@@ -181,10 +175,7 @@ def test_windows_of_recordings_alone_and_of_a_paced_replay(http: httpx.Client, r
     assert read.theory.nominal_reason == ""
     assert "evaluated by an offline replay alone" in read.theory.estimated_reason
     assert answered(http.get(f"{PLACE}/spectra"), SpectrumSnapshot).start_ns is None  # nothing is live
-    early = answered(
-        http.get(f"{PLACE}/spectra", params={"recording": NAME, "until_ns": START_NS + S}), SpectrumSnapshot
-    )
-    assert "is full yet" in early.reason
+    assert "is full yet" in spectra(START_NS + S).reason
     never = answered(http.get(f"{PLACE}/orbits", params={"recording": NAME, "until_ns": 5}), OrbitSnapshot)
     assert "nothing was recorded in between" in never.reason
     paced = started(http, mode="paced", pace=0.1)

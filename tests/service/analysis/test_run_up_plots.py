@@ -18,11 +18,11 @@ from service.analysis.figures.run_up import bode, centreline, polar
 from service.analysis.figures.style import Look
 from service.analysis.figures.waveform import waveform
 from service.analysis.orbit import in_planes, orbit_pairs, recorded_pairs
+from service.analysis.recorded import Recorded
 from service.analysis.runup import read_centreline, read_run_up
 from service.analysis.spectrum import read_full_spectrum
-from simulator.recorder import record
 from tests.service.rig.live import LAB, START_NS
-from tests.service.rig.replaying import S, machine_blocks, recorded, recording
+from tests.service.rig.replaying import S, machine_blocks, made, recorded, without_angle
 
 RATE_HZ = LAB.rate_hz
 Signals = dict[str, Callable[[FloatArray], FloatArray]]
@@ -32,10 +32,6 @@ def turning(hz: float, sense: int = 1) -> Callable[[FloatArray], FloatArray]:
     return lambda t: (sense * 2 * np.pi * hz * t) % (2 * np.pi)
 
 
-def made(tmp_path: Path, signals: Signals, seconds: float) -> Path:
-    return recording(tmp_path / "made.mcap", machine_blocks(signals, seconds))
-
-
 @pytest.mark.parametrize("sense", [1, -1])
 @pytest.mark.parametrize("orders", [False, True])
 def test_a_circle_with_the_rotation_is_one_forward_line_and_an_ellipse_two(
@@ -43,19 +39,14 @@ def test_a_circle_with_the_rotation_is_one_forward_line_and_an_ellipse_two(
 ) -> None:
     """A circle of radius 20 µm; an ellipse with half axes of 30 and 10 µm, the sum and difference of two circles."""
     angle = 2 * np.pi * 20.0
-    data = recorded(
-        made(
-            tmp_path,
-            {
-                "theta": turning(20.0, sense),
-                "y1": lambda t: 20 * np.cos(angle * t) + 300,
-                "z1": lambda t: sense * 20 * np.sin(angle * t) - 200,
-                "y2": lambda t: 30 * np.cos(angle * t),
-                "z2": lambda t: sense * 10 * np.sin(angle * t),
-            },
-            21.0,
-        )
-    )
+    signals: Signals = {
+        "theta": turning(20.0, sense),
+        "y1": lambda t: 20 * np.cos(angle * t) + 300,
+        "z1": lambda t: sense * 20 * np.sin(angle * t) - 200,
+        "y2": lambda t: 30 * np.cos(angle * t),
+        "z2": lambda t: sense * 10 * np.sin(angle * t),
+    }
+    data = made(tmp_path, signals, 21.0)
     found = read_full_spectrum(data, recorded_pairs(data), 20.0, 0.5, orders=orders)
     one = 1.0 if orders else 20.0
     forward, reverse = (int(np.argmin(np.abs(found.lines - at))) for at in (one, -one))
@@ -72,24 +63,19 @@ def test_orders_stay_sharp_while_the_speed_changes(tmp_path: Path) -> None:
     def angle(t: FloatArray) -> FloatArray:
         return np.asarray(2 * np.pi * (20 * t + 0.25 * t**2))
 
-    data = recorded(
-        made(
-            tmp_path,
-            {
-                "theta": lambda t: angle(t) % (2 * np.pi),
-                "y1": lambda t: 20 * np.cos(angle(t)),
-                "z1": lambda t: 20 * np.sin(angle(t)),
-            },
-            20.0,
-        )
-    )
+    signals: Signals = {
+        "theta": lambda t: angle(t) % (2 * np.pi),
+        "y1": lambda t: 20 * np.cos(angle(t)),
+        "z1": lambda t: 20 * np.sin(angle(t)),
+    }
+    data = made(tmp_path, signals, 20.0)
     pairs = recorded_pairs(data, "bearing")
     assert read_full_spectrum(data, pairs, 20.0, 0.5, orders=True).values_um.max() == pytest.approx(40, rel=5e-3)
     assert read_full_spectrum(data, pairs, 20.0, 0.5, orders=False).values_um.max() < 20
 
 
 def test_full_spectra_need_two_directions_and_orders_a_rotation(tmp_path: Path) -> None:
-    data = recorded(made(tmp_path, {"y1": lambda t: np.sin(300 * t)}, 5.0))
+    data = made(tmp_path, {"y1": lambda t: np.sin(300 * t)}, 5.0)
     with pytest.raises(MachineFileError, match="--place is 'DE', where demo/lab has no displacements in y"):
         recorded_pairs(data, "DE")
     with pytest.raises(RotorwatchError, match="--axis orders needs a shaft that turns, and it stands still"):
@@ -115,10 +101,7 @@ def test_probes_at_an_angle_are_turned_to_y_and_z() -> None:
         )
     )  # fmt: skip
     pairs = orbit_pairs([left, right, y, z])
-    assert {frozenset((one.name, other.name)) for one, other in pairs} == {
-        frozenset(("DE-L", "DE-R")),
-        frozenset(("N-y", "N-z")),
-    }
+    assert sorted(sorted((one.name, other.name)) for one, other in pairs) == [["DE-L", "DE-R"], ["N-y", "N-z"]]
     angle = np.linspace(0, 6, 50)
     shaft = {"y": 30 * np.cos(angle), "z": 10 * np.sin(angle)}
     shown = {
@@ -155,19 +138,18 @@ def jeffcott() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 @pytest.fixture(scope="module", params=[1, -1])
-def run_up(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[int, Path]:
+def run_up(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[int, Recorded]:
     sense, (theta, y, z) = request.param, jeffcott()
     signals: Signals = {"theta": lambda _: (sense * theta) % (2 * np.pi), "y2": lambda _: y, "z2": lambda _: sense * z}
     return sense, made(tmp_path_factory.mktemp("runup"), signals, 60.0)
 
 
-def test_a_run_up_shows_the_critical_speed_of_a_simple_rotor(run_up: tuple[int, Path]) -> None:
+def test_a_run_up_shows_the_critical_speed_of_a_simple_rotor(run_up: tuple[int, Recorded]) -> None:
     """Amplitude e r²/√((1-r²)² + (2ζr)²), greatest at r = 1/√(1-2ζ²), and a lag of 90° at r = 1.
 
     The sweep, 0.5 Hz/s, delays both by about its rate over ζω, 0.06 Hz: hence 1 % of the speed, and 3 % of the height.
     """
-    sense, path = run_up
-    data = recorded(path)
+    sense, data = run_up
     found = read_run_up(data, data.channels(["y2", "z2"]), 1, 4)
     hz = np.abs(found.speed_rad_s) / (2 * np.pi)
     assert found.direction == sense
@@ -193,11 +175,11 @@ def drawn(paint: Callable[[Look], Figure]) -> Figure:
     return figure
 
 
-def test_a_polar_plot_counts_the_lag_against_the_rotation_from_the_sensor(run_up: tuple[int, Path]) -> None:
+def test_a_polar_plot_counts_the_lag_against_the_rotation_from_the_sensor(run_up: tuple[int, Recorded]) -> None:
     """At resonance y lags 90°: so the high spot is a quarter turn against the rotation from where y looks."""
-    sense, path = run_up
+    sense, data = run_up
     for name, sensor in (("y2", 0.0), ("z2", np.pi / 2)):
-        axes = drawn(polar(recorded(path), [name], 1, 4, None)).axes[0]
+        axes = drawn(polar(data, [name], 1, 4, None)).axes[0]
         assert isinstance(axes, PolarAxes)
         assert axes.get_theta_offset() == pytest.approx(sensor)
         assert axes.get_theta_direction() == -sense
@@ -210,8 +192,8 @@ def test_a_polar_plot_counts_the_lag_against_the_rotation_from_the_sensor(run_up
         assert any(abs(one - 60 * CRITICAL_HZ) < 60 for one in speeds)
 
 
-def test_a_bode_plot_marks_the_greatest_amplitude(run_up: tuple[int, Path]) -> None:
-    lower, upper = drawn(bode(recorded(run_up[1]), ["y2"], 1, 4, None)).axes
+def test_a_bode_plot_marks_the_greatest_amplitude(run_up: tuple[int, Recorded]) -> None:
+    lower, upper = drawn(bode(run_up[1], ["y2"], 1, 4, None)).axes
     assert lower.get_ylabel() == "1× amplitude, µm p-p"
     top, bottom = upper.get_ylim()
     assert top > bottom  # lag grows downwards
@@ -231,7 +213,7 @@ def test_run_out_is_taken_away(tmp_path: Path) -> None:
         "theta": lambda t: angle(t) % (2 * np.pi),
         "y1": lambda t: 3 * np.cos(angle(t)) - 10 * fast(t) * np.cos(angle(t)),
     }
-    data = recorded(made(tmp_path, signals, 20.0))
+    data = made(tmp_path, signals, 20.0)
     channels = data.channels(["y1"])
     raw, less = (read_run_up(data, channels, 1, 8, slow) for slow in (None, 300.0))
     assert (raw.amplitude[-1, 0], less.amplitude[-1, 0]) == pytest.approx((14, 20), rel=1e-3)
@@ -249,22 +231,13 @@ def test_vectors_at_an_order_do_not_see_the_others(tmp_path: Path) -> None:
         "theta": turning(20.0),
         "y1": lambda t: 100 + np.sum([a * np.cos(k * turn * t - 0.5 * k) for k, a in amplitudes.items()], axis=0),
     }
-    path = recording(tmp_path / "orders.mcap", machine_blocks(signals, 12.0, without=[55]))
-    data = recorded(path)
+    data = made(tmp_path, signals, 12.0, without=[55])
     for order, revolutions in product(amplitudes, (1, 2, 5, 20)):
         found = read_run_up(data, data.channels(["y1"]), order, revolutions)
         assert found.amplitude == pytest.approx(2 * amplitudes[order], rel=2e-3)
         assert found.lag_deg == pytest.approx(np.degrees(0.5 * order), abs=0.5)
         assert found.speed_rad_s == pytest.approx(turn, rel=1e-3)
         assert not ((found.time_ns > START_NS + 5.5 * S) & (found.time_ns < START_NS + 5.6 * S)).any()
-
-
-def without_angle(path: Path, signals: Signals, seconds: float) -> Path:
-    machine = LAB.model_copy(update={"sensors": LAB.sensors[:-1]})
-    stream = machine_blocks(signals, seconds)
-    short = (type(one)(one.start_ns, one.sequence, one.run, one.rate_hz, one.samples[:, :-1].copy()) for one in stream)
-    record(machine, ((one, ()) for one in short), path)
-    return path
 
 
 def test_without_a_keyphasor_the_speed_is_found_in_the_vibration_and_there_is_no_phase(tmp_path: Path) -> None:
@@ -275,7 +248,7 @@ def test_without_a_keyphasor_the_speed_is_found_in_the_vibration_and_there_is_no
         turned = 15 * t + 0.125 * t**2
         return np.asarray(noise[: t.size] + 20 * np.cos(2 * np.pi * turned))
 
-    data = recorded(without_angle(tmp_path / "plain.mcap", {"y2": rising}, 60.0))
+    data = recorded(without_angle(tmp_path / "plain.mcap", machine_blocks({"y2": rising}, 60.0)))
     channels = data.channels(["y2"])
     with pytest.raises(MachineFileError, match="without it vibration has no phase, and the speed"):
         read_run_up(data, channels, 1, 8)
@@ -288,8 +261,8 @@ def test_without_a_keyphasor_the_speed_is_found_in_the_vibration_and_there_is_no
     assert [axes.get_ylabel() for axes in figure.axes] == ["1× amplitude, µm p-p"]
     with pytest.raises(MachineFileError, match="--slow-roll needs phases"):
         read_run_up(data, channels, 1, 8, 500.0, (600, 2400))
-    quiet: Signals = {"y2": lambda t: noise[: t.size]}
-    data = recorded(without_angle(tmp_path / "noise.mcap", quiet, 20.0))
+    quiet = machine_blocks({"y2": lambda t: noise[: t.size]}, 20.0)
+    data = recorded(without_angle(tmp_path / "noise.mcap", quiet))
     with pytest.raises(RotorwatchError, match="no line between 600 and 2400 rpm stands out"):
         read_run_up(data, channels, 1, 8, between_rpm=(600, 2400))
 
@@ -310,10 +283,9 @@ def test_a_centreline_is_the_mean_of_the_gaps(tmp_path: Path, keyphasor: bool) -
     }
     if keyphasor:
         signals["theta"] = lambda t: angle(t) % (2 * np.pi)
-        path = made(tmp_path, signals, 20.0)
+        data = made(tmp_path, signals, 20.0)
     else:
-        path = without_angle(tmp_path / "plain.mcap", signals, 20.0)
-    data = recorded(path)
+        data = recorded(without_angle(tmp_path / "plain.mcap", machine_blocks(signals, 20.0)))
     found = read_centreline(data, recorded_pairs(data, "bearing"), 2.0)
     middle_s = (found.time_ns - START_NS) / S
     assert middle_s == pytest.approx(np.arange(1, 20, 2), abs=0.25)
@@ -341,7 +313,7 @@ def test_a_waveform_has_the_unit_of_its_channel_and_a_mark_at_each_pulse(
         "y1": lambda t: 7 * np.cos(2 * np.pi * 20 * t) + 500,
         "y2_dot": lambda t: 3 * np.sin(2 * np.pi * 20 * t),
     }
-    data = recorded(made(tmp_path, signals, 5.0))
+    data = made(tmp_path, signals, 5.0)
     first, second = drawn(waveform(data, ["y1", "y2_dot"], window_s)).axes
     assert (first.get_ylabel(), second.get_ylabel()) == ("µm", "mm/s")
     assert second.get_xlim() == pytest.approx((0, shown_ms), abs=0.5)
@@ -352,7 +324,7 @@ def test_a_waveform_has_the_unit_of_its_channel_and_a_mark_at_each_pulse(
 
 
 def test_a_waveform_ends_at_a_gap_and_goes_on_after_it(tmp_path: Path) -> None:
-    path = recording(tmp_path / "gap.mcap", machine_blocks({"y1": lambda t: np.sin(9 * t)}, 3.0, without=[25]))
-    axes = drawn(waveform(recorded(path), ["y1"], 1.0)).axes[0]
+    data = made(tmp_path, {"y1": lambda t: np.sin(9 * t)}, 3.0, without=[25])
+    axes = drawn(waveform(data, ["y1"], 1.0)).axes[0]
     starts = [float(np.asarray(line.get_xdata())[0]) for line in axes.lines[0:4:2]]
     assert starts == pytest.approx([0, 600])

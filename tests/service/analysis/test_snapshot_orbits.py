@@ -1,26 +1,22 @@
 """Orbits of a live machine."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 
 from models.machine import Machine
-from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix
-from models.signals.block import SampleBlock
 from service.analysis.snapshots.heading import LatestData
-from simulator.scenario import load_scenario
-from simulator.stream import blocks
 from tests.commissioning.rotor_kit import LAB, NOTHING, stream
-from tests.service.analysis.snapshotting import SECONDS, SEED, latest, numbers, snapshots_of, synthetic, window_of
-
-
-@cache
-def quiet(machine: Machine = LAB) -> tuple[SampleBlock, ...]:
-    """The rotor kit with nothing but its unbalance."""
-    scenario, _ = load_scenario("healthy")
-    still = {"sources": (), "sensors": type(scenario.sensors)(), "duration_s": SECONDS}
-    return tuple(block for block, _ in blocks(scenario.model_copy(update=still), machine))
+from tests.service.analysis.snapshotting import (
+    SECONDS,
+    SEED,
+    latest,
+    numbers,
+    quiet,
+    snapshots_of,
+    synthetic,
+    unbalance_um,
+    window_of,
+)
 
 
 def test_the_orbit_of_a_known_unbalance() -> None:
@@ -28,10 +24,7 @@ def test_the_orbit_of_a_known_unbalance() -> None:
     snapshot = snapshots_of(LAB).orbits(data, 8)
     assert (snapshot.reason, snapshot.path_reason, snapshot.revolutions) == ("", "", 8)
     assert snapshot.speed_source == "phase reference"
-    W, rotor = LAB.operation.speed_rad_s, LAB.rotor
-    H = H_matrix(rotor, W)
-    dynamic = -(W**2) * M_matrix(rotor) + 1j * W * P_matrix(rotor, W) + Q_matrix(rotor)
-    q_um = 1e6 * np.linalg.solve(dynamic, H[:, 0] - 1j * H[:, 1])  # rows y1, y2, psi, z1, z2, phi
+    W, q_um = LAB.operation.speed_rad_s, unbalance_um()
     circle = np.exp(1j * np.linspace(0, 2 * np.pi, 20_000))
     assert [orbit.location for orbit in snapshot.orbits] == ["bearing", "disc"]
     for orbit, q_y, q_z in zip(snapshot.orbits, q_um[[0, 1]], q_um[[3, 4]], strict=True):

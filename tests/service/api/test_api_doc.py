@@ -19,7 +19,6 @@ from rotorwatch.records.monitor import Problem
 from service.access.guard import Guard
 from service.api.app import create_app
 from service.runtime.runtime import Runtime
-from service.settings.service import ServiceSettings
 from tests.service.rig.live import ROOT, settings, until
 from tests.service.rig.monitored import GUARDED, PLACE, client, fed, token
 
@@ -31,7 +30,7 @@ WIDTH = 118
 
 def description() -> dict[str, Any]:
     """The service's own description, of a service that does not run."""
-    plan: ServiceSettings = settings("tcp/127.0.0.1:0")
+    plan = settings("tcp/127.0.0.1:0")
     runtime = Runtime(plan)
     store = runtime.store
     app = create_app(runtime, Guard(store.tokens, store.audit, plan.access, plan.http.host))
@@ -162,9 +161,7 @@ def test_every_section_says_more_than_the_description() -> None:
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
     """Address and token of a service with an alarm of a gap."""
     with fed(tmp_path_factory.mktemp("machine"), GUARDED) as (runtime, feed):
-        feed.put_good()
-        feed.skip()
-        feed.put_good()
+        feed.gap()
         with client(runtime, token(runtime)) as http:
             until(lambda: '"unacknowledged"' in http.get(f"{PLACE}/alarms").text, "alarm")
         yield runtime.http_url, token(runtime, name="reader of the page")

@@ -29,8 +29,8 @@ from service.runtime.runtime import Runtime, running
 from service.settings.access import AccessSettings, LimitSettings
 from service.settings.service import MachineEntry
 from service.stream.monitored import Monitored
-from tests.service.rig.live import endpoint, settings, until
-from tests.service.rig.monitored import OPEN, client, fed, problem, token
+from tests.service.rig.live import OPEN, endpoint, settings, until
+from tests.service.rig.monitored import client, fed, problem, token
 
 EVENTS = "/api/v1/events"
 LAB, HEAVY = "demo/lab", "demo/heavy"
@@ -39,10 +39,8 @@ LAB, HEAVY = "demo/lab", "demo/heavy"
 @contextmanager
 def monitor(access: AccessSettings = OPEN) -> Iterator[Runtime]:
     """Two machines without data."""
-    plan = settings(endpoint()).model_copy(
-        update={"access": access, "machines": (MachineEntry(file="lab"), MachineEntry(file="heavy"))}
-    )
-    with running(plan) as runtime:
+    machines = (MachineEntry(file="lab"), MachineEntry(file="heavy"))
+    with running(settings(endpoint(), access=access, machines=machines)) as runtime:
         yield runtime
 
 
@@ -442,23 +440,15 @@ def test_while_the_history_cannot_be_read_a_stream_waits(shared: Runtime, monkey
         asked.set()
         raise StoreError("the disk is gone")
 
-    with reading(shared, f"?machine={LAB}") as reader:
+    with reading(shared, f"?machine={LAB}") as reader, client(shared) as http:
         reader.next("start")
         monkeypatch.setattr(lab.history, "events", fail)
         happen(lab, 2)
         assert asked.wait(180)
+        found = problem(http.get(f"/api/v1/machines/{LAB}/alarms/events"), 503)
+        assert found.detail == "the history cannot be used: the disk is gone"
         monkeypatch.setattr(lab.history, "events", read)
         assert [one.data.sequence for one in reader.alarms(2)] == [
             lab.history.last_sequence() - 1,
             lab.history.last_sequence(),
         ]
-
-
-def test_a_history_that_fails_is_a_problem(shared: Runtime, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(**_: object) -> Any:
-        raise StoreError("the disk is gone")
-
-    monkeypatch.setattr(shared.machines()[0].history, "events", fail)
-    with client(shared) as http:
-        found = problem(http.get("/api/v1/machines/demo/lab/alarms/events"), 503)
-    assert found.detail == "the history cannot be used: the disk is gone"

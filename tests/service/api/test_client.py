@@ -36,11 +36,23 @@ from rotorwatch.client import errors
 from service.access.scopes import Scope
 from service.monitor.conversion import machine_description
 from service.runtime.runtime import Runtime, running
-from service.settings.access import AccessSettings, HttpTlsSettings
-from service.settings.service import HistorySettings, HttpSettings, ServiceSettings
+from service.settings.access import AccessSettings
+from service.settings.service import HttpSettings, ServiceSettings
 from service.stream.worker import MachineWorker
-from tests.service.rig.live import IN_ORDER, ROOT, Feed, endpoint, machine_file, open_session, settings, until
-from tests.service.rig.monitored import GUARDED, OPEN, client, faulty, fed, token
+from tests.service.access.test_access_tokens import files
+from tests.service.rig.live import (
+    IN_ORDER,
+    OPEN,
+    ROOT,
+    Feed,
+    endpoint,
+    kept_in,
+    machine_file,
+    open_session,
+    settings,
+    until,
+)
+from tests.service.rig.monitored import GUARDED, client, faulty, fed, token
 
 PLACE = "demo/lab"
 PAGE = (ROOT / "docs" / "client.md").read_text(encoding="utf-8")
@@ -201,17 +213,14 @@ def gapped(plan: ServiceSettings, *, feed_it: bool = True) -> Iterator[Runtime]:
         if feed_it:
             with open_session(plan.link.listen[0]) as session:
                 feed = Feed(session)
-                feed.put_good()
-                feed.skip()
-                feed.put_good()
+                feed.gap()
                 until(lambda: runtime.machines()[0].alarms().sequence >= 0, "alarm")
         yield runtime
 
 
 def plan(folder: Path, **changes: object) -> ServiceSettings:
     latching = ("[alarms]", '[alarms]\nlatching = ["data-gap"]')
-    made = settings(endpoint(), machine_file(folder, IN_ORDER, latching), when_full="wait")
-    return made.model_copy(update=changes)
+    return settings(endpoint(), machine_file(folder, IN_ORDER, latching), when_full="wait").model_copy(update=changes)
 
 
 def test_operators_work(tmp_path: Path) -> None:
@@ -236,8 +245,7 @@ def test_operators_work(tmp_path: Path) -> None:
 def test_events_go_on_after_a_restart(tmp_path: Path) -> None:
     """The service stops, comes back on the same port with its history, and goes on: each event once, in order."""
     port = int(endpoint().rsplit(":", 1)[1])
-    history = HistorySettings(url=f"sqlite:///{tmp_path / 'history.sqlite'}")
-    kept = plan(tmp_path, history=history, http=HttpSettings(port=port), access=OPEN)
+    kept = plan(tmp_path, history=kept_in(tmp_path), http=HttpSettings(port=port), access=OPEN)
     heard: list[ServiceEvent] = []
     errors: list[Exception] = []
 
@@ -280,17 +288,9 @@ def plant_events_after(plant: Client, cursor: str, count: int) -> list[ServiceEv
 
 
 def test_encrypted(tmp_path: Path) -> None:
-    authority = trustme.CA()
-    issued = authority.issue_cert("127.0.0.1")
-    certificate, key, ca = (tmp_path / name for name in ("service.pem", "service.key", "ca.pem"))
-    certificate.write_bytes(b"".join(blob.bytes() for blob in issued.cert_chain_pems))
-    key.write_bytes(issued.private_key_pem.bytes())
-    key.chmod(0o600)
-    authority.cert_pem.write_to_path(str(ca))
-    tls = HttpTlsSettings(certificate=certificate, key=key)
-    with running(plan(tmp_path, access=AccessSettings(tls=tls))) as runtime:
+    with running(plan(tmp_path, access=AccessSettings(tls=files(tmp_path, trustme.CA())))) as runtime:
         text = token(runtime)
-        with Client(runtime.http_url, text, ca=ca) as plant:
+        with Client(runtime.http_url, text, ca=tmp_path / "ca.pem") as plant:
             assert plant.health(PLACE).state == "warming"
         with Client(runtime.http_url, text) as plant, pytest.raises(NoAnswer, match="certificate"):
             plant.health(PLACE)
@@ -299,10 +299,6 @@ def test_encrypted(tmp_path: Path) -> None:
 
 
 # The page
-
-
-def code(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", PAGE, flags=re.DOTALL)
 
 
 def test_examples_in_the_page_run(

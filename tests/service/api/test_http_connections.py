@@ -33,9 +33,8 @@ EVENTS = b"GET /api/v1/events HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n"
 
 @contextmanager
 def monitor(access: AccessSettings = OPEN, **http: float) -> Iterator[Runtime]:
-    plan = settings(endpoint())
-    http_settings = HttpSettings.model_validate({"port": 0, **http})
-    with running(plan.model_copy(update={"access": access, "http": http_settings})) as runtime:
+    plan = settings(endpoint(), access=access, http=HttpSettings.model_validate({"port": 0, **http}))
+    with running(plan) as runtime:
         yield runtime
 
 

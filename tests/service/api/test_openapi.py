@@ -214,6 +214,9 @@ def test_the_page_of_the_api_loads_nothing_from_elsewhere(http: httpx.Client) ->
 def test_everything_is_described_with_examples(description: dict[str, Any]) -> None:
     """Every argument in words, every body and answer with an example that its own schema accepts."""
     schemas = description["components"]["schemas"]
+    for name, schema in schemas.items():
+        for field, part in schema.get("properties", {}).items():
+            assert part.get("description") or set(part) == {"$ref"}, f"{name}.{field}"
     for path, methods in description["paths"].items():
         for method, route in methods.items():
             place = f"{method.upper()} {path}"

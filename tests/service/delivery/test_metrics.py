@@ -16,9 +16,9 @@ from service.delivery.metrics.requests import RequestCounts
 from service.history.records import StoreError
 from service.monitor.reports import Tally
 from service.runtime.runtime import Runtime, running
-from service.settings.service import HistorySettings
+from service.settings.service import RecordingSettings
 from tests.service.delivery.hooked import hook, settings_for
-from tests.service.rig.live import IN_ORDER, ROOT, Feed, endpoint, machine_file, open_session, settings, until
+from tests.service.rig.live import IN_ORDER, ROOT, Feed, endpoint, kept_in, machine_file, open_session, settings, until
 from tests.service.rig.monitored import GUARDED, PLACE, client, token
 
 LAB = {"site": "demo", "machine": "lab"}
@@ -74,19 +74,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def served(folder: Path) -> Iterator[tuple[Runtime, str, Read]]:
     """12 good blocks, one with a nan, one of a number that was there, 3 s missing, 2 good blocks; recorded."""
     address = endpoint()
-    file = machine_file(folder, IN_ORDER)
     (folder / "recordings").mkdir()
-    plan = settings(address, file, when_full="wait")
-    recording = plan.recording.model_copy(update={"directory": str(folder / "recordings")})
     with hook() as receiver:
-        plan = plan.model_copy(
-            update={
-                "access": GUARDED,
-                "recording": recording,
-                "history": HistorySettings(url=f"sqlite:///{folder / 'history.sqlite'}"),
-                "webhooks": (settings_for(receiver, folder),),
-            }
-        )
+        plan = settings(
+            address, machine_file(folder, IN_ORDER), when_full="wait", access=GUARDED, history=kept_in(folder),
+            recording=RecordingSettings(directory=str(folder / "recordings")),
+            webhooks=(settings_for(receiver, folder),),
+        )  # fmt: skip
         with running(plan) as runtime, open_session(address) as session:
             worker = runtime.machines()[0]
             feed = Feed(session)
@@ -245,14 +239,10 @@ def test_webhooks_over_http(served: tuple[Runtime, str, Read]) -> None:
 
 def test_after_a_restart(tmp_path: Path) -> None:
     address = endpoint()
-    file = machine_file(tmp_path, IN_ORDER)
-    plan = settings(address, file, when_full="wait")
-    plan = plan.model_copy(update={"history": HistorySettings(url=f"sqlite:///{tmp_path / 'history.sqlite'}")})
+    plan = settings(address, machine_file(tmp_path, IN_ORDER), when_full="wait", history=kept_in(tmp_path))
     with running(plan) as runtime, open_session(address) as session:
         feed = Feed(session)
-        feed.put_good()
-        feed.skip()
-        feed.put_good()
+        feed.gap()
         until(lambda: runtime.machines()[0].history.last_sequence() == 0, "the alarm on the gap")
         until(lambda: parsed(runtime.metrics.text().decode()).of_lab("alarm_events_total", kind="raised") == 1, "count")
         assert parsed(runtime.metrics.text().decode()).of_lab("restored_at_start") == 0.0

@@ -12,11 +12,21 @@ from rotorwatch.records.health import HealthState
 from rotorwatch.records.monitor import MachineReadiness, Readiness
 from service.history.store import Store
 from service.runtime.runtime import Runtime, readiness_of, running
-from service.settings.service import HistorySettings, ServiceSettings
+from service.settings.service import ServiceSettings
 from service.stream.liveness import Pulse
 from tests.service.delivery.hooked import hook, settings_for
 from tests.service.delivery.test_metrics import parsed
-from tests.service.rig.live import IN_ORDER, Feed, endpoint, machine_file, open_session, service, settings, until
+from tests.service.rig.live import (
+    IN_ORDER,
+    Feed,
+    endpoint,
+    kept_in,
+    machine_file,
+    open_session,
+    service,
+    settings,
+    until,
+)
 from tests.service.rig.monitored import client
 
 
@@ -31,44 +41,38 @@ def test_a_history_that_cannot_be_written_is_a_reason_until_it_can(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address, file = endpoint(), tmp_path / "history.sqlite"
-    machine = machine_file(tmp_path, IN_ORDER)
-    plan = settings(address, machine, when_full="wait")
     # As the runtime makes it, but not as patient with its database.
     monkeypatch.setattr("service.runtime.runtime.Store", partial(Store, timeout_s=2.0, retry_s=0.05))
-    runtime = Runtime(plan.model_copy(update={"history": HistorySettings(url=f"sqlite:///{file}")}))
-    runtime.start()
-    try:
-        with open_session(address) as session:
-            assert asked(runtime) == (200, runtime.readiness())  # nothing has come that could be on its way
-            assert runtime.readiness().ready
-            feed = Feed(session)
-            feed.put_good()
-            until(lambda: runtime.machines()[0].health().quality.accepted_blocks == 1, "the first block")
-            blocker = sqlite3.connect(file, isolation_level=None)  # another program that does not let go of the file
-            blocker.execute("BEGIN IMMEDIATE")
-            feed.skip()
-            feed.put_good()  # an alarm on the gap, which must be written
-            until(lambda: not runtime.readiness().ready, "trouble")
-            status, found = asked(runtime)
-            assert (status, found.history_open, found.session_open) == (503, True, True)
-            assert str(file) in found.history_trouble
-            assert found.reasons == (
-                f"the history cannot be written, what happens waits in memory: {found.history_trouble}",
-            )
-            assert found.machines[0].history_waiting >= 1
-            read = parsed(runtime.metrics.text().decode())
-            assert (read("ready"), read("history_failing")) == (0.0, 1.0)
-            assert read.of_lab("history_waiting_steps") >= 1.0
-            assert read.of_lab("alarm_events_total", kind="raised") == 0.0  # it is not in the history yet
-            blocker.execute("ROLLBACK")
-            blocker.close()
-            until(lambda: runtime.readiness().ready, "recovery")
-            status, found = asked(runtime)
-            assert (status, found.reasons, found.machines[0].history_waiting) == (200, (), 0)
-            read = parsed(runtime.metrics.text().decode())
-            assert (read("ready"), read.of_lab("alarm_events_total", kind="raised")) == (1.0, 1.0)
-    finally:
-        runtime.stop()
+    plan = settings(address, machine_file(tmp_path, IN_ORDER), when_full="wait", history=kept_in(tmp_path))
+    with running(plan) as runtime, open_session(address) as session:
+        assert asked(runtime) == (200, runtime.readiness())  # nothing has come that could be on its way
+        assert runtime.readiness().ready
+        feed = Feed(session)
+        feed.put_good()
+        until(lambda: runtime.machines()[0].health().quality.accepted_blocks == 1, "the first block")
+        blocker = sqlite3.connect(file, isolation_level=None)  # another program that does not let go of the file
+        blocker.execute("BEGIN IMMEDIATE")
+        feed.skip()
+        feed.put_good()  # an alarm on the gap, which must be written
+        until(lambda: not runtime.readiness().ready, "trouble")
+        status, found = asked(runtime)
+        assert (status, found.history_open, found.session_open) == (503, True, True)
+        assert str(file) in found.history_trouble
+        assert found.reasons == (
+            f"the history cannot be written, what happens waits in memory: {found.history_trouble}",
+        )
+        assert found.machines[0].history_waiting >= 1
+        read = parsed(runtime.metrics.text().decode())
+        assert (read("ready"), read("history_failing")) == (0.0, 1.0)
+        assert read.of_lab("history_waiting_steps") >= 1.0
+        assert read.of_lab("alarm_events_total", kind="raised") == 0.0  # it is not in the history yet
+        blocker.execute("ROLLBACK")
+        blocker.close()
+        until(lambda: runtime.readiness().ready, "recovery")
+        status, found = asked(runtime)
+        assert (status, found.reasons, found.machines[0].history_waiting) == (200, (), 0)
+        read = parsed(runtime.metrics.text().decode())
+        assert (read("ready"), read.of_lab("alarm_events_total", kind="raised")) == (1.0, 1.0)
 
 
 def test_a_stuck_worker_is_a_reason_until_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,6 +94,8 @@ def test_a_stuck_worker_is_a_reason_until_it_goes_on(monkeypatch: pytest.MonkeyP
         assert asked(runtime)[0] == 200
         worker.stop()
         assert runtime.readiness().reasons == ("demo/lab: the thread that evaluates its blocks has stopped",)
+        assert asked(runtime)[0] == 503
+        assert httpx.get(f"{runtime.http_url}/healthz", trust_env=False, timeout=180.0).json() == {"alive": True}
 
 
 def void(_: object) -> None:
@@ -101,13 +107,10 @@ def test_webhooks_and_recorders_are_stated_and_no_reason(tmp_path: Path, monkeyp
     address = endpoint()
     machine = machine_file(tmp_path, IN_ORDER)
     with hook(lambda _: (503, {})) as receiver:
-        plan = settings(address, machine, when_full="wait")
-        plan = plan.model_copy(update={"webhooks": (settings_for(receiver, tmp_path),)})
+        plan = settings(address, machine, when_full="wait", webhooks=(settings_for(receiver, tmp_path),))
         with running(plan) as runtime, open_session(address) as session:
             feed = Feed(session)
-            feed.put_good()
-            feed.skip()
-            feed.put_good()
+            feed.gap()
             until(lambda: runtime.readiness().failing_webhooks != (), "the webhook that fails")
             status, found = asked(runtime)
             assert (status, found.failing_webhooks) == (200, ("pager: 503 Service Unavailable",))
@@ -117,7 +120,7 @@ def test_webhooks_and_recorders_are_stated_and_no_reason(tmp_path: Path, monkeyp
 def test_a_replay_tells_nobody(tmp_path: Path) -> None:
     """A monitor in a namespace hears a recording, whose alarms are none of today's."""
     with hook() as receiver:
-        plan = settings(endpoint()).model_copy(update={"webhooks": (settings_for(receiver, tmp_path),)})
+        plan = settings(endpoint(), webhooks=(settings_for(receiver, tmp_path),))
         assert started(plan) == ["pager"]
         link = plan.link.model_copy(update={"namespace": "replay/monday"})
         assert started(plan.model_copy(update={"link": link})) == []
@@ -126,38 +129,6 @@ def test_a_replay_tells_nobody(tmp_path: Path) -> None:
 def started(plan: ServiceSettings) -> list[str]:
     with running(plan) as runtime:
         return [status.name for status in runtime.webhooks.statuses().webhooks]
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"session_open": False}, "the Zenoh session is closed: nothing arrives and nothing is published"),
-        ({"history_open": False}, "the history is not open, or its tables are not up to date"),
-        ({"history_trouble": "disk full"}, "the history cannot be written, what happens waits in memory: disk full"),
-    ],
-)
-def test_each_reason_in_a_sentence(change: dict[str, object], reason: str) -> None:
-    good: dict[str, object] = {
-        "session_open": True, "history_open": True, "history_trouble": "", "history_lost": "",
-        "failing_webhooks": ("pager: 404",),
-        "machines": [machine()],
-    }  # fmt: skip
-    assert readiness_of(**good).ready  # type: ignore[arg-type]  # as below
-    found = readiness_of(**(good | change))  # type: ignore[arg-type]  # fields of any kind
-    assert (found.ready, found.reasons) == (False, (reason,))
-
-
-def test_the_trouble_of_one_machine_is_a_reason_that_names_it() -> None:
-    machines = [machine(), machine(machine="pump", trouble="no window was evaluated")]
-    found = readiness_of(
-        session_open=True,
-        machines=machines,
-        history_open=True,
-        history_trouble="",
-        history_lost="",
-        failing_webhooks=(),
-    )
-    assert found.reasons == ("demo/pump: no window was evaluated",)
 
 
 def machine(**changes: object) -> MachineReadiness:
@@ -169,14 +140,26 @@ def machine(**changes: object) -> MachineReadiness:
     return MachineReadiness.model_validate(fields | changes)
 
 
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"machines": [machine(), machine(machine="pump", trouble="no window")]}, "demo/pump: no window"),
+        ({"session_open": False}, "the Zenoh session is closed: nothing arrives and nothing is published"),
+        ({"history_open": False}, "the history is not open, or its tables are not up to date"),
+        ({"history_trouble": "disk full"}, "the history cannot be written, what happens waits in memory: disk full"),
+    ],
+)
+def test_each_reason_in_a_sentence(change: dict[str, object], reason: str) -> None:
+    good: dict[str, object] = {
+        "session_open": True, "history_open": True, "history_trouble": "", "history_lost": "",
+        "failing_webhooks": ("pager: 404",), "machines": [machine()],
+    }  # fmt: skip
+    assert readiness_of(**good).ready  # type: ignore[arg-type]  # as below
+    found = readiness_of(**(good | change))  # type: ignore[arg-type]  # fields of any kind
+    assert (found.ready, found.reasons) == (False, (reason,))
+
+
 def test_a_pulse_that_nobody_will_answer_is_not_waited_for() -> None:
     pulse = Pulse(lambda _: False, lambda: None, clock=iter([1.0, 100.0]).__next__)
     pulse.beat()
     assert pulse.busy_s == 0.0
-
-
-def test_liveness_is_not_readiness(tmp_path: Path) -> None:
-    with service(endpoint()) as (runtime, worker):
-        worker.stop()
-        assert asked(runtime)[0] == 503
-        assert httpx.get(f"{runtime.http_url}/healthz", trust_env=False, timeout=180.0).json() == {"alive": True}

@@ -141,7 +141,7 @@ def test_a_monitor_does_not_start_without_its_secrets(tmp_path: Path) -> None:
     """Rather not at all than without telling anybody of alarms."""
     webhook = WebhookSettings(name="pager", url="https://p.example/", secret_file=tmp_path / "none")
     with pytest.raises(MachineFileError, match=r"webhooks\.pager: secret_file"):
-        Runtime(settings(endpoint()).model_copy(update={"webhooks": (webhook,)}))
+        Runtime(settings(endpoint(), webhooks=(webhook,)))
 
 
 @pytest.fixture
@@ -236,9 +236,7 @@ def test_a_monitor_logs_what_is_not_delivered_and_no_secret(tmp_path: Path) -> N
             monitor.url()
             with open_session(address) as session:
                 feed = Feed(session)
-                feed.put_good()
-                feed.skip()
-                feed.put_good()
+                feed.gap()
             until(lambda: len(receiver.got) >= 2, "another attempt")
             assert monitor.stop() == 0
     assert {got.path for got in receiver.got} == {f"/hook/{path}"}

@@ -7,16 +7,14 @@ import pytest
 
 from rotorwatch.records.health import HealthState
 from rotorwatch.records.history import AlarmEvidence
-from service.history.records import Retention
-from service.history.store import Store
 from service.runtime.runtime import running
-from service.settings.service import HistorySettings, MachineEntry
 from simulator.scenario import parse_fault
 from tests.service.rig.live import (
     LAB,
     SHORT,
     Feed,
     endpoint,
+    kept_in,
     machine_file,
     open_session,
     scenario_blocks,
@@ -24,6 +22,7 @@ from tests.service.rig.live import (
     until,
 )
 from tests.service.rig.monitored import PLACE, client, problem
+from tests.service.rig.postgres import opened
 
 FAULT_S = 40.0
 CHANGED = -0.33
@@ -32,14 +31,8 @@ HOP = 50
 
 
 def test_an_alarm_can_be_understood_long_after_its_window_is_gone(tmp_path: Path) -> None:
-    file = machine_file(tmp_path, *SHORT)
     address = endpoint()
-    plan = settings(address, when_full="wait").model_copy(
-        update={
-            "machines": (MachineEntry(file=file),),
-            "history": HistorySettings(url=f"sqlite:///{tmp_path / 'history.sqlite'}"),
-        }
-    )
+    plan = settings(address, machine_file(tmp_path, *SHORT), when_full="wait", history=kept_in(tmp_path))
     blocks = scenario_blocks(100.0, parse_fault(f"k_by={CHANGED}@{FAULT_S:g}"))
     with running(plan) as runtime, open_session(address) as session, client(runtime) as http:
         worker = runtime.machines()[0]
@@ -102,14 +95,12 @@ def test_an_alarm_can_be_understood_long_after_its_window_is_gone(tmp_path: Path
 def test_evidence_of_many_occurrences_does_not_grow_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.history.machine._MOST_EVIDENCE", 3)
     clock = iter(range(1, 100))
-    store = Store("sqlite:///:memory:", Retention(), now_ns=lambda: next(clock))
-    store.open()
-    lab, other = store.machine("demo", "lab"), store.machine("demo", "other")
-    other.keep_evidence("e", 1, "other")
-    for occurrence in range(1, 8):
-        lab.keep_evidence("e", occurrence, f"{occurrence}")
-    lab.keep_evidence("e", 7, "seven")
-    assert [lab.evidence("e", occurrence) for occurrence in range(4, 8)] == [None, "5", "6", "seven"]
-    assert lab.evidence("e") == "seven"
-    assert other.evidence("e") == "other"
-    store.close()
+    with opened("sqlite:///:memory:", now_ns=lambda: next(clock)) as store:
+        lab, other = store.machine("demo", "lab"), store.machine("demo", "other")
+        other.keep_evidence("e", 1, "other")
+        for occurrence in range(1, 8):
+            lab.keep_evidence("e", occurrence, f"{occurrence}")
+        lab.keep_evidence("e", 7, "seven")
+        assert [lab.evidence("e", occurrence) for occurrence in range(4, 8)] == [None, "5", "6", "seven"]
+        assert lab.evidence("e") == "seven"
+        assert other.evidence("e") == "other"

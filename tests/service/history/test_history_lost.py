@@ -9,15 +9,14 @@ import pytest
 from typer.testing import CliRunner
 
 from models.alarm_names import FAULT
-from service.history.records import Retention, StoredEvent, TokenRecord
-from service.history.store import Store
+from service.history.records import StoredEvent, StoreError, TokenRecord
 from service.rotorwatch import app
 from service.runtime.runtime import running as running_here
-from service.settings.service import HistorySettings
 from tests.service.history.test_store import AUDIT, T0, alarm_event
 from tests.service.monitor.test_alarm_trouble import Bench, bench, block
-from tests.service.rig.live import PATIENT, endpoint, machine_file, settings, until
+from tests.service.rig.live import PATIENT, endpoint, kept_in, machine_file, settings, until
 from tests.service.rig.monitored import client
+from tests.service.rig.postgres import opened
 from tests.service.runtime.test_survives import do, running
 
 TOKEN = TokenRecord("aaaa", "control room", ("read",), b"hash", T0, None, None)
@@ -100,9 +99,8 @@ def test_a_history_that_was_replaced_goes_on_with_the_numbers_of_the_alarms(tmp_
     if damaged:
         other.write_bytes(b"no database " * 1000)
     else:
-        store = Store(f"sqlite:///{other}", Retention())
-        store.open()
-        store.close()
+        with opened(f"sqlite:///{other}"):
+            pass
     with bench(tmp_path) as at:
         at.put(*map(block, range(12)), block(40, run=2, sequence=0))
         at.put(*(block(40 + n, run=2, sequence=n) for n in range(1, 35)))
@@ -116,11 +114,11 @@ def test_a_history_that_was_replaced_goes_on_with_the_numbers_of_the_alarms(tmp_
         assert at.log() == [(last + 1, "raised", FAULT)]
         assert in_file(tmp_path, "SELECT count(*) FROM checkpoints") == state == [(1,)]
         # Nobody else gets the machine meanwhile.
-        second = Store(f"sqlite:///{history_of(tmp_path)}", Retention())
-        second.open()
-        with pytest.raises(Exception, match="another monitor writes the history of demo/lab"):
+        with (
+            opened(f"sqlite:///{history_of(tmp_path)}") as second,
+            pytest.raises(StoreError, match="another monitor writes the history of demo/lab"),
+        ):
             second.machine("demo", "lab")
-        second.close()
     assert len(list(tmp_path.glob("history.sqlite.damaged-*"))) == damaged
     with bench(tmp_path) as at:
         assert at.worker.restart.startswith("went on where it stood")
@@ -144,8 +142,7 @@ def test_a_machine_without_a_new_alarm_keeps_its_numbers_in_a_file_begun_anew(tm
 @pytest.mark.parametrize("where", ["head", "tables"])
 def test_a_monitor_starts_with_a_damaged_history_and_keeps_it_aside(tmp_path: Path, where: str) -> None:
     file = history_of(tmp_path)
-    plan = settings(endpoint(), machine_file(tmp_path, PATIENT))
-    plan = plan.model_copy(update={"history": HistorySettings(url=f"sqlite:///{file}")})
+    plan = settings(endpoint(), machine_file(tmp_path, PATIENT), history=kept_in(tmp_path))
     with running_here(plan):
         pass
     data = bytearray(file.read_bytes())

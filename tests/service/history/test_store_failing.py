@@ -20,7 +20,7 @@ from sqlalchemy import Select, func, literal, select, text
 
 from service.history.database import Database
 from service.history.machine import MachineStore
-from service.history.records import Retention, Step, StoreError
+from service.history.records import Step, StoreError
 from service.history.store import Store
 from service.history.tables import MIGRATING
 from tests.service.history.test_store import T0, alarm_event, head, hop_step
@@ -120,14 +120,12 @@ def test_what_waits_is_bounded_and_events_are_never_dropped(parts: Parts) -> Non
 
 def test_what_waits_is_written_at_closing(parts: Parts) -> None:
     url, fail, mend = parts
-    store = Store(url, Retention(), timeout_s=QUICK_S, retry_s=3600.0)
-    store.open()
-    lab = store.machine("demo", "lab")
-    fail()
-    assert not lab.commit(Step(events=(alarm_event(0),)))
-    assert not lab.commit(Step(events=(alarm_event(1),)))
-    mend()
-    store.close()
+    with history_opened(url, timeout_s=QUICK_S, retry_s=3600.0) as store:
+        lab = store.machine("demo", "lab")
+        fail()
+        assert not lab.commit(Step(events=(alarm_event(0),)))
+        assert not lab.commit(Step(events=(alarm_event(1),)))
+        mend()
     with opened(url) as store:
         assert store.machine("demo", "lab").last_sequence() == 1
 

@@ -4,7 +4,7 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -56,7 +56,15 @@ def test_pages_are_everything_once(
 ) -> None:
     lab = store.machine("demo", uuid.uuid4().hex)
     edges = sorted({0, len(times), *(min(cut, len(times)) for cut in cuts)})
-    events = [alarm_event(n, time_ns=time, alarm=("e", "model")[n % 2]) for n, time in enumerate(times)]
+    kinds = [
+        {
+            "alarm": ("e", "model")[n % 2],
+            "kind": ("raised", "cleared")[n % 3 // 2],
+            "severity": ("alert", "danger")[n % 5 // 4],
+        }
+        for n in range(len(times))
+    ]
+    events = [alarm_event(n, time_ns=time, **kinds[n]) for n, time in enumerate(times)]
     reports = [StoredReport(0, time, "healthy", 1.0, f"{n}") for n, time in enumerate(times)]
     readings = [StoredReading(time, "misfit", "z", float(n), None) for n, time in enumerate(times)]
     for first, last in pairwise(edges):
@@ -72,7 +80,7 @@ def test_pages_are_everything_once(
         return lab.readings(quantity="misfit", name="z", since_ns=since, until_ns=until, after=after, limit=limit)
 
     def forth(after: int | None) -> tuple[StoredEvent, ...]:
-        return lab.events(after=after, since_ns=since, until_ns=until, alarm="e", limit=limit)
+        return lab.events(after=after, since_ns=since, until_ns=until, limit=limit, **wanted)
 
     def back(before: int | None) -> tuple[StoredEvent, ...]:
         return lab.events(before=before, since_ns=since, until_ns=until, limit=limit, newest_first=True)
@@ -80,5 +88,8 @@ def test_pages_are_everything_once(
     assert [report for _, report in pages(older, lambda row: row[0], limit)] == [reports[n] for n in chosen[::-1]]
     singles = pages(later, lambda reading: reading.number, limit)
     assert [(one.end_ns, one.value) for one in singles] == [(readings[n].end_ns, readings[n].value) for n in chosen]
-    assert pages(forth, lambda event: event.sequence, limit) == [events[n] for n in chosen if n % 2 == 0]
+    wanted: dict[str, Any]
+    for wanted in ({"alarm": "e"}, {"kind": "cleared"}, {"alarm": "e", "kind": "raised", "severity": "danger"}):
+        found = [events[n] for n in chosen if wanted.items() <= kinds[n].items()]
+        assert pages(forth, lambda event: event.sequence, limit) == found
     assert pages(back, lambda event: event.sequence, limit) == [events[n] for n in chosen[::-1]]

@@ -14,6 +14,7 @@ from service.history.store import Store
 from service.history.tables import buckets, machines
 from service.history.windows import READING, add_up, packed, singles, unpacked
 from tests.service.history.test_store import T0, executed
+from tests.service.rig.postgres import opened
 
 NS = 1_000_000_000
 BUCKET = 600 * NS
@@ -129,15 +130,11 @@ def test_readings_count_once_when_the_length_of_buckets_is_another_after_a_resta
 ) -> None:
     monkeypatch.setattr("service.history.trend._SINGLE", 0)
     for number, bucket_s in enumerate((600, 60, 600)):
-        store = Store(url, Retention(bucket_s=bucket_s))
-        store.open()
-        try:
+        with opened(url, Retention(bucket_s=bucket_s)) as store:
             lab = store.machine("demo", "lab")
             for time_s in range(5, 300, 50):
                 commit(lab, 300 * number + time_s)
             assert sum(counts(lab)) == 6 * (number + 1)
-        finally:
-            store.close()
 
 
 def test_a_window_whose_readings_are_damaged_is_passed_over(store: Store, url: str) -> None:

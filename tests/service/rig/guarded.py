@@ -23,9 +23,10 @@ from service.access.problems import add_problems
 from service.access.scopes import Caller, Scope
 from service.access.tls import server_arguments
 from service.access.tokens import new_token
-from service.history.records import AuditEntry, Retention, TokenRecord
+from service.history.records import AuditEntry, TokenRecord
 from service.history.store import Store
 from service.settings.access import AccessSettings
+from tests.service.rig.postgres import opened
 
 JSON = {"content-type": "application/json"}
 
@@ -176,17 +177,13 @@ def guarded(
 ) -> Iterator[Guarded]:
     """The application of `build` behind its guard, with a store in `folder`."""
     access = access or AccessSettings()
-    store = Store(f"sqlite:///{folder / 'history.sqlite'}", Retention())
-    store.open()
-    try:
+    with opened(f"sqlite:///{folder / 'history.sqlite'}") as store:
         clock, done = Clock(), list[str]()
         guard = Guard(store.tokens, store.audit, access, "127.0.0.1", monotonic=clock)
         app = build(guard, done)
         guard.protect(app)
         with served(app, **server_arguments(access)) as url:
             yield Guarded(url, store, guard, app, clock, done)
-    finally:
-        store.close()
 
 
 def basic(token: str, user: str = "x") -> dict[str, str]:

@@ -78,10 +78,15 @@ def open_session(connect: str, mode: Literal["peer", "client"] = "peer") -> Iter
 
 
 def settings(
-    listen: str, machine: str = "lab", bundle: str | None = None, when_full: str = "drop", bound: int = 600
+    listen: str,
+    machine: str = "lab",
+    bundle: str | None = None,
+    when_full: str = "drop",
+    bound: int = 600,
+    **others: object,
 ) -> ServiceSettings:
-    """Settings of a service on loopback with a free HTTP port."""
-    return ServiceSettings(
+    """Settings of a service on loopback with a free HTTP port, and others of its sections."""
+    made = ServiceSettings(
         link=LinkSettings(listen=(listen,)),
         http=HttpSettings(port=0),
         history=IN_MEMORY,
@@ -89,6 +94,12 @@ def settings(
         machines=(MachineEntry(file=machine, bundle=bundle),),
         queue=QueueSettings.model_validate({"blocks": bound, "when_full": when_full}),
     )
+    return made.model_copy(update=others)
+
+
+def kept_in(folder: Path) -> HistorySettings:
+    """Settings of a history that is there after a restart."""
+    return HistorySettings(url=f"sqlite:///{folder / 'history.sqlite'}")
 
 
 def worker_of(runtime: Runtime) -> MachineWorker:
@@ -195,6 +206,12 @@ class Feed:
         """Leave out so much: a gap before the next block."""
         self.sequence += 10 * seconds
         self.start_ns += seconds * 10**9
+
+    def gap(self) -> None:
+        """Publish two good blocks with a gap between them."""
+        self.put_good()
+        self.skip()
+        self.put_good()
 
 
 @dataclass(slots=True)

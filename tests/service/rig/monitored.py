@@ -15,10 +15,12 @@ from service.access.scopes import Scope
 from service.access.tokens import new_token
 from service.runtime.runtime import Runtime, running
 from service.settings.access import AccessSettings, LimitSettings
+from service.settings.service import RecordingSettings
 from service.stream.worker import MachineWorker
 from simulator.scenario import parse_fault
 from tests.service.rig.live import (
     IN_ORDER,
+    OPEN,
     PATIENT,
     Feed,
     endpoint,
@@ -32,7 +34,6 @@ from tests.service.rig.live import (
 )
 
 PLACE = "/api/v1/machines/demo/lab"
-OPEN = AccessSettings(open_on_loopback=True, limits=LimitSettings(requests_per_minute=1_000_000))
 GUARDED = AccessSettings(
     limits=LimitSettings(requests_per_minute=1_000_000, failures_per_minute=100_000, refusals_recorded_per_minute=1000)
 )
@@ -46,9 +47,8 @@ def faulty(folder: Path, access: AccessSettings = OPEN) -> Iterator[tuple[Runtim
     address = endpoint()
     file = machine_file(folder, ("on_delay_s = 5.0", "on_delay_s = 10.0"), PATIENT)
     (folder / "recordings").mkdir(exist_ok=True)
-    plan = settings(address, file, bundle="lab", when_full="wait")
-    recording = plan.recording.model_copy(update={"directory": folder / "recordings"})
-    with running(plan.model_copy(update={"access": access, "recording": recording})) as runtime:
+    kept = RecordingSettings(directory=str(folder / "recordings"))
+    with running(settings(address, file, bundle="lab", when_full="wait", access=access, recording=kept)) as runtime:
         worker = worker_of(runtime)
         send(address, scenario_blocks(78.0, parse_fault("k_by=-0.33@0")), load_machine(file))
         until(lambda: worker.health().quality.accepted_blocks == 780, "all blocks")
@@ -60,8 +60,8 @@ def fed(folder: Path, access: AccessSettings = OPEN, *lines: tuple[str, str]) ->
     """The lab machine, which gets the blocks that a test puts; gaps of a second are an alarm at once."""
     address = endpoint()
     file = machine_file(folder, IN_ORDER, *lines)
-    plan = settings(address, file, when_full="wait")
-    with running(plan.model_copy(update={"access": access})) as runtime, open_session(address) as session:
+    plan = settings(address, file, when_full="wait", access=access)
+    with running(plan) as runtime, open_session(address) as session:
         yield runtime, Feed(session)
 
 

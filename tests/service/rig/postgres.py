@@ -101,9 +101,9 @@ def database_url(kind: str, folder: Path, *, empty: bool = False) -> str:
 
 
 @contextmanager
-def opened(url: str, **changes: Any) -> Iterator[Store]:
-    """A history with the usual retention."""
-    store = Store(url, Retention(), **changes)
+def opened(url: str, retention: Retention | None = None, **changes: Any) -> Iterator[Store]:
+    """A history, with the usual retention if no other is given."""
+    store = Store(url, retention or Retention(), **changes)
     store.open()
     try:
         yield store

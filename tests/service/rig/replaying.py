@@ -87,6 +87,19 @@ def machine_blocks(
     ]
 
 
+def without_angle(path: Path, stream: Sequence[SampleBlock]) -> Path:
+    """A recording of the rotor kit without its keyphasor."""
+    machine = LAB.model_copy(update={"sensors": LAB.sensors[:-1]})
+    return recording(path, [replace(one, samples=one.samples[:, :-1].copy()) for one in stream], machine)
+
+
+def made(
+    folder: Path, signals: dict[str, Callable[[FloatArray], FloatArray]], seconds: float, without: Sequence[int] = ()
+) -> Recorded:
+    """What a recording of `machine_blocks` has."""
+    return recorded(recording(folder / "made.mcap", machine_blocks(signals, seconds, without)))
+
+
 def recorded(path: Path, seconds: tuple[float, float] | None = None) -> Recorded:
     """What the rotor kit's recording has, all or between two times."""
     source = RecordingSource([path])

@@ -5,10 +5,12 @@ kept up to date, so where there is none, these tests are skipped (what is asked 
 ``test_access_http.py``). To keep what was seen: ``ROTORWATCH_SCREENSHOTS=FOLDER``.
 """
 
+import json
 import os
 import shutil
+import subprocess
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -16,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deno import find_deno_bin
 from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
 
 from service.runtime.runtime import Runtime, running
@@ -81,14 +84,11 @@ def plant_running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
     """Machine lab with a fault to come, and spare without data."""
     entries = []
     for name in ("lab", "spare"):
-        changes = (
-            *SHORT,
-            ('name = "lab"', f'name = "{name}"'),
-            ("[operation]", "[ingest]\nno_data_after_s = 6.0\n\n[operation]"),
-        )
+        quiet = ("[operation]", "[ingest]\nno_data_after_s = 6.0\n\n[operation]")
+        changes = (*SHORT, quiet, ('name = "lab"', f'name = "{name}"'))
         entries.append(MachineEntry(file=machine_file(tmp_path_factory.mktemp(name), *changes)))
     address = endpoint()
-    plan = settings(address, when_full="wait").model_copy(update={"machines": tuple(entries)})
+    plan = settings(address, when_full="wait", machines=tuple(entries))
     with running(plan) as runtime, open_session(address) as session:
         made = Plant(runtime, Feed(session, LAB))
         session.declare_subscriber(LAB.keys.alarm_event, lambda sample: made.heard.append(sample.payload.to_string()))
@@ -125,10 +125,23 @@ def kept(page: Page, name: str) -> None:
         page.screenshot(path=Path(SCREENSHOTS) / f"{name}.png", full_page=True)
 
 
-def route_events(page: Page, instead: Callable[[Route], None]) -> None:
-    """Tell a page something else than the monitor does, and end that."""
+def tell_instead(page: Page, *healths: Mapping[str, Any]) -> None:
+    """Tell a page health other than the monitor does, as it is when the page asks, and end that."""
+
+    def instead(route: Route) -> None:
+        told = "".join(f"event: health\ndata: {json.dumps(health)}\n\n" for health in healths)
+        route.fulfill(body=f"event: start\ndata: {{}}\n\n{told}", content_type="text/event-stream")
+
     page.add_init_script("delete window.SharedWorker")  # what it asks for cannot be routed
     page.route("**/api/v1/events?*", instead)
+
+
+def run_deno(folder: Path, *arguments: str, given: str = "") -> subprocess.CompletedProcess[str]:
+    """What a command of Deno, which brings TypeScript, says; nothing is fetched."""
+    quiet = {"DENO_DIR": str(folder / "cache"), "DENO_NO_UPDATE_CHECK": "1", "NO_COLOR": "1"}
+    command, *rest = arguments
+    words = [find_deno_bin(), command, "--no-remote", "--quiet", *rest]
+    return subprocess.run(words, input=given, env=os.environ | quiet, capture_output=True, text=True, check=False)
 
 
 def violations(page: Page) -> list[str]:

@@ -1,6 +1,5 @@
 """What a person sees in a browser: a real Chromium opens the pages of a running service."""
 
-import json
 import re
 from collections.abc import Iterator
 from typing import Any
@@ -26,7 +25,7 @@ from tests.service.api.page.browsing import (
     kept,
     looking,
     plant_running,
-    route_events,
+    tell_instead,
     unreached,
     violations,
 )
@@ -146,11 +145,8 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
         page.locator("alarm-list tr", has_text="k_by").get_by_role("link", name="Why?").click()
         why = page.locator("why-view")
         expect(why.get_by_role("heading", level=1)).to_have_text("bearing stiffness, horizontal")
-        expect(why.locator(".verdict")).to_contain_text(
-            re.compile(
-                r"^bearing stiffness, horizontal changed by −3\d\.\d % ± \d\.\d % since 2026-01-01 00:00:[34]\d UTC"
-            )
-        )
+        said = r"^bearing stiffness, horizontal changed by −3\d\.\d % ± \d\.\d % since 2026-01-01 00:00:[34]\d UTC"
+        expect(why.locator(".verdict")).to_contain_text(re.compile(said))
         weighed = why.locator("table", has_text="What else was considered").locator("tbody tr")
         expect(weighed.first).to_contain_text(re.compile("^bearing stiffness, horizontal.*%"))
         expect(weighed.filter(has_text="nothing changed")).to_contain_text("< 0.1 %")
@@ -182,9 +178,8 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
         with looking(browser, url, phone=phone, dark=dark) as page:
             for view, path in VIEWS.items():
                 page.goto(f"{url}/#/{path}")
-                expect(page.locator(f"{view}-view" if view != "alarms" else "alarms-view alarm-list")).to_contain_text(
-                    "lab"
-                )
+                told = page.locator(f"{view}-view" if view != "alarms" else "alarms-view alarm-list")
+                expect(told).to_contain_text("lab")
                 if view == "machine":
                     expect(page.locator("spectrum-plot canvas")).to_be_visible()
                 kept(page, f"{view}-{kind}")
@@ -209,10 +204,6 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
     report["opinions"][0]["agreement"][0]["verdict"] = "disagree"
     told |= {"report": report, "reason": "<b>reason</b> & more"}
 
-    def instead(route: Route) -> None:
-        lines = f"event: start\ndata: {{}}\n\nevent: health\ndata: {json.dumps(told)}\n\n"
-        route.fulfill(body=lines, content_type="text/event-stream")
-
     growing = report["levels"][0] | {"channel": "DE-H"}
     sensor = {"name": "DE-H", "quantity": "acceleration", "location": "DE", "direction": "H", "unit": "m/s2"}
     read = [
@@ -221,7 +212,7 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
     ]
     file = {"description": "", "rotor": None, "operation": None, "sensors": [sensor]}
     with looking(browser, url) as page:
-        route_events(page, instead)
+        tell_instead(page, told)
         page.goto(f"{url}/#/machines/demo/lab")
         view = page.locator("machine-view")
         expect(view).to_contain_text("<b>reason</b> & more")
@@ -239,7 +230,7 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
     told["report"] = report | {"parameters": [], "verdict": None, "levels": [growing]}
     told["alarms"] = [told["alarms"][0] | {"name": "level:DE-H", "severity": "danger"}]
     with looking(browser, url) as page:
-        route_events(page, instead)
+        tell_instead(page, told)
         page.route("**/configuration", lambda route: route.fulfill(json={"file": file}))
         page.route("**/readings?*", lambda route: route.fulfill(json={"buckets": read}))
         page.add_init_script(_WRITTEN)
@@ -258,7 +249,7 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
         expect(page.locator("rotor-drawing svg")).to_contain_text(re.compile(r"[\d.]+ (mm/s|m/s²) rms"))
     told |= {"alarms": [], "state": "not-evaluable"}
     with looking(browser, url) as page:
-        route_events(page, instead)
+        tell_instead(page, told)
         page.goto(f"{url}/#/")
         expect(page.locator("machine-tile .worst")).to_have_text("<b>reason</b> & more")  # not one of its levels
 
@@ -287,21 +278,16 @@ def test_machines_stand_by_site_and_only_lines_that_are_seen_are_asked_for(brows
     url = plant.runtime.http_url
     asked: list[list[str]] = []
 
-    def health(number: int) -> str:
+    def health(number: int) -> dict[str, object]:
         state = {"state": "healthy", "alarms": []} if number != 70 else {}
-        told = {**dict(example(Health)), "site": f"site-{number // 40}", "machine": f"m{number}", **state}
-        return f"event: health\ndata: {json.dumps(told)}\n\n"
-
-    def instead(route: Route) -> None:
-        lines = "event: start\ndata: {}\n\n" + "".join(map(health, range(120)))
-        route.fulfill(body=lines, content_type="text/event-stream")
+        return {**dict(example(Health)), "site": f"site-{number // 40}", "machine": f"m{number}", **state}
 
     def lines(route: Route) -> None:
         asked.append(parse_qs(urlsplit(route.request.url).query)["of"])
         route.fulfill(json={"trends": [{"starts_ns": [1, 2, 3], "means": [0.0, 1.0, 0.5]}] * len(asked[-1])})
 
     with looking(browser, url) as page:
-        route_events(page, instead)
+        tell_instead(page, *map(health, range(120)))
         page.route("**/api/v1/trends?*", lines)
         page.goto(url)
         sites, tiles = page.locator("site-section"), page.locator("machine-tile")

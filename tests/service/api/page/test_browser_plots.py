@@ -1,20 +1,19 @@
 """The plots of a machine in a browser: loaded when they are opened, of what is live and of recordings."""
 
 import importlib
-import json
 import re
 from collections.abc import AsyncIterator, Iterator
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Route, expect
+from playwright.sync_api import Browser, expect
 
 from models.machine import load_machine
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health
 from rotorwatch.records.windows import SensorFault, UnbalanceVector
 from service.runtime.runtime import Runtime
-from tests.service.api.page.browsing import kept, looking, route_events, violations
+from tests.service.api.page.browsing import kept, looking, tell_instead, violations
 from tests.service.rig.live import ROOT
 from tests.service.rig.monitored import faulty
 from tests.service.rig.replaying import recording
@@ -109,12 +108,8 @@ def test_the_drawing_turns_the_unbalance_with_the_shaft_and_names_the_sensor_at_
     file = load_machine("lab").model_dump(mode="json")
     file["operation"]["unbalance_phase_rad"] = 0.5235987755982988
 
-    def instead(route: Route) -> None:
-        lines = f"event: start\ndata: {{}}\n\nevent: health\ndata: {json.dumps(told)}\n\n"
-        route.fulfill(body=lines, content_type="text/event-stream")
-
     with looking(browser, runtime.http_url) as page:
-        route_events(page, instead)
+        tell_instead(page, told)
         page.route("**/configuration", lambda route: route.fulfill(json={"file": file}))
         page.goto(f"{runtime.http_url}/#/machines/demo/lab")
         drawing = page.locator("rotor-drawing")

@@ -2,13 +2,10 @@
 
 import itertools
 import json
-import os
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from deno import find_deno_bin
 
 import service.api
 from rotorwatch.records.alarms import Alarm
@@ -17,6 +14,7 @@ from rotorwatch.records.health import Health, Report
 from rotorwatch.records.levels import ChannelLevels, LevelLimits
 from rotorwatch.records.windows import Parameter
 from service.analysis.overview import nearness, overview
+from tests.service.api.page.browsing import run_deno
 
 STATES = Path(service.api.__file__).parent / "page" / "monitor" / "states.js"
 RAISED = [(), ("k_by",), ("level:y1",), ("stream-lost",), ("k_by", "level:z1"), ("c_by", "stream-lost", "level:y1")]
@@ -97,15 +95,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Health, dict[s
     script.write_text(_ASKED.replace("STATES", STATES.as_uri()))
     all_of_them = list(healths())
     told = [one for health in all_of_them for one in (health, overview(health))]
-    quiet = {"DENO_DIR": str(folder / "cache"), "DENO_NO_UPDATE_CHECK": "1", "NO_COLOR": "1"}
-    done = subprocess.run(
-        [find_deno_bin(), "run", "--no-remote", "--quiet", str(script)],
-        input="[" + ",".join(one.model_dump_json() for one in told) + "]",
-        env=os.environ | quiet,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_deno(folder, "run", str(script), given="[" + ",".join(one.model_dump_json() for one in told) + "]")
     assert done.returncode == 0, done.stderr
     answers = json.loads(done.stdout)
     return list(zip(all_of_them, answers[::2], answers[1::2], strict=True))

@@ -4,15 +4,13 @@ Deno brings TypeScript in a package of Python; nothing of the page is run here, 
 """
 
 import json
-import os
 import re
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
-from deno import find_deno_bin
 
+from tests.service.api.page.browsing import run_deno
 from tests.service.api.test_api_doc import description
 from tests.service.rig.live import ROOT
 
@@ -41,9 +39,7 @@ def found(folder: Path, checked: list[Path]) -> str:
     """What TypeScript finds in modules, on a computer that has fetched nothing and fetches nothing."""
     config = folder / "deno.json"
     config.write_text(json.dumps({"compilerOptions": OPTIONS}))
-    quiet = {"DENO_DIR": str(folder / "cache"), "DENO_NO_UPDATE_CHECK": "1", "NO_COLOR": "1"}
-    command = [find_deno_bin(), "check", "--no-remote", "--quiet", "--config", str(config), *map(str, checked)]
-    done = subprocess.run(command, env=os.environ | quiet, capture_output=True, text=True, check=False)
+    done = run_deno(folder, "check", "--config", str(config), *map(str, checked))
     return done.stdout + done.stderr if done.returncode else ""
 
 
