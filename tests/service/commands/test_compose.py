@@ -134,6 +134,7 @@ def test_the_commands_work_together(tmp_path: Path) -> None:
     with program(tmp_path, *command("router")) as router:
         until(lambda: check_health("router", streams).returncode == 0, "healthy router")
         with program(tmp_path, *command("monitor")) as monitor:
+            monitor.wait_for(f"Zenoh connecting to {address}")
             until(lambda: check_health("monitor", api).returncode == 0, "healthy monitor")
             with program(tmp_path, *command("simulator")) as simulator:
                 until(lambda: monitor.health().filled > 0, "a first hop of data through the router")

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from models.signals.recording import RecordedMessage, read_recording
 from service.rotorwatch import app
-from simulator.recorder import record
 from simulator.scenario import Event, parse_fault
+from tests.service.rig import replaying
 from tests.service.rig.live import LAB, START_NS, scenario_blocks
 from tests.service.rig.preloaded import ran
 from tests.service.rig.replaying import recording, write
@@ -33,17 +33,7 @@ def run_up(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def without_angle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same machine without a keyphasor."""
-    machine = LAB.model_copy(update={"sensors": LAB.sensors[:-1]})
-    stream = [(block, ()) for block in scenario_blocks(5.0)]
-    path = tmp_path_factory.mktemp("plots") / "plain.mcap"
-    short = iter(
-        [
-            (type(block)(block.start_ns, block.sequence, block.run, block.rate_hz, block.samples[:, :-1].copy()), truth)
-            for block, truth in stream
-        ]
-    )
-    record(machine, short, path)
-    return path
+    return replaying.without_angle(tmp_path_factory.mktemp("plots") / "plain.mcap", scenario_blocks(5.0))
 
 
 def run(*arguments: str | Path) -> tuple[int, str]:

@@ -15,13 +15,7 @@ from rotorwatch.records.alarms import AlarmState, EventKind
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.life_cycle import OWED, REFUSED, STAYS, TABLE, Cell, follow
-from service.monitor.alarms.operation import (
-    KIND_OF_EVENT,
-    OperationConflict,
-    OperationRefused,
-    OperatorAction,
-    UnknownAlarm,
-)
+from service.monitor.alarms.operation import KIND_OF_EVENT, OperationRefused, OperatorAction
 
 ROOT = Path(__file__).parents[3]
 S = 10**9
@@ -84,12 +78,6 @@ def test_what_nobody_asks_for_is_never_refused_and_operators_are_told() -> None:
     }  # fmt: skip
 
 
-def test_escalation_opens_the_acknowledgement_again_and_a_new_occurrence_too() -> None:
-    assert TABLE[AlarmState.ACKNOWLEDGED, EventKind.ESCALATED] is AlarmState.UNACKNOWLEDGED
-    for state in (AlarmState.RETURNED, AlarmState.LATCHED_ACKNOWLEDGED, AlarmState.LATCHED_UNACKNOWLEDGED):
-        assert TABLE[state, EventKind.RAISED] is AlarmState.UNACKNOWLEDGED
-
-
 # The book
 
 
@@ -127,17 +115,6 @@ def test_acknowledged_then_cleared_is_normal_and_cleared_then_acknowledged_too()
     assert state_of(book) is AlarmState.RETURNED
     book.operate(act("acknowledge"), (now_s + 30) * S)
     assert state_of(book) is AlarmState.NORMAL
-
-
-def test_a_latching_alarm_stays_until_it_is_reset() -> None:
-    book, now_s = raised("c_by")
-    cleared(book, "c_by", now_s + 5)
-    assert state_of(book, "c_by") is AlarmState.LATCHED_UNACKNOWLEDGED
-    book.operate(act("acknowledge", "c_by"), 100 * S)
-    with pytest.raises(OperationRefused, match="c_by is latched-acknowledged: acknowledge is not possible"):
-        book.operate(act("acknowledge", "c_by"), 101 * S)
-    book.operate(act("reset", "c_by"), 102 * S)
-    assert state_of(book, "c_by") is AlarmState.NORMAL
 
 
 def test_danger_opens_the_acknowledgement_again() -> None:
@@ -186,15 +163,6 @@ def test_shelving_needs_a_reason_and_has_a_longest_time() -> None:
         book.operate(act("shelve", duration_s=7201), now_s * S)
     with pytest.raises(OperationRefused, match="remove-from-service of k_by: reason is empty"):
         book.operate(act("remove-from-service", reason=""), now_s * S)
-    assert state_of(book) is AlarmState.UNACKNOWLEDGED
-
-
-def test_out_of_service_and_back() -> None:
-    book, now_s = raised()
-    book.operate(act("remove-from-service", reason="probe dismounted"), now_s * S)
-    (alarm,) = (one for one in book.alarms if one.name == "k_by")
-    assert (alarm.out_of_service_by, alarm.out_of_service_reason) == ("anna", "probe dismounted")
-    book.operate(act("return-to-service"), (now_s + 5) * S)
     assert state_of(book) is AlarmState.UNACKNOWLEDGED
 
 
@@ -255,22 +223,6 @@ def test_who_shelved_what_a_rule_suppresses_finds_it_suppressed_afterwards() -> 
     told = book.operate(act("unshelve"), (now_s + 1) * S)
     assert [event.kind for event in told] == ["unshelved", "suppressed"]
     assert state_of(book) is AlarmState.SUPPRESSED
-
-
-def test_what_was_seen_must_still_be_so() -> None:
-    book, now_s = raised()
-    version = book.alarms[0].version
-    with pytest.raises(OperationConflict, match=r"k_by is unacknowledged \(version 0\), not as it was"):
-        book.operate(act("acknowledge", expected_state="normal"), now_s * S)
-    book.update("k_by", -0.7, 0.01, (now_s + 5) * S, named=True)
-    with pytest.raises(OperationConflict, match="version"):
-        book.operate(act("acknowledge", expected_version=version), (now_s + 5) * S)
-    book.operate(act("acknowledge", expected_version=version + 1), (now_s + 6) * S)
-
-
-def test_an_unknown_alarm_is_named() -> None:
-    with pytest.raises(UnknownAlarm, match="no alarm k_bx; there are: k_by"):
-        AlarmBook(SETTINGS).operate(act("acknowledge", "k_bx"), 0)
 
 
 def test_a_clock_that_is_set_leaves_shelving_as_long_as_it_was_meant() -> None:

@@ -21,7 +21,7 @@ from rotorwatch.records.alarms import AlarmState
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Report
 from service.history.machine import MachineStore
-from service.history.records import Checkpoint, Retention, Step, StoreError
+from service.history.records import Checkpoint, Step, StoreError
 from service.history.store import Store
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.alarms.book import AlarmBook
@@ -35,6 +35,7 @@ from service.stream.liveness import Clocks
 from service.stream.worker import MachineWorker
 from simulator.scenario import load_scenario
 from tests.service.rig.live import START_NS, until
+from tests.service.rig.postgres import opened
 
 S = 10**9
 BLOCK_NS = S // 2
@@ -88,21 +89,22 @@ class Outlet:
 class Bench:
     """A worker without a network, with a history in a file."""
 
-    def __init__(self, folder: Path, installed: Installed, clocks: Clocks) -> None:
-        self.store = Store(f"sqlite:///{folder / 'history.sqlite'}", Retention())
-        self.store.open()
-        self.history = self.store.machine("demo", "lab")
-        self.worker = MachineWorker(installed, QueueSettings(blocks=1000), self.history, clocks)
-        self.outlet = Outlet()
+    def __init__(self, store: Store, installed: Installed, clocks: Clocks = REAL, outlet: Outlet | None = None) -> None:
+        self.store = store
+        self.history = store.machine("demo", "lab")
+        self.worker = MachineWorker(installed, QueueSettings(blocks=10_000), self.history, clocks)
+        self.outlet = outlet or Outlet()
+        self.worker.start(self.outlet)
 
     def put(self, *blocks: SampleBlock) -> None:
         for one in blocks:
             self.worker.inbox.put(RawBlock(*encode_block(one, self.worker.machine.descriptor.schema_hash)))
-        until(lambda: len(self.worker.inbox) == 0, "empty queue")
         self.settle()
 
     def settle(self) -> None:
+        """Wait until everything that was put is done."""
         done: list[bool] = []
+        until(lambda: len(self.worker.inbox) == 0, "empty queue")
         self.worker.inbox.call(lambda: done.append(True))
         until(lambda: bool(done), "idle monitor")
 
@@ -124,13 +126,12 @@ class Bench:
 
 @contextmanager
 def bench(folder: Path, clocks: Clocks = REAL, **alarms: object) -> Iterator[Bench]:
-    made = Bench(folder, install(machine(**alarms), None), clocks)
-    made.worker.start(made.outlet)
-    try:
-        yield made
-    finally:
-        made.worker.stop()
-        made.store.close()
+    with opened(f"sqlite:///{folder / 'history.sqlite'}") as store:
+        made = Bench(store, install(machine(**alarms), None), clocks)
+        try:
+            yield made
+        finally:
+            made.worker.stop()
 
 
 def watched(monkeypatch: pytest.MonkeyPatch, look: Callable[[Step], None]) -> None:
@@ -386,22 +387,7 @@ def test_an_alarm_comes_back_when_its_rule_is_taken_out_of_the_machine_file() ->
     assert {one.name: one.state for one in without.alarms}["k_by"] is AlarmState.UNACKNOWLEDGED
 
 
-def test_an_unknown_speed_keeps_only_what_depends_on_it() -> None:
-    rules = [
-        {"alarms": ["model"], "while_alarm": "data-stuck", "because": "stuck; see the sensor"},
-        {"alarms": ["model"], "below_rpm": 600, "because": "slow; coasting"},
-    ]
-    book = AlarmBook(AlarmSettings.model_validate({"suppress": rules}))
-    book.update_state("data-stuck", True, 0, at_once=True)
-    book.suppress(1320.0, 1)
-    book.update_state("data-stuck", False, 2, at_once=True)
-    assert named(book.suppress(None, 2)) == [("unsuppressed", "model")]
-    book.suppress(500.0, 3)
-    assert book.suppress(None, 4) == ()
-    assert next(one.suppressed_by for one in book.alarms if one.name == "model") == "slow; coasting"
-
-
-def test_rules_with_the_same_words_are_told_apart() -> None:
+def test_rules_with_the_same_words_are_told_apart_and_an_unknown_speed_keeps_only_what_depends_on_it() -> None:
     rules = [
         {"alarms": ["model"], "while_alarm": "data-stuck", "because": "known"},
         {"alarms": ["model"], "below_rpm": 600, "because": "known"},
@@ -414,6 +400,8 @@ def test_rules_with_the_same_words_are_told_apart() -> None:
     again.restore(book.checkpoint())
     for one in (book, again):
         assert named(one.suppress(None, 2)) == [("unsuppressed", "model")]
+        assert named(one.suppress(500.0, 3)) == [("suppressed", "model")]
+        assert one.suppress(None, 4) == ()
 
 
 def test_a_rule_on_a_lost_stream_holds_while_it_is_lost() -> None:
@@ -436,12 +424,9 @@ def test_a_gap_and_a_silence_name_the_time_without_data() -> None:
     lost, again, gap = monitor.step(block(21, sequence=21, run=2)).events
     assert named((lost, again, gap)) == [("raised", STREAM_LOST), ("cleared", STREAM_LOST), ("raised", GAP)]
     end_ns = block(0).end_ns
-    assert [lost.alarm.evidence and (lost.alarm.evidence.start_ns, lost.alarm.evidence.end_ns)] == [
-        (end_ns, end_ns + 5 * S)
-    ]
-    assert [gap.alarm.evidence and (gap.alarm.evidence.start_ns, gap.alarm.evidence.end_ns)] == [
-        (end_ns, block(21).start_ns)
-    ]
+    for event, until_ns in ((lost, end_ns + 5 * S), (gap, block(21).start_ns)):
+        assert event.alarm.evidence is not None
+        assert (event.alarm.evidence.start_ns, event.alarm.evidence.end_ns) == (end_ns, until_ns)
 
 
 def test_a_reading_that_is_no_number_is_left_out_and_holds_nothing_up() -> None:

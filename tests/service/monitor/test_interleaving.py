@@ -2,7 +2,6 @@
 
 import sqlite3
 import tempfile
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -14,18 +13,16 @@ from hypothesis import strategies as st
 from models.commissioning.commissioned import Installed, install
 from models.machine import Machine
 from models.signals.block import SampleBlock
-from models.signals.keys import Topic
 from models.signals.wire import encode_block
 from service.history.records import Retention
 from service.history.store import Store
 from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.monitor import MachineMonitor
-from service.settings.service import QueueSettings
 from service.stream.checkpoints import stored_event
 from service.stream.inbox import RawBlock
-from service.stream.worker import MachineWorker
 from simulator.scenario import Scenario, load_scenario
 from simulator.stream import blocks
+from tests.service.monitor.test_alarm_trouble import Bench, Outlet
 from tests.service.rig.live import START_NS, until
 
 SEED = 7_700_501
@@ -80,47 +77,24 @@ def test_the_story_is_worth_telling() -> None:
     assert len(told) == 7
 
 
-def raw(block: SampleBlock) -> RawBlock:
-    return RawBlock(*encode_block(block, installed().machine.descriptor.schema_hash))
-
-
-@dataclass
-class Heard:
-    """What was published, by whichever monitor."""
-
-    events: list[str] = field(default_factory=list)
-
-    def __call__(self, topic: Topic, text: str) -> None:
-        if topic == "alarm_event":
-            self.events.append(text)
-
-
 class Plant:
     """A monitor that can be struck down, and the database it left."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._number = 0
-        self.heard = Heard()
+        self.heard = Outlet()
         self._start()
 
     def _start(self) -> None:
-        self.store = Store(f"sqlite:///{self._folder / str(self._number)}", Retention())
-        self.store.open()
-        history = self.store.machine("demo", "lab")
-        self.worker = MachineWorker(installed(), QueueSettings(blocks=10_000), history)
-        self.worker.start(self.heard)
+        store = Store(f"sqlite:///{self._folder / str(self._number)}", Retention())
+        store.open()
+        self.at = Bench(store, installed(), outlet=self.heard)
 
     def put(self, block: SampleBlock) -> None:
-        until(lambda: len(self.worker.inbox) <= BEHIND, "monitor that keeps up")
-        self.worker.inbox.put(raw(block))
-
-    def settle(self) -> None:
-        """Wait until everything that was put is done."""
-        done: list[bool] = []
-        until(lambda: len(self.worker.inbox) == 0, "empty queue")
-        self.worker.inbox.call(lambda: done.append(True))
-        until(lambda: bool(done), "idle monitor")
+        inbox = self.at.worker.inbox
+        until(lambda: len(inbox) <= BEHIND, "monitor that keeps up")
+        inbox.put(RawBlock(*encode_block(block, installed().machine.descriptor.schema_hash)))
 
     def strike(self) -> None:
         """Go on from an image of the database as it is now, whatever the monitor is doing, and let the old one be."""
@@ -134,8 +108,8 @@ class Plant:
         self._start()
 
     def stop(self) -> None:
-        self.worker.stop()
-        self.store.close()
+        self.at.worker.stop()
+        self.at.store.close()
 
 
 @pytest.mark.slow
@@ -165,11 +139,11 @@ def test_repetitions_reordering_and_restarts_change_nothing(seed: int, strikes: 
                     plant.strike()
                     for block in sent[max(0, newest + 1 - CACHED) : newest + 1]:
                         plant.put(block)
-            plant.settle()
-            log = plant.worker.history.events(limit=1000)
+            plant.at.settle()
+            log = plant.at.history.events(limit=1000)
         finally:
             plant.stop()
-        identity = plant.worker.identity
+        identity = plant.at.worker.identity
         assert [one.text for one in log] == [stored_event(identity, event, 0).text for event in expected()]
         # Whoever listened to all of it heard every event, some perhaps twice with the same id, in the end in order.
         assert list(dict.fromkeys(plant.heard.events)) == [one.text for one in log]

@@ -59,13 +59,8 @@ def blocks(
         gain = np.where(t >= growth[0], growth[1], 1.0)
         drive = gain * (0.4 * np.sin(2 * np.pi * 24.8 * t) + 0.5 * rng.standard_normal(size))
         other = 1.1 * np.sin(2 * np.pi * 24.8 * t) + 0.3 * rng.standard_normal(size)
-        yield SampleBlock(
-            run=1,
-            sequence=number,
-            start_ns=START_NS + round(number * BLOCK_S * 1e9),
-            rate_hz=RATE_HZ,
-            samples=np.column_stack([drive, other]).astype(np.float32),
-        )
+        samples = np.column_stack([drive, other]).astype(np.float32)
+        yield SampleBlock(START_NS + round(number * BLOCK_S * 1e9), number, 1, RATE_HZ, samples)
 
 
 def run(monitor: MachineMonitor, stream: Iterator[SampleBlock]) -> tuple[list[str], list[tuple[EventKind, str, float]]]:
@@ -80,6 +75,12 @@ def run(monitor: MachineMonitor, stream: Iterator[SampleBlock]) -> tuple[list[st
     return windows, events
 
 
+def latest(monitor: MachineMonitor) -> Report:
+    found = monitor.health().latest
+    assert found is not None
+    return found
+
+
 def test_a_machine_file_with_nothing_but_sensors_is_watched_from_the_first_hop_on() -> None:
     monitor = MachineMonitor(install(FAN, None))
     windows, events = run(monitor, blocks(1, 30))
@@ -89,8 +90,7 @@ def test_a_machine_file_with_nothing_but_sensors_is_watched_from_the_first_hop_o
     health = monitor.health()
     assert health.state is HealthState.WATCHING
     assert "neither known nor commissioned" in health.reason
-    assert health.latest is not None
-    drive, other = health.latest.levels
+    drive, other = latest(monitor).levels
     assert drive.overall == pytest.approx(np.hypot(0.4 / np.sqrt(2), 0.5), rel=0.02)
     assert other.overall == pytest.approx(np.hypot(1.1 / np.sqrt(2), 0.3 * np.sqrt(990 / 2560)), rel=0.02)
     assert (drive.unit, other.unit, other.velocity) == ("m/s2", "mm/s", None)
@@ -101,8 +101,7 @@ def test_a_running_speed_in_the_machine_file_is_followed_in_the_vibration() -> N
     run(monitor, blocks(1, 30))
     health = monitor.health()
     assert (health.state, health.filled) == (HealthState.WATCHING, 1.0)
-    assert health.latest is not None
-    assert [one.x1 for one in health.latest.levels] == pytest.approx([0.4 / np.sqrt(2), 1.1 / np.sqrt(2)], rel=0.02)
+    assert [one.x1 for one in latest(monitor).levels] == pytest.approx([0.4 / np.sqrt(2), 1.1 / np.sqrt(2)], rel=0.02)
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
@@ -136,9 +135,8 @@ def test_an_alarm_stays_in_the_deadband_and_clears_below_it() -> None:
     for second, (level, state, raised) in enumerate(
         [(9.9, "normal", False), (10.1, "alert", True), (9.5, "normal", True), (8.9, "normal", False)]
     ):
-        now = limit.model_copy(
-            update={"measure": "overall", "alert": 10.0, "danger": 20.0, "fall": None, "state": state}
-        )
+        changes = {"measure": "overall", "alert": 10.0, "danger": 20.0, "fall": None, "state": state}
+        now = limit.model_copy(update=changes)
         watch.latest = (healthy.model_copy(update={"overall": level, "limits": (now,)}),)
         watch.tell(book, START_NS + second * 10**9)
         assert book.present("level:DE-H") == raised, level
@@ -218,23 +216,19 @@ def test_levels_are_judged_at_a_speed_that_was_not_commissioned() -> None:
 def test_a_machine_that_is_watched_says_what_would_have_been_seen() -> None:
     monitor = MachineMonitor(install(FAN, None))
     run(monitor, blocks(1, 30))
-    before = monitor.health().latest
+    before = latest(monitor).level_growth
     assert before is not None
-    assert before.level_growth is not None
-    assert before.level_growth.growth is None
-    assert "no limit yet" in before.level_growth.text
+    assert before.growth is None
+    assert "no limit yet" in before.text
     run(monitor, blocks(1, 70, first=60))
-    now = monitor.health().latest
-    assert now is not None
+    now = latest(monitor)
     assert now.state == HealthState.WATCHING
     assert now.level_growth is not None
     assert now.level_growth.growth is not None
     assert 0.5 < now.level_growth.growth < 0.9
     _, events = run(monitor, blocks(1, 40, growth=(0.0, 1.05 * (1 + now.level_growth.growth)), first=200))
     assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
-    later = monitor.health().latest
-    assert later is not None
-    assert later.level_growth is None  # an alert says more
+    assert latest(monitor).level_growth is None  # an alert says more
 
 
 def test_status_says_what_would_have_been_seen(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -258,11 +252,10 @@ def test_a_dead_sensor_at_whatever_place_is_a_fault_of_that_sensor_and_no_quiet_
     monitor = MachineMonitor(install(FAN, None))
     _, events = run(monitor, held(blocks(5, 60), 1, 0.25))
     assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "data-stuck")]
-    health = monitor.health()
-    assert health.latest is not None
-    assert [(one.states, one.kind) for one in health.latest.sensors] == [(("@NDE-V",), "stuck")]
-    assert health.latest.sensors[0].text.startswith("NDE-V: repeated the value 0.25 mm/s")
-    assert health.state is HealthState.DATA_HEALTH
+    (fault,) = latest(monitor).sensors
+    assert (fault.states, fault.kind) == (("@NDE-V",), "stuck")
+    assert fault.text.startswith("NDE-V: repeated the value 0.25 mm/s")
+    assert monitor.health().state is HealthState.DATA_HEALTH
 
 
 def test_a_dead_sensor_elsewhere_is_told_and_the_rotor_is_diagnosed_as_before() -> None:
@@ -275,9 +268,7 @@ def test_a_dead_sensor_elsewhere_is_told_and_the_rotor_is_diagnosed_as_before() 
         wider = np.pad(block.samples.astype(np.float32), ((0, 0), (0, 1)))
         monitor.step(replace(block, samples=wider))
         alone.step(block)
-    told, plain = monitor.health().latest, alone.health().latest
-    assert told is not None
-    assert plain is not None
+    told, plain = latest(monitor), latest(alone)
     assert [one.states for one in told.sensors] == [("@DE-H",)]
     assert (told.state, told.verdict) == (plain.state, plain.verdict)
     assert [one.name for one in monitor.health().alarms if one.raised] == ["data-stuck"]

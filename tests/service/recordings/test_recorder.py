@@ -70,8 +70,7 @@ def recorded(recorder: MachineRecorder, key: str = KEYS.stream) -> list[Recorded
 
 def test_everything_under_the_keys_is_recorded_as_it_was(tmp_path: Path) -> None:
     listen = endpoint()
-    plan = settings(listen).model_copy(update={"recording": into(tmp_path / "kept")})
-    with running(plan) as service:
+    with running(settings(listen, recording=into(tmp_path / "kept"))) as service:
         with open_session(listen) as session:
             feed = Feed(session)
             sent = []
@@ -81,12 +80,8 @@ def test_everything_under_the_keys_is_recorded_as_it_was(tmp_path: Path) -> None
                 sent.append(encode_block(block, LAB.descriptor.schema_hash))
                 feed.put_raw(*sent[-1])
                 feed.sequence, feed.start_ns = feed.sequence + 1, block.end_ns
-            session.put(
-                f"{KEYS.root}/operator/note",
-                b"\x00\xff bearing changed",
-                attachment=b"\x01\x02",
-                encoding="text/plain;µ",
-            )
+            note_key, said = f"{KEYS.root}/operator/note", b"\x00\xff bearing changed"
+            session.put(note_key, said, attachment=b"\x01\x02", encoding="text/plain;µ")
             session.put("rotorwatch/demo/other/stream", b"another machine")
             until(lambda: service.machines()[0].health().quality.accepted_blocks == 120, "120 accepted blocks")
             recorder = worker_of(service).recorder
@@ -98,8 +93,8 @@ def test_everything_under_the_keys_is_recorded_as_it_was(tmp_path: Path) -> None
     (path,) = files(recorder)
     found = list(read_recording(path))
     assert [(m.payload, m.attachment, m.encoding) for m in found if m.key == KEYS.stream] == sent
-    (note,) = [m for m in found if m.key == f"{KEYS.root}/operator/note"]
-    assert (note.payload, note.attachment, note.encoding) == (b"\x00\xff bearing changed", b"\x01\x02", "text/plain;µ")
+    (note,) = [m for m in found if m.key == note_key]
+    assert (note.payload, note.attachment, note.encoding) == (said, b"\x01\x02", "text/plain;µ")
     keys = {message.key for message in found}
     assert {KEYS.health, KEYS.alarm_state, KEYS.report, KEYS.descriptor} <= keys
     assert all(key.startswith(KEYS.root + "/") for key in keys)
@@ -112,20 +107,8 @@ def test_everything_under_the_keys_is_recorded_as_it_was(tmp_path: Path) -> None
 def test_a_descriptor_announced_before_the_recorder_came_is_asked_for(tmp_path: Path) -> None:
     listen = endpoint()
     announced = b'{"announced": "by query"}'
-    with (
-        session_of(LinkSettings(listen=(listen,))) as session,
-        program(
-            tmp_path,
-            "service.rotorwatch",
-            "record",
-            "--machine",
-            "lab",
-            "--out",
-            str(tmp_path / "o"),
-            "--connect",
-            listen,
-        ) as recorder,
-    ):
+    command = ("service.rotorwatch", "record", "--machine", "lab", "--out", str(tmp_path / "o"), "--connect", listen)
+    with session_of(LinkSettings(listen=(listen,))) as session, program(tmp_path, *command) as recorder:
 
         def answer(query: zenoh.Query) -> None:
             with query:
@@ -223,8 +206,7 @@ def test_a_missing_folder_is_waited_for_without_losing_anything(tmp_path: Path) 
     """What a mount that comes late looks like; the monitor does not care."""
     listen, place = endpoint(), tmp_path / "disk"
     place.write_text("not a folder")
-    plan = settings(listen).model_copy(update={"recording": into(place)})
-    with running(plan) as service, open_session(listen) as session:
+    with running(settings(listen, recording=into(place))) as service, open_session(listen) as session:
         feed = Feed(session)
         for _ in range(30):
             feed.put_good()

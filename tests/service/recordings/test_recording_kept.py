@@ -160,12 +160,19 @@ FEW = {"rotate_mb": 0.1, "keep_gb": 0.0007, "alarm_keep_gb": 1.0, "alarm_before_
 
 
 def record_files(
-    directory: Path, first: int, last: int, forged_at: int | None = None, events: tuple[StoredEvent, ...] = ()
+    directory: Path,
+    first: int,
+    last: int,
+    forged_at: int | None = None,
+    events: tuple[StoredEvent, ...] = (),
+    away: bool = False,
 ) -> Path:
     """Record one file of 0.3 MB per five minutes, numbered from now on, with an alarm event off the wire in one."""
     settings = RecordingSettings.model_validate({"directory": str(directory), **FEW})
 
     def committed(since_ns: int) -> tuple[StoredEvent, ...]:
+        if away:
+            raise StoreError("the database is away")
         return tuple(event for event in events if event.recorded_ns >= since_ns)
 
     recorder = MachineRecorder(LAB, settings, committed, now_ns=lambda: NOW_NS + 3600 * NS)
@@ -232,18 +239,7 @@ def test_what_kept_json_says_is_found_anew_when_it_is_lost(tmp_path: Path) -> No
 def test_a_history_that_cannot_be_read_takes_nothing_back(tmp_path: Path) -> None:
     folder = record_files(tmp_path, 0, 3, events=(at_file(1),))
     before = kept_reasons(folder)
-
-    def failing(_: int) -> tuple[StoredEvent, ...]:
-        raise StoreError("the database is away")
-
-    settings = RecordingSettings.model_validate({"directory": str(tmp_path), **FEW})
-    recorder = MachineRecorder(LAB, settings, failing, now_ns=lambda: NOW_NS + 3600 * NS)
-    for number in range(20, 29):
-        time_ns = NOW_NS + 300 * number * NS
-        recorder.put(RecordedMessage(LAB.keys.stream, bytes(300_000), b"", "x", time_ns, time_ns))
-    recorder.start()
-    recorder.stop()
-    assert recorder.status().problem == ""
+    record_files(tmp_path, 20, 29, away=True)
     assert kept_reasons(folder) == before
 
 
@@ -251,9 +247,9 @@ def test_a_history_that_cannot_be_read_takes_nothing_back(tmp_path: Path) -> Non
 def recorded(folder: Path) -> Iterator[tuple[Runtime, Feed]]:
     """A monitor that records, and closes a file after a second."""
     address = endpoint()
-    plan = settings(address, machine_file(folder, PATIENT))
-    recording = RecordingSettings(directory=str(folder / "kept"), rotate_s=1.0)
-    with running(plan.model_copy(update={"recording": recording})) as runtime, open_session(address) as session:
+    kept = RecordingSettings(directory=str(folder / "kept"), rotate_s=1.0)
+    plan = settings(address, machine_file(folder, PATIENT), recording=kept)
+    with running(plan) as runtime, open_session(address) as session:
         yield runtime, Feed(session)
 
 
@@ -394,29 +390,11 @@ def with_secret(tmp_path: Path) -> Catalogue:
 @pytest.mark.parametrize(
     "name",
     [
-        "../s/m/secret.mcap",
-        "s/m/../../../s/m/secret.mcap",
-        "s/../../s/m/secret.mcap",
-        "./s/m/good.mcap",
-        "s/m/./good.mcap",
-        "s//m/good.mcap",
-        "/s/m/good.mcap",
-        "s/m/good.mcap/",
-        "s/m/good.mcap\n",
-        "s/m/good.mcap\0",
-        "s\\m\\good.mcap",
-        "s/m/..",
-        "../m/good.mcap",
-        "s/m/link.mcap",
-        "s/linked/secret.mcap",
-        "linked/m/secret.mcap",
-        "s/m/folder.mcap",
-        "s/m/pipe.mcap",
-        "s/m/none.mcap",
-        "s/m/.lock",
-        "s/m/kept.json",
-        "%2e%2e/m/good.mcap",
-        "",
+        *("../s/m/secret.mcap", "s/m/../../../s/m/secret.mcap", "s/../../s/m/secret.mcap", "s/m/..", "../m/good.mcap"),
+        *("./s/m/good.mcap", "s/m/./good.mcap", "s//m/good.mcap", "/s/m/good.mcap", "s/m/good.mcap/", ""),
+        *("s\\m\\good.mcap", "s/m/good.mcap\n", "s/m/good.mcap\0", "%2e%2e/m/good.mcap"),
+        *("s/m/link.mcap", "s/linked/secret.mcap", "linked/m/secret.mcap", "s/m/folder.mcap", "s/m/pipe.mcap"),
+        *("s/m/none.mcap", "s/m/.lock", "s/m/kept.json"),
     ],
 )
 def test_no_id_reaches_anything_but_the_directory_s_own_files(with_secret: Catalogue, name: str) -> None:

@@ -19,10 +19,11 @@ from service.recordings.replay.control import Control
 from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.source import RecordingSource
 from service.runtime.runtime import running
-from service.stream.replay_link import NetworkPlan, replay_to_network
+from service.stream.replay_link import replay_to_network
 from service.stream.transport import TopicMessage, follow
 from service.stream.worker import MachineWorker
 from simulator.scenario import parse_fault
+from tests.service.recordings.test_replay_network import plan
 from tests.service.rig.live import LAB, endpoint, scenario_blocks, send, service, settings, until, worker_of
 from tests.service.rig.replaying import digest_of, lines_of, recording, split
 
@@ -50,26 +51,10 @@ def expected(faulty: Path) -> OfflineSummary:
     return summary
 
 
-def network(source: RecordingSource, address: str, prefix: str, pace: float | None) -> NetworkPlan:
-    return NetworkPlan(
-        link=LinkSettings(mode="client", connect=(address,)),
-        machines=source.machines,
-        everything=False,
-        prefix=prefix,
-        pace=pace,
-        passes=1,
-        from_ns=source.span().start_ns,
-        to_ns=source.span().end_ns + 1,
-        wait_for_subscriber_s=20.0,
-    )
-
-
 @contextmanager
 def monitor_in(namespace: str, link: LinkSettings, when_full: str = "drop") -> Iterator[MachineWorker]:
-    base = settings("tcp/127.0.0.1:0", bundle="lab", when_full=when_full, bound=2000)
-    with running(
-        base.model_copy(update={"link": link.model_copy(update={"namespace": namespace})})
-    ) as runtime:  # fmt: skip
+    apart = link.model_copy(update={"namespace": namespace})
+    with running(settings(endpoint(), bundle="lab", when_full=when_full, bound=2000, link=apart)) as runtime:
         yield worker_of(runtime)
 
 
@@ -110,7 +95,8 @@ def test_one_sample_more_or_less_is_another_answer(tmp_path: Path) -> None:
 def test_replayed_onto_the_network_is_the_same(faulty: Path, expected: OfflineSummary) -> None:
     address, source = endpoint(), RecordingSource([faulty])
     with monitor_in("replay/x", LinkSettings(listen=(address,)), when_full="wait") as worker:
-        count = replay_to_network(source, network(source, address, "replay/x", None), Control())
+        going = plan(source, address, "replay/x", wait_for_subscriber_s=20.0)
+        count = replay_to_network(source, going, Control())
         until(lambda: worker.health().quality.accepted_blocks == BLOCKS, "all blocks")
         health = worker.health()
         found = digest_of(worker)
@@ -133,8 +119,8 @@ def test_a_replay_disturbs_nothing_that_is_live(faulty: Path, expected: OfflineS
         monitor_in("replay/x", client) as replayed,
         follow(client, "demo/lab", ("alarm_event", "report"), heard.append),
     ):
-        plan = network(source, address, "replay/x", 30.0)
-        thread = threading.Thread(target=replay_to_network, args=(source, plan, Control()))
+        paced = plan(source, address, "replay/x", pace=30.0, wait_for_subscriber_s=20.0)
+        thread = threading.Thread(target=replay_to_network, args=(source, paced, Control()))
         thread.start()
         until(lambda: replayed.health().quality.accepted_blocks > 0, "replayed blocks")
         assert not live.health().stream.publisher_alive

@@ -2,6 +2,8 @@
 
 import json
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -41,9 +43,17 @@ def plan(source: RecordingSource, address: str, prefix: str, **changes: object) 
     return NetworkPlan(**(fields | changes))  # type: ignore[arg-type]  # fields of many types
 
 
-def collect(heard: Heard, sample: zenoh.Sample) -> None:
-    attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-    heard.append((str(sample.key_expr), sample.payload.to_bytes(), attachment, str(sample.encoding)))
+@contextmanager
+def hearing(session: zenoh.Session, key: str = "**") -> Iterator[Heard]:
+    heard = Heard()
+
+    def collect(sample: zenoh.Sample) -> None:
+        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        heard.append((str(sample.key_expr), sample.payload.to_bytes(), attachment, str(sample.encoding)))
+
+    subscriber = session.declare_subscriber(key, collect)
+    yield heard
+    subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
 def as_heard(message: RecordedMessage, prefix: str) -> tuple[str, bytes, bytes, str]:
@@ -59,19 +69,16 @@ def source(tmp_path: Path) -> RecordingSource:
 
 @pytest.mark.parametrize("everything", [False, True])
 def test_messages_go_out_byte_for_byte(source: RecordingSource, everything: bool) -> None:
-    address, heard, alive = endpoint(), Heard(), list[str]()
-    with session(address) as listener:
-        subscriber = listener.declare_subscriber("**", lambda sample: collect(heard, sample))
+    address, alive = endpoint(), list[str]()
+    with session(address) as listener, hearing(listener) as heard:
         tokens = listener.liveliness().declare_subscriber(
             "x/rotorwatch/**", lambda sample: alive.append(f"{sample.kind} {sample.key_expr}"), history=True
         )
         replay_to_network(source, plan(source, address, "x", everything=everything), Control())
-        expected = [
-            as_heard(one, "x/") for one in source.messages() if everything or one.key != LAB.keys.report
-        ]  # fmt: skip
+        sent = [one for one in source.messages() if everything or one.key != LAB.keys.report]
+        expected = [as_heard(one, "x/") for one in sent]
         until(lambda: len(heard) >= len(expected), "everything")
         until(lambda: len(alive) == 2, "the token's end")
-        subscriber.undeclare()  # type: ignore[no-untyped-call]
         tokens.undeclare()  # type: ignore[no-untyped-call]
     # Different keys may overtake each other.
     for key in {entry[0] for entry in expected}:
@@ -81,13 +88,11 @@ def test_messages_go_out_byte_for_byte(source: RecordingSource, everything: bool
 
 
 def test_a_stretch_begins_with_the_descriptor_that_held_then(source: RecordingSource) -> None:
-    address, heard = endpoint(), Heard()
+    address = endpoint()
     begin_ns, end_ns = source.span().start_ns + 10**9, source.span().start_ns + 2 * 10**9
-    with session(address, "x") as listener:
-        subscriber = listener.declare_subscriber("rotorwatch/**", lambda sample: collect(heard, sample))
+    with session(address, "x") as listener, hearing(listener, "rotorwatch/**") as heard:
         replay_to_network(source, plan(source, address, "x", from_ns=begin_ns, to_ns=end_ns), Control())
         until(lambda: len(heard) >= 11, "everything")
-        subscriber.undeclare()  # type: ignore[no-untyped-call]
     (descriptor,) = [entry for entry in heard if entry[0] == LAB.keys.descriptor]
     assert json.loads(descriptor[1]) == LAB.descriptor.model_dump(mode="json")
     blocks = [as_heard(one, "") for one in source.messages({LAB.keys.stream}, from_ns=begin_ns, to_ns=end_ns)]
@@ -96,12 +101,10 @@ def test_a_stretch_begins_with_the_descriptor_that_held_then(source: RecordingSo
 
 
 def test_each_pass_has_a_prefix_of_its_own(source: RecordingSource) -> None:
-    address, heard = endpoint(), Heard()
-    with session(address) as listener:
-        subscriber = listener.declare_subscriber("**/stream", lambda sample: collect(heard, sample))
+    address = endpoint()
+    with session(address) as listener, hearing(listener, "**/stream") as heard:
         count = replay_to_network(source, plan(source, address, "r/x", passes=2), Control())
         until(lambda: len(heard) == 60, "both passes")
-        subscriber.undeclare()  # type: ignore[no-untyped-call]
     assert count == 62
     assert [entry[0] for entry in heard] == [f"r/x/{number}/{LAB.keys.stream}" for number in (1, 2) for _ in range(30)]
 
@@ -116,20 +119,18 @@ def test_original_keys_are_refused_while_a_monitor_is_alive(source: RecordingSou
 
 
 def test_original_keys_are_refused_while_a_publisher_is_alive(source: RecordingSource) -> None:
-    address, heard = endpoint(), Heard()
-    with session(address) as other:
-        subscriber = other.declare_subscriber("**", lambda sample: collect(heard, sample))
+    address = endpoint()
+    with session(address) as other, hearing(other) as heard:
         token = other.liveliness().declare_token(LAB.keys.publisher_alive)
         with pytest.raises(LiveMachineError, match="a live publisher of demo/lab is there"):
             replay_to_network(source, plan(source, address, ""), Control())
         token.undeclare()  # type: ignore[no-untyped-call]
-        subscriber.undeclare()  # type: ignore[no-untyped-call]
     assert heard == []
 
 
 @pytest.mark.parametrize("who", ["publisher", "monitor"])
 def test_original_keys_are_left_as_soon_as_somebody_live_appears(source: RecordingSource, who: str) -> None:
-    address, heard, errors = endpoint(), Heard(), list[str]()
+    address, errors = endpoint(), list[str]()
     keys = MachineKeys("demo", "lab")
 
     def run() -> None:
@@ -139,15 +140,13 @@ def test_original_keys_are_left_as_soon_as_somebody_live_appears(source: Recordi
         except LiveMachineError as error:
             errors.append(str(error))
 
-    with session(address) as other:
-        subscriber = other.declare_subscriber(keys.stream, lambda sample: collect(heard, sample))
+    with session(address) as other, hearing(other, keys.stream) as heard:
         thread = threading.Thread(target=run)
         thread.start()
         until(lambda: bool(heard), "first block")
         token = other.liveliness().declare_token(keys.publisher_alive if who == "publisher" else keys.monitor_alive)
         thread.join()
         token.undeclare()  # type: ignore[no-untyped-call]
-        subscriber.undeclare()  # type: ignore[no-untyped-call]
     (error,) = errors
     assert error.startswith(f"a live {who} of demo/lab is there")
     assert error.endswith("the replay on the original keys was stopped")
@@ -168,18 +167,16 @@ def test_a_monitor_that_starts_during_a_replay_on_the_original_keys_takes_none_o
 
     callbacks = MachineCallbacks(taken.append, nothing, nothing, nothing, lambda: "{}", lambda: "{}", lambda *_: "[]")
     with route(LinkSettings(listen=(address,))):
-        heard = Heard()
         other = Link(LinkSettings(mode="client", connect=(address,)))
-        subscriber = other.session.declare_subscriber(LAB.keys.stream, lambda sample: collect(heard, sample))
         thread = threading.Thread(target=run)
-        thread.start()
-        until(lambda: bool(heard), "first block")
+        with hearing(other.session, LAB.keys.stream) as heard:
+            thread.start()
+            until(lambda: bool(heard), "first block")
         late = Link(LinkSettings(mode="client", connect=(address,)))
         monitor = MachineLink(late, LAB.keys, callbacks, wait_when_full=False)
         thread.join()
         assert errors  # it has seen the monitor
         monitor.close()
-        subscriber.undeclare()  # type: ignore[no-untyped-call]
         late.close()
         other.close()
     assert taken == []

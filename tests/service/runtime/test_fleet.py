@@ -32,11 +32,8 @@ if TYPE_CHECKING:
 def fleet_plan(folder: Path, database: str, count: int = 2) -> ServiceSettings:
     """Two machines, each in a shard of its own if there are two."""
     plan = plan_for(folder, count)
-    changed = {
-        "link": LinkSettings(mode="client", connect=plan.link.listen),
-        "history": HistorySettings(url=database),
-        "fleet": FleetSettings(listen=endpoint()),
-    }
+    link = LinkSettings(mode="client", connect=plan.link.listen)
+    changed = {"link": link, "history": HistorySettings(url=database), "fleet": FleetSettings(listen=endpoint())}
     return plan.model_copy(update=changed)
 
 

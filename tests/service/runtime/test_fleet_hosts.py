@@ -68,12 +68,9 @@ def ray_node(net: Hosts, host: str, log: Path, *options: str) -> Group:
         "--block",
     ]
     command += ["--node-ip-address", net.address(host), *options]
+    variables = os.environ | _VARIABLES
     with log.open("wb") as out:
-        made = Group(
-            subprocess.Popen(
-                command, stdout=out, stderr=out, cwd=ROOT, env=os.environ | _VARIABLES, start_new_session=True
-            )
-        )
+        made = Group(subprocess.Popen(command, stdout=out, stderr=out, cwd=ROOT, env=variables, start_new_session=True))
     until(lambda: "Ray runtime started" in log.read_text(encoding="utf-8", errors="replace"), f"Ray on {host}", 120.0)
     return made
 
@@ -168,14 +165,8 @@ def test_a_cut_cable_and_a_lost_host_leave_the_alarm_logs_of_a_fleet_as_they_wou
         node("first", *head, "--system-config", CHECKS)
         worker("left")
         right = worker("right")
-        command = (
-            "service.rotorwatch",
-            "fleet",
-            "--address",
-            f"{net.address('first')}:6379",
-            "--config",
-            str(settings),
-        )
+        where = ("--address", f"{net.address('first')}:6379", "--config", str(settings))
+        command = ("service.rotorwatch", "fleet", *where)
         alone = {key: value for key, value in os.environ.items() if not key.startswith("ROTORWATCH_")} | _VARIABLES
         served = running.enter_context(program(tmp_path, *command, network=net.network("first"), alone=alone))
         url = served.url()

@@ -25,14 +25,12 @@ from service.monitor.alarm_conversion import alarm_cloud_event
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MonitorReport
 from service.runtime.runtime import Runtime, running
-from service.settings.service import HttpSettings, MachineEntry, ServiceSettings
+from service.settings.service import HttpSettings, MachineEntry
 from service.stream.checkpoints import stored_event, stored_report
 from service.stream.transport import LinkError, TopicMessage, follow
 from service.terminal.logs import Limiter
 from simulator.scenario import parse_fault
 from tests.service.rig.live import (
-    IN_MEMORY,
-    OPEN,
     ROOT,
     Feed,
     endpoint,
@@ -87,10 +85,9 @@ def test_live_says_exactly_what_the_monitor_says_offline_and_silence_clears_noth
             until(lambda: "stream-lost" in "".join(topics.texts("/alarm/event")), "alarm on the silence")
             heard = [AlarmCloudEvent.model_validate_json(text) for text in topics.texts("/alarm/event")]
             assert heard[0] == alarm_cloud_event(worker.identity, events[0])
-            assert [(one.data.kind, one.data.name, one.data.sequence) for one in heard[1:]] == [
-                ("raised", "stream-lost", 1)
-            ]
-            assert heard[1].data.time_ns == stream[-1].end_ns + 500_000_000
+            (lost,) = (one.data for one in heard[1:])
+            assert (lost.kind, lost.name, lost.sequence) == ("raised", "stream-lost", 1)
+            assert lost.time_ns == stream[-1].end_ns + 500_000_000
             until(lambda: '"stream-lost"' in topics.texts("/alarm/state")[-1], "alarms with the silence among them")
             states = AlarmStates.model_validate_json(topics.texts("/alarm/state")[-1])
             assert [(alarm.name, alarm.state) for alarm in states.alarms] == [
@@ -176,13 +173,7 @@ def test_defect_in_the_monitor_costs_one_block_and_is_shown(monkeypatch: pytest.
 def test_several_machines_have_nothing_to_do_with_each_other(tmp_path: Path) -> None:
     other = machine_file(tmp_path, ('name = "lab"', 'name = "rig-2"'))
     address = endpoint()
-    two = ServiceSettings(
-        link=LinkSettings(listen=(address,)),
-        http=HttpSettings(port=0),
-        machines=(MachineEntry(file="lab"), MachineEntry(file=other)),
-        history=IN_MEMORY,
-        access=OPEN,
-    )
+    two = settings(address, machines=(MachineEntry(file="lab"), MachineEntry(file=other)))
     with running(two) as runtime, open_session(address) as session:
         first, second = runtime.machines()
         feed = Feed(session, second.machine)
@@ -202,19 +193,17 @@ def test_nothing_is_left_behind_when_a_part_cannot_start() -> None:
     address = endpoint()
     with service(address) as (runtime, _):
         port = int(runtime.http_url.rsplit(":", 1)[1])
-        clash = settings(endpoint()).model_copy(update={"http": HttpSettings(port=port)})
         with pytest.raises(HttpError) as http:
-            Runtime(clash).start()
+            Runtime(settings(endpoint(), http=HttpSettings(port=port))).start()
         assert f"HTTP cannot listen on 127.0.0.1 port {port}: the port is in use" in str(http.value)
-        second = settings(address)
-        failed = Runtime(second)
+        failed = Runtime(settings(address))
         with pytest.raises(LinkError) as link:
             failed.start()
-        assert address in str(link.value)
+        assert f"listen {address}) could not be opened: address already in use" in str(link.value)
         assert not failed.readiness().ready
         assert not any(one.status().alive for one in failed.machines())
     # Both addresses are free again.
-    with running(second.model_copy(update={"http": HttpSettings(port=port)})) as runtime:
+    with running(settings(address, http=HttpSettings(port=port))) as runtime:
         assert runtime.readiness().ready
 
 
@@ -246,11 +235,9 @@ def test_health_over_http_is_the_health_on_the_topic() -> None:
             feed.put_raw(b"", b"", "rubbish")
             until(lambda: bool(worker.health().quality.refused_blocks), "refusal")
             until(lambda: any("rubbish" in text for text in topics.texts("/health")), "refusal on the topic")
-        over_http = httpx.get(
-            f"{runtime.http_url}/api/v1/machines/demo/lab/health", trust_env=False, timeout=180.0
-        ).json()
-        on_topic = json.loads(topics.texts("/health")[-1])
-        assert over_http == on_topic
+        place = f"{runtime.http_url}/api/v1/machines/demo/lab/health"
+        over_http = httpx.get(place, trust_env=False, timeout=180.0).json()
+        assert over_http == json.loads(topics.texts("/health")[-1])
 
 
 _ARENAS = """

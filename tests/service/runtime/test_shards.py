@@ -32,6 +32,7 @@ from tests.service.rig.live import (
     SHORT,
     Feed,
     endpoint,
+    kept_in,
     machine_file,
     open_session,
     program,
@@ -41,7 +42,7 @@ from tests.service.rig.live import (
     until,
     worker_of,
 )
-from tests.service.rig.monitored import OPEN, answered, client, problem
+from tests.service.rig.monitored import answered, client, problem
 from tests.service.rig.preloaded import CONTEXT
 
 SECONDS = 45.0
@@ -67,14 +68,8 @@ def plan_for(folder: Path, count: int | None, address: str | None = None) -> Ser
         (folder / name).mkdir(exist_ok=True)
         changes = (*SHORT, PATIENT, ('name = "lab"', f'name = "{name}"'), ("on_delay_s = 5.0", "on_delay_s = 10.0"))
         entries.append(MachineEntry(file=machine_file(folder / name, *changes)))
-    plan = settings(address, when_full="wait")
-    changed = {
-        "access": OPEN,
-        "machines": tuple(entries),
-        "shards": ShardSettings(count=count),
-        "history": HistorySettings(url=f"sqlite:///{folder}/history.sqlite"),
-    }
-    return plan.model_copy(update=changed)
+    shards = ShardSettings(count=count)
+    return settings(address, when_full="wait", machines=tuple(entries), shards=shards, history=kept_in(folder))
 
 
 @contextmanager
@@ -141,10 +136,8 @@ def test_operators_and_listeners_reach_a_machine_of_another_process(tmp_path: Pa
             assert Health.model_validate_json(health.data).machine == "lab"
         again = http.post(f"{place}/k_by/acknowledge", json={}, headers={"If-Match": seen.headers["etag"]})
         problem(again, 409)
-        assert (
-            "no alarm nothing"
-            in problem(http.post(f"{place}/nothing/acknowledge", json={}, headers={"If-Match": "*"}), 404).detail
-        )
+        nothing = http.post(f"{place}/nothing/acknowledge", json={}, headers={"If-Match": "*"})
+        assert "no alarm nothing" in problem(nothing, 404).detail
         states = answered(http.get(place), AlarmStates)
         assert [one.state for one in states.alarms if one.name == "k_by"] == ["acknowledged"]
 

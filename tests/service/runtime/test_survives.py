@@ -45,15 +45,9 @@ def do(at: Program, kind: str, name: str, state: str, **order: object) -> None:
 
 
 def log(at: Program) -> list[tuple[str, str, int, int]]:
-    answer = (
-        httpx.get(f"{at.url()}{ALARMS}/events?after=-1&limit=1000", trust_env=False, timeout=180.0)
-        .raise_for_status()
-        .json()
-    )
-    found = [
-        (one["data"]["kind"], one["data"]["name"], one["data"]["sequence"], one["data"]["occurrence"])
-        for one in answer["events"]
-    ]
+    answer = httpx.get(f"{at.url()}{ALARMS}/events?after=-1&limit=1000", trust_env=False, timeout=180.0)
+    told = [one["data"] for one in answer.raise_for_status().json()["events"]]
+    found = [(one["kind"], one["name"], one["sequence"], one["occurrence"]) for one in told]
     return sorted(found, key=lambda one: one[2])
 
 

@@ -11,20 +11,20 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from models.signals.keys import Grant, MachineKeys
+from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from rotorwatch.client.alarm_log import follow_alarms
 from rotorwatch.client.errors import ClientError, LogReplaced
 from rotorwatch.client.log_order import LogOrder
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage, AlarmStates
 from rotorwatch.records.example import example
-from service.history.records import Retention, Step, StoreError
+from service.history.records import Step, StoreError
 from service.history.shared import committed_events
 from service.history.store import Store
 from service.stream.transport import Link, MachineCallbacks, MachineLink, route
+from tests.service.access.plant import plant
 from tests.service.history.test_store import alarm_event
 from tests.service.rig.live import endpoint, until
-from tests.service.rig.postgres import KINDS, database_url
 
 PLACE = "demo/lab"
 
@@ -47,10 +47,10 @@ def page(events: list[AlarmCloudEvent], latest: int, place: str = PLACE) -> Alar
 LOG = [event(number) for number in range(30)]
 
 
-def take_all(order: LogOrder) -> list[int]:
+def take_all(order: LogOrder) -> list[AlarmCloudEvent]:
     taken = []
     while (found := order.next()) is not None:
-        taken.append(found.data.sequence)
+        taken.append(found)
         order.taken()
     return taken
 
@@ -70,7 +70,7 @@ def test_any_order_of_arrival_gives_the_log_from_the_given_event_on(
     after: int, happenings: list[tuple[str, int]]
 ) -> None:
     order = LogOrder(PLACE, after)
-    taken: list[int] = []
+    taken: list[AlarmCloudEvent] = []
 
     def ask(limit: int) -> None:
         begin = order.ask_after + 1
@@ -89,22 +89,14 @@ def test_any_order_of_arrival_gives_the_log_from_the_given_event_on(
     while order.incomplete:
         ask(2)
         taken += take_all(order)
-    assert taken == list(range(after + 1, len(LOG)))
+    assert taken == LOG[after + 1 :]
 
 
 def test_what_the_log_says_outranks_what_was_heard() -> None:
     order = LogOrder(PLACE, 3)
     order.hear(event(5, "heard, and lost in a crash"))
     order.read(page([event(4), event(5, "of the log")], 5))
-    assert take_all_texts(order) == ["", "of the log"]
-
-
-def take_all_texts(order: LogOrder) -> list[str]:
-    taken = []
-    while (found := order.next()) is not None:
-        taken.append(found.data.text)
-        order.taken()
-    return taken
+    assert [one.data.text for one in take_all(order)] == ["", "of the log"]
 
 
 def test_another_log_is_noticed() -> None:
@@ -341,27 +333,12 @@ def test_event_that_could_not_be_kept_is_not_taken() -> None:
 
 def test_viewer_with_a_grant_can_follow(tmp_path: Path) -> None:
     """Through a router that lets a viewer read this machine and nothing else."""
-    address = endpoint()
-    passwords = tmp_path / "passwords"
-    passwords.write_text("monitor:m\nviewer:v\n", encoding="utf-8")
-    secrets = {}
-    for name, password in (("monitor", "m"), ("viewer", "v")):
-        secrets[name] = tmp_path / name
-        secrets[name].write_text(f"{password}\n", encoding="utf-8")
-    for file in (passwords, *secrets.values()):
-        file.chmod(0o600)
-    grants = (Grant(who=("monitor",), monitors=("*/*",)), Grant(who=("viewer",), views=(PLACE,)))
-    router = LinkSettings(mode="router", listen=(address,), passwords_file=passwords, grants=grants)
-
-    def user(name: str) -> LinkSettings:
-        return LinkSettings(mode="client", connect=(address,), user=name, password_file=secrets[name])
-
-    with route(router):
-        link = Link(user("monitor"))
+    with plant(tmp_path) as router:
+        link, viewer = Link(router.link("monitor")), router.link("one")
         lab, pump = Monitor(link), Monitor(link, "demo/pump")
         for machine in (lab, pump):
             machine.happen(published=False)
-        with Following(user("viewer")) as following, Following(user("viewer"), machines="demo/pump") as refused:
+        with Following(viewer) as following, Following(viewer, machines="demo/pump") as refused:
             following.reaches(0)
             for machine in (lab, pump):
                 machine.happen(published=False)
@@ -398,11 +375,7 @@ def test_connection_that_was_cut_is_made_again() -> None:
     assert following.taken == machine.log
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_who_may_not_write_reads_what_was_committed(kind: str, tmp_path: Path) -> None:
-    url = database_url(kind, tmp_path)
-    store = Store(url, Retention())
-    store.open()
+def test_who_may_not_write_reads_what_was_committed(store: Store, url: str) -> None:
     lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
     events = tuple(alarm_event(number) for number in range(4))
     lab.commit(Step(events=events))
@@ -411,7 +384,6 @@ def test_who_may_not_write_reads_what_was_committed(kind: str, tmp_path: Path) -
         assert read("demo", "lab", events[1].recorded_ns) == events[1:]
         assert read("demo", "pump", 0) == events[:1]
         assert read("demo", "fan", 0) == ()
-    store.close()
 
 
 def test_a_history_that_is_only_looked_into_is_not_made(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ def heard(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
             found.setdefault(names[key], []).append(text.decode() if names[key] != "stream" else "")
 
     link = LinkSettings(mode="client", connect=(address,))
-    plant = settings(address, file, bundle="lab", when_full="wait").model_copy(update={"link": link})
+    plant = settings(address, file, bundle="lab", when_full="wait", link=link)
     with route(LinkSettings(listen=(address,))), running(plant) as runtime, open_session(address, "client") as session:
         worker = worker_of(runtime)
         subscriber = session.declare_subscriber(

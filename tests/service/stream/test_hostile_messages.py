@@ -310,7 +310,7 @@ def test_a_replay_that_is_announced_silences_no_machine(first: str) -> None:
     address = endpoint()
     joined = LinkSettings(mode="client", connect=(address,))
     with route(LinkSettings(listen=(address,))), closing(Link(joined)) as liar:
-        plan = settings(address).model_copy(update={"link": joined})
+        plan = settings(address, link=joined)
         announce = liar.session.liveliness().declare_token
         early = None if first == "monitor" else announce(LAB.keys.replay_alive)
         with running(plan) as runtime, open_session(address, "client") as session:

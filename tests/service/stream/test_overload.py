@@ -292,7 +292,7 @@ def test_an_overloaded_service_loses_no_sample_says_so_and_is_replayed_to_the_sa
     monkeypatch.setattr(shedding, "_LASTING_S", 0.3)  # data come a hundred times as fast as from a machine
     address, stream, file = endpoint(), loud_in_between(LENGTH_S), short_machine(tmp_path)
     recording = RecordingSettings(directory=str(tmp_path / "recordings"))
-    plan = plan_for(address, file, bound=1500).model_copy(update={"recording": recording})
+    plan = plan_for(address, file, bound=1500, recording=recording)
     with running(plan) as runtime, open_session(address) as session:
         worker = worker_of(runtime)
         feed = Feed(session, worker.machine)
