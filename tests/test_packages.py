@@ -1,4 +1,4 @@
-"""What is installed: both wheels are built and looked into, and the code runs where nothing of it is installed."""
+"""What is installed: both wheels are looked into, the code runs where none of it is installed, help comes at once."""
 
 import shutil
 import subprocess
@@ -18,6 +18,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("models", "rotorwatch", "service", "simulator")
 SHIPPED = {".py", ".toml", ".json", ".safetensors", ".jinja", ".mako", ".typed", ".dictionary", ".js", ".css", ".html"}
 PROGRAMS = {"rotorsim": "simulator.rotorsim", "rotortrain": "simulator.rotortrain", "rotorwatch": "service.rotorwatch"}
+HEAVY = {"scipy", "torch", "zenoh", "fastapi", "pyarrow", "mcap"}
 
 
 @pytest.fixture(scope="module")
@@ -155,3 +156,20 @@ def test_a_checkout_that_is_not_installed_can_be_imported_and_commissioning_need
         "print([d.name for d in m.distributions() if d.name.startswith('rotorwatch')])"
     )
     assert in_new_process(code, checkout, others, cwd=tmp_path) == "False\n[]"
+
+
+@pytest.mark.parametrize(
+    ("program", "command", "heavy", "said"),
+    [
+        ("rotorwatch", [], HEAVY | {"numpy"}, ("run", "check-config", "watch", "status", "router")),
+        ("rotorsim", ["publish"], HEAVY, ("back-pressure",)),
+        ("rotortrain", ["train"], HEAVY | {"numpy"}, ("rotortrain train --machine lab",)),
+    ],
+)
+def test_help_waits_for_nothing_heavy(program: str, command: list[str], heavy: set[str], said: tuple[str, ...]) -> None:
+    code = f"import sys\nfrom {PROGRAMS[program]} import app\n"
+    code += f"try:\n    app([*{command}, '--help'])\nexcept SystemExit:\n    print(*{heavy} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    *told, loaded = done.stdout.splitlines()
+    assert loaded == ""
+    assert all(word in "\n".join(told) for word in said)

@@ -40,6 +40,18 @@ def elsewhere(machine: MachineFile) -> MachineFile:
     return machine.model_copy(update={"sensors": tuple(moved)})
 
 
+def mounted(machine: Machine, at: dict[str, tuple[float, float]]) -> Machine:
+    """The machine with its probes of some states' names (``y1``) turned: those in y and z to these angles."""
+    fields = machine.model_dump()
+    for sensor in fields["sensors"]:
+        for first, angles in at.items():
+            pair = (first, first.replace("y", "z"))
+            if sensor["name"] in pair:
+                number = pair.index(sensor["name"])
+                sensor |= {"direction": "XY"[number], "angle_deg": angles[number]}
+    return Machine.model_validate(fields)
+
+
 @cache
 def stream(duration_s: float, seed: int, *events: Event) -> tuple[SampleBlock, ...]:
     """Blocks of the shipped healthy scenario with events of one's own."""
@@ -62,6 +74,17 @@ def with_samples(stream_: Sequence[SampleBlock], samples: FloatArray) -> list[Sa
         found.append(replace(block, samples=part))
         at += n_samples
     return found
+
+
+def humming(stream_: Sequence[SampleBlock], line_hz: float, bearing_m: float = 60e-6) -> list[SampleBlock]:
+    """The same on a floor that another machine shakes: the disc moves by 60 um."""
+    samples = samples_of(stream_)
+    turned = 2 * np.pi * line_hz * np.arange(len(samples)) / LAB.rate_hz
+    for column, channel in enumerate(LAB.sensors[:8]):
+        moved_m = bearing_m if channel.location == "bearing" else 60e-6
+        hum = 2 * np.pi * line_hz * np.cos(turned) if channel.quantity == "velocity" else np.sin(turned)
+        samples[:, column] += moved_m * hum / channel.to_si
+    return with_samples(stream_, samples)
 
 
 def recording(machine: MachineFile, stream_: Sequence[SampleBlock], name: str = "healthy.mcap") -> HealthyRecording:

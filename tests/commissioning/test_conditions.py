@@ -11,6 +11,7 @@ from rotorwatch.records.windows import Parameter
 from service.monitor.evaluation import Evaluation, evaluator_for
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, stream, windows_of
+from tests.sure import sure
 
 SLOW = LAB.operation.speed_rpm
 FAST = 1.15 * SLOW
@@ -49,10 +50,8 @@ def verdict_of(made: Commissioning) -> tuple[str, str]:
 def test_two_speeds_of_one_machine_make_one_baseline() -> None:
     made = made_of(("slow.mcap", 91, (at(SLOW),)), ("fast.mcap", 92, (at(FAST),)))
     assert verdict_of(made)[0] == "passed"
-    assert made.commissioned is not None
-    (baseline,) = made.commissioned.baselines
-    assert baseline.conditions.speed_rpm is not None
-    low, high = baseline.conditions.speed_rpm
+    (baseline,) = sure(made.commissioned).baselines
+    low, high = sure(baseline.conditions.speed_rpm)
     assert abs(low / SLOW - 1) < 0.001
     assert abs(high / FAST - 1) < 0.001
     between = evaluated(made, 93, at((SLOW + FAST) / 2))
@@ -69,13 +68,11 @@ def test_a_bearing_that_depends_on_the_speed_has_a_baseline_for_each() -> None:
     assert verdict == "limited"
     assert "bearing stiffness, horizontal" in text
     assert "a baseline is kept for each speed" in text
-    assert made.commissioned is not None
-    assert len(made.commissioned.baselines) == 2
+    assert len(sure(made.commissioned).baselines) == 2
     assert abs(reading(evaluated(made, 94, at(FAST), stiffer), "k_by").z or 99.0) < 4
     assert abs(reading(evaluated(made, 95, at(SLOW)), "k_by").z or 99.0) < 4
     lost = reading(evaluated(made, 96, at(FAST)), "k_by")  # the stiffness of the slow machine, at the high speed
-    assert lost.relative_change is not None
-    assert abs(lost.relative_change - (1 / 1.3 - 1)) < 0.05
+    assert abs(sure(lost.relative_change) - (1 / 1.3 - 1)) < 0.05
 
 
 @pytest.mark.slow

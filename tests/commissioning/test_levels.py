@@ -41,6 +41,7 @@ from tests.commissioning.rotor_kit import (
     windows_of,
     with_samples,
 )
+from tests.sure import sure
 
 HEALTHY_S = 90.0
 MACHINES = {"full": LAB, "partial": PARTIAL, "none": NOTHING}
@@ -57,8 +58,7 @@ def test_a_machine_file_says_how_much_is_known() -> None:
     assert knowledge_of(PARTIAL).level is KnowledgeLevel.PARTIAL
     assert "k_by_N_per_m, k_bz_N_per_m, c_by_N_s_per_m, c_bz_N_s_per_m, e_m" in knowledge_of(PARTIAL).text
     assert knowledge_of(NOTHING).level is KnowledgeLevel.NONE
-    assert PARTIAL.rotor is not None
-    rotor = PARTIAL.rotor.model_copy(update={"I2_kg_m2": None})
+    rotor = sure(PARTIAL.rotor).model_copy(update={"I2_kg_m2": None})
     without_inertia = PARTIAL.model_copy(update={"rotor": rotor})
     assert knowledge_of(without_inertia).level is KnowledgeLevel.NONE
     assert "lacks I2_kg_m2" in knowledge_of(without_inertia).text
@@ -68,8 +68,7 @@ def test_a_machine_file_says_how_much_is_known() -> None:
 def test_where_no_motion_is_measured_levels_are_all_there_is_whatever_is_known(known: MachineFile) -> None:
     machine = elsewhere(known)
     assert install(machine, None).watching
-    made = commissioned(machine, healthy(machine, 70.0, 60106)).commissioned
-    assert made is not None
+    made = sure(commissioned(machine, healthy(machine, 70.0, 60106)).commissioned)
     assert (made.level, made.levels is None) == (KnowledgeLevel.NONE, False)
     blocks = stream(70.0, 60106)
     still = samples_of(blocks)
@@ -88,8 +87,7 @@ def test_partial_knowledge_identifies_the_rotor_within_its_errors() -> None:
     assert made.report.verdict in {"commissioned", "limited"}
     assert made.machine is not None
     assert made.commissioned is not None
-    assert made.commissioned.identified is not None
-    errors = np.sqrt(np.diag(made.commissioned.identified.matrix()))
+    errors = np.sqrt(np.diag(sure(made.commissioned.identified).matrix()))
     for name, error in zip(PARAMETERS, errors.tolist(), strict=True):
         found, true = (getattr(machine.rotor, FAULT_FIELDS[name]) for machine in (made.machine, LAB))
         assert 0 < error < 0.03, name
@@ -114,8 +112,7 @@ def test_a_later_window_is_judged_by_how_the_healthy_ones_were_off() -> None:
     before, judged, changed = [], [], []
     for _ in range(1500):
         # Windows of half the monitor's length, and then one as long.
-        healthy = HealthyMisfit.of([window(0.5) for _ in range(8)], [0.5] * 8)
-        assert healthy is not None
+        healthy = sure(HealthyMisfit.of([window(0.5) for _ in range(8)], [0.5] * 8))
         assert (healthy.error, healthy.excess_error) == pytest.approx((0.5, 0.5**0.5))
         before.append(window(1.0).misfit_z)
         judged.append(healthy.beyond(window(1.0), 1.0).misfit_z)
@@ -133,8 +130,7 @@ def test_a_later_window_is_judged_by_how_the_healthy_ones_were_off() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("level", ["partial", pytest.param("full", marks=pytest.mark.long)])
 def test_a_misfit_that_was_there_when_the_machine_was_healthy_is_none_of_a_later_window(level: str) -> None:
-    made, machine = made_at(level).commissioned, MACHINES[level]
-    assert made is not None
+    made, machine = sure(made_at(level).commissioned), MACHINES[level]
     assert made.misfit is not None
     assert "misfit" not in json.loads(made.model_copy(update={"misfit": None}).model_dump_json())
     assert made.misfit.error == pytest.approx((60 / 35 / 2) ** 0.5, rel=0.05)  # of 70 s
@@ -147,11 +143,10 @@ def test_a_misfit_that_was_there_when_the_machine_was_healthy_is_none_of_a_later
 
     raw = judged(None)
     assert raw.goodness is not None
-    assert raw.misfit_z is not None
     scores = {one.tried: one.z for one in raw.goodness.alternatives}
     assert len(scores) == len(raw.goodness.alternatives)
     exact = HealthyMisfit(mean=0.0, scores=scores, error=0.0, excess=raw.goodness.excess_z, excess_error=0.0)
-    assert (judged(exact).misfit_z or 0.0) < raw.misfit_z
+    assert (judged(exact).misfit_z or 0.0) < sure(raw.misfit_z)
     shifted = exact.model_copy(update={"scores": scores | {"mass of the disc": scores["mass of the disc"] - 12.0}})
     assert (judged(shifted).misfit_z or 0.0) > 10.0
     assert "mass of the disc" in judged(shifted).suspect
@@ -179,8 +174,7 @@ def test_what_was_commissioned_comes_back_from_its_file(level: str, tmp_path: Pa
 
 @pytest.mark.slow
 def test_a_bundle_is_refused_for_another_machine_or_when_damaged(tmp_path: Path) -> None:
-    made = made_at("none").commissioned
-    assert made is not None
+    made = sure(made_at("none").commissioned)
     path = tmp_path / FILE
     path.write_text(made.model_dump_json())
     with pytest.raises(BundleError, match="commissioned for demo/lab, not for demo/other"):
@@ -224,12 +218,8 @@ def test_a_longer_recording_is_asked_for_where_the_commissioning_dominates() -> 
     little = commissioned(NOTHING, healthy(NOTHING, 46.0, 46))
     much = made_at("none")
     for one, other in zip(little.report.parameters[:4], much.report.parameters[:4], strict=True):
-        assert one.commissioning_error is not None
-        assert other.commissioning_error is not None
-        assert one.commissioning_error > 1.3 * other.commissioning_error
-        assert one.detectable_loss is not None
-        assert other.detectable_loss is not None
-        assert one.detectable_loss < other.detectable_loss < 0
+        assert sure(one.commissioning_error) > 1.3 * sure(other.commissioning_error)
+        assert sure(one.detectable_loss) < sure(other.detectable_loss) < 0
     assert isinstance(much.commissioned, Commissioned)
 
 
@@ -237,13 +227,11 @@ def test_a_longer_recording_is_asked_for_where_the_commissioning_dominates() -> 
 def test_the_valid_band_of_what_is_derived_is_stated() -> None:
     note, linear = made_at("none").report.notes
     assert linear.startswith("The relations are linear.")
-    found = re.search(r"up to (\d) derivatives .* valid from 0 to (\d+) Hz", note)
-    assert found is not None
+    found = sure(re.search(r"up to (\d) derivatives .* valid from 0 to (\d+) Hz", note))
     assert 50 <= int(found[2]) <= NOTHING.window.band_hz[1]
     displacements = [n for n, channel in enumerate(NOTHING.sensors) if channel.quantity != "velocity"]
     few = NOTHING.model_copy(update={"sensors": tuple(NOTHING.sensors[n] for n in displacements)})
     blocks = [replace(block, samples=block.samples[:, displacements]) for block in stream(HEALTHY_S, 41)[:700]]
     less, _ = commissioned(few, recording(few, blocks)).report.notes
-    deeper = re.search(r"up to (\d) derivatives", less)
-    assert deeper is not None
+    deeper = sure(re.search(r"up to (\d) derivatives", less))
     assert int(deeper[1]) > int(found[1])

@@ -19,11 +19,13 @@ from tests.commissioning.rotor_kit import (
     PARTIAL,
     commissioned,
     healthy,
+    humming,
     recording,
     samples_of,
     stream,
     with_samples,
 )
+from tests.sure import sure
 
 HEALTHY_S = 80.0
 
@@ -114,20 +116,13 @@ def test_a_machine_that_changed_meanwhile() -> None:
 
 
 def test_another_machine_that_hums() -> None:
-    blocks = stream(HEALTHY_S, 56)
-    samples = samples_of(blocks)
-    turned = 2 * np.pi * 48.6 * np.arange(samples.shape[0]) / LAB.rate_hz
-    for column, channel in enumerate(LAB.sensors[:8]):
-        moved_m = 20e-6 if channel.location == "bearing" else 60e-6
-        hum = 2 * np.pi * 48.6 * np.cos(turned) if channel.quantity == "velocity" else np.sin(turned)
-        samples[:, column] += moved_m * hum / channel.to_si
-    humming = with_samples(blocks, samples)
-    verdict, text, advice = verdict_of(made_of(humming), "second excitation")
+    disturbed = humming(stream(HEALTHY_S, 56), 48.6, bearing_m=20e-6)
+    verdict, text, advice = verdict_of(made_of(disturbed), "second excitation")
     assert verdict in {"limited", "refused"}
     assert "a steady line at 48.60 Hz" in text
     assert "neighbouring machine" in advice
     sensors = tuple(one.model_copy(update={"name": f"XE-{one.name}"}) for one in NOTHING.sensors)
-    named = check_lines(NOTHING.model_copy(update={"sensors": sensors}), [recording(NOTHING, humming)]).text
+    named = check_lines(NOTHING.model_copy(update={"sensors": sensors}), [recording(NOTHING, disturbed)]).text
     assert "of the random vibration of XE-" in named
 
 
@@ -224,9 +219,8 @@ def test_shapes_without_power_are_no_commissioning(count: int, varies: float, ve
 
 @pytest.mark.slow
 def test_a_machine_that_is_no_such_rotor_is_told_the_cure() -> None:
-    assert PARTIAL.rotor is not None
     masses = {"m1_kg": 1.5 * LAB.rotor.m1_kg, "m2_kg": 0.7 * LAB.rotor.m2_kg}
-    wrong = PARTIAL.model_copy(update={"rotor": PARTIAL.rotor.model_copy(update=masses)})
+    wrong = PARTIAL.model_copy(update={"rotor": sure(PARTIAL.rotor).model_copy(update=masses)})
     made = commissioned(wrong, healthy(wrong, 45.0, 41))
     assert refused(made)
     assert "leave [rotor] out of the machine file" in verdict_of(made, "agrees with the identified rotor")[2]

@@ -27,6 +27,8 @@ from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MonitorReport
 from simulator.scenario import Event
 from tests.service.rig.live import LAB, scenario_blocks
+from tests.sure import sure
+from tests.windows import full_windows
 
 FAULT_S, DURATION_S = 78.0, 106.0
 WITHOUT_ANGLE = LAB.model_copy(update={"sensors": tuple(one for one in LAB.sensors if one.name != "theta")})
@@ -103,8 +105,7 @@ def test_a_monitor_stopped_at_any_block_goes_on_to_the_last_bit(machine: str, re
             running = renewed(running, kept, lambda: monitor(machine), messages[:number])
         assert running.step(block) == expected[number], f"block {number}"
     assert sum(bool(window.parameters) for report in expected for window in report.windows) >= 6
-    last = expected[hops[-1]].windows[-1].verdict
-    assert last is not None
+    last = sure(expected[hops[-1]].windows[-1].verdict)
     assert [finding.name for finding in last.changed] == ["k_by"]
     assert {report.verdict.reason for report in expected} == {None, "overlap"}
     assert sum(not report.verdict.continuous for report in expected) == 3  # two gaps, one repetition
@@ -130,22 +131,20 @@ def test_what_the_likelihood_remembers_matters() -> None:
     assert now.parameters != then.parameters
     for one, other in zip(now.parameters, then.parameters, strict=True):
         if one.relative_change is not None:
-            assert other.relative_change is not None
-            assert other.standard_error is not None
-            assert abs(one.relative_change - other.relative_change) < other.standard_error
+            assert abs(one.relative_change - sure(other.relative_change)) < sure(other.standard_error)
 
 
 @lru_cache
 def windows() -> tuple[WindowStatistics, ...]:
     """Sixteen windows at speeds that are never quite the same, but always between the same two frequencies."""
-    plan = plan_for(LAB, lagged=False)
-    window, found, rng = SlidingWindow(plan), list[WindowStatistics](), np.random.default_rng(3)
-    for block in scenario_blocks(138.0, Event(at_s=130.0, parameter="c_bz", relative_change=0.6)):
-        for _ in window.feed(plan.to_si(block.samples), block.start_ns):
-            full = window.statistics()
-            if full is not None:
-                found.append(replace(full, speed_rad_s=full.speed_rad_s * (1.002 + 1e-4 * rng.standard_normal())))
-    return tuple(found)
+    rng, stream = (
+        np.random.default_rng(3),
+        scenario_blocks(138.0, Event(at_s=130.0, parameter="c_bz", relative_change=0.6)),
+    )
+    return tuple(
+        replace(full, speed_rad_s=full.speed_rad_s * (1.002 + 1e-4 * rng.standard_normal()))
+        for full in full_windows(SlidingWindow(plan_for(LAB, lagged=False)), stream)
+    )
 
 
 @pytest.mark.slow
@@ -171,8 +170,7 @@ def test_slopes_taken_over_from_another_speed_are_those_of_that_speed() -> None:
     first, second = windows()[:2]
     fit = LikelihoodFit(LAB, follow=True)
     fit.diagnose(first)
-    line = fit._line
-    assert line is not None
+    line = sure(fit._line)
     search = fit._search(line.model, second, second.speed_rad_s, line.weights.strength)
     found = search.maximise(line.theta, 0, 0.15, 3.0, line.derivatives)
     assert found.slopes_rad_s == first.speed_rad_s != second.speed_rad_s

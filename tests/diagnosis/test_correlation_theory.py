@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from models.diagnosis.moments import plan_for
-from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.diagnosis.window import WindowStatistics
 from models.machine import load_machine
 from models.physics.excitation import expanded_A, expanded_B
 from models.physics.response import correlation, stationary_covariance, synchronous_response
@@ -12,6 +12,7 @@ from models.physics.rotor import STATE_INDEX
 from simulator.scenario import Scenario
 from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition
+from tests.windows import last_window
 
 LAB = load_machine("lab")
 MACHINE = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 30.0})})
@@ -19,14 +20,8 @@ SEED = 7_700_004
 
 
 def simulated(condition: Scenario, seed: int) -> WindowStatistics:
-    plan = plan_for(MACHINE)
-    window = SlidingWindow(plan)
-    for block, _ in blocks(condition.model_copy(update={"seed": seed}), MACHINE, block_s=1.0):
-        for _ in window.feed(plan.to_si(block.samples), block.start_ns):
-            pass
-    statistics = window.statistics()
-    assert statistics is not None
-    return statistics
+    stream = blocks(condition.model_copy(update={"seed": seed}), MACHINE, block_s=1.0)
+    return last_window(plan_for(MACHINE), (block for block, _ in stream))
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ from models.diagnosis.shape import FEWEST_WINDOWS, HealthyShape, learn_shape
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.physics.rotor import PARAMETERS
+from tests.sure import sure
 
 PROBES = ("y1", "z1", "y2_ddot")
 LENGTH_S = 20.0
@@ -57,8 +58,7 @@ def test_a_lost_fifth_of_stiffness_is_seen_and_never_named() -> None:
     for window in recorded(2, 8, change=-0.2):
         judged = shape.judge(window)
         assert judged[0].verdict == "changed"
-        assert judged[0].z is not None
-        assert judged[0].z > judged[0].limit
+        assert sure(judged[0].z) > judged[0].limit
         for one in judged:
             said = one.text.replace(one.state, "")
             assert not any(name in said.split() for name in (*PARAMETERS, "bearing", "disc", "stiffness", "damping"))
@@ -81,12 +81,9 @@ def test_the_spread_holds_what_the_excitation_did_where_it_was_seen() -> None:
 def test_fewer_healthy_windows_and_shorter_ones_ask_for_a_larger_change() -> None:
     healthy, (changed, *_) = recorded(1, 6), recorded(2, 8, change=-0.2)
     shape = learn_shape(healthy)
-    known = shape.judge(changed)[0].z
-    fewer = replace_windows(shape, FEWEST_WINDOWS).judge(changed)[0].z
-    shorter = shape.judge(replace(changed, duration_s=7.0))[0].z
-    assert known is not None
-    assert fewer is not None
-    assert shorter is not None
+    known = sure(shape.judge(changed)[0].z)
+    fewer = sure(replace_windows(shape, FEWEST_WINDOWS).judge(changed)[0].z)
+    shorter = sure(shape.judge(replace(changed, duration_s=7.0))[0].z)
     assert fewer < known
     assert shorter < known
 
@@ -176,8 +173,7 @@ def test_few_healthy_windows_have_no_power_and_say_how_many_would() -> None:
     growths = {count: replace_windows(varies, count).powers(rate)["y1"].growth for count in range(4, 12)}
     assert growths[5] == np.inf
     assert growths[11] < 8
-    needed = varies.powers(rate)["y1"].windows
-    assert needed is not None
+    needed = sure(varies.powers(rate)["y1"].windows)
     assert 5 < needed <= 11
     assert growths[needed] <= 8 < growths[needed - 1]
 

@@ -13,6 +13,7 @@ from models.diagnosis.window import window_statistics
 from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from tests.commissioning.rotor_kit import NOTHING
+from tests.sure import sure
 
 RATE_HZ, SPEED_HZ = NOTHING.rate_hz, 22.0
 N = round(70 * RATE_HZ)
@@ -125,8 +126,7 @@ def test_a_beat_of_the_healthy_machine_is_not_new_and_a_1x_that_drifted_then_hid
     beats, drifts = line(22.08), line(SPEED_HZ, 6.0) * T / T[-1]
     found, speed_rad_s = lines(beats), 2 * np.pi * SPEED_HZ
     for healthy_y1, new in ((beats, False), (drifts, True)):
-        known = known_lines([recording(healthy_y1)])
-        assert known is not None
+        known = sure(known_lines([recording(healthy_y1)]))
         assert (new_line(found, known, speed_rad_s) is not None) is new
 
 

@@ -16,28 +16,19 @@ from models.diagnosis.moments import plan_for
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import learn_sensor_reference
 from models.diagnosis.shape import learn_shape
-from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.diagnosis.window import WindowStatistics
 from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import SampleBlock
 from models.signals.channels import Channel, ChannelDescriptor, state_name, with_channel_names
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
+from tests.commissioning.rotor_kit import mounted
+from tests.sure import sure
+from tests.windows import last_window
 
 LAB = load_machine("lab").model_copy(update={"dtype": "float64"})
 NAMES = [channel.name for channel in LAB.sensors]
 SECONDS = 64.0
-
-
-def mounted(machine: Machine, at: dict[str, tuple[float, float]]) -> Machine:
-    """The machine with its probes of some states' names (``y1``) turned: those in y and z to these angles."""
-    fields = machine.model_dump()
-    for sensor in fields["sensors"]:
-        for first, angles in at.items():
-            pair = (first, first.replace("y", "z"))
-            if sensor["name"] in pair:
-                number = pair.index(sensor["name"])
-                sensor |= {"direction": "XY"[number], "angle_deg": angles[number]}
-    return Machine.model_validate(fields)
 
 
 API_670 = mounted(LAB, {"y1": (45, 135), "y2": (45, 135)})
@@ -58,14 +49,7 @@ def _simulated(machine_json: str, events: tuple[Event, ...], noise: float, seed:
 
 
 def window_of(machine: MachineFile, stream: Sequence[SampleBlock], *, lagged: bool = False) -> WindowStatistics:
-    plan = plan_for(machine, lagged=lagged)
-    sliding = SlidingWindow(plan)
-    for block in stream:
-        for _ in sliding.feed(plan.to_si(block.samples), block.start_ns):
-            pass
-    found = sliding.statistics()
-    assert found is not None
-    return found
+    return last_window(plan_for(machine, lagged=lagged), stream)
 
 
 def changed(stream: Sequence[SampleBlock], name: str, gain: float = 1.0, offset: float = 0.0) -> list[SampleBlock]:
@@ -110,9 +94,8 @@ def test_the_diagnosis_is_the_same_as_with_probes_in_y_and_z(machine: Machine, c
     turned = LikelihoodFit(machine).diagnose(window_of(machine, simulated(machine, *change, noise=1e-9)))
     assert plain.evaluable
     for one, other in zip(plain.parameters, turned.parameters, strict=True):
-        assert one.relative_change is not None
         assert one.standard_error is not None
-        assert other.relative_change == pytest.approx(one.relative_change, abs=0.05 * one.standard_error)
+        assert other.relative_change == pytest.approx(sure(one.relative_change), abs=0.05 * one.standard_error)
         assert other.standard_error == pytest.approx(one.standard_error, rel=0.01)
 
 
@@ -173,9 +156,7 @@ def test_without_a_phase_reference_vectors_are_turned_hop_by_hop() -> None:
         window_of(one, [replace(block, samples=block.samples[:, columns]) for block in simulated(of)])
         for one, of in ((machine, API_670), (plain, LAB))
     )
-    turned, same = found.relative_synchronous, expected.relative_synchronous
-    assert turned is not None
-    assert same is not None
+    turned, same = sure(found.relative_synchronous), sure(expected.relative_synchronous)
     # the channel at angle zero is the same
     assert np.abs(turned.imag).max(axis=0).argmin() == np.abs(same.imag).max(axis=0).argmin()
     assert np.abs(turned) == pytest.approx(np.abs(same), rel=0.01)

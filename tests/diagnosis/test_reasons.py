@@ -18,6 +18,7 @@ from models.machine import load_machine
 from models.physics.rotor import impossible
 from service.monitor.evaluation import KnownMachineEvaluator
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
+from tests.sure import sure
 
 MACHINE = load_machine("lab")
 _NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
@@ -106,8 +107,7 @@ def test_beside_a_misfit_the_rotor_must_be_seen(window: WindowStatistics) -> Non
         LikelihoodFit(MACHINE).diagnose(replace(window, spectrum=spectrum))
         for spectrum in (window.spectrum * np.outer(gain, gain), window.spectrum + noise)
     )
-    assert seen.misfit_z is not None
-    assert seen.misfit_z > 4
+    assert sure(seen.misfit_z) > 4
     assert not seen.unexplained
     assert not drowned.unexplained  # nothing contradicts the rotor: its parameters are only vague
     assert_beyond(reason_of(replace(window, spectrum=window.spectrum + noise * more)))
@@ -138,8 +138,7 @@ def test_an_unsteady_speed_says_so_in_numbers(window: WindowStatistics) -> None:
 
 
 def test_networks_say_what_they_do_not_know(window: WindowStatistics) -> None:
-    networks = load_bundle("lab", MACHINE).amortised
-    assert networks is not None
+    networks = sure(load_bundle("lab", MACHINE).amortised)
     diagnostician = NetworkDiagnostician(MACHINE, networks)
     spectrum = window.spectrum.copy()
     spectrum[:, :2, :2] *= np.exp(2 * np.sin(0.1 * np.arange(len(spectrum))))[:, None, None]

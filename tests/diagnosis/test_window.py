@@ -15,8 +15,10 @@ from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import load_machine
 from models.signals.block import FloatArray
 from models.signals.waveform import Waveform, waveform_of
-from simulator.scenario import Event, NamedSource, Scenario, Sensors
+from simulator.scenario import Event, Scenario, Sensors
 from simulator.stream import blocks
+from tests.diagnosis.sensors.test_sensor_checks import sources_along
+from tests.sure import sure
 
 RATE = 200.0
 
@@ -160,12 +162,10 @@ def test_a_million_samples_with_an_offset_a_million_times_the_fluctuation() -> N
 def test_synchronous_part_and_speed_are_recovered_and_removed() -> None:
     plan, samples = small_plan(hops=20), signal(2100, 1)
     statistics = feed(SlidingWindow(plan), samples)[-1]
-    assert statistics.synchronous is not None
-    assert statistics.hop_synchronous is not None
     # Least squares over 2000 samples of noise with density 25 at low frequency: standard error √(2·25/2000)·√2 ≈ 0.22.
-    np.testing.assert_allclose(statistics.synchronous, [2.0 + 1.0j, 0.5 - 0.3j], atol=0.9)
+    np.testing.assert_allclose(sure(statistics.synchronous), [2.0 + 1.0j, 0.5 - 0.3j], atol=0.9)
     assert statistics.speed_rad_s == pytest.approx(2 * np.pi * 7.3, rel=1e-9)
-    assert statistics.hop_synchronous.shape == (20, 2)
+    assert sure(statistics.hop_synchronous).shape == (20, 2)
     clean = signal(2100, 1)
     theta = clean[:, 2]
     clean[:, :2] += 50 * np.cos(theta)[:, None]
@@ -189,17 +189,14 @@ def test_a_gap_costs_the_hop_it_falls_into_and_no_more() -> None:
     window = SlidingWindow(plan)
     feed(window, samples[:530])  # four hops and 80 samples
     assert window.filled == 1.0
-    before = window.statistics()
+    before = sure(window.statistics())
     window.gap()
     later = signal(1200, 3)
     feed(window, later[:140], 1000)
-    assert before is not None
-    now = window.statistics()
-    assert now is not None
+    now = sure(window.statistics())
     assert_identical(now, before)
     feed(window, later[140:150], 1140)
-    now = window.statistics()
-    assert now is not None
+    now = sure(window.statistics())
     assert now.start_ns == before.start_ns + round(0.5e9)
     assert now.end_ns == round(1150e9 / RATE)
 
@@ -269,12 +266,7 @@ def run_of_lab(seed: int, change: float = 0.0, *, unbalanced: bool = True) -> Fl
         events.append(Event(at_s=0.0, parameter="e", relative_change=-0.9999))
     rotor = LAB.rotor
     force_N = rotor.m2_kg * rotor.e_m * LAB.operation.speed_rad_s**2 * 0.5
-    sources = tuple(
-        NamedSource.model_validate(
-            {"name": str(i), "cutoff_hz": 90.0, "direction": tuple(np.eye(6)[i]), "force_rms_N": force_N}
-        )
-        for i in (0, 1, 3, 4)
-    )
+    sources = sources_along(np.eye(6)[[0, 1, 3, 4]], 90.0, force_N)
     sensors = Sensors(noise_relative=0.02, noise_corner_hz=300.0)
     scenario = Scenario(
         machine="lab", seed=seed, duration_s=63.0, sources=sources, sensors=sensors, events=tuple(events)
@@ -310,8 +302,7 @@ def test_one_set_of_coefficients_would_not_do(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("models.diagnosis.moments.STEADY", 1.0)
     (window,) = feed(SlidingWindow(plan), samples)
     assert not window.removed_by_hop
-    misfit = LikelihoodFit(LAB).diagnose(window).misfit_z
-    assert misfit is not None
+    misfit = sure(LikelihoodFit(LAB).diagnose(window).misfit_z)
     assert misfit > 4
 
 

@@ -17,6 +17,7 @@ from service.history.store import Store
 from tests.faults.rig import Plant, Seen, locked, pause
 from tests.service.delivery.hooked import Got, hook, settings_for
 from tests.service.rig.live import Feed, endpoint, open_session, program, scenario_blocks, until
+from tests.sure import sure
 
 _PAGE = 8192
 _FED_S = 0.1  # length of the blocks of `scenario_blocks`
@@ -85,8 +86,7 @@ def clock_set(offset_s: float) -> Callable[[Plant], None]:
                 plant.broken()
                 plant.stated(lambda seen: any(one.name == CLOCK for one in seen.health.alarms), "clock that was set")
                 plant.over(lambda seen: seen.well and seen.raised(CLOCK))
-                seen = plant.look()
-                assert seen is not None
+                seen = sure(plant.look())
                 plant.missing_s += sum(seen.health.quality.refused_blocks.values()) * _FED_S
             finally:
                 stop.set()
@@ -116,8 +116,7 @@ def through_router(plant: Plant) -> None:
 
 def link_cut(plant: Plant) -> None:
     plant.at_work()
-    assert plant.router is not None
-    plant.router.kill()
+    sure(plant.router).kill()
     plant.broken()
     plant.stated(_silent, "stream lost")
     plant.start_router()
@@ -321,8 +320,7 @@ def receiver(plant: Plant) -> None:
 
 
 def receiver_away(plant: Plant) -> None:
-    receiver, taken = plant.receiver, list[str]()
-    assert receiver is not None
+    receiver, taken = sure(plant.receiver), list[str]()
 
     def take(got: Got) -> tuple[int, Mapping[str, str]]:
         taken.append(got.id)

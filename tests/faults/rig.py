@@ -27,6 +27,7 @@ from rotorwatch.records.monitor import Readiness
 from tests.loopback import session_of
 from tests.service.delivery.hooked import Hook
 from tests.service.rig.live import LAB, Program, endpoint, program
+from tests.sure import sure
 
 BLOCK_S = 0.2
 _PLACE = "/api/v1/machines/demo/lab"
@@ -111,8 +112,7 @@ class Plant:
     @property
     def running(self) -> Program:
         """The monitor that runs."""
-        assert self.monitor is not None
-        return self.monitor
+        return sure(self.monitor)
 
     # What runs
 

@@ -27,6 +27,7 @@ from tests.interchange.material import (
     signals,
     stretches,
 )
+from tests.sure import sure
 
 STEP_NS = 500_000
 NANOSECONDS = '[time]\ncolumn = "t"\nunit = "ns"\nstart = "unix"\n'
@@ -291,8 +292,7 @@ def test_pulse_times_of_a_file_become_its_shaft_angle(tmp_path: Path) -> None:
     mapping = TIME + CHANNELS_OF_KEYPHASOR + '[keyphasor]\npulse_times = "k"\nunit = "ms"\n'
     done, recording = imported(tmp_path, tmp_path / "run.npz", mapping)
     (found,) = stretches(recording)
-    assert done.pulses is not None
-    assert done.pulses.missing == 1
+    assert sure(done.pulses).missing == 1
     assert found.samples.shape == (20_000, 3)
     assert off_by(found.samples[:, 2], angle).max() < 1e-6
 

@@ -13,6 +13,7 @@ from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from models.signals.waveform import waveform_of
 from rotorwatch.records.levels import ChannelLevels
+from tests.sure import sure
 
 RATE_HZ, HOP_S, HOPS = 2560.0, 5.0, 4
 DE = Channel.model_validate(
@@ -48,14 +49,12 @@ def judged(samples: FloatArray, healthy: LevelReference | None) -> ChannelLevels
 
 def grown(samples: FloatArray, healthy: LevelReference) -> tuple[str, str]:
     """State and words of the growth in bands."""
-    limits = judged(samples, healthy).limit("growth")
-    assert limits is not None
+    limits = sure(judged(samples, healthy).limit("growth"))
     return limits.state, limits.text
 
 
 def test_bands_hold_what_is_in_them() -> None:
-    bands = window(noise(1) + line(97.3, 4.0)).bands
-    assert bands is not None
+    bands = sure(window(noise(1) + line(97.3, 4.0)).bands)
     low, high = bands.edges_hz[:-1], bands.edges_hz[1:]
     within = (low < 97.3) & (high > 97.3)
     assert bands.rms[within, 0] == pytest.approx(4 / np.sqrt(2), rel=0.01)
@@ -140,5 +139,4 @@ def test_first_windows_remember_their_bands() -> None:
         for number in (2, 3):
             one.take(number, number + 1, window(noise(number)))
     assert first.reference == again.reference
-    assert first.reference is not None
-    assert first.reference.states[0].bands["DE"].mean
+    assert sure(first.reference).states[0].bands["DE"].mean

@@ -13,6 +13,7 @@ from models.levels.measures import hop_levels, level_plan, window_levels
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from models.signals.waveform import waveform_of
+from tests.sure import sure
 
 RATE_HZ, HOP_S, HOPS = 1000.0, 5.0, 12
 PLACES = ("bearing y", "disc y", "disc z")
@@ -42,19 +43,15 @@ def window(
         columns.append(gain * lfilter([1.0], [1, -2 * root.real, abs(root) ** 2], force))
     samples: FloatArray = 1e-6 * np.column_stack(columns)
     hops = [hop_levels(PLAN, *waveform_of(part), None) for part in np.split(samples, HOPS)]
-    found = window_levels(PLAN, hops, np.full(HOPS, np.nan), phase_reference=False).bands
-    assert found is not None
-    return found
+    return sure(window_levels(PLAN, hops, np.full(HOPS, np.nan), phase_reference=False).bands)
 
 
 @pytest.fixture(scope="module")
 def reference() -> GainReference:
     """Of two recordings, of excitation of two colours."""
-    learned = learn_gains(
-        PLACES, [[window(10 * n + k, pole=pole) for k in range(4)] for n, pole in ((1, 0.5), (2, 0.8))]
+    return sure(
+        learn_gains(PLACES, [[window(10 * n + k, pole=pole) for k in range(4)] for n, pole in ((1, 0.5), (2, 0.8))])
     )
-    assert learned is not None
-    return learned
 
 
 @pytest.mark.parametrize("at", range(3))
@@ -62,8 +59,7 @@ def reference() -> GainReference:
 def test_a_gain_is_told_with_its_place(reference: GainReference, at: int, gain: float) -> None:
     gains = [1.0, 1.0, 1.0]
     gains[at] = gain
-    found = wrong_gain(window(100 + at, gains=gains, pole=0.8), PLACES, reference)
-    assert found is not None
+    found = sure(wrong_gain(window(100 + at, gains=gains, pole=0.8), PLACES, reference))
     assert found[0] == PLACES[at]
     assert found[1] == pytest.approx(gain, rel=0.03)
 

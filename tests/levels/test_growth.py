@@ -13,6 +13,7 @@ from models.levels.reference import LevelReference, learn_levels
 from models.levels.settings import LevelSettings
 from models.signals.channels import Channel
 from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels
+from tests.sure import sure
 
 CHANNELS = [
     Channel.model_validate({"name": name, "quantity": quantity, "location": "DE", "direction": "V", "unit": unit})
@@ -53,8 +54,7 @@ def test_the_growth_that_is_stated_is_the_one_that_raises_an_alert(scales: tuple
         for factor, state in ((0.999, "normal"), (1.001, "alert")):
             now = judged(window(mean * (1 + one.growth) * factor), healthy)
             (channel,) = [levels for levels in now if levels.channel == one.channel.name]
-            limit = channel.limit(one.measure)
-            assert limit is not None
+            limit = sure(channel.limit(one.measure))
             assert (limit.state == "normal") == (state == "normal")
         assert one.alert == pytest.approx(one.healthy * (1 + one.growth))
     units = {(one.channel.name, one.measure): one.unit for one in stated}

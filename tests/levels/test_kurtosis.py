@@ -14,6 +14,7 @@ from models.levels.settings import LevelSettings
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from models.signals.waveform import waveform_of
+from tests.sure import sure
 
 RATE_HZ, HOP_S, HOPS = 1000.0, 5.0, 12
 Y = Channel.model_validate(
@@ -39,8 +40,7 @@ def window(samples: FloatArray, *, turning: bool = True) -> WindowLevels:
 
 
 def kurtosis(samples: FloatArray, *, turning: bool = True) -> FloatArray:
-    found = window(samples, turning=turning).random_kurtosis
-    assert found is not None
+    found = sure(window(samples, turning=turning).random_kurtosis)
     return found[:, 0]
 
 
@@ -67,9 +67,7 @@ def test_without_a_known_rotation_nothing_is_said() -> None:
 
 
 def reference() -> HopReference:
-    learned = learn_hops([kurtosis(noise(10 + n) + 2 * np.cos(THETA)) for n in range(5)])
-    assert learned is not None
-    return learned
+    return sure(learn_hops([kurtosis(noise(10 + n) + 2 * np.cos(THETA)) for n in range(5)]))
 
 
 def test_healthy_windows_stay_within_the_limit_and_another_excitation_too() -> None:

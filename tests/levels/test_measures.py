@@ -9,6 +9,7 @@ from models.machine import load_machine
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from models.signals.waveform import waveform_of
+from tests.sure import sure
 
 RATE_HZ = 25_600.0
 
@@ -105,8 +106,7 @@ def test_orders_with_a_phase_reference_are_amplitude_and_phase_lag() -> None:
     shown = {"x_half": 12e-6, "x1": 60e-6, "x2": 20e-6, "x3": 8e-6}
     for name, value in shown.items():
         assert found.values[name][0] == pytest.approx(value, rel=1e-3), name
-    assert found.vectors is not None
-    assert found.vectors[1, 0] == pytest.approx(vectors[1], rel=1e-3)
+    assert sure(found.vectors)[1, 0] == pytest.approx(vectors[1], rel=1e-3)
     assert found.values["not_x1"][0] == pytest.approx(np.sqrt((100 + 16 + 36) / 2) * 1e-6, rel=5e-3)
 
 
@@ -228,15 +228,13 @@ def test_whatever_the_size_of_a_vibration_its_levels_have_all_their_digits(size:
 def test_levels_are_the_same_by_the_spectrum_that_the_moments_have() -> None:
     machine = load_machine("lab")
     plan = plan_for(machine, levels=True)
-    assert plan.levels is not None
     rng = np.random.default_rng(20261126)
     t = np.arange(plan.need) / plan.rate_hz
     theta = 2 * np.pi * 22.3 * t
     gap = np.linspace(1e3, 3e3, len(plan.states))  # a million times the vibration, and not what is subtracted
     seen = gap + 1e-3 * (np.cos(theta)[:, None] + rng.standard_normal((plan.need, len(plan.states))))
-    moments = hop_moments(plan, np.column_stack([seen, theta % (2 * np.pi)]), 0.9 * gap, 0).levels
-    alone = hop_levels(plan.levels, *waveform_of(seen[-plan.hop :]), theta[-plan.hop :])
-    assert moments is not None
+    moments = sure(hop_moments(plan, np.column_stack([seen, theta % (2 * np.pi)]), 0.9 * gap, 0).levels)
+    alone = hop_levels(sure(plan.levels), *waveform_of(seen[-plan.hop :]), theta[-plan.hop :])
     alone.sums[CONTACT] = moments.sums[CONTACT]  # which only the moments look for
     assert moments.sums == pytest.approx(alone.sums, rel=1e-5, abs=0, nan_ok=True)
     assert moments.bands == pytest.approx(alone.bands, rel=1e-4, abs=0)

@@ -18,6 +18,7 @@ from models.signals.block import FloatArray
 from rotorwatch.records.levels import ChannelLevels
 from simulator.scenario import load_scenario
 from simulator.stream import blocks
+from tests.sure import sure
 
 PROBE = {"quantity": "displacement", "location": "DE", "unit": "mm"}
 RUNOUT = {"slow_roll_um_pp": 12.0, "slow_roll_phase_lag_deg": 250.0}
@@ -46,11 +47,9 @@ def window_of(machine: MachineFile, samples: FloatArray) -> SlidingWindow:
 
 def levels(machine: MachineFile, samples: FloatArray) -> tuple[WindowLevels, tuple[ChannelLevels, ...]]:
     window = window_of(machine, samples)
-    found, plan = window.levels(), window.plan
-    assert found is not None
-    assert plan.levels is not None
+    found, plan = sure(window.levels()), window.plan
     channels = [machine.sensors[column] for column in plan.columns]
-    return found, LevelJudge(plan.levels, channels, machine.levels).judge(found, None)
+    return found, LevelJudge(sure(plan.levels), channels, machine.levels).judge(found, None)
 
 
 @pytest.mark.parametrize("turned", [1, -1])
@@ -62,8 +61,7 @@ def test_the_vector_sum_of_a_run_out_and_a_vibration_gives_back_the_vibration(tu
     rest = 0.003 * np.cos(3.7 * theta)
     _, (x, y) = levels(machine, np.column_stack([both + rest, both + rest, theta % (2 * np.pi)]))
     assert x.x1 == pytest.approx(40e-3, rel=1e-3)
-    assert x.x1_phase_lag_deg is not None
-    assert (x.x1_phase_lag_deg - lag_deg + 180) % 360 - 180 == pytest.approx(0, abs=0.1)
+    assert (sure(x.x1_phase_lag_deg) - lag_deg + 180) % 360 - 180 == pytest.approx(0, abs=0.1)
     vector = 40 * np.exp(-1j * np.radians(lag_deg)) + 12 * np.exp(-1j * np.radians(250))
     assert y.x1 == pytest.approx(abs(vector) / 1000, rel=1e-3)  # no slow roll is given for it
     assert y.x1_phase_lag_deg == pytest.approx(-np.degrees(np.angle(vector)) % 360, abs=0.1)
@@ -98,9 +96,7 @@ def with_slow_roll(machine: Machine, **more: dict[str, object]) -> Machine:
 
 
 def statistics(machine: Machine, samples: FloatArray) -> WindowStatistics:
-    found = window_of(machine, samples).statistics()
-    assert found is not None
-    return found
+    return sure(window_of(machine, samples).statistics())
 
 
 def with_run_out(samples: FloatArray) -> FloatArray:
@@ -114,8 +110,7 @@ def test_the_unbalance_is_read_without_the_run_out() -> None:
 
     def unbalance(of: Machine, seen: FloatArray) -> float:
         (found,) = [one for one in LikelihoodFit(of).diagnose(statistics(of, seen)).parameters if one.name == "e"]
-        assert found.relative_change is not None
-        return found.relative_change
+        return sure(found.relative_change)
 
     true = unbalance(machine, samples)
     assert abs(unbalance(machine, with_run_out(samples)) - true) > 0.1
@@ -125,12 +120,10 @@ def test_the_unbalance_is_read_without_the_run_out() -> None:
 def test_sensors_are_judged_by_what_they_gave() -> None:
     machine, samples = simulated()
     compensated, measured = (statistics(one, with_run_out(samples)) for one in (with_slow_roll(machine), machine))
-    assert compensated.synchronous is not None
     assert measured.synchronous is not None
-    assert abs(compensated.synchronous[0] - measured.synchronous[0]) == pytest.approx(8e-6)
+    assert abs(sure(compensated.synchronous)[0] - measured.synchronous[0]) == pytest.approx(8e-6)
     assert np.array_equal(compensated.spectrum, measured.spectrum)
-    assert compensated.as_mounted.synchronous is not None
-    assert np.array_equal(compensated.as_mounted.synchronous, measured.synchronous)
+    assert np.array_equal(sure(compensated.as_mounted.synchronous), measured.synchronous)
     assert sensor_findings(compensated, None, machine.sensors) == sensor_findings(measured, None, machine.sensors)
 
 
@@ -142,9 +135,8 @@ def test_run_out_of_probes_at_an_angle_is_taken_out_as_they_are_mounted() -> Non
     }
     turned, seen = with_slow_roll(machine, **angles), samples.copy()
     seen[:, 0], seen[:, 1] = (samples[:, 0] + samples[:, 1]) / 2**0.5, (samples[:, 1] - samples[:, 0]) / 2**0.5
-    expected, found = statistics(machine, samples).synchronous, statistics(turned, with_run_out(seen)).synchronous
-    assert expected is not None
-    assert found is not None
+    expected = sure(statistics(machine, samples).synchronous)
+    found = sure(statistics(turned, with_run_out(seen)).synchronous)
     assert np.abs(found - expected).max() < 1e-3 * np.abs(expected).max()
 
 

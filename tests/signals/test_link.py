@@ -20,6 +20,7 @@ from models.mistakes import in_folder
 from models.signals.block import SampleBlock
 from models.signals.keys import Grant, MachineKeys, access_control
 from models.signals.link import LinkSettings, TlsSettings, load_link
+from tests.sure import sure
 
 ROOT = Path(__file__).parents[2]
 ENDPOINT = ("tcp/127.0.0.1:7447",)
@@ -210,8 +211,7 @@ def test_a_certificate_serves_the_role_of_the_endpoint(tmp_path: Path) -> None:
         found = json.loads(inserted(link).get_json("transport/link/tls"))
         assert {role for role in ("listen", "connect") if found[f"{role}_certificate"]} == roles
         assert {role for role in ("listen", "connect") if found[f"{role}_private_key"]} == roles
-        assert link.tls is not None
-        assert found["enable_mtls"] is link.tls.mutual
+        assert found["enable_mtls"] is sure(link.tls).mutual
         assert found["verify_name_on_connect"] is True
 
 

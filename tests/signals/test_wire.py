@@ -35,6 +35,7 @@ from models.signals.keys import PREFIX, MachineKeys
 from models.signals.link import LinkSettings
 from models.signals.wire import ARROW_ENCODING, BLOCK_ENCODING, HEADER_BYTES, decode_block, encode_arrow, encode_block
 from tests.loopback import endpoint, session_of
+from tests.sure import sure
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
 Encoder = Callable[[SampleBlock, str], tuple[bytes, bytes, str]]
@@ -234,8 +235,7 @@ def test_the_page_names_encodings_and_units() -> None:
     assert BLOCK_ENCODING in PAGE
     assert ARROW_ENCODING in PAGE
     for quantity, units in UNIT_TO_SI.items():
-        row = re.search(rf"^\| {quantity} \|.*\| ([^|]+) \|$", PAGE, re.MULTILINE)
-        assert row is not None
+        row = sure(re.search(rf"^\| {quantity} \|.*\| ([^|]+) \|$", PAGE, re.MULTILINE))
         assert row[1].split(", ") == list(units)
 
 

@@ -12,22 +12,15 @@ from models.machine import Machine, MachineFile
 from simulator.commission.page import JSON, write_report
 from simulator.scenario import load_scenario
 from simulator.stream import blocks
-from tests.commissioning.rotor_kit import LAB, commissioned
+from tests.commissioning.rotor_kit import LAB, commissioned, mounted
+from tests.sure import sure
 
-PAIRS = {"y1": 45, "z1": 135, "y2": 45, "z2": 135, "y1_dot": 45, "z1_dot": 135, "y2_dot": 45, "z2_dot": 135}
-
-
-def _mounted() -> Machine:
-    fields = LAB.model_dump()
-    for sensor in fields["sensors"]:
-        if sensor["name"] in PAIRS:
-            sensor |= {"direction": "XY"[PAIRS[sensor["name"]] > 90], "angle_deg": PAIRS[sensor["name"]]}
-    return Machine.model_validate(fields)
+TURNED = mounted(LAB, dict.fromkeys(("y1", "y2", "y1_dot", "y2_dot"), (45, 135)))
 
 
 @cache
 def kit(*, mounted: bool, full: bool) -> tuple[Commissioning, HealthyRecording, MachineFile]:
-    machine: MachineFile = _mounted() if mounted else LAB
+    machine: MachineFile = TURNED if mounted else LAB
     scenario, _ = load_scenario("healthy")
     sensors = scenario.sensors.model_copy(update={"noise_relative": 1e-6})
     scenario = scenario.model_copy(update={"duration_s": 100.0, "seed": 77_205, "sensors": sensors})
@@ -54,12 +47,10 @@ def test_probes_at_an_angle_are_commissioned_as_probes_in_y_and_z(
         else:
             assert other.window_error == pytest.approx(one.window_error, rel=0.05)
     assert turned.commissioned is not None
-    sensors = turned.commissioned.sensors
-    assert sensors is not None
+    sensors = sure(turned.commissioned.sensors)
     assert {"bearing@45", "bearing@135_dot"} <= {one.state for one in sensors.channels}
     assert {(one.first, one.second) for one in sensors.pairs} >= {("disc@45", "disc@45_dot")}
-    assert turned.commissioned.levels is not None
-    assert set(turned.commissioned.levels.states[0].levels) == {one.name for one in LAB.sensors[:-1]}
+    assert set(sure(turned.commissioned.levels).states[0].levels) == {one.name for one in LAB.sensors[:-1]}
     for picture in ("draw_readings", "draw_budget", "draw_levels"):  # they take long and name no channel
         monkeypatch.setattr(f"simulator.commission.page.{picture}", lambda *_: None)
     page = write_report(tmp_path, turned.report, [recording], machine=machine, commissioned=turned.commissioned)

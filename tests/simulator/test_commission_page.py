@@ -39,11 +39,11 @@ from tests.commissioning.rotor_kit import (
     commissioned,
     elsewhere,
     healthy,
+    humming,
     recording,
-    samples_of,
     stream,
-    with_samples,
 )
+from tests.sure import sure
 
 VOID = {"meta", "br", "link", "img", "hr", "input"}
 MEASURES = (
@@ -101,16 +101,7 @@ class Page(HTMLParser):
 
 
 def disturbed() -> HealthyRecording:
-    """The rotor kit on a floor that another machine shakes at 41.4 Hz."""
-    blocks = stream(70.0, 61)
-    samples = samples_of(blocks)
-    turned = 2 * np.pi * 41.4 * np.arange(len(samples)) / LAB.rate_hz
-    for column, channel in enumerate(LAB.sensors):
-        if channel.quantity == "displacement":
-            samples[:, column] += 60.0 * np.sin(turned)  # µm
-        elif channel.quantity == "velocity":
-            samples[:, column] += 60.0e-3 * 2 * np.pi * 41.4 * np.cos(turned)  # mm/s
-    return recording(NOTHING, with_samples(blocks, samples), RUDE)
+    return recording(NOTHING, humming(stream(70.0, 61), 41.4), RUDE)
 
 
 def without_reference(operation: Operation | None) -> tuple[MachineFile, HealthyRecording]:
@@ -183,8 +174,7 @@ def written(folder: Path, name: str) -> tuple[str, CommissioningReport]:
 
 def section(text: str, name: str) -> str:
     """What is seen of one section."""
-    found = re.search(rf'<section id="{name}">(.*?)</section>', text, re.DOTALL)
-    assert found is not None
+    found = sure(re.search(rf'<section id="{name}">(.*?)</section>', text, re.DOTALL))
     return Page(found[1]).text
 
 
@@ -374,10 +364,8 @@ def test_recordings_and_conditions(folder: Path) -> None:
     assert "1 healthy.mcap 000000000000 2026-01-01 00:00:02 65 s none none 1320 rpm" in seen
     assert "Outside these conditions nothing is evaluated" in seen
     assert "speed 1320 rpm" in seen
-    assert report.conditions is not None
-    low, high = report.conditions.rms["y2_dot"]
-    found = re.search(r"disc, horizontal, velocity ([\d.]+) to ([\d.]+) mm/s rms", seen)
-    assert found is not None
+    low, high = sure(report.conditions).rms["y2_dot"]
+    found = sure(re.search(r"disc, horizontal, velocity ([\d.]+) to ([\d.]+) mm/s rms", seen))
     assert [float(edge) for edge in found.groups()] == pytest.approx([1e3 * low, 1e3 * high], rel=6e-3)
     seen = section(written(folder, "no phase reference")[0], "recordings")
     assert "1, 0.1 s missing" in seen
@@ -387,8 +375,7 @@ def test_recordings_and_conditions(folder: Path) -> None:
 def test_a_page_says_what_it_replaces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("simulator.commission.page.pictures_of", lambda *_: ())  # they take long
     made, _, machine = case("no phase reference")
-    assert made.commissioned is not None
-    before = made.commissioned
+    before = sure(made.commissioned)
     after = before.model_copy(update={"version": 2, "replaces": before.identity, "why": "bearing exchanged < today"})
     report = made.report.model_copy(update={"version": 2, "identity": after.identity})
     text = write_report(tmp_path, report, (), machine=machine, commissioned=after).read_text(encoding="utf-8")
@@ -414,8 +401,7 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 
 def test_which_error_is_said_to_dominate() -> None:
     one = next(each for each in case("partial")[0].report.parameters if each.name == "k_by")
-    own = one.window_error
-    assert own is not None
+    own = sure(one.window_error)
     for shared, which in (
         (0.0, "window"),
         (own / 2.1, "window"),
@@ -463,8 +449,7 @@ def test_the_terminal_says_the_same_in_80_columns(name: str) -> None:
         assert squeezed(f"{check.verdict} {check.name} {check.text}") in wide
     for one in report.parameters:
         if one.evaluable:
-            assert one.window_error is not None
-            assert re.search(rf"^{one.name} .*{percent(one.window_error)} ", text, re.MULTILINE)
+            assert re.search(rf"^{one.name} .*{percent(sure(one.window_error))} ", text, re.MULTILINE)
         else:
             assert re.search(rf"^{one.name} +not readable", text, re.MULTILINE)
 

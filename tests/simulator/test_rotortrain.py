@@ -35,17 +35,6 @@ def test_train_writes_a_bundle_that_fits_the_machine(tmp_path: Path) -> None:
     assert bundle.amortised is not None
 
 
-def test_help_needs_neither_torch_nor_scipy_nor_numpy() -> None:
-    code = (
-        "import sys, typer.testing, simulator.rotortrain as t\n"
-        "result = typer.testing.CliRunner().invoke(t.app, ['train', '--help'])\n"
-        "assert result.exit_code == 0 and 'rotortrain train --machine lab' in result.output, result.output\n"
-        "print([name for name in ('torch', 'scipy', 'numpy') if name in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 @pytest.mark.parametrize(
     "command",
     [

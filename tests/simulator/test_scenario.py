@@ -27,6 +27,7 @@ from simulator.scenario import (
 )
 from simulator.stream import TruthRecord
 from simulator.timeline import Condition, Timeline, compile_timeline
+from tests.sure import sure
 
 PAGE = (Path(__file__).parents[2] / "docs" / "scenario.md").read_text(encoding="utf-8")
 
@@ -217,8 +218,7 @@ def test_the_page_names_every_scenario_fault_and_parameter() -> None:
 def test_the_page_says_what_the_shipped_scenarios_do() -> None:
     for name in shipped_scenarios():
         scenario, _ = load_scenario(name)
-        row = re.search(rf"^\| `{name}` \| (\d+) s \| (.*) \|$", PAGE, re.MULTILINE)
-        assert row is not None
+        row = sure(re.search(rf"^\| `{name}` \| (\d+) s \| (.*) \|$", PAGE, re.MULTILINE))
         assert float(row[1]) == scenario.duration_s
         for event in scenario.events:
             assert f"{event.relative_change:+.0%}".replace("%", " %").replace("-", "−") in row[2]

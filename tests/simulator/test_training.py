@@ -23,6 +23,7 @@ from models.machine import Machine, load_machine
 from simulator.training.calibration import calibrate_again
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 from simulator.training.spectral_draws import LOG_RATIO, FeatureDraws, batches
+from tests.sure import sure
 
 pytestmark = pytest.mark.slow
 
@@ -66,8 +67,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
 @pytest.fixture(scope="module")
 def recipe(bundle: Bundle) -> FeatureDraws:
     """As the training made it."""
-    assert bundle.amortised is not None
-    basis = bundle.amortised.basis
+    basis = sure(bundle.amortised).basis
     return FeatureDraws(COARSE, SEED, DRAWS // 8, basis.mean, basis.directions)
 
 
@@ -75,8 +75,7 @@ def test_a_bundle_holds_both_networks_of_every_equation_and_says_how_they_were_t
     assert {one.equation.number for one in bundle.networks} == {"28", "29", "30", "31"}
     assert bundle.amortised is not None
     assert {one.equation for one in bundle.amortised.networks} == {"28", "29", "30", "31"}
-    assert bundle.amortised.near is not None
-    assert {one.equation for one in bundle.amortised.near.networks} == {"28", "29", "30", "31"}
+    assert {one.equation for one in sure(bundle.amortised.near).networks} == {"28", "29", "30", "31"}
     assert bundle.amortised.coherent != bundle.amortised.calibration  # of windows with one source, and with several
     made = bundle.manifest.training
     assert (made.seed, made.training_windows, made.calibration_windows, made.drawn_conditions) == (SEED, 2, 5, DRAWS)
@@ -109,8 +108,7 @@ def test_amortised_networks_learn_and_are_trained_again_to_the_last_bit(bundle: 
         LOG_RATIO,
         SEED,
     )
-    first = bundle.amortised
-    assert first is not None
+    first = sure(bundle.amortised)
     for one, other in zip(first.networks, again.networks, strict=True):
         np.testing.assert_array_equal(one.weights[0], other.weights[0])
         np.testing.assert_array_equal(one.direct, other.direct)
@@ -162,8 +160,7 @@ def test_a_small_training_finds_and_sizes_a_fault_on_new_windows(monkeypatch: py
         for faults in ({"k_by": size, "c_by": -size},)
     ]
     trained = calibrate(network, still, [changed], SHORT)
-    assert trained.healthy is not None
-    assert trained.healthy.gain == pytest.approx((1.0, 1.0), abs=0.3)
+    assert sure(trained.healthy).gain == pytest.approx((1.0, 1.0), abs=0.3)
     draw = Draw(SHORT, SEED, Purpose.EVALUATION, 1, faults={"k_by": -0.2}, layout=Layout.INDEPENDENT)
     readings = [read_equation(trained, simulate_window(draw, number), SHORT).parameters for number in range(6)]
     k_by = np.array([reading[0].relative_change for reading in readings], dtype=np.float64)
@@ -178,8 +175,7 @@ def held(layout: Layout, count: int) -> list[tuple[Any, dict[str, float]]]:
 
 
 def test_calibration_finds_the_true_size_of_the_errors_and_tells_one_source_from_several() -> None:
-    shipped = load_bundle("lab", LAB).amortised
-    assert shipped is not None
+    shipped = sure(load_bundle("lab", LAB).amortised)
     one, several = held(Layout.ONE_SOURCE, 6), held(Layout.INDEPENDENT, 6)
     calibrated = calibrate_networks(SHORT, replace(shipped, calibration={}, coherent={}), one, several)
     for found in (calibrated.calibration, calibrated.coherent):
@@ -188,8 +184,7 @@ def test_calibration_finds_the_true_size_of_the_errors_and_tells_one_source_from
     reader = NetworkDiagnostician(SHORT, calibrated)
     for group, expected in ((one, calibrated.coherent), (several, calibrated.calibration)):
         for window, _ in group[1:]:
-            seen = reader.inputs(window)
-            assert seen is not None
+            seen = sure(reader.inputs(window))
             assert calibrated.calibration_at(seen[1]) is expected
     doubled = Calibration(bias=0.0, log_deviation=(-5.0, -3.0), z_scale=(2.0, 4.0))
     np.testing.assert_allclose(doubled.scale(np.exp([-9.0, -4.0, 0.0])), [2.0, 3.0, 4.0])

@@ -48,6 +48,7 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError, RecordingError
 from models.machine import load_machine
 from simulator.training.draws import Draw, Purpose, simulate_window
+from tests.sure import sure
 
 LAB = load_machine("lab")
 
@@ -65,8 +66,7 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
 
 
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
-    share = rate(row["named"] for row in records)
-    assert share is not None
+    share = sure(rate(row["named"] for row in records))
     yield Chart("toy", "A caption", {"panel": {"one": [("a", share), ("b", 0.5)]}}, "what", "share")
     yield Chart("toy-steps", "Steps", {"panel": {"one": [(1.0, 0.5), (2.0, 1.0)]}}, "s", "found", steps=True)
 
@@ -199,9 +199,7 @@ def test_files_tell_what_their_level_allows() -> None:
 
 
 def shares(count: int, of: int) -> Estimate:
-    found = rate([True] * count + [False] * (of - count))
-    assert found is not None
-    return found
+    return sure(rate([True] * count + [False] * (of - count)))
 
 
 def test_rates_have_clopper_pearson_intervals() -> None:
@@ -221,8 +219,7 @@ def test_intervals_by_resampling_are_those_of_the_normal_distribution() -> None:
 
 def test_a_spread_is_robust_and_needs_four_windows() -> None:
     # Median 0.005, distances 0.025, 0.005, 0.005, 0.045 with the median 0.015.
-    found = scatter("off")([{"off": off} for off in (-0.02, 0.0, 0.01, 0.05, None)])
-    assert found is not None
+    found = sure(scatter("off")([{"off": off} for off in (-0.02, 0.0, 0.01, 0.05, None)]))
     assert found.value == pytest.approx(1.4826 * 0.015)
     assert scatter("off")([{"off": off} for off in (0.1, 0.2, 0.3)]) is None
     assert robust(np.array([1.0, 2.0, 1e9])) == pytest.approx(1.4826)

@@ -1,6 +1,7 @@
 """The overhung rotor of `benchmarks.finite_elements`, for tests of what must not depend on six degrees of freedom."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from benchmarks.finite_elements.machines import rotor_named
 from benchmarks.finite_elements.motion import PROBES
 from benchmarks.finite_elements.rotor import BeamRotor
 from models.diagnosis.moments import Plan
+from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
 ROTOR = replace(rotor_named("overhung"), speed_rad_s=2 * np.pi * 24.0)
@@ -24,7 +26,7 @@ class Excitation:
     level_N: float = 4.0
 
 
-INDEPENDENT = ((0.7, 0, 0, 0), (0, 0.5, 0, 0), (0, 0, 0.6, 0), (0, 0, 0, 0.8))
+OTHER = Excitation(50.0, ((0.7, 0, 0, 0), (0, 0.5, 0, 0), (0, 0, 0.6, 0), (0, 0, 0, 0.8)))
 
 
 def simulate(
@@ -51,3 +53,24 @@ def plan(hops: int = 12, states: tuple[str, ...] = observed.MOTION, speed_rad_s:
     columns = np.array([PROBES.index(name) for name in states])
     angle_column = len(PROBES) if speed_rad_s is None else None
     return replace(made, columns=columns, angle_column=angle_column, speed_rad_s=speed_rad_s)
+
+
+@cache
+def recorded(
+    rotor: BeamRotor, excitation: Excitation, seed: int, count: int = 1, **noise: float
+) -> tuple[WindowStatistics, ...]:
+    """Windows of a minute that follow on each other."""
+    return tuple(observed.windows_of(simulate(rotor, excitation, 60.0 * count + 3, seed, **noise), plan()))
+
+
+def of_states(window: WindowStatistics, states: tuple[str, ...]) -> WindowStatistics:
+    """What is seen of some of the motions."""
+    at = [window.states.index(name) for name in states]
+    return replace(
+        window,
+        states=states,
+        correlation=window.correlation[:, at][:, :, at],
+        hop_correlation=window.hop_correlation[:, :, at][:, :, :, at],
+        spectrum=window.spectrum[:, at][:, :, at],
+        synchronous=None if window.synchronous is None else window.synchronous[at],
+    )

@@ -9,24 +9,17 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from benchmarks.finite_elements.observed import windows_of
-from benchmarks.finite_elements.rotor import BeamRotor, changed_rotor
+from benchmarks.finite_elements.rotor import changed_rotor
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician, gain_suspicion
 from models.diagnosis.baseline.learned import Baseline, disagreements, learn_baseline, learned_rows, undetermined
 from models.diagnosis.baseline.rows import ROWS
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.readings import Diagnosis, parameter_reading
-from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
-from tests.diagnosis.baseline.fe_rotor import INDEPENDENT, ROTOR, Excitation, plan, simulate
+from tests.diagnosis.baseline.fe_rotor import OTHER, ROTOR, Excitation, recorded
+from tests.sure import sure
 
 FAST = replace(ROTOR, speed_rad_s=2 * np.pi * 33.0)
-OTHER = Excitation(cutoff_hz=50.0, sources=INDEPENDENT)
-
-
-@cache
-def recorded(rotor: BeamRotor, excitation: Excitation, seed: int, count: int) -> tuple[WindowStatistics, ...]:
-    return tuple(windows_of(simulate(rotor, excitation, 60.0 * count + 3, seed), plan()))
 
 
 @cache
@@ -44,9 +37,7 @@ def test_every_commissioned_speed_has_its_own_unbalance() -> None:
         heavier = changed_rotor(rotor, {"e": 0.6})
         e = monitor.diagnose(*recorded(heavier, Excitation(), seed, 1)).evaluable[-1]
         assert e.name == "e"
-        assert e.relative_change is not None
-        assert e.standard_error is not None
-        assert abs(e.relative_change - 0.6) < 3 * e.standard_error
+        assert abs(sure(e.relative_change) - 0.6) < 3 * sure(e.standard_error)
     between = replace(ROTOR, speed_rad_s=2 * np.pi * 28.0)
     found = {one.name: one.reason for one in monitor.diagnose(*recorded(between, OTHER, 85, 1)).parameters}
     assert found["e"] == "speed 1680 rpm, the baseline was learned at 1440, 1980 rpm"
@@ -65,10 +56,8 @@ def test_a_condition_with_another_bearing_is_found_and_widens_later_intervals() 
     mixed = learn_baseline([*recorded(ROTOR, Excitation(), 81, 2), *softer], conditions=["a", "a", "b", "b"])
     assert any("bearing stiffness, horizontal" in sentence for sentence in disagreements(mixed))
     horizontal, vertical = mixed.relations
-    assert horizontal is not None
-    assert vertical is not None
-    assert horizontal.allowance > 5
-    assert vertical.allowance < 3
+    assert sure(horizontal).allowance > 5
+    assert sure(vertical).allowance < 3
 
 
 @pytest.mark.slow
@@ -100,9 +89,7 @@ def test_a_restored_baseline_reads_the_same_to_the_last_bit() -> None:
     assert one.parameters == other.parameters
     assert one.misfit_z == other.misfit_z
     for a, b in ((one.covariance, other.covariance), (one.common, other.common)):
-        assert a is not None
-        assert b is not None
-        assert np.array_equal(a, b)
+        assert np.array_equal(sure(a), sure(b))
 
 
 @pytest.mark.parametrize("damage", ["nan", "shape", "reason", "unknown", "text"])
@@ -130,8 +117,7 @@ def suspected(k: float, c: float, states: tuple[str, ...] = ("y1", "y2")) -> str
         for name, value, error in zip(("k_by", "c_by"), (k, c), errors, strict=True)
     )
     first, _ = baseline().relations
-    assert first is not None
-    relations = (replace(first, states=states), None)
+    relations = (replace(sure(first), states=states), None)
     diagnosis = Diagnosis("baseline", readings, covariance=np.diag(errors**2))
     found = gain_suspicion(diagnosis, learned_rows(ROWS), relations)
     return "" if found is None else f"{found.sentence} {100 * found.factor:.0f} {found.z > 5}"

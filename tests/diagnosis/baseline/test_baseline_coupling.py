@@ -15,6 +15,7 @@ from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
+from tests.sure import sure
 
 SEED = 6301
 
@@ -70,19 +71,16 @@ def test_each_condition_that_a_relation_holds_in_makes_it_surer_elsewhere() -> N
     assert found[0].unexplained == ""  # although the force is another one
     for name, floor in (("k_by", 0.005), ("c_by", 0.03)):
         alone, two = (next(each.standard_error for each in one.evaluable if each.name == name) for one in found)
-        assert alone is not None
         assert two is not None
         assert floor < two * np.sqrt(2)
-        assert two < alone
-    common = found[0].common
-    assert common is not None
+        assert two < sure(alone)
+    common = sure(found[0].common)
     assert np.all(np.sqrt(np.diag(common))[:4] > (0.0045, 0.025, 0.0045, 0.025))  # no number of windows makes it less
 
 
 def test_a_relation_that_leaves_over_too_much_in_its_own_recording_is_none() -> None:
     first, second = baseline("overhung").relations
-    assert first is not None
-    foreign = replace(baseline("overhung"), relations=(replace(first, misfit=5.5), second))
+    foreign = replace(baseline("overhung"), relations=(replace(sure(first), misfit=5.5), second))
     reason, none = undetermined(foreign)
     assert "what is left over is 5.5 times what chance leaves" in reason
     assert none == ""

@@ -18,6 +18,7 @@ from models.diagnosis.baseline.rows import COUPLED_ROWS
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
+from tests.sure import sure
 
 _SEED = 6101
 
@@ -49,8 +50,7 @@ def test_what_a_stiffening_bearing_does_under_another_force_is_no_change_of_it()
     assert all(one is not None and one.slope > 2 * one.standard_error for one in learned.growth)
     monitor = BaselineDiagnostician(learned)
     reading = next(one for one in monitor.diagnose(window).evaluable if one.name == "k_by")
-    assert reading.relative_change is not None
-    assert reading.relative_change < -0.02  # the weaker motion meets a softer bearing
+    assert sure(reading.relative_change) < -0.02  # the weaker motion meets a softer bearing
     assert isolate_window(monitor.diagnose(window), 0.01).changed == ()
     again = BaselineRecord.model_validate_json(BaselineRecord.of(learned).model_dump_json())
     assert again.baseline().growth == learned.growth
@@ -61,9 +61,7 @@ def test_what_a_stiffening_bearing_does_under_another_force_is_no_change_of_it()
     before = next(one for one in older.diagnostician().diagnose(window).evaluable if one.name == "k_by")
     now = next(one for one in monitor.diagnose(window).evaluable if one.name == "k_by")
     assert before.relative_change == now.relative_change
-    assert before.standard_error is not None
-    assert now.standard_error is not None
-    assert now.standard_error > 2 * before.standard_error
+    assert sure(now.standard_error) > 2 * sure(before.standard_error)
 
 
 @pytest.mark.slow
@@ -71,8 +69,7 @@ def test_a_window_of_another_force_that_the_relations_do_not_hold_in_names_nothi
     # One source hid in both planes that the film couples them.
     monitor = BaselineDiagnostician(baseline("fluid-film", 4))
     diagnosis = monitor.diagnose(later("fluid-film", 4, 3))
-    assert diagnosis.misfit_z is not None
-    assert diagnosis.misfit_z > 8
+    assert sure(diagnosis.misfit_z) > 8
     assert "(record a healthy condition like this one then)" in diagnosis.unexplained
     verdict = isolate_window(diagnosis, 0.01)
     assert verdict.outside
@@ -99,8 +96,7 @@ def with_a_force_that_hides_a_plane() -> tuple[Baseline, tuple[WindowStatistics,
 
 
 def test_windows_that_hardly_determine_a_stiffness_show_no_growth_of_it() -> None:
-    horizontal = with_a_force_that_hides_a_plane()[0].growth[0]
-    assert horizontal is not None
+    horizontal = sure(with_a_force_that_hides_a_plane()[0].growth[0])
     assert abs(horizontal.slope) < min(2.0, 2 * horizontal.standard_error)
 
 
@@ -119,8 +115,7 @@ def test_what_a_healthy_window_does_not_determine_is_not_evaluable_and_no_fault_
             assert reasons["k_by"] == reasons["c_by"]
             assert not reasons["k_bz"]
             assert not diagnosis.suspect
-            assert diagnosis.misfit_z is not None
-            assert diagnosis.misfit_z < 3
+            assert sure(diagnosis.misfit_z) < 3
 
 
 def test_a_reversed_sensor_is_suspected_although_the_force_that_it_leaves_hides_the_plane() -> None:

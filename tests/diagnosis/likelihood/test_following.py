@@ -17,6 +17,8 @@ from simulator.scenario import Event
 from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 from tests.service.rig.foreign import Foreign, as_blocks, foreign
+from tests.sure import sure
+from tests.windows import full_windows, last_window
 
 LAB = load_machine("lab")
 SEED = 61
@@ -28,13 +30,8 @@ def slid(layout: Layout, step: tuple[str, float] | None = None) -> tuple[Sliding
     draw = Draw(LAB, SEED, Purpose.EVALUATION, 7, layout=layout)
     faults = [] if step is None else [Event(at_s=77.5, parameter=step[0], relative_change=step[1])]
     scenario = draw_condition(draw, 0).overridden(duration_s=92.6, faults=faults)
-    plan = plan_for(LAB)
-    window, found = SlidingWindow(plan), []
-    for block, _ in blocks(scenario, LAB, block_s=1.0):
-        for _ in window.feed(plan.to_si(block.samples), block.start_ns):
-            full = window.statistics()
-            found += [] if full is None else [full]
-    return window, tuple(found)
+    window = SlidingWindow(plan_for(LAB))
+    return window, tuple(full_windows(window, (block for block, _ in blocks(scenario, LAB, block_s=1.0))))
 
 
 def values(diagnosis: Diagnosis) -> tuple[FloatArray, FloatArray]:
@@ -53,10 +50,8 @@ def test_followed_or_at_a_glance_a_window_reads_what_a_search_reads(layout: Layo
         assert np.all(np.abs(followed - searched) < 0.7 * error)  # each is converged to 0.15 errors
         np.testing.assert_allclose(followed_error, error, rtol=0.1)
     for hops in (2, 4, 7):
-        stretch = sliding.statistics(hops)
-        assert stretch is not None
-        seen = following.glance(stretch)
-        assert seen is not None
+        stretch = sure(sliding.statistics(hops))
+        seen = sure(following.glance(stretch))
         assert seen.misfit_z is None
         near = LikelihoodFit(LAB)
         near.start_near(following)
@@ -71,8 +66,7 @@ def test_news_is_not_read_at_a_glance() -> None:
     for full in windows:
         fits.window(full)
         fit.diagnose(full)
-    stretch = window.statistics(2)
-    assert stretch is not None
+    stretch = sure(window.statistics(2))
     assert fit.glance(stretch) is None
     change, error = values(fits.short(2, stretch))
     assert abs(change[0] + 0.2) < 4 * error[0] < 0.2
@@ -80,19 +74,14 @@ def test_news_is_not_read_at_a_glance() -> None:
 
 def test_nothing_is_glanced_at_before_a_window_was_searched() -> None:
     window, _ = slid(Layout.INDEPENDENT)
-    stretch = window.statistics(2)
-    assert stretch is not None
+    stretch = sure(window.statistics(2))
     assert LikelihoodFit(LAB, follow=True).glance(stretch) is None
 
 
 @pytest.mark.parametrize("kind", ["drift", "late copy"])
 def test_what_could_not_be_explained_leaves_nothing_behind(kind: Foreign) -> None:
     """A window of something else in between: the next one is read as if it were the first."""
-    plan, window = plan_for(LAB), SlidingWindow(plan_for(LAB))
-    for block in as_blocks(LAB, foreign(LAB, kind, SEED, 70.0)):
-        tuple(window.feed(plan.to_si(block.samples), block.start_ns))
-    strange = window.statistics()
-    assert strange is not None
+    strange = last_window(plan_for(LAB), as_blocks(LAB, foreign(LAB, kind, SEED, 70.0)))
     fit = LikelihoodFit(LAB, follow=True)
     with suppress(UnexplainedError):
         assert fit.diagnose(strange).unexplained

@@ -18,6 +18,7 @@ from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.rotor import M_matrix, P_matrix, Q_matrix, changed
 from simulator.training.draws import Anomaly, Draw, Excitation, Layout, Purpose, simulate_window
+from tests.sure import sure
 
 SEED = 7_700_001
 """Of this file's windows alone: neither training, calibration nor the shipped scenarios use it."""
@@ -114,8 +115,7 @@ def test_the_score_is_the_slope_of_the_likelihood() -> None:
     theta = search.centre + rng.normal(0, 0.1, model.size)
     theta[model.level_at] += np.eye(6)[ROWS, COLUMNS]
     _, whitened = search._value(theta)
-    assert whitened is not None
-    gradient = search._scores(theta, whitened)[0]
+    gradient = search._scores(theta, sure(whitened))[0]
     for parameter in range(model.size):
         step = np.zeros(model.size)
         step[parameter] = 1e-5
@@ -215,8 +215,7 @@ def test_a_dead_channel_is_named() -> None:
     samples[:, 3] = 0.0
     for _ in window.feed(samples, 0):
         pass
-    statistics = window.statistics()
-    assert statistics is not None
+    statistics = sure(window.statistics())
     with pytest.raises(EstimationError, match="lab: no fluctuation in z2"):
         LikelihoodFit(machine).diagnose(statistics)
 

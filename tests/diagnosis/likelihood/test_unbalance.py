@@ -18,6 +18,7 @@ from rotorwatch.records.windows import Parameter
 from simulator.scenario import Event
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 from tests.commissioning.rotor_kit import LAB, recording, samples_of, stream, windows_of, with_samples
+from tests.sure import sure
 
 SEED = 7_700_021
 MACHINE = load_machine("lab")
@@ -30,26 +31,21 @@ def drawn(number: int, e: float = 0.0, layout: Layout = Layout.INDEPENDENT) -> W
 
 def turned(window: WindowStatistics, degrees: float) -> WindowStatistics:
     """The same window with the heavy spot elsewhere: what turns with the shaft leads by that much more."""
-    turn = np.exp(1j * np.radians(degrees))
-    assert window.synchronous is not None
-    assert window.hop_synchronous is not None
-    return replace(window, synchronous=turn * window.synchronous, hop_synchronous=turn * window.hop_synchronous)
+    turn, hops = np.exp(1j * np.radians(degrees)), sure(window.hop_synchronous)
+    return replace(window, synchronous=turn * sure(window.synchronous), hop_synchronous=turn * hops)
 
 
 def e_of(window: WindowStatistics) -> tuple[Parameter, UnbalanceVector]:
     diagnosis = LikelihoodFit(MACHINE).diagnose(window)
-    assert diagnosis.unbalance is not None
-    return diagnosis.parameters[-1], diagnosis.unbalance
+    return diagnosis.parameters[-1], sure(diagnosis.unbalance)
 
 
 @pytest.mark.parametrize(("e", "degrees"), [(-0.5, -170.0), (0.0, 180.0), (1.0, 40.0)])
 def test_a_turned_heavy_spot_is_read_as_a_vector_and_never_below_nothing(e: float, degrees: float) -> None:
     reading, vector = e_of(turned(drawn(1, e), degrees))
     assert vector.magnitude_change == pytest.approx(e, abs=4.5 * vector.magnitude_error)
-    assert vector.turned_deg is not None
-    assert vector.turned_error_deg is not None
-    apart = (vector.turned_deg - degrees + 180) % 360 - 180
-    assert abs(apart) < 4.5 * vector.turned_error_deg + 0.5
+    apart = (sure(vector.turned_deg) - degrees + 180) % 360 - 180
+    assert abs(apart) < 4.5 * sure(vector.turned_error_deg) + 0.5
     true = (1 + e) * np.exp(1j * np.radians(degrees)) - 1
     assert vector.change == pytest.approx(abs(true), abs=4.5 * vector.change_error + 0.01)
     assert reading.relative_change is not None
@@ -58,8 +54,7 @@ def test_a_turned_heavy_spot_is_read_as_a_vector_and_never_below_nothing(e: floa
     assert reading.relative_change == pytest.approx(
         abs(true) if abs(reading.relative_change - e) > 0.05 else e, abs=0.1
     )
-    assert reading.interval_95 is not None
-    assert reading.interval_95[0] >= -1
+    assert sure(reading.interval_95)[0] >= -1
 
 
 @pytest.mark.slow
@@ -69,21 +64,16 @@ def test_a_rotor_that_was_balanced_has_lost_its_unbalance_and_no_more() -> None:
     drawings = [simulate_window(draw, number) for number in range(3)]
     last = drawings.pop()
     for window in drawings:
-        assert window.synchronous is not None
-        assert last.synchronous is not None
-        reading, vector = e_of(replace(window, synchronous=window.synchronous - last.synchronous))
-        assert reading.relative_change is not None
-        assert -1 < reading.relative_change < -0.8
+        reading, vector = e_of(replace(window, synchronous=sure(window.synchronous) - sure(last.synchronous)))
+        assert -1 < sure(reading.relative_change) < -0.8
         assert vector.turned_deg is None
 
 
 def test_vectors_that_no_unbalance_makes_are_not_read_as_one() -> None:
     window = drawn(2)
-    assert window.synchronous is not None
-    foreign = np.abs(window.synchronous) * np.exp(1j * np.random.default_rng(5).uniform(0, 6, len(window.states)))
+    foreign = np.abs(sure(window.synchronous)) * np.exp(1j * np.random.default_rng(5).uniform(0, 6, len(window.states)))
     diagnosis = LikelihoodFit(MACHINE).diagnose(replace(window, synchronous=foreign))
-    vector = diagnosis.unbalance
-    assert vector is not None
+    vector = sure(diagnosis.unbalance)
     assert "not what an unbalance makes" in vector.foreign
     verdict = isolate_window(diagnosis, 0.001)
     assert "e" not in verdict.changed
@@ -99,12 +89,10 @@ def test_the_parts_of_the_vector_have_honest_errors(layout: Layout) -> None:
     z = []
     for number in range(8):
         _, vector = e_of(turned(drawn(100 + number, 0.3, layout), 60.0))
-        assert vector.turned_deg is not None
-        assert vector.turned_error_deg is not None
         z.append(
             (
                 (vector.magnitude_change - 0.3) / vector.magnitude_error,
-                (vector.turned_deg - 60) / vector.turned_error_deg,
+                (sure(vector.turned_deg) - 60) / sure(vector.turned_error_deg),
             )
         )
     assert np.sqrt(np.mean(np.square(z))) < 1.8
@@ -188,9 +176,7 @@ def test_accelerations_become_velocities(window: WindowStatistics) -> None:
     inside = true.frequencies_hz > 10
     ratio = found.spectrum[inside].real.diagonal(axis1=1, axis2=2) / (true.spectrum[inside][:, at, at].real)
     assert np.median(ratio) == pytest.approx(1.0, abs=0.02)
-    assert found.synchronous is not None
-    assert true.synchronous is not None
-    np.testing.assert_allclose(found.synchronous, true.synchronous[at], rtol=0.02)
+    np.testing.assert_allclose(sure(found.synchronous), sure(true.synchronous)[at], rtol=0.02)
     assert integrated(true) is true
 
 
@@ -198,7 +184,5 @@ def test_the_likelihood_reads_a_healthy_machine_from_accelerometers_alone(window
     diagnosis = LikelihoodFit(accelerometers()).diagnose(window)
     assert len(diagnosis.evaluable) == 6
     for reading in diagnosis.evaluable:
-        assert reading.z is not None
-        assert abs(reading.z) < 4, reading
-        assert reading.standard_error is not None
-        assert reading.standard_error < 0.05
+        assert abs(sure(reading.z)) < 4, reading
+        assert sure(reading.standard_error) < 0.05

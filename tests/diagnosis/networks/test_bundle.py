@@ -25,6 +25,7 @@ from models.machine import load_machine
 from models.physics.rotor import PARAMETERS
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window, with_tilt
 from simulator.training.spectral_draws import SpectralDraws
+from tests.sure import sure
 
 SEED = 7_700_003
 LAB = load_machine("lab")
@@ -42,21 +43,17 @@ def test_round_trip(tmp_path: Path) -> None:
     one = np.random.default_rng(0).standard_normal((5, 4))
     np.testing.assert_array_equal(again.networks[0].network(one), shipped.networks[0].network(one))
     assert again.networks[0].healthy == shipped.networks[0].healthy
-    loaded = again.amortised
-    assert loaded is not None
+    loaded = sure(again.amortised)
     assert loaded.calibration == shipped.amortised.calibration
     assert (loaded.coherent, loaded.coherence_limit) == (shipped.amortised.coherent, shipped.amortised.coherence_limit)
-    assert loaded.near is not None
-    assert shipped.amortised.near is not None
-    for read, expected in ((loaded, shipped.amortised), (loaded.near, shipped.amortised.near)):
+    for read, expected in ((loaded, shipped.amortised), (sure(loaded.near), sure(shipped.amortised.near))):
         x = np.random.default_rng(SEED).standard_normal((3, read.networks[0].direct.shape[0])).astype(np.float32)
         for part, of in zip(read.networks[0](x), expected.networks[0](x), strict=True):
             np.testing.assert_array_equal(part, of)
     once = replace(shipped.amortised, near=None)
     save_bundle(tmp_path / "once", LAB, shipped.networks, MADE, once)
     assert "near" not in json.loads((tmp_path / "once" / "manifest.json").read_text())["amortised"]
-    read_once = load_bundle(tmp_path / "once", LAB).amortised
-    assert read_once is not None
+    read_once = sure(load_bundle(tmp_path / "once", LAB).amortised)
     assert read_once.near is None
     uncalibrated = replace(shipped.amortised, calibration={})
     with pytest.raises(BundleError, match="the amortised networks are not calibrated"):
@@ -161,8 +158,7 @@ def test_the_shipped_bundle_is_the_documented_training_and_refuses_another_machi
     bundle = load_bundle("lab", LAB)
     assert [network.equation.number for network in bundle.networks] == ["28", "29", "30", "31"]
     assert bundle.manifest.training.seed not in {SEED}
-    assert bundle.amortised is not None
-    assert [network.equation for network in bundle.amortised.networks] == ["28", "29", "30", "31"]
+    assert [network.equation for network in sure(bundle.amortised).networks] == ["28", "29", "30", "31"]
     with pytest.raises(BundleError, match=r"trained for another machine than demo/heavy: .*rotor\.m1_kg is 5\.0"):
         load_bundle("lab", load_machine("heavy"))
 
@@ -194,9 +190,7 @@ def window(parameter: str, number: int, layout: Layout = Layout.INDEPENDENT) -> 
 
 @cache
 def shipped() -> AmortisedNetworks:
-    amortised = load_bundle("lab", LAB).amortised
-    assert amortised is not None
-    return amortised
+    return sure(load_bundle("lab", LAB).amortised)
 
 
 @pytest.mark.slow
@@ -223,8 +217,7 @@ def test_simulated_windows_look_like_drawn_ones() -> None:
     novelty = []
     for number in range(3):
         for layout in Layout:
-            seen = reader.inputs(window("", number, layout))
-            assert seen is not None
+            seen = sure(reader.inputs(window("", number, layout)))
             novelty.append(float(shipped().basis.novelty(seen[0])[0]))
     # Training windows are one on average; the evaluation's are drawn less broadly.
     assert 0.2 < np.median(novelty) < 1.5
@@ -276,8 +269,7 @@ def test_the_second_reading_is_sharper() -> None:
     errors, stated = [], []
     for layout, parameter, number in product(Layout, ("k_by", "k_bz"), range(4)):
         seen = window(parameter, number, layout)
-        looked_at = once.inputs(seen)
-        assert looked_at is not None
+        looked_at = sure(once.inputs(seen))
         read = [one.stated(seen, looked_at[0]) for one in (once, twice)]
         for equation, name in (("28", "k_by"), ("31", "k_bz")):
             true = np.log1p(FAULTS[name]) if name == parameter else 0.0
@@ -292,8 +284,7 @@ def test_the_first_reading_stands_where_the_second_was_not_trained() -> None:
     deaf = replace(vague, biases=(*vague.biases[:-1], vague.biases[-1] + np.array([0, 0, 5, 5, 0], dtype=np.float32)))
     amortised = replace(shipped(), networks=(deaf, *shipped().networks[1:]))
     reader = NetworkDiagnostician(LAB, amortised)
-    seen = reader.inputs(healthy)
-    assert seen is not None
+    seen = sure(reader.inputs(healthy))
     stated = reader.stated(healthy, seen[0])
     first = NetworkDiagnostician(LAB, replace(amortised, near=None)).stated(healthy, seen[0])
     for name, (mean, _) in stated.items():
@@ -311,13 +302,11 @@ def test_the_shipped_networks_find_and_size_faults_on_new_windows(parameter: str
         diagnosis = reader.diagnose(window(parameter, number))
         by_name = {reading.name: reading for reading in diagnosis.parameters}
         assert tuple(by_name) == ("k_by", "c_by", "e", "EI", "k_bz", "c_bz")
-        assert diagnosis.covariance is not None
         np.testing.assert_allclose(
-            np.sqrt(np.diag(diagnosis.covariance)),
+            np.sqrt(np.diag(sure(diagnosis.covariance))),
             np.array([one.standard_error for one in diagnosis.evaluable], dtype=np.float64),
         )
-        assert by_name[parameter].relative_change is not None
-        read.append(by_name[parameter].relative_change)
+        read.append(sure(by_name[parameter].relative_change))
         z_others += [abs(one.z or 0.0) for name, one in by_name.items() if name != parameter]
     assert np.median(np.array(read, dtype=np.float64)) == pytest.approx(FAULTS[parameter], abs=0.03)
     assert np.mean(np.array(z_others) > 3.14) < 0.1

@@ -19,6 +19,7 @@ from models.diagnosis.verdict.stretch import added, from_scale, slope, stretch_o
 from models.errors import EstimationError
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
+from tests.sure import sure
 
 SEED = 88_100
 
@@ -134,8 +135,7 @@ def test_outside_the_model_is_a_verdict_of_its_own() -> None:
     quiet, loud = (isolate_window(window(np.zeros(6), cov, misfit_z=z), 0.01) for z in (1.0, 5.0))
     assert (quiet.outside, quiet.low_confidence) == (False, False)
     assert (loud.outside, loud.low_confidence, loud.changed) == (True, True, ())
-    assert loud.outside_confidence is not None
-    assert loud.outside_confidence > 0.9999
+    assert sure(loud.outside_confidence) > 0.9999
     assert outside_confidence(-3.0) == 0.5
     assert outside_confidence(2.326) == pytest.approx(1 / (1 + np.e * 0.01 * np.log(100)), rel=1e-3)
 

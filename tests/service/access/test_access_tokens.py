@@ -19,6 +19,7 @@ from service.access.tokens import masked, new_token, parse_token, token_is_valid
 from service.history.records import TokenRecord
 from service.settings.access import AccessSettings, HttpTlsSettings, check_access
 from tests.service.rig.guarded import guarded
+from tests.sure import sure
 
 DAY_NS = 86_400 * 10**9
 ALPHABET = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
@@ -43,8 +44,7 @@ def test_only_the_hash_of_the_secret_is_in_the_record() -> None:
     secret = text.rpartition("_")[2]
     assert secret not in repr(record)
     assert len(record.secret_hash) == 32
-    parsed = parse_token(text)
-    assert parsed is not None
+    parsed = sure(parse_token(text))
     assert parsed.token_id == record.token_id
     assert secret not in repr(parsed)
     assert repr(parsed.secret_hash) not in repr(parsed)
@@ -68,8 +68,7 @@ def test_one_wrong_character_is_enough(place: int, other: str) -> None:
 
 @given(st.text(alphabet=ALPHABET, min_size=12, max_size=12), st.text(alphabet=ALPHABET, min_size=43, max_size=43))
 def test_whatever_has_the_form_is_taken_apart(token_id: str, secret: str) -> None:
-    parsed = parse_token(f"rw_{token_id}_{secret}")
-    assert parsed is not None
+    parsed = sure(parse_token(f"rw_{token_id}_{secret}"))
     assert parsed.token_id == token_id
     assert not token_is_valid(None, parsed, 1)
 

@@ -21,6 +21,7 @@ from simulator.publisher import PublishError, PublishSettings, publish
 from tests.loopback import session_of
 from tests.service.access.plant import GRANTS, PUMP, Plant, at_once, kept, plant
 from tests.service.rig.live import LAB, ROOT, endpoint, program, scenario_blocks, until
+from tests.sure import sure
 
 
 @pytest.fixture
@@ -35,8 +36,7 @@ def knock(link: LinkSettings) -> None:
 
 
 def text_of(reply: zenoh.Reply) -> str:
-    assert reply.ok is not None
-    return reply.ok.payload.to_string()
+    return sure(reply.ok).payload.to_string()
 
 
 # The door

@@ -1,6 +1,7 @@
 """What the tests of snapshots share: windows of the rotor kit as a monitor holds them."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -20,6 +21,8 @@ from service.monitor.reports import Identity
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
 from tests.commissioning.rotor_kit import LAB, stream
+from tests.sure import sure
+from tests.windows import full_windows
 
 SEED = 7_700_011
 SECONDS = 70.0
@@ -36,13 +39,9 @@ def snapshots_of(machine: MachineFile) -> MachineSnapshots:
 
 def window_of(machine: MachineFile, stream_: Sequence[SampleBlock], *, lagged: bool = True) -> WindowStatistics:
     """The latest full window, as a monitor has it; columns are those of `machine`, by name."""
-    window = SlidingWindow(plan_for(machine, lagged=lagged))
     columns = [NAMES.index(channel.name) for channel in machine.sensors]
-    latest: WindowStatistics | None = None
-    for block in stream_:
-        for _ in window.feed(window.plan.to_si(block.samples[:, columns]), block.start_ns):
-            latest = window.statistics() or latest
-    assert latest is not None
+    seen = (replace(block, samples=block.samples[:, columns]) for block in stream_)
+    *_, latest = full_windows(SlidingWindow(plan_for(machine, lagged=lagged)), seen)
     return latest
 
 
@@ -71,8 +70,7 @@ def unbalance_um() -> npt.NDArray[np.complex128]:
 
 
 def numbers(series: Sequence[float | None] | None) -> FloatArray:
-    assert series is not None
-    return np.array([np.nan if value is None else value for value in series], dtype=np.float64)
+    return np.array([np.nan if value is None else value for value in sure(series)], dtype=np.float64)
 
 
 def by_plane(snapshot: CorrelationSnapshot, plane: str) -> list[CorrelationPair]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.machine import Machine, load_machine_file
+from models.machine import load_machine_file
 from models.signals.block import SampleBlock
 from rotorwatch.records.health import HealthState
 from service.analysis.orbit import orbit_pairs, orbits_of
@@ -20,22 +20,11 @@ from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.reports import Identity
 from simulator.scenario import load_scenario
 from simulator.stream import blocks
-from tests.commissioning.rotor_kit import LAB
-from tests.service.analysis.snapshotting import NAMES, numbers, snapshots_of, window_of
+from tests.commissioning.rotor_kit import LAB, mounted
+from tests.service.analysis.snapshotting import numbers, snapshots_of, window_of
+from tests.sure import sure
 
-ANGLES = {"y1": ("X", 45), "z1": ("Y", 135), "y2": ("X", 100), "z2": ("Y", 160)}
-
-
-def _mounted() -> Machine:
-    fields = LAB.model_dump()
-    for sensor in fields["sensors"]:
-        if sensor["name"] in ANGLES:
-            way, angle = ANGLES[sensor["name"]]
-            sensor |= {"direction": way, "angle_deg": angle}
-    return Machine.model_validate(fields)
-
-
-TURNED = _mounted()
+TURNED = mounted(LAB, {"y1": (45, 135), "y2": (100, 160)})
 
 
 @cache
@@ -67,20 +56,15 @@ def test_orbits_are_turned_and_say_so() -> None:
         assert other.y is not None
         assert other.y.amplitude == pytest.approx(one.y.amplitude, rel=1e-3)
         assert other.y.phase_lag_deg == pytest.approx(one.y.phase_lag_deg, abs=0.1)
-        assert one.path is not None
-        assert other.path is not None
-        assert numbers(other.path.z) == pytest.approx(numbers(one.path.z), abs=1e-2)
-    assert turned.orbits[0].y is not None
-    assert turned.orbits[0].z is not None
-    assert turned.orbits[0].y.channel == "y of y1 and z1"
-    assert turned.orbits[0].z.channel == "z of y1 and z1"
+        assert numbers(sure(other.path).z) == pytest.approx(numbers(sure(one.path).z), abs=1e-2)
+    assert sure(turned.orbits[0].y).channel == "y of y1 and z1"
+    assert sure(turned.orbits[0].z).channel == "z of y1 and z1"
 
 
 def test_spectra_and_correlations_are_those_of_the_probes_and_so_is_the_theory() -> None:
     data = held(mounted=True)
     spectrum = snapshots_of(TURNED).spectra(data, ["y1", "z2", "y2_dot"], ["y1"], ["y1_dot"])
-    assert data.window is not None
-    mounted = data.window.as_mounted
+    mounted = sure(data.window).as_mounted
     for density in spectrum.densities:
         column = {"y1": "bearing@45", "z2": "disc@160", "y2_dot": "y2_dot"}[density.channel]
         at = mounted.states.index(column)
@@ -94,8 +78,7 @@ def test_spectra_and_correlations_are_those_of_the_probes_and_so_is_the_theory()
     assert (cross.first, cross.second) == ("y1", "y1_dot")
     found = snapshots_of(TURNED).correlations(data, ["y1", "y1"], ["y1", "z2"])
     for pair in found.pairs:
-        assert pair.nominal_z is not None
-        assert pair.nominal_z < 4
+        assert sure(pair.nominal_z) < 4
 
 
 def test_theory_of_a_probe_is_that_of_the_planes_seen_at_its_angle() -> None:
@@ -134,9 +117,8 @@ def test_a_descriptor_with_another_angle_is_another_stream() -> None:
 def test_the_client_is_told_the_angle() -> None:
     identity = Identity(site="demo", machine="lab", bundle=None, machine_hash="9a0c41d27be8")
     told = machine_description(identity, TURNED, HealthState.HEALTHY)
-    assert [channel.angle_deg for channel in told.channels] == [
-        *(float(ANGLES[name][1]) if name in ANGLES else None for name in NAMES)
-    ]
+    angles = {channel.name: channel.angle_deg for channel in told.channels if channel.angle_deg is not None}
+    assert angles == {"y1": 45.0, "z1": 135.0, "y2": 100.0, "z2": 160.0}
 
 
 def test_init_writes_the_angle(tmp_path: Path) -> None:

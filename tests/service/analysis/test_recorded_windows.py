@@ -26,6 +26,7 @@ from tests.service.monitor.test_schedule import KIT, stream
 from tests.service.rig.live import SHORT, START_NS, endpoint, machine_file, scenario_blocks, settings, until
 from tests.service.rig.monitored import PLACE, answered, client, problem
 from tests.service.rig.replaying import S, recording
+from tests.sure import sure
 
 SECONDS, FAULT_S = 60.0, 25.0
 GAP = range(303, 306)
@@ -124,7 +125,6 @@ def finished(http: httpx.Client, job: ReplayJob) -> ReplayJob:
 
 def test_windows_before_and_after_a_fault(http: httpx.Client) -> None:
     job = finished(http, started(http, changes=["alarms.on_delay_s = 5"]))
-    assert job.summary is not None
     listed = answered(http.get(f"{REPLAYS}/{job.id}/reports", params={"limit": 1000}), ReplayReportList).reports
     healthy = next(one for one in listed if one.filled == 1 and one.parameters)
     late = listed[-1]
@@ -138,30 +138,25 @@ def test_windows_before_and_after_a_fault(http: httpx.Client) -> None:
         correlations = answered(http.get(f"{PLACE}/correlations", params=asked), CorrelationSnapshot)
         for one in (orbits, spectra, correlations):
             assert (one.end_ns, one.filled, one.reason) == (report.end_ns, 1.0, "")
-            assert one.machine_hash == job.summary.machine_hash  # that of the replay, with its changes
+            assert one.machine_hash == sure(job.summary).machine_hash  # that of the replay, with its changes
             read = {each.name: each.relative_change for each in report.parameters if each.relative_change is not None}
             stated = {each.name: each.relative_change for each in one.theory.changes}
             assert stated == pytest.approx(read, rel=1e-5)
         assert orbits.revolutions == 8
-        assert orbits.path_start_ns is not None
-        assert report.end_ns - S < orbits.path_start_ns < report.end_ns
+        assert report.end_ns - S < sure(orbits.path_start_ns) < report.end_ns
         waves = answered(http.get(f"{PLACE}/waveforms", params=asked), WaveformSnapshot)
-        assert waves.end_ns is not None
-        assert report.end_ns - S // 10 < waves.end_ns <= report.end_ns + 1000
+        assert report.end_ns - S // 10 < sure(waves.end_ns) <= report.end_ns + 1000
         full = answered(http.get(f"{PLACE}/full-spectra", params=asked), FullSpectrumSnapshot)
         assert (full.source, full.reason) == ("recordings", "")
         found[report.end_ns] = orbits, spectra
     (first_orbits, first), (last_orbits, last) = found.values()
     for one, report in ((first_orbits, healthy), (last_orbits, late)):
         (x1,) = (each.x1 for each in report.levels if each.channel == "y1")
-        assert one.orbits[0].y is not None
-        assert 2 * one.orbits[0].y.amplitude == pytest.approx(x1, rel=0.05)  # that is of hops
+        assert 2 * sure(one.orbits[0].y).amplitude == pytest.approx(x1, rel=0.05)  # that is of hops
     assert np.abs(numbers(last.densities[0].measured) / numbers(first.densities[0].measured) - 1).max() > 0.5
     within: dict[str, str | int] = {"recording": NAME, "since_ns": healthy.start_ns, "until_ns": healthy.end_ns}
     rows = answered(http.get(f"{PLACE}/waterfalls", params=within), WaterfallSnapshot)
-    assert rows.start_ns is not None
-    assert rows.end_ns is not None
-    assert healthy.start_ns <= rows.start_ns < rows.end_ns <= healthy.end_ns + S // 10
+    assert healthy.start_ns <= sure(rows.start_ns) < sure(rows.end_ns) <= healthy.end_ns + S // 10
 
 
 def test_windows_of_recordings_alone_and_of_a_paced_replay(http: httpx.Client, runtime: Runtime) -> None:

@@ -17,6 +17,7 @@ from tests.service.analysis.snapshotting import (
     unbalance_um,
     window_of,
 )
+from tests.sure import sure
 
 
 def test_the_orbit_of_a_known_unbalance() -> None:
@@ -53,25 +54,21 @@ def test_the_orbit_of_a_known_unbalance() -> None:
         assert np.abs(path - on_ellipse).max() < 0.01 * radius.max()
     assert snapshot.theory.estimated_reason == "not asked"
     assert np.diff(snapshot.pulses_s) == pytest.approx(2 * np.pi / W, rel=1e-4)
-    assert snapshot.path_start_ns is not None
-    assert quiet()[-1].end_ns - snapshot.path_start_ns < 9.1 * 2e9 * np.pi / W
+    assert quiet()[-1].end_ns - sure(snapshot.path_start_ns) < 9.1 * 2e9 * np.pi / W
 
 
 def test_errors_of_an_orbit_are_the_scatter_of_many() -> None:
     """Twelve hops of the healthy machine against the errors of its amplitudes, and the estimated orbit's own size."""
     data = latest()
     assert data.window is not None
-    assert data.window.hop_synchronous is not None
     snapshot = snapshots_of(LAB).orbits(data)
     for orbit in snapshot.orbits:
-        assert orbit.nominal is not None
         assert orbit.estimated is not None
         for vector in (orbit.y, orbit.z):
             assert vector is not None
-            hops = 1e6 * np.abs(data.window.hop_synchronous[:, data.window.states.index(vector.channel)])
+            hops = 1e6 * np.abs(sure(data.window.hop_synchronous)[:, data.window.states.index(vector.channel)])
             assert vector.amplitude_error == pytest.approx(hops.std(ddof=1) / np.sqrt(12), rel=0.2)
-        assert orbit.ellipse is not None
-        assert orbit.ellipse.semi_major == pytest.approx(orbit.nominal.semi_major, rel=0.1)
+        assert sure(orbit.ellipse).semi_major == pytest.approx(sure(orbit.nominal).semi_major, rel=0.1)
     assert snapshot.revolutions == 0
     assert snapshot.path_reason == "none were asked for"
     assert all(orbit.path is None for orbit in snapshot.orbits)
@@ -101,10 +98,8 @@ def test_a_shaft_that_turns_backwards() -> None:
     assert orbit.ellipse.semi_major == pytest.approx(30, rel=2e-3)
     assert orbit.ellipse.semi_minor == pytest.approx(10, rel=5e-3)
     assert orbit.ellipse.tilt_deg == pytest.approx(0, abs=0.2)
-    assert orbit.y is not None
-    assert orbit.y.phase_lag_deg == pytest.approx(90, abs=0.2)
-    assert orbit.path is not None
-    assert np.ptp(numbers(orbit.path.z)) == pytest.approx(20, rel=0.5)
+    assert sure(orbit.y).phase_lag_deg == pytest.approx(90, abs=0.2)
+    assert np.ptp(numbers(sure(orbit.path).z)) == pytest.approx(20, rel=0.5)
 
 
 def test_without_a_phase_reference_size_and_sense_remain() -> None:
@@ -117,11 +112,10 @@ def test_without_a_phase_reference_size_and_sense_remain() -> None:
         assert one.y is not None
         assert (one.y.phase_lag_deg, one.y.phase_error_deg) == (None, None)
         assert one.ellipse is not None
-        assert other.ellipse is not None
         assert (one.ellipse.sense, one.ellipse.precession) == ("y to z", None)
-        assert one.ellipse.semi_major == pytest.approx(other.ellipse.semi_major, rel=0.15)
-        assert one.path is not None
-        assert one.path.times_s[-1] == pytest.approx(4 * 2 * np.pi / LAB.operation.speed_rad_s, abs=2 / LAB.rate_hz)
+        assert one.ellipse.semi_major == pytest.approx(sure(other.ellipse).semi_major, rel=0.15)
+        turns_s = 4 * 2 * np.pi / LAB.operation.speed_rad_s
+        assert sure(one.path).times_s[-1] == pytest.approx(turns_s, abs=2 / LAB.rate_hz)
     assert blind.revolutions == 4
     assert blind.pulses_s == ()
     assert blind.path_reason.startswith("the shaft angle is not measured")

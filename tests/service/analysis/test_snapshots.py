@@ -37,6 +37,7 @@ from tests.service.analysis.snapshotting import (
     synthetic,
     window_of,
 )
+from tests.sure import sure
 
 
 @pytest.mark.parametrize("lagged", [True, False])
@@ -52,8 +53,7 @@ def test_theory_is_within_the_errors_of_a_healthy_machine(lagged: bool) -> None:
     for pair in snapshot.pairs:
         assert pair.unit == "um^2"
         assert pair.nominal_z is not None
-        assert pair.estimated_z is not None
-        assert max(pair.nominal_z, pair.estimated_z) < 2.5
+        assert max(pair.nominal_z, sure(pair.estimated_z)) < 2.5
         z = (numbers(pair.measured) - numbers(pair.nominal)) / numbers(pair.standard_error)
         assert np.abs(z).max() < 5
         assert np.sqrt(np.mean(z**2)) == pytest.approx(pair.nominal_z, rel=1e-3)
@@ -65,21 +65,17 @@ def test_a_fault_parts_the_nominal_prediction_from_what_is_measured(lagged: bool
     changes = {change.name: change.relative_change for change in snapshot.theory.changes}
     assert changes["k_by"] == pytest.approx(-0.3, abs=0.02)
     for pair in by_plane(snapshot, "y"):
-        assert pair.nominal_z is not None
-        assert pair.nominal_z > 8
-        assert pair.estimated_z is not None
-        assert pair.estimated_z < 2.5
+        assert sure(pair.nominal_z) > 8
+        assert sure(pair.estimated_z) < 2.5
     for pair in by_plane(snapshot, "z"):
-        assert pair.nominal_z is not None
-        assert pair.nominal_z < 2.5
+        assert sure(pair.nominal_z) < 2.5
 
 
 @pytest.mark.parametrize("faults", [(), (K_BY,)])
 def test_predicted_correlations_are_those_of_the_ljapunov_equation(faults: tuple[Event, ...]) -> None:
     """All quantities at all lags, with the sources that the simulator really had: what is left is their estimation."""
     data = latest(*faults)
-    assert data.window is not None
-    window = data.window
+    window = sure(data.window)
     sources = tuple(Source(cutoff_hz=90.0, direction=tuple(np.eye(6)[dof]), force_rms_N=0.47) for dof in (0, 1, 3, 4))
     rotor = changed(LAB.rotor, {"k_by": -0.3} if faults else {})
     A = expanded_A(rotor, window.speed_rad_s, sources)
@@ -151,8 +147,6 @@ def test_standard_errors_from_spectra_are_those_of_many_windows() -> None:
 
 def test_densities_scatter_around_theory_as_their_degrees_of_freedom_say() -> None:
     snapshot = snapshots_of(LAB).spectra(latest(K_BY), [name for name in NAMES if name != "theta"])
-    assert snapshot.degrees_of_freedom is not None
-    assert snapshot.interval_95 is not None
     assert snapshot.left_out_hz is not None
     frequencies_hz = np.array(snapshot.frequencies_hz)
     assert (frequencies_hz[0], frequencies_hz[-1], frequencies_hz.size) == (3.0, 150.0, 736)
@@ -162,8 +156,8 @@ def test_densities_scatter_around_theory_as_their_degrees_of_freedom_say() -> No
         measured, expected = numbers(density.measured)[compared], numbers(density.estimated)[compared]
         ratio = measured / expected
         assert ratio.mean() == pytest.approx(1.0, abs=0.03)
-        assert ratio.var() * snapshot.degrees_of_freedom / 2 == pytest.approx(1.0, abs=0.25)
-        low, high = snapshot.interval_95
+        assert ratio.var() * sure(snapshot.degrees_of_freedom) / 2 == pytest.approx(1.0, abs=0.25)
+        low, high = sure(snapshot.interval_95)
         assert np.mean((measured * low < expected) & (expected < measured * high)) == pytest.approx(0.95, abs=0.03)
         whole = numbers(density.measured).sum() * 0.2
         assert density.rms == pytest.approx(np.sqrt(whole), rel=1e-5)
@@ -201,8 +195,7 @@ def test_coherence_and_phase_of_a_delayed_channel() -> None:
     frequencies_hz = np.array(snapshot.frequencies_hz)
     assert numbers(late.phase_deg) == pytest.approx(-360 * frequencies_hz * 2 / LAB.rate_hz, abs=1.0)
     assert numbers(late.coherence).min() > 0.99
-    assert snapshot.coherence_95 is not None
-    beyond = np.mean(numbers(foreign.coherence) > snapshot.coherence_95)
+    beyond = np.mean(numbers(foreign.coherence) > sure(snapshot.coherence_95))
     assert beyond == pytest.approx(0.05, abs=0.03)
     # One-sided density of white noise of unit variance, in the band and everywhere: 2 / rate.
     assert numbers(snapshot.densities[0].measured).mean() == pytest.approx(2 / LAB.rate_hz, rel=0.03)
@@ -220,8 +213,7 @@ def test_a_wide_band_is_averaged_into_fewer_lines() -> None:
     assert len(snapshot.frequencies_hz) == 828
     assert np.diff(snapshot.frequencies_hz) == pytest.approx(0.6, abs=1e-3)
     measured = numbers(snapshot.densities[0].measured)
-    assert snapshot.degrees_of_freedom is not None
-    assert measured.var() / measured.mean() ** 2 * snapshot.degrees_of_freedom / 2 == pytest.approx(1.0, abs=0.2)
+    assert measured.var() / measured.mean() ** 2 * sure(snapshot.degrees_of_freedom) / 2 == pytest.approx(1.0, abs=0.2)
 
 
 def test_a_part_of_the_band() -> None:

@@ -26,6 +26,7 @@ from service.runtime.runtime import Runtime
 from service.stream.worker import MachineWorker
 from tests.service.rig.live import ROOT, START_NS
 from tests.service.rig.monitored import GUARDED, PLACE, answered, client, faulty, fed, problem, token
+from tests.sure import sure
 
 HOP_NS = 5_000_000_000
 
@@ -74,8 +75,7 @@ def test_health_names_the_fault_with_its_interval(http: httpx.Client) -> None:
     health = answered(http.get(f"{PLACE}/health"), Health)
     assert health.state == "alert"
     assert health.filled == 1.0
-    report = health.report
-    assert report is not None
+    report = sure(health.report)
     assert report == next(iter(answered(http.get(f"{PLACE}/reports?limit=1"), ReportList).reports))
     assert report.start_ns == report.end_ns - 12 * HOP_NS
     assert [parameter.name for parameter in report.parameters] == list(PARAMETERS)
@@ -113,8 +113,7 @@ def test_reports_are_cut_by_time_and_number(http: httpx.Client) -> None:
 
 
 def test_measures_of_the_window_are_in_history_and_on_the_page(http: httpx.Client) -> None:
-    report = answered(http.get(f"{PLACE}/health"), Health).report
-    assert report is not None
+    report = sure(answered(http.get(f"{PLACE}/health"), Health).report)
     page = (ROOT / "service/api/page/machine/data-quality.js").read_text(encoding="utf-8")
     for name, (field, measure) in MEASURES.items():
         value = getattr(report, field)
@@ -127,8 +126,7 @@ def test_readings_over_time(http: httpx.Client) -> None:
     every = answered(http.get(f"{PLACE}/readings?name=k_by"), ReadingList)
     assert (len(every.readings), every.buckets, every.next_after) == (4, (), None)
     health = answered(http.get(f"{PLACE}/health"), Health)
-    assert health.report is not None
-    k_by = health.report.parameters[0]
+    k_by = sure(health.report).parameters[0]
     assert (every.readings[-1].value, every.readings[-1].standard_error) == (k_by.relative_change, k_by.standard_error)
     first = answered(http.get(f"{PLACE}/readings?name=k_by&limit=4"), ReadingList)
     second = answered(http.get(f"{PLACE}/readings?name=k_by&limit=4&after={first.next_after}"), ReadingList)
@@ -241,8 +239,7 @@ def test_one_alarm_and_its_version(http: httpx.Client) -> None:
 def test_health_says_what_changed_since_when_and_who_agrees(http: httpx.Client) -> None:
     health = answered(http.get(f"{PLACE}/health"), Health)
     assert health.report is not None
-    verdict = health.report.verdict
-    assert verdict is not None
+    verdict = sure(health.report.verdict)
     (found,) = verdict.changed
     assert (found.name, found.text) == ("k_by", "bearing stiffness, horizontal")
     assert found.since_ns < found.found_ns
@@ -267,19 +264,15 @@ def test_detectable_changes(http: httpx.Client) -> None:
     asked = answered(http.get(f"{PLACE}/detectable?change=-0.1"), DetectableChanges)
     assert asked.change == -0.1
     for parameter in asked.parameters:
-        assert parameter.length_s is not None
-        assert (parameter.length_s < 60.0) == (parameter.loss > -0.1)
+        assert (sure(parameter.length_s) < 60.0) == (parameter.loss > -0.1)
 
 
 def test_correlations_beside_theory(http: httpx.Client) -> None:
     found = answered(http.get(f"{PLACE}/correlations?first=y2&second=y2"), CorrelationSnapshot)
     (pair,) = found.pairs
-    assert pair.estimated is not None
-    assert len(pair.measured) == len(pair.estimated) == len(found.lags_s) > 10
-    assert pair.nominal_z is not None
-    assert pair.estimated_z is not None
+    assert len(pair.measured) == len(sure(pair.estimated)) == len(found.lags_s) > 10
     # A third of a bearing's stiffness is missing: only theory with the estimated parameters fits.
-    assert pair.estimated_z < 3 < pair.nominal_z
+    assert sure(pair.estimated_z) < 3 < sure(pair.nominal_z)
     health = answered(http.get(f"{PLACE}/health"), Health)
     assert health.report is not None
     assert (found.start_ns, found.end_ns) == (health.report.start_ns, health.report.end_ns)
@@ -302,8 +295,7 @@ def test_spectra_and_orbits(http: httpx.Client) -> None:
     assert all(one.path is not None for one in orbits.orbits)
     assert len(orbits.pulses_s) == 4
     # The samples are the newest: the last whole revolution ends less than another one before the end of the stream.
-    assert orbits.path_start_ns is not None
-    left_s = START_NS / 1e9 + 78.0 - (orbits.path_start_ns / 1e9 + orbits.pulses_s[-1])
+    left_s = START_NS / 1e9 + 78.0 - (sure(orbits.path_start_ns) / 1e9 + orbits.pulses_s[-1])
     assert left_s == pytest.approx(60 / 1320, abs=0.001) or 0 <= left_s < 60 / 1320
 
 

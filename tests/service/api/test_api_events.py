@@ -31,6 +31,7 @@ from service.settings.service import MachineEntry
 from service.stream.monitored import Monitored
 from tests.service.rig.live import OPEN, endpoint, settings, until
 from tests.service.rig.monitored import client, fed, problem, token
+from tests.sure import sure
 
 EVENTS = "/api/v1/events"
 LAB, HEAVY = "demo/lab", "demo/heavy"
@@ -278,9 +279,7 @@ def test_whole_health_of_some_machines_and_of_the_others_what_matters_most(share
 )
 def test_what_matters_most_of_a_window(alarm: str, settled: bool, vibration: float, expected: set[str]) -> None:
     health = Health.model_validate(example(Health))
-    report, raised = health.report, health.alarms[0]
-    assert report is not None
-    assert report.verdict is not None
+    report, raised = sure(health.report), health.alarms[0]
     one, seen, level = report.parameters[0], report.detectable[0], report.levels[0]
     read = one.model_copy(update={"name": "c_by", "relative_change": 0.03})
     level = level.model_copy(update={"channel": "y1", "velocity": 1.0})
@@ -292,14 +291,13 @@ def test_what_matters_most_of_a_window(alarm: str, settled: bool, vibration: flo
                 seen.model_copy(update={"name": name, "loss": -least, "gain": least})
                 for name, least in (("k_by", 0.3), ("c_by", 0.02))
             ),
-            "verdict": report.verdict.model_copy(update={"settled": settled, "current": (one, read)}),
+            "verdict": sure(report.verdict).model_copy(update={"settled": settled, "current": (one, read)}),
             "levels": (level, level.model_copy(update={"channel": "z1", "velocity": vibration, "limits": (limit,)})),
         }
     )
     alarms = (raised.model_copy(update={"name": alarm}),) if alarm else ()
     found = overview(health.model_copy(update={"report": report, "alarms": alarms}))
-    told = found.report
-    assert told is not None
+    told = sure(found.report)
     assert told.verdict is not None
     assert {part.name for part in told.parameters} | {part.channel for part in told.levels} == expected
     assert [part.name for part in told.detectable] == [part.name for part in told.verdict.current]

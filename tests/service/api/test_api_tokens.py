@@ -15,6 +15,7 @@ from service.access.scopes import Scope
 from service.api.routes.tokens import add_token_routes
 from service.settings.access import AccessSettings
 from tests.service.rig.guarded import Guarded, application, guarded, problem
+from tests.sure import sure
 
 READ, OPERATE, CONFIGURE = Scope
 TOKENS = "/api/v1/tokens"
@@ -59,8 +60,7 @@ def test_a_token_is_created_used_and_revoked(monitor: Guarded, capfd: pytest.Cap
             assert user.get("/health").json()["name"] == "control room"
             problem(user.get(TOKENS), 403)
             problem(user.post(TOKENS, json={"name": "x", "scopes": ["read"]}), 403)
-            used_ns = listed(chief)["control room"].last_used_ns
-            assert used_ns is not None
+            used_ns = sure(listed(chief)["control room"].last_used_ns)
             assert before_ns < used_ns <= time.time_ns()
 
             assert "valid already" in problem(chief.post(TOKENS, json={"name": told.name, "scopes": ["read"]}), 409)

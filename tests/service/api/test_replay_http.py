@@ -21,6 +21,7 @@ from tests.service.rig import monitored
 from tests.service.rig.live import START_NS, endpoint, scenario_blocks, settings, until
 from tests.service.rig.monitored import problem
 from tests.service.rig.replaying import hurried, recording
+from tests.sure import sure
 
 M = TypeVar("M", bound=BaseModel)
 ID = "demo/lab/20260101T000000Z.mcap"
@@ -98,10 +99,8 @@ def test_recordings_are_listed(client: httpx.Client) -> None:
     quick = get(client, f"{RECORDINGS}/{QUICK}", RecordingDetail)  # recorded in 0.15 s, on another day
     assert (quick.data_start_ns, quick.data_end_ns) == (START_NS + 3600 * 10**9, START_NS + 3603 * 10**9)
     assert quick.start_ns > START_NS + DAY_NS
-    assert quick.data_end_ns is not None
-    third = ended(client, start(client, recordings=[QUICK], from_ns=quick.data_end_ns - 10**9))
-    assert third.summary is not None
-    assert third.summary.blocks == 10
+    third = ended(client, start(client, recordings=[QUICK], from_ns=sure(quick.data_end_ns) - 10**9))
+    assert sure(third.summary).blocks == 10
 
 
 def test_a_recording_is_downloaded_whole_or_in_part(client: httpx.Client, directory: Path) -> None:
@@ -146,10 +145,8 @@ def test_an_offline_replay_over_http_finds_what_it_finds_on_the_command_line(
     assert (done.state, done.error) == ("finished", "")
     assert get(client, f"{REPLAYS}/{job.id}", ReplayJob) == done
     assert done in get(client, REPLAYS, ReplayList).replays
-    summary = done.summary
-    assert summary is not None
-    assert done.progress is not None
-    assert done.progress.fraction == 1.0
+    summary = sure(done.summary)
+    assert sure(done.progress).fraction == 1.0
     assert (summary.alarms, summary.raised, summary.blocks) == (1, ("c_bz",), 700)
     results = (directory / ".replays" / job.id / "results.jsonl").read_bytes()
     assert hashlib.sha256(results).hexdigest() == summary.sha256
@@ -205,8 +202,7 @@ def test_a_stretch_and_another_machine_from_our_own_page(client: httpx.Client, r
     assert done.summary is not None
     assert done.summary.bundle is None
     assert done.summary.blocks == 300
-    assert done.progress is not None
-    assert done.progress.fraction == 1.0
+    assert sure(done.progress).fraction == 1.0
     failed = ended(client, start(client, from_ns=START_NS + DAY_NS))
     assert failed.state == "failed"
     assert "nothing was recorded in between" in failed.error
@@ -312,8 +308,7 @@ def test_the_service_ends_its_replays_and_old_results_make_room(directory: Path)
         problem(client.get(f"{REPLAYS}/{first.id}"), 404)
         until(lambda: get(client, f"{REPLAYS}/{second.id}", ReplayJob).progress is not None, "first block")
         jobs = runtime.replays.jobs
-    stopped = jobs.find(second.id)
-    assert stopped is not None
+    stopped = sure(jobs.find(second.id))
     assert stopped.view.state == "stopped"
     assert not processes_with(second.id)
 

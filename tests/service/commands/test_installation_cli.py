@@ -25,6 +25,7 @@ from tests.loopback import endpoint
 from tests.service.rig.live import ROOT, until
 from tests.service.rig.monitored import client, token
 from tests.service.rig.preloaded import rotorwatch as run
+from tests.sure import sure
 
 RATE_HZ, START_NS = 2560.0, 1_767_225_600_000_000_000
 FAN = (
@@ -67,8 +68,7 @@ def test_init_writes_files_that_the_other_commands_take(tmp_path: Path) -> None:
     assert "rotorwatch doctor --machine" in done.stdout
     machine = load_machine_file(tmp_path / "fan.toml")
     assert [channel.name for channel in machine.sensors] == ["DE-H", "NDE-V"]
-    assert machine.operation is not None
-    assert machine.operation.speed_rpm == 1488
+    assert sure(machine.operation).speed_rpm == 1488
     assert run("check-config", str(tmp_path / "rotorwatch.toml")).returncode == 0
     again = run(*FAN, "--folder", str(tmp_path))
     assert again.returncode == 2
@@ -153,8 +153,7 @@ def test_a_strangers_two_sensors_have_a_trend_in_three_commands(tmp_path: Path) 
         until(lambda: worker.health().filled == 1, "a full window")
         health = worker.health()
         assert health.state == "watching"
-        assert health.report is not None
-        assert [one.channel for one in health.report.levels] == ["DE-H", "NDE-V"]
+        assert [one.channel for one in sure(health.report).levels] == ["DE-H", "NDE-V"]
         until(lambda: worker.history.downsampled(quantity="level", names=["NDE-V:overall"], points=10) != (), "a level")
         (bucket, *_) = worker.history.downsampled(quantity="level", names=["NDE-V:overall"], points=1)
         assert bucket.mean == pytest.approx(1.1 / np.sqrt(2), rel=0.01)

@@ -33,23 +33,6 @@ from tests.service.rig.live import (
 from tests.service.rig.preloaded import rotorwatch as run
 
 
-def test_help_is_quick_because_nothing_heavy_is_imported() -> None:
-    code = (
-        "import sys\nfrom service.rotorwatch import app\n"
-        "try:\n    app(['--help'])\nexcept SystemExit:\n    pass\n"
-        "print('loaded', sorted({name.split('.')[0] for name in sys.modules}))"
-    )
-    found = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=300, check=True
-    )
-    loaded = found.stdout.splitlines()[-1]
-    assert loaded.startswith("loaded")
-    for name in ("numpy", "scipy", "torch", "zenoh", "fastapi", "pyarrow"):
-        assert f"'{name}'" not in loaded
-    for command in ("run", "check-config", "watch", "status", "router"):
-        assert command in found.stdout
-
-
 def test_numpy_computes_in_one_thread() -> None:
     code = (
         "import os, sys\nfrom service import rotorwatch\n"

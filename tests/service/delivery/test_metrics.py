@@ -20,6 +20,7 @@ from service.settings.service import RecordingSettings
 from tests.service.delivery.hooked import hook, settings_for
 from tests.service.rig.live import IN_ORDER, ROOT, Feed, endpoint, kept_in, machine_file, open_session, settings, until
 from tests.service.rig.monitored import GUARDED, PLACE, client, token
+from tests.sure import sure
 
 LAB = {"site": "demo", "machine": "lab"}
 
@@ -152,8 +153,7 @@ def test_blocks_that_wait_are_told_as_seconds_of_data(served: tuple[Runtime, str
 
 
 def test_the_service_itself(read: Read, served: tuple[Runtime, str, Read]) -> None:
-    recorder = served[0].machines()[0].status().recorder
-    assert recorder is not None
+    recorder = sure(served[0].machines()[0].status().recorder)
     assert read.of_lab("recorder_state", state="recording") == 1.0
     assert read.of_lab("recorder_state", state="off") == 0.0
     assert 16 <= read.of_lab("recorder_received_messages_total") <= recorder.received

@@ -23,6 +23,7 @@ from tests.service.rig.live import (
 )
 from tests.service.rig.monitored import PLACE, client, problem
 from tests.service.rig.postgres import opened
+from tests.sure import sure
 
 FAULT_S = 40.0
 CHANGED = -0.33
@@ -64,9 +65,7 @@ def test_an_alarm_can_be_understood_long_after_its_window_is_gone(tmp_path: Path
         problem(http.get(f"{PLACE}/alarms/k_by/evidence?occurrence=2"), 404)
         assert http.get(f"{PLACE}/alarms/k_by/evidence?occurrence=1").content == answer.content
     begin_ns = blocks[0].start_ns
-    before, raised, settled = found.before, found.raised, found.settled
-    assert before is not None
-    assert settled is not None
+    before, raised, settled = sure(found.before), found.raised, sure(found.settled)
     assert before.report.state is HealthState.HEALTHY
     assert before.report.end_ns <= begin_ns + FAULT_S * 1e9 < raised.report.end_ns <= settled.report.end_ns
     assert settled.report.start_ns >= begin_ns + (FAULT_S - 5.0) * 1e9
@@ -76,11 +75,9 @@ def test_an_alarm_can_be_understood_long_after_its_window_is_gone(tmp_path: Path
         assert {len(one.measured) for one in picture.correlations.pairs} == {len(picture.correlations.lags_s)}
         assert picture.correlations.pairs[0].nominal is None
         assert len(picture.spectra.frequencies_hz) == len(picture.spectra.densities[0].measured) > 10
-    read = {one.name: one.relative_change for one in settled.report.parameters}["k_by"]
-    assert read is not None
+    read = sure({one.name: one.relative_change for one in settled.report.parameters}["k_by"])
     assert abs(read - CHANGED) < 0.1
-    verdict = raised.report.verdict
-    assert verdict is not None
+    verdict = sure(raised.report.verdict)
     best, *others = verdict.alternatives
     assert best.names == ("k_by",)
     assert best.probability == pytest.approx(verdict.confidence)

@@ -29,6 +29,7 @@ from service.history.records import (
 )
 from service.history.store import Store
 from tests.service.rig.postgres import KINDS, database_url, opened
+from tests.sure import sure
 
 NS = 1_000_000_000
 T0 = 1_767_225_600 * NS
@@ -316,8 +317,7 @@ def test_tokens_are_kept_and_revoked_once(store: Store) -> None:
     assert store.tokens.revoke("aaaa", T0 + 9) is True
     assert store.tokens.revoke("aaaa", T0 + 10) is False
     assert store.tokens.revoke("cccc", T0) is False
-    revoked = store.tokens.find("aaaa")
-    assert revoked is not None
+    revoked = sure(store.tokens.find("aaaa"))
     assert revoked.revoked_ns == T0 + 9
 
 

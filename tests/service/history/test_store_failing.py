@@ -27,6 +27,7 @@ from tests.service.history.test_store import T0, alarm_event, head, hop_step
 from tests.service.rig.live import until
 from tests.service.rig.postgres import KINDS, USER, PostgresServer, database_url, postgres_server
 from tests.service.rig.postgres import opened as history_opened
+from tests.sure import sure
 
 QUICK_S = 1.0
 
@@ -90,8 +91,7 @@ def test_nothing_is_lost_while_the_database_is_away(parts: Parts) -> None:
         assert [event.sequence for event in pump.events()] == list(range(37))
         assert [report.text for _, report in lab.reports()] == [f'{{"number": {n}}}' for n in range(40, -1, -1)]
         assert [round(each.value / 0.1) for each in lab.readings(quantity="parameter", name="k_by")] == list(range(41))
-        restored = lab.restore()
-        assert restored is not None
+        restored = sure(lab.restore())
         assert restored.head == head(T0 + 40 * 5_000_000_000)
         assert [part for _, part in restored.parts] == [b"part 38", b"part 39", b"part 40"]
 
@@ -113,8 +113,7 @@ def test_what_waits_is_bounded_and_events_are_never_dropped(parts: Parts) -> Non
         ]  # fmt: skip
         kept = [round(each.value / 0.1) for each in lab.readings(quantity="parameter", name="k_by")]
         assert kept == [0, 1, 55, 56, 57, 58, 59]
-        restored = lab.restore()
-        assert restored is not None
+        restored = sure(lab.restore())
         assert [part for _, part in restored.parts] == [b"part 57", b"part 58", b"part 59"]
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from tests.service.rig.live import program
 from tests.service.rig.postgres import opened
+from tests.sure import sure
 
 ROUNDS = 4
 
@@ -30,7 +31,6 @@ def test_a_killed_writer_leaves_whole_steps(url: str, tmp_path: Path) -> None:
             texts = [report.text for _, report in lab.reports(limit=10_000)]
             assert texts == [f'{{"number": {n}}}' for n in range(steps - 1, -1, -1)]
             assert len(lab.readings(quantity="misfit", name="z", limit=10_000)) == steps
-            restored = lab.restore()
-            assert restored is not None
+            restored = sure(lab.restore())
             assert [part for _, part in restored.parts] == [b"part %d" % n for n in range(steps - 3, steps)]
             safe = steps - 1

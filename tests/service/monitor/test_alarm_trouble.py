@@ -36,6 +36,7 @@ from service.stream.worker import MachineWorker
 from simulator.scenario import load_scenario
 from tests.service.rig.live import START_NS, until
 from tests.service.rig.postgres import opened
+from tests.sure import sure
 
 S = 10**9
 BLOCK_NS = S // 2
@@ -118,10 +119,8 @@ class Bench:
     def shelf_s(self, name: str) -> float:
         """How long an alarm stays shelved, from the end of the newest data."""
         alarm = next(one for one in self.worker.alarms().alarms if one.name == name)
-        end_ns = self.worker._monitor.end_ns
-        assert alarm.shelf is not None
-        assert end_ns is not None
-        return (alarm.shelf.until_ns - end_ns) / S
+        end_ns = sure(self.worker._monitor.end_ns)
+        return (sure(alarm.shelf).until_ns - end_ns) / S
 
 
 @contextmanager
@@ -156,9 +155,8 @@ def test_log_and_state_agree_in_every_commit(tmp_path: Path, monkeypatch: pytest
 
     def agree(step: Step) -> None:
         committed[0] += len(step.events)
-        assert step.checkpoint is not None
         book = AlarmBook(AlarmSettings())
-        book.restore(step.checkpoint.head.alarms)
+        book.restore(sure(step.checkpoint).head.alarms)
         assert book.next_sequence == committed[0]
 
     watched(monkeypatch, agree)
@@ -314,8 +312,7 @@ def test_another_machine_file_keeps_the_time_of_the_alarms(later_ns: int, expect
     assert after.end_ns == end_ns
     report = after.step(block(1, end_ns + later_ns - BLOCK_NS))
     assert named(report.events) == expected
-    shelf = found(after, "k_by").shelf
-    assert shelf is not None
+    shelf = sure(found(after, "k_by").shelf)
     moved_ns = later_ns if abs(later_ns) == YEAR_NS else 0
     assert shelf.until_ns == end_ns + 3600 * S + moved_ns
 

@@ -22,6 +22,7 @@ from simulator.scenario import Event, Rub, load_scenario
 from simulator.stream import blocks
 from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, samples_of, stream, with_samples
 from tests.service.monitor.test_monitor import feed
+from tests.sure import sure
 
 SEED = 71
 _FULL = 625
@@ -37,8 +38,7 @@ def before() -> Sequence[SampleBlock]:
 @cache
 def installed() -> Installed:
     made = commissioned(MACHINE, recording(MACHINE, before()[:1500]))
-    assert made.commissioned is not None
-    return Installed(MACHINE, None, made.commissioned)
+    return Installed(MACHINE, None, sure(made.commissioned))
 
 
 def full(windows: Sequence[Report]) -> list[Report]:
@@ -63,13 +63,11 @@ def test_the_healthy_machine_stays_healthy() -> None:
 def test_a_change_is_named_alone(name: str, change: float) -> None:
     blocks = stream(65.0, SEED + 2, Event(at_s=0.0, parameter=name, relative_change=change))
     windows, events = feed(MachineMonitor(installed()), blocks)
-    verdict = full(windows)[-1].verdict
-    assert verdict is not None
+    verdict = sure(full(windows)[-1].verdict)
     assert [finding.name for finding in verdict.changed] == [name]
     assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {name}
     (reading,) = (one for one in verdict.current if one.name == name)
-    assert reading.interval_95 is not None
-    low, high = reading.interval_95
+    low, high = sure(reading.interval_95)
     assert low - 0.05 < change < high + 0.05
 
 
@@ -231,8 +229,7 @@ def with_sensors(columns: list[int], duration_s: float) -> Installed:
     """The machine with some of its sensors, commissioned for as long."""
     machine = MACHINE.model_copy(update={"sensors": tuple(MACHINE.sensors[n] for n in columns)})
     made = commissioned(machine, recording(machine, of_sensors(columns, before()[: round(10 * duration_s)])))
-    assert made.commissioned is not None
-    return Installed(machine, None, made.commissioned)
+    return Installed(machine, None, sure(made.commissioned))
 
 
 def test_with_too_few_sensors_only_changed_or_not_changed_is_said() -> None:

@@ -24,6 +24,7 @@ from simulator.scenario import Scenario, load_scenario
 from simulator.stream import blocks
 from tests.service.monitor.test_alarm_trouble import Bench, Outlet
 from tests.service.rig.live import START_NS, until
+from tests.sure import sure
 
 SEED = 7_700_501
 REORDERED = 8
@@ -55,8 +56,7 @@ def stream() -> tuple[SampleBlock, ...]:
         {"at_s": 42.0, "parameter": "k_by", "relative_change": 0.0},
     ]
     fields = scenario.model_dump() | {"duration_s": 126.0, "seed": SEED, "events": events}
-    machine = installed().known
-    assert machine is not None
+    machine = sure(installed().known)
     made = [one for one, _ in blocks(Scenario.model_validate(fields), machine, 0.5, START_NS)]
     for block in made[208:226]:
         block.samples[:, 0] = 7.0

@@ -31,6 +31,7 @@ from service.stream.checkpoints import checkpoint_step, restored
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import NOTHING, commissioned, elsewhere, healthy, stream
 from tests.service.rig.live import LAB, scenario_blocks
+from tests.sure import sure
 
 RATE_HZ, BLOCK_S, START_NS = 5120.0, 0.5, 1_767_225_600_000_000_000
 FAN = MachineFile.model_validate(
@@ -76,9 +77,7 @@ def run(monitor: MachineMonitor, stream: Iterator[SampleBlock]) -> tuple[list[st
 
 
 def latest(monitor: MachineMonitor) -> Report:
-    found = monitor.health().latest
-    assert found is not None
-    return found
+    return sure(monitor.health().latest)
 
 
 def test_a_machine_file_with_nothing_but_sensors_is_watched_from_the_first_hop_on() -> None:
@@ -201,8 +200,7 @@ def test_commissioned_levels_are_the_reference_and_say_what_is_unchanged(tmp_pat
 
 def test_levels_are_judged_at_a_speed_that_was_not_commissioned() -> None:
     machine = elsewhere(NOTHING)
-    made = commissioned(machine, healthy(machine, 70.0, 60163)).commissioned
-    assert made is not None
+    made = sure(commissioned(machine, healthy(machine, 70.0, 60163)).commissioned)
     faster = Event(at_s=0.0, speed_rpm=1.06 * LAB.operation.speed_rpm)
     for size, state in ((1.0, HealthState.WATCHING), (4.0, HealthState.ALERT)):
         monitor = MachineMonitor(Installed(machine, None, made))
@@ -216,8 +214,7 @@ def test_levels_are_judged_at_a_speed_that_was_not_commissioned() -> None:
 def test_a_machine_that_is_watched_says_what_would_have_been_seen() -> None:
     monitor = MachineMonitor(install(FAN, None))
     run(monitor, blocks(1, 30))
-    before = latest(monitor).level_growth
-    assert before is not None
+    before = sure(latest(monitor).level_growth)
     assert before.growth is None
     assert "no limit yet" in before.text
     run(monitor, blocks(1, 70, first=60))

@@ -30,6 +30,7 @@ from simulator.scenario import Event, load_scenario
 from simulator.stream import DEFAULT_START_NS, blocks
 from tests.commissioning.rotor_kit import windows_of
 from tests.service.rig.live import LAB, scenario_blocks
+from tests.sure import sure
 
 SECOND = 10**9
 ON_S, EVERY_S = 4.0, 20.0
@@ -46,8 +47,7 @@ KIT = Machine.model_validate(scheduled(ON_S, EVERY_S, length_s=6 * EVERY_S))
 
 def snapshots(everything: Sequence[SampleBlock], machine: MachineFile) -> tuple[SampleBlock, ...]:
     """Those of a stream that lie in snapshots, as a sender numbers them that sends nothing else."""
-    schedule = machine.schedule
-    assert schedule is not None
+    schedule = sure(machine.schedule)
     within = [
         one
         for one in everything
@@ -190,8 +190,7 @@ def test_a_fault_is_named_from_snapshots_and_nothing_is_missing() -> None:
     assert [window.state for window in windows[5:12]] == [HealthState.HEALTHY] * 7
     events = [event for report in reports for event in report.events]
     assert [event.alarm.name for event in events] == ["k_by"]
-    assert windows[-1].verdict is not None
-    change = {one.name: one.relative_change for one in windows[-1].verdict.current}["k_by"]
+    change = {one.name: one.relative_change for one in sure(windows[-1].verdict).current}["k_by"]
     assert change == pytest.approx(-0.25, abs=0.03)
     assert monitor.health().quality.gaps == 0
 

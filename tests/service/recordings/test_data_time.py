@@ -22,6 +22,7 @@ from service.recordings.replay.source import RecordingSource
 from service.rotorwatch import app
 from tests.service.rig.live import LAB, START_NS, scenario_blocks
 from tests.service.rig.replaying import hurried, recording, split, write
+from tests.sure import sure
 
 S = 10**9
 
@@ -154,9 +155,7 @@ def test_replays_from_and_to_times_of_the_data(
     )
     assert found.exit_code == 0, found.output
     lines = [ReplayLine.model_validate_json(line) for line in found.stdout.splitlines()]
-    summary, progress = lines[-1].summary, lines[-2].progress
-    assert summary is not None
-    assert progress is not None
+    summary, progress = sure(lines[-1].summary), sure(lines[-2].progress)
     assert (summary.blocks, progress.fraction) == (count, 1.0), summary_lines(summary)
     assert abs(progress.position_ns - START_NS - (15 if count == 30 else 40) * S) <= 1
 

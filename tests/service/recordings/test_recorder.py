@@ -26,6 +26,7 @@ from service.runtime.runtime import running
 from service.settings.service import RecordingSettings, ServiceSettings
 from tests.loopback import session_of
 from tests.service.rig.live import LAB, Feed, Program, endpoint, open_session, program, settings, until, worker_of
+from tests.sure import sure
 
 KEYS = LAB.keys
 NOW_NS = 1_795_271_130_000_000_000  # 2026-11-21 14:25:30 UTC
@@ -84,8 +85,7 @@ def test_everything_under_the_keys_is_recorded_as_it_was(tmp_path: Path) -> None
             session.put(note_key, said, attachment=b"\x01\x02", encoding="text/plain;µ")
             session.put("rotorwatch/demo/other/stream", b"another machine")
             until(lambda: service.machines()[0].health().quality.accepted_blocks == 120, "120 accepted blocks")
-            recorder = worker_of(service).recorder
-            assert recorder is not None
+            recorder = sure(worker_of(service).recorder)
             # Descriptor, note, health, alarm states, and the reports of two hops.
             until(lambda: recorder.status().received >= 126, "messages at the recorder")
         assert service.readiness().machines[0].recording == "recording"
@@ -214,8 +214,7 @@ def test_a_missing_folder_is_waited_for_without_losing_anything(tmp_path: Path) 
         until(lambda: "failing" in service.readiness().machines[0].recording, "failing recorder")
         assert "disk/demo/lab: cannot be written" in service.readiness().machines[0].recording
         assert service.readiness().ready
-        recorder = worker_of(service).recorder
-        assert recorder is not None
+        recorder = sure(worker_of(service).recorder)
         until(lambda: recorder.status().received >= 30, "messages at the recorder")
         place.unlink()
         until(lambda: service.readiness().machines[0].recording == "recording", "recorder that works")

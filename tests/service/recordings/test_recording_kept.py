@@ -48,6 +48,7 @@ from tests.service.rig.live import (
 from tests.service.rig.replaying import recording
 from tests.service.runtime.test_survives import do, log
 from tests.service.runtime.test_survives import running as monitor_running
+from tests.sure import sure
 
 NS = 1_000_000_000
 NOW_NS = 1_795_271_130 * NS  # 2026-11-21 14:25:30 UTC
@@ -257,8 +258,7 @@ def test_a_monitor_keeps_recordings_for_its_own_alarms_alone(tmp_path: Path) -> 
     folder = tmp_path / "kept" / "demo" / "lab"
     with recorded(tmp_path) as (runtime, feed):
         worker = worker_of(runtime)
-        recorder = worker.recorder
-        assert recorder is not None
+        recorder = sure(worker.recorder)
 
         def closed(count: int) -> bool:
             feed.session.put(LAB.keys.alarm_event, ALARM.payload, encoding=ALARM.encoding)

@@ -16,6 +16,7 @@ from service.recordings.replay.player import PlayPlan, play
 from service.recordings.replay.source import RecordingSource, parse_moment
 from tests.service.rig.live import until
 from tests.service.rig.replaying import write
+from tests.sure import sure
 
 SECOND = 10**9
 KEY = "rotorwatch/demo/lab/stream"
@@ -93,8 +94,7 @@ def test_the_descriptor_of_a_time_is_the_latest_before_it(tmp_path: Path) -> Non
     machine = source.machine()
 
     def found(before_ns: int | None = None) -> bytes:
-        descriptor = source.descriptor(machine, before_ns)
-        assert descriptor is not None
+        descriptor = sure(source.descriptor(machine, before_ns))
         return descriptor.payload
 
     assert found() == found(0) == b"1.0"

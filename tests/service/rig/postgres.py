@@ -21,6 +21,7 @@ from typing import Any
 
 from service.history.records import Retention
 from service.history.store import Store
+from tests.sure import sure
 
 USER = "rotorwatch"
 KINDS = ("sqlite", "postgresql")
@@ -148,8 +149,7 @@ def _account() -> str:
 
 def _programs(folder: Path, account: str | None) -> Path:
     """Folder with PostgreSQL's programs; a copy if the account cannot get to where they are installed."""
-    found = importlib.util.find_spec(_PACKAGE)
-    assert found is not None
+    found = sure(importlib.util.find_spec(_PACKAGE))
     assert found.origin is not None, f"{_PACKAGE} is not installed (make setup)"
     installed = Path(found.origin).parents[1]
     if account is None or all(place.stat().st_mode & 0o005 == 0o005 for place in (installed, *installed.parents)):

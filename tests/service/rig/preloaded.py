@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO
 
 from tests.service.rig.hosts import move_to
+from tests.sure import sure
 
 _ROOT = Path(__file__).parents[3]
 
@@ -52,8 +53,7 @@ class Preloaded:
     @property
     def pid(self) -> int:
         """Number of the process."""
-        assert self._process.pid is not None
-        return self._process.pid
+        return sure(self._process.pid)
 
     @property
     def returncode(self) -> int | None:
@@ -68,8 +68,7 @@ class Preloaded:
         """Wait for the end."""
         self._process.join(timeout)
         if self._process.exitcode is None:
-            assert timeout is not None
-            raise subprocess.TimeoutExpired(self.args, timeout)
+            raise subprocess.TimeoutExpired(self.args, sure(timeout))
         return self._process.exitcode
 
     def send_signal(self, number: int) -> None:

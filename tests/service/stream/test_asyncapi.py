@@ -33,6 +33,7 @@ from tests.service.rig.live import (
     worker_of,
 )
 from tests.service.stream.asyncapi import asyncapi
+from tests.sure import sure
 
 PAGE = ROOT / "docs" / "asyncapi.json"
 DOCUMENT = asyncapi(TruthRecord)
@@ -139,8 +140,7 @@ def heard(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
             ("alarm_log", f"{KEYS.alarm_event}?after=-1;limit=1000"),
         ):
             (reply,) = session.get(selector, timeout=60.0)
-            assert reply.ok is not None
-            found.setdefault(name, []).append(reply.ok.payload.to_string())
+            found.setdefault(name, []).append(sure(reply.ok).payload.to_string())
         subscriber.undeclare()  # type: ignore[no-untyped-call]
     return found
 

@@ -30,6 +30,7 @@ from service.recordings.replay.source import RecordingSource
 from service.runtime.runtime import Runtime
 from service.stream.worker import MachineWorker
 from tests.service.rig.live import LAB, Feed, endpoint, machine_file, open_session, service, until
+from tests.sure import sure
 
 HASH = LAB.descriptor.schema_hash
 
@@ -190,8 +191,7 @@ def test_reports_and_alarm_logs_of_every_version_are_read(version: str) -> None:
     report, log = documents(version)
     found = Report.model_validate_json(report)
     assert found.state == "alert"
-    assert found.verdict is not None
-    assert [one.name for one in found.verdict.changed] == ["k_by"]
+    assert [one.name for one in sure(found.verdict).changed] == ["k_by"]
     assert [one.name for one in found.parameters] == ["k_by", "c_by", "k_bz", "c_bz", "e", "EI"]
     assert found.parameters[4].vector is not None
     assert [one.equation for one in found.equations] == ["28", "29", "30", "31"]

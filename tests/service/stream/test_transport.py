@@ -27,6 +27,7 @@ from tests.service.rig.live import (
     until,
     until_subscribed,
 )
+from tests.sure import sure
 
 KEYS = LAB.keys
 
@@ -314,8 +315,7 @@ def test_alarm_log_is_answered_from_a_number_on() -> None:
             ("after=99", "history: the disk is full"),
         ):
             (reply,) = session.get(f"{KEYS.alarm_event}?{parameters}", timeout=60.0)
-            assert reply.err is not None
-            assert told in json.loads(reply.err.payload.to_string())["error"]
+            assert told in json.loads(sure(reply.err).payload.to_string())["error"]
         assert link.errors == 0
 
 

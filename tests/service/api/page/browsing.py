@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 from deno import find_deno_bin
-from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
+from playwright.sync_api import Browser, HttpCredentials, Page, Route, expect, sync_playwright
 
 from service.runtime.runtime import Runtime, running
 from service.settings.service import MachineEntry
@@ -100,7 +100,9 @@ def plant_running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
 
 
 @contextmanager
-def looking(browser: Browser, url: str, *, phone: bool = False, dark: bool = False) -> Iterator[Page]:
+def looking(
+    browser: Browser, url: str, *, phone: bool = False, dark: bool = False, given: HttpCredentials | None = None
+) -> Iterator[Page]:
     """A page that nothing goes wrong on and that asks nobody else, in a browser of its own."""
     asked: list[str] = []
     faults: list[str] = []
@@ -108,6 +110,7 @@ def looking(browser: Browser, url: str, *, phone: bool = False, dark: bool = Fal
         viewport={"width": 390, "height": 844} if phone else {"width": 1360, "height": 850},
         is_mobile=phone,
         color_scheme="dark" if dark else "light",
+        http_credentials=given,
     ) as context:
         context.set_default_timeout(PATIENCE_MS)
         page = context.new_page()
@@ -116,7 +119,7 @@ def looking(browser: Browser, url: str, *, phone: bool = False, dark: bool = Fal
         page.on("pageerror", lambda error: faults.append(str(error)))
         yield page
     assert asked
-    assert all(one.startswith((f"{url}/", "data:")) for one in asked), asked
+    assert all(one.startswith((f"{url}/", "data:", "blob:")) for one in asked), asked
     assert not faults
 
 

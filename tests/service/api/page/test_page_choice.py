@@ -15,6 +15,7 @@ from rotorwatch.records.levels import ChannelLevels, LevelLimits
 from rotorwatch.records.windows import Parameter
 from service.analysis.overview import nearness, overview
 from tests.service.api.page.browsing import run_deno
+from tests.sure import sure
 
 STATES = Path(service.api.__file__).parent / "page" / "monitor" / "states.js"
 RAISED = [(), ("k_by",), ("level:y1",), ("stream-lost",), ("k_by", "level:z1"), ("c_by", "stream-lost", "level:y1")]
@@ -54,9 +55,7 @@ def channel(level: ChannelLevels, name: str, found: list[tuple[float | None, str
 def healths() -> Iterator[Health]:
     """Every combination of alarms, readings and levels; of some parameters nothing is known that would be seen."""
     health = Health.model_validate(example(Health))
-    report, alarm = health.report, health.alarms[0]
-    assert report is not None
-    assert report.verdict is not None
+    report, alarm = sure(health.report), health.alarms[0]
     one, seen, level = report.parameters[0], report.detectable[0], report.levels[0]
     least = [seen.model_copy(update={"name": name, "loss": -0.3, "gain": 0.02}) for name in ("k_by", "c_by")]
     for raised, settled, change, other, y1, z1, known in itertools.product(
@@ -72,7 +71,7 @@ def healths() -> Iterator[Health]:
                 "parameters": stated if settled else (*stated[:1], parameter(one, "c_by", 5.0)),
                 "detectable": tuple(least[:known]),
                 "levels": (channel(level, "y1", y1), channel(level, "z1", z1)),
-                "verdict": report.verdict.model_copy(
+                "verdict": sure(report.verdict).model_copy(
                     update={"settled": settled, "current": stated, "alternatives": ()}
                 ),
             }
@@ -115,8 +114,7 @@ def test_what_is_nearest_to_its_limit_is_that_by_the_same_number(
     calm = [(health, whole) for health, whole, _ in found if not health.alarms]
     assert len(calm) > 1000
     for health, whole in calm:
-        assert health.report is not None
-        near = nearness(health.report)
+        near = nearness(sure(health.report))
         first = max(near, key=near.__getitem__)
         assert whole["nearness"] == pytest.approx(near[first], rel=1e-12)
         series = str(whole["series"])

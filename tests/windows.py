@@ -1,0 +1,25 @@
+"""Windows of a stream of blocks, as a monitor makes them."""
+
+from collections.abc import Iterable, Iterator
+
+from models.diagnosis.moments import Plan
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.signals.block import SampleBlock
+from tests.sure import sure
+
+
+def full_windows(window: SlidingWindow, stream: Iterable[SampleBlock]) -> Iterator[WindowStatistics]:
+    """Each full one, at every hop."""
+    for block in stream:
+        for _ in window.feed(window.plan.to_si(block.samples), block.start_ns):
+            full = window.statistics()
+            if full is not None:
+                yield full
+
+
+def last_window(plan: Plan, stream: Iterable[SampleBlock]) -> WindowStatistics:
+    """The one at the end."""
+    window = SlidingWindow(plan)
+    for block in stream:
+        tuple(window.feed(plan.to_si(block.samples), block.start_ns))
+    return sure(window.statistics())
