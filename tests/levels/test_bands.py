@@ -6,13 +6,13 @@ import scipy.signal
 
 from models.levels.bands import BandReference
 from models.levels.judgement import LevelJudge
-from models.levels.measures import HopLevels, LevelPlan, WindowLevels, hop_levels, level_plan, window_levels
+from models.levels.measures import LevelPlan, WindowLevels, level_plan
 from models.levels.reference import FirstWindows, LevelReference, learn_levels
 from models.levels.settings import LevelSettings
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
-from models.signals.waveform import waveform_of
 from rotorwatch.records.levels import ChannelLevels
+from tests.levels.test_measures import taken
 from tests.sure import sure
 
 RATE_HZ, HOP_S, HOPS = 2560.0, 5.0, 4
@@ -25,9 +25,7 @@ T = np.arange(round(HOPS * HOP_S * RATE_HZ)) / RATE_HZ
 
 def window(samples: FloatArray, count: int = HOPS) -> WindowLevels:
     """Of a machine whose speed is not known; of its first hops."""
-    parts = np.split(samples, HOPS)[:count]
-    hops: list[HopLevels] = [hop_levels(PLAN, *waveform_of(part[:, None]), None) for part in parts]
-    return window_levels(PLAN, hops, np.full(count, np.nan), phase_reference=False)
+    return taken(PLAN, samples[: count * samples.size // HOPS, None], count)
 
 
 def noise(seed: int) -> FloatArray:

@@ -9,10 +9,9 @@ from scipy.signal import lfilter
 
 from models.levels.bands import BandLevels
 from models.levels.gains import GainReference, learn_gains, wrong_gain
-from models.levels.measures import hop_levels, level_plan, window_levels
-from models.signals.block import FloatArray
+from models.levels.measures import level_plan
 from models.signals.channels import Channel
-from models.signals.waveform import waveform_of
+from tests.levels.test_measures import taken
 from tests.sure import sure
 
 RATE_HZ, HOP_S, HOPS = 1000.0, 5.0, 12
@@ -41,9 +40,7 @@ def window(
         root = 0.9 * np.exp(2j * np.pi * hz / RATE_HZ)
         force = shared + 0.1 * rng.standard_normal(n)
         columns.append(gain * lfilter([1.0], [1, -2 * root.real, abs(root) ** 2], force))
-    samples: FloatArray = 1e-6 * np.column_stack(columns)
-    hops = [hop_levels(PLAN, *waveform_of(part), None) for part in np.split(samples, HOPS)]
-    return sure(window_levels(PLAN, hops, np.full(HOPS, np.nan), phase_reference=False).bands)
+    return sure(taken(PLAN, 1e-6 * np.column_stack(columns), HOPS).bands)
 
 
 @pytest.fixture(scope="module")

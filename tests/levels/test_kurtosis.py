@@ -8,12 +8,12 @@ import pytest
 from models.levels.contact import LatestContact
 from models.levels.judgement import LevelJudge
 from models.levels.kurtosis import HopReference, departure, learn_hops
-from models.levels.measures import LevelPlan, WindowLevels, hop_levels, level_plan, window_levels
+from models.levels.measures import LevelPlan, WindowLevels, level_plan
 from models.levels.reference import learn_levels
 from models.levels.settings import LevelSettings
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
-from models.signals.waveform import waveform_of
+from tests.levels.test_measures import taken
 from tests.sure import sure
 
 RATE_HZ, HOP_S, HOPS = 1000.0, 5.0, 12
@@ -30,13 +30,7 @@ def noise(seed: int) -> FloatArray:
 
 
 def window(samples: FloatArray, *, turning: bool = True) -> WindowLevels:
-    angles = np.split(THETA, HOPS) if turning else [None] * HOPS
-    hops = [
-        hop_levels(PLAN, *waveform_of(1e-6 * part[:, None]), angle)
-        for part, angle in zip(np.split(samples, HOPS), angles, strict=True)
-    ]
-    speed = 2 * np.pi * 23.0 if turning else np.nan
-    return window_levels(PLAN, hops, np.full(HOPS, speed), phase_reference=turning)
+    return taken(PLAN, 1e-6 * samples[:, None], HOPS, THETA if turning else None, phase=turning)
 
 
 def kurtosis(samples: FloatArray, *, turning: bool = True) -> FloatArray:

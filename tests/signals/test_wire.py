@@ -387,7 +387,13 @@ def test_units_turn_into_si(quantity: str, unit: str, factor: float) -> None:
 
 @pytest.mark.parametrize(
     ("fields", "message"),
-    [({"unit": "mm/s"}, "unit 'mm/s' is not one of"), ({"name": "a b"}, "pattern"), ({"gain": "1"}, "Extra inputs")],
+    [
+        ({"unit": "mm/s"}, "unit 'mm/s' is not one of"),
+        ({"name": ""}, "at least 1 character"),
+        ({"name": "a b"}, "pattern"),
+        ({"name": "x" * 65}, "at most 64"),
+        ({"gain": "1"}, "Extra inputs"),
+    ],
 )
 def test_unusable_channels_are_refused(fields: dict[str, str], message: str) -> None:
     with pytest.raises(ValidationError, match=message):

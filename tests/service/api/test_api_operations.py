@@ -174,7 +174,11 @@ def test_an_alarm_that_never_was_can_be_shelved(plant: tuple[Runtime, Feed, http
         ("data-gap/acknowledge", {"If-Match": "0"}, {}, 422, "If-Match: String should match"),
         ("data-gap/acknowledge", {"If-Match": '"0", "1"'}, {}, 422, "If-Match: String should match"),
         ("data-gap/acknowledge", {"If-Match": "*"}, {"reason": "a\u0000b"}, 422, "reason: String should match"),
+        ("data-gap/acknowledge", {"If-Match": "*"}, {"duration_s": 5}, 422, "duration_s: Extra inputs"),
+        ("data-gap/acknowledge", {"If-Match": "*"}, {"reason": "x" * 501}, 422, "reason: String should have at most"),
         ("data-gap/acknowledge", {"If-Match": "*"}, [], 422, "body: Input should be"),
+        ("data-gap/shelve", {"If-Match": "*"}, {}, 422, "reason: Field required"),
+        ("data-gap/shelve", {"If-Match": "*"}, {"reason": "x", "duration_s": 0}, 422, "duration_s: Input should be"),
         ("data-gap/shelve", {"If-Match": "*"}, {"reason": "  "}, 422, "reason: String should match"),
         (
             "data-gap/shelve",

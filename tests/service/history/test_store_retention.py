@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+from pydantic import ValidationError
 
 from service.history.machine import MachineStore
 from service.history.records import Dropped, Retention, Step, StoredBucket, StoredReading, StoredReport
@@ -229,6 +230,14 @@ def test_what_is_written_meanwhile_stays(store: Store, clock: Clock) -> None:
     assert len(lab.readings(quantity="parameter", name="k_by", limit=1_000_000)) == fed
     total = sum(bucket.count for bucket in lab.downsampled(quantity="parameter", names=["k_by"], points=1000))
     assert total == 2000 + fed
+
+
+@pytest.mark.parametrize(
+    "fields", [{"reports_days": 0}, {"readings_days": -1}, {"bucket_s": 0}, {"bucket_s": 90_000}, {"keep": 1}]
+)
+def test_retention_is_bounded(fields: dict[str, float]) -> None:
+    with pytest.raises(ValidationError):
+        Retention.model_validate(fields)
 
 
 def test_it_is_told_how_far_back_the_history_goes(store: Store, clock: Clock) -> None:
