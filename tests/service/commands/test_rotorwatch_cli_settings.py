@@ -1,15 +1,12 @@
 """Settings: file, environment over it, and what is said about mistakes."""
 
 from pathlib import Path
-from types import UnionType
-from typing import get_args
 
 import pytest
-from pydantic import BaseModel
 
 from models.errors import MachineFileError
-from service.settings.service import DEFAULT_LISTEN, ServiceSettings, load_settings
-from tests.service.rig.live import ROOT, machine_file
+from service.settings.service import DEFAULT_LISTEN, load_settings
+from tests.service.rig.live import machine_file
 from tests.service.rig.preloaded import rotorwatch as run
 
 GOOD = """
@@ -99,25 +96,3 @@ def test_check_config_says_what_is_fine_and_what_is_not(tmp_path: Path) -> None:
     assert f"{good}: ok" in mixed.stdout
     assert f"{wrong_machine}: rate_hz: expected above 0 and at most 1000000 (found -1.0)" in mixed.stderr
     assert str(wrong_bundle) in mixed.stderr
-
-
-def fields_of(model: type[BaseModel], table: str = "") -> list[tuple[str, str, str | None]]:
-    found: list[tuple[str, str, str | None]] = []
-    for name, field in model.model_fields.items():
-        inner = field.annotation
-        if isinstance(inner, UnionType):  # a table that may be left out
-            inner = get_args(inner)[0]
-        if isinstance(inner, type) and issubclass(inner, BaseModel):
-            found += fields_of(inner, name)
-        else:
-            found.append((table, name, field.description))
-    return found
-
-
-def test_every_setting_is_described_and_documented() -> None:
-    page = "".join(
-        (ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("service.md", "access.md", "zenoh-security.md")
-    )
-    for table, name, description in fields_of(ServiceSettings):
-        assert description, f"{table}.{name} has no description"
-        assert f"`{name}`" in page or f"[[{name}]]" in page, f"no page mentions {table}.{name}"
