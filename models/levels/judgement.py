@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -70,6 +70,13 @@ class _Nearest:
     high: float
 
 
+class Foreign(NamedTuple):
+    """What the levels of a window show that no change of a parameter makes."""
+
+    text: str = ""  # empty if there is nothing
+    hides: bool = False  # whether nothing that is read of parameters beside it can be believed
+
+
 class LevelJudge:
     """Says what the levels of a machine's windows are, and on which side of their limits.
 
@@ -121,8 +128,8 @@ class LevelJudge:
         latest: LatestContact,
         *,
         named: bool,
-    ) -> str:
-        """What the levels of a window show that no change of a parameter makes; empty if nothing.
+    ) -> Foreign:
+        """What the levels of a window show that no change of a parameter makes.
 
         A shaft that is pushed back where it is far out, a new line, a wrong gain of all sensors of a place, a 2x that
         has grown, or a random part that is not Gaussian as it was on the healthy machine.
@@ -137,7 +144,7 @@ class LevelJudge:
             Whether a parameter has been found to have changed, which this would cast doubt on.
         """
         if reference is None:
-            return ""
+            return Foreign()
         state, seen = reference.at(levels.speed_rad_s)
         found = ""
         if seen:
@@ -150,13 +157,13 @@ class LevelJudge:
             if wrong is not None:
                 own = " and ".join(one.name for one in self._channels if place_of(one) == wrong[0])
                 more = f"{wrong[1]:.2f} times as much at all frequencies, compared with the other places"
-                found = f"gain of {own}: {more}"
+                return Foreign(f"gain of {own}: {more}", hides=True)
         if found or not seen:  # at another speed much is otherwise
-            return found
+            return Foreign(found)
         kurtosis, twice = levels.random_kurtosis, [one.limit("x2") for one in judged]
         grown = [limits.text for limits in twice if limits and limits.text and not limits.absolute]
         if grown or kurtosis is None:
-            return next(iter(grown), "")
+            return Foreign(next(iter(grown), ""))
         n_errors = _ERRORS_OF_DOUBT if named else ERRORS
         departures = [
             (self._departure(levels, column, state, n_errors), one)
@@ -165,10 +172,10 @@ class LevelJudge:
         ]
         most, channel = max(departures, key=lambda one: abs(one[0]), default=(0.0, None))
         if channel is None or not most:
-            return ""
+            return Foreign()
         healthy = state.kurtosis[channel.name].mean
         how = "clipped, as by a rub" if most < 0 else "with impacts, as of a rub, a loose part or a damaged bearing"
-        return (
+        return Foreign(
             f"a vibration at {channel.name} ({channel.location} {channel.direction}) that is {how}: kurtosis of its "
             f"random part {healthy + most:.2f}, {healthy:.2f} on the healthy machine"
         )

@@ -14,7 +14,7 @@ from models.diagnosis.lines import new_line, steady_lines
 from models.diagnosis.moments import Plan
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.levels.contact import LatestContact
-from models.levels.judgement import LevelJudge, channel_state, fallen
+from models.levels.judgement import Foreign, LevelJudge, channel_state, fallen
 from models.levels.measures import WindowLevels
 from models.levels.reference import FirstWindows, LevelReference, expected_levels
 from models.machine import Machine, MachineFile
@@ -32,6 +32,8 @@ _DEPENDS_ON: Any = {
 _WINDOWS_OF_CONTACT = 4
 _STILL_RAD = 0.1
 """Less than this in a hop is no turning: an encoder may waver. The slowest kilns turn further."""
+_NEARLY_ALL = 0.9
+"""Part of a channel's random vibration from which on a new line hides what the machine does by itself."""
 
 
 class LevelWatch:
@@ -96,10 +98,10 @@ class LevelWatch:
         if self._takes_first and window.filled == 1 and not stood:
             self._first.take(window.hops[0].start_ns, window.hops[-1].end_ns, found)
 
-    def foreign(self, window: SlidingWindow, statistics: WindowStatistics, *, named: bool) -> str:
+    def foreign(self, window: SlidingWindow, statistics: WindowStatistics, *, named: bool) -> Foreign:
         """What the latest window shows that no change of a parameter makes: a new line, or see `LevelJudge.foreign`."""
         if self._found is None:
-            return ""
+            return Foreign()
         healthy, speed_rad_s = self.reference, statistics.speed_rad_s
         if healthy is not None and healthy.lines is not None and math.isfinite(speed_rad_s) and speed_rad_s:
             lines = steady_lines(window.plan, window.hops, statistics)
@@ -116,7 +118,7 @@ class LevelWatch:
                     f"random vibration of {line.state}{beats}) that the healthy machine did not have: a neighbouring "
                     "machine, whirl or looseness"
                 )
-                return with_channel_names(text, self._machine.sensors)
+                return Foreign(with_channel_names(text, self._machine.sensors), hides=line.share >= _NEARLY_ALL)
         if self._by_theory is not None:
             healthy = self._expected or self._by_file(self._by_theory, self._found)
             if self._found.contact is not None and self._found.lines is not None:  # all of it can be told

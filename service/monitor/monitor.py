@@ -445,14 +445,14 @@ class MachineMonitor:
         except EstimationError as error:
             return unread(HealthState.WATCHING if self._watching else HealthState.NOT_EVALUABLE, str(error))
         foreign = self._levels.foreign(self._window, statistics, named=bool(self._test.state.findings))
-        evaluation = evaluation.named(self.machine.sensors, foreign)
+        evaluation = evaluation.named(self.machine.sensors, foreign.text)
         looks = {hops: stretch_of(short, present[hops].start_ns, end_ns) for hops, short in evaluation.short.items()}
         whole = self._test.settings.window_hops
         looks[whole] = stretch_of(evaluation.deciding, start_ns, end_ns)
-        verdict = self._test.update(looks, foreign=foreign != "")
+        verdict = self._test.update(looks, foreign=foreign.text != "")
         unexplained = evaluation.deciding.unexplained
-        suspect = foreign if unexplained else evaluation.deciding.suspect
-        self._alarms.found(verdict, self._test.unexplained, suspect, end_ns)
+        suspect = foreign.text if unexplained else evaluation.deciding.suspect
+        self._alarms.found(verdict, self._test.unexplained, suspect, end_ns, hidden=foreign.hides)
         explained = bool(verdict.changed) and not verdict.outside_model
         self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=explained)
         reason = evaluation.reason(told=bool(verdict.current))

@@ -68,7 +68,7 @@ def told(levels: WindowLevels, healthy: list[WindowLevels] | LevelReference) -> 
     judge = LevelJudge(PLAN, CHANNELS, LevelSettings())
     reference = learn_levels("commissioned", NAMES, healthy) if isinstance(healthy, list) else healthy
     reference = type(reference).model_validate_json(reference.model_dump_json())
-    return judge.foreign(levels, judge.judge(levels, reference), reference, LatestContact(4), named=False)
+    return judge.foreign(levels, judge.judge(levels, reference), reference, LatestContact(4), named=False).text
 
 
 @pytest.fixture(scope="module")

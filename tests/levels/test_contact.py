@@ -118,7 +118,7 @@ def heard(hops: FloatArray, *, faster: int | None = None, stop: int | None = Non
         if end == stop:
             arrays, latest = latest.checkpoint(), LatestContact(LATEST)
             latest.restore(arrays)
-        if judge.foreign(levels, (), reference, latest, named=False):
+        if judge.foreign(levels, (), reference, latest, named=False).text:
             found.append(end)
     return found
 

@@ -91,7 +91,7 @@ def suspects(meshes: Sequence[float], healthy_mesh: float, spoilt: Callable[[Flo
     found, judge = [], LevelJudge(PLAN, [Y], LevelSettings())
     for number, mesh in enumerate(meshes):
         levels = window(spoilt(samples(60160 + number, mesh)))
-        found.append(judge.foreign(levels, judge.judge(levels, healthy), healthy, LatestContact(4), named=False))
+        found.append(judge.foreign(levels, judge.judge(levels, healthy), healthy, LatestContact(4), named=False).text)
     return found
 
 

@@ -216,7 +216,7 @@ class BaselineDiagnostician:
             diagnosis, dict(zip(self._names, np.diag(bearing.noise + bearing.common), strict=True))
         )
         if impossible:
-            return replace(diagnosis, misfit_z=max(_SURELY_OUTSIDE, diagnosis.misfit_z or 0.0), suspect=impossible)
+            return replace(diagnosis, misfit_z=max(_SURELY_OUTSIDE, diagnosis.misfit_z or 0.0), unexplained=impossible)
         suspicion = gain_suspicion(diagnosis, self._rows, self._baseline.relations) if known else None
         if suspicion is None:
             abstains = self._alone and not same
@@ -384,7 +384,7 @@ def _impossible(diagnosis: Diagnosis, variances: Mapping[str, float]) -> str:
             continue
         gone = reading.relative_change + 2 * reading.standard_error < _GONE
         if gone or (reading.name.startswith("k") and variances[reading.name] > LOST**2):
-            return f"a sensor of this plane that is swapped, reversed or late ({reading.name} makes no sense)"
+            return f"{reading.name} makes no sense, as with a sensor of this plane that is swapped, reversed or late"
     return ""
 
 

@@ -93,7 +93,7 @@ class AlarmBook:
 
     # What the data say
 
-    def found(self, verdict: Verdict, unexplained: str, suspect: str, end_ns: int) -> None:
+    def found(self, verdict: Verdict, unexplained: str, suspect: str, end_ns: int, *, hidden: bool = False) -> None:
         """Judge what the sequential test has found at the end of a hop; without clean data alarms stay where they are.
 
         Parameters
@@ -102,11 +102,14 @@ class AlarmBook:
             Why nothing can be said of parameters; empty if something can.
         suspect : str
             What explains data outside the model best; empty if nothing does.
+        hidden : bool
+            Whether it hides what a parameter does, so that none is named.
         """
         named = [finding.name for finding in verdict.changed]
         probability = {one.name: one.probability for one in verdict.candidates}
         another = verdict.outside_model and len(named) >= _ANOTHER
-        sure = {one for one in named if not another and probability.get(one, 0.0) >= self._settings.name_confidence}
+        nameless = another or hidden
+        sure = {one for one in named if not nameless and probability.get(one, 0.0) >= self._settings.name_confidence}
         held = {*named, *(one for one, likely in probability.items() if likely >= _TAKEN_BACK)}
         start_ns = end_ns - round(verdict.decided_s * 1e9)
         evidence = Evidence(start_ns=start_ns, end_ns=end_ns, confidence=verdict.confidence)
@@ -118,7 +121,7 @@ class AlarmBook:
                     reading.standard_error,
                     end_ns,
                     named=reading.name in sure,
-                    taken_back=verdict.settled and (another or reading.name not in held),
+                    taken_back=verdict.settled and (nameless or reading.name not in held),
                     low_confidence=verdict.outside_model,
                     evidence=evidence,
                     note="" if reading.vector is None else reading.vector.text,
@@ -131,11 +134,11 @@ class AlarmBook:
         if verdict.current:
             # Outside the model no candidate need be right, and `model` says so; and one cause has one alarm.
             told = verdict.outside_model or any(self.present(name) for name in probability)
-            nameless = [] if sure or told else named
+            unsure = [] if sure or told else named
             changes = [
                 (abs(one.relative_change or 0.0), self._settings.for_parameter(one.name))
                 for one in verdict.current
-                if one.name in nameless
+                if one.name in unsure
             ]
             self.update_state(
                 CHANGED,

@@ -147,9 +147,9 @@ def test_every_kind_of_fault_of_a_sensor_raises_its_alarm(kind: FaultKind) -> No
     assert book.severity is None
 
 
-def judged(hops: Sequence[Mapping[str, float]], *, settled: bool = True, outside: bool = False) -> list[str]:
+def judged(hops: Sequence[Mapping[str, float]], **more: bool) -> list[str]:
     """What alarms say of hops, each with the probability of every parameter; the likelier half is what has changed."""
-    return [f"{event.kind} {event.alarm.name}" for event in happened(hops, settled=settled, outside=outside)]
+    return [f"{event.kind} {event.alarm.name}" for event in happened(hops, **more)]
 
 
 def verdict(probability: Mapping[str, float], *, settled: bool = True, outside: bool = False) -> Verdict:
@@ -166,11 +166,12 @@ def verdict(probability: Mapping[str, float], *, settled: bool = True, outside: 
 
 
 def happened(
-    hops: Sequence[Mapping[str, float]], *, settled: bool = True, outside: bool = False
+    hops: Sequence[Mapping[str, float]], *, settled: bool = True, outside: bool = False, hidden: bool = False
 ) -> tuple[AlarmEvent, ...]:
     book = AlarmBook(SETTINGS)
     for number, probability in enumerate(hops):
-        book.found(verdict(probability, settled=settled, outside=outside), "", "", number * 5_000_000_000)
+        found = verdict(probability, settled=settled, outside=outside)
+        book.found(found, "", "", number * 5_000_000_000, hidden=hidden)
     return book.take()
 
 
@@ -195,6 +196,11 @@ def test_where_most_has_changed_outside_the_model_nothing_is_named() -> None:
     assert judged([SURE] * 3 + [most] * 9, outside=True)[-1] == "cleared c_bz"
     half = ["raised c_by", "raised k_bz", "raised c_bz", "raised model"]
     assert judged([most | {"k_by": 0.1}] * 3, outside=True) == half
+
+
+def test_where_a_line_hides_the_machine_nothing_is_named() -> None:
+    assert judged([SURE] * 3, outside=True) == ["raised c_bz", "raised model"]
+    assert judged([SURE] * 9, outside=True, hidden=True) == ["raised model"]
 
 
 def test_a_name_is_held_with_reserve_once_nothing_explains_the_machine() -> None:
