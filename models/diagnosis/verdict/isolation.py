@@ -4,7 +4,9 @@ For every set A the parameters outside A are held at nominal. What is then left 
 R(A) = x'Jx - x_A' J_AA x_A with the restricted estimate x_A = J_AA⁻¹ (Jx)_A, is χ² with one degree of freedom per
 parameter outside A if nothing outside A changed. A set pays for its size, R(A) + h₁² + (|A| - 1) h₂², and the cheapest
 set is the verdict. So a single parameter is named where its restricted test value exceeds h₁, the declared rate's
-threshold, and another one is added where it takes more than h₂² further off R.
+threshold, and another one is added where it takes more than h₂² further off R. That price of two would hide two small
+changes, so what the best pair explains is compared with what chance lets a pair explain as well: beyond that something
+has changed, and the cheapest set that is not empty is the verdict.
 
 The prior that belongs to this: odds of exp(-h₁²/2) against the first and exp(-h₂²/2) against every further changed
 parameter, the spread of possible sizes included. The confidence is the posterior under that prior.
@@ -26,6 +28,7 @@ from models.signals.block import FloatArray
 from rotorwatch.records.windows import Alternative, Parameter
 
 _LIKELIEST = 4  # sets that are told whatever they hold
+_BY_PAIRS = 0.1  # false alarms by two parameters together, over those of the declared rate
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +100,11 @@ def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") ->
     price = thresholds.first**2 + (members.sum(axis=1) - 1) * thresholds.further**2
     price[0] = 0.0  # of the empty set
     gain = (explained - price) / 2
+    pairs = members.sum(axis=1) == 2
+    if pairs.any():
+        # Where two together are beyond chance and neither is by itself, something has changed all the same.
+        beyond = (float(explained[pairs].max()) - _pair_price(thresholds.first, len(known))) / 2
+        gain[0] = min(0.0, float(gain[1:].max()) - beyond)
     weight = np.exp(gain - gain.max())
     weight /= weight.sum()
     best = int(np.argmax(gain))
@@ -111,6 +119,13 @@ def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") ->
         outside_confidence=confidence,
         alternatives=_alternatives(sets, known, weight, explained) if changed else (),
     )
+
+
+@lru_cache
+def _pair_price(first: float, n: int) -> float:
+    """What chance explains with the best pair of n parameters in a tenth of the cases in which one exceeds `first`."""
+    alone = 2 * n * float(ndtr(-first))
+    return -2 * math.log(_BY_PAIRS * alone / (n * (n - 1) / 2))
 
 
 def _alternatives(

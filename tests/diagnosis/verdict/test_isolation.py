@@ -13,8 +13,8 @@ import models
 import service
 import simulator
 from models.diagnosis.readings import Z95, Diagnosis, no_reading, parameter_reading, possible_reading
-from models.diagnosis.verdict.calibration import agreements, beside
-from models.diagnosis.verdict.isolation import Isolation, isolate_window, outside_confidence
+from models.diagnosis.verdict.calibration import agreements, beside, month_thresholds
+from models.diagnosis.verdict.isolation import Isolation, isolate, isolate_window, outside_confidence
 from models.diagnosis.verdict.stretch import added, from_scale, slope, stretch_of, to_scale
 from models.errors import EstimationError
 from models.physics.rotor import PARAMETERS
@@ -109,6 +109,19 @@ def test_changes_that_hide_each_other_in_single_tests_are_found_together() -> No
     true[1] = -J[0, 0] / J[0, 1] * 0.1  # the restricted estimate of k_by is zero
     found = isolate_window(window(true, cov), 0.01)
     assert found.changed == ("k_by", "c_by")
+
+
+@pytest.mark.parametrize(("first", "second", "found"), [(4.7, 4.7, True), (4.7, 4.0, False)])
+def test_two_that_chance_may_have_made_one_by_one_but_not_together_have_changed(
+    first: float, second: float, found: bool
+) -> None:
+    thresholds = month_thresholds(1.0, 5.0, 12, len(PARAMETERS), 10)
+    assert first < thresholds.first
+    seen = window(1e-3 * np.array([0.0, first, 0.0, second, 0.0, 0.0]), np.diag(np.full(6, 1e-6)))
+    isolation = isolate(stretch_of(seen, 0, 0).complete().believed(), thresholds)
+    assert bool(isolation.changed) is found
+    likeliest = np.argsort(isolation.probability)[-2:]
+    assert {PARAMETERS[i] for i in likeliest} == {"c_by", "c_bz"}
 
 
 def test_the_restricted_estimate_is_sharper_and_right() -> None:
