@@ -19,7 +19,7 @@ from benchmarks.studies.opinions import LAYOUTS, SEVERAL
 from benchmarks.studies.results import Chart, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from models.commissioning.commissioned import KnowledgeLevel
-from models.diagnosis.likelihood.fit import LengthFits
+from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import plan_for
 from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest

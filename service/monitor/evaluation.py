@@ -7,6 +7,7 @@ no equation, each channel with its own healthy form.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -16,7 +17,7 @@ from models.checkpoint import checked, prefixed, unprefixed
 from models.commissioning.commissioned import Commissioned, Installed
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.rows import evaluable_rows
-from models.diagnosis.likelihood.fit import LengthFits
+from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import states_of
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
@@ -26,7 +27,7 @@ from models.diagnosis.sensors.reference import Naming
 from models.diagnosis.verdict.calibration import agreements, beside
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import determined, with_shared_error
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError, EstimationError, UnexplainedError
 from models.machine import Machine, MachineFile
 from models.physics.rotor import PARAMETERS
@@ -50,7 +51,7 @@ class Evaluation:
     """What the diagnosticians say about a window."""
 
     deciding: Diagnosis  # the likelihood's, every parameter in the order of `PARAMETERS`
-    # The same of the latest hops, by how many; without those that could not be evaluated.
+    # The same of the latest hops, by how many; without those that have no news or could not be evaluated.
     short: Mapping[int, Diagnosis]
     equations: tuple[Equation, ...]  # every equation of the table, by its network, or why not
     opinions: tuple[Opinion, ...]  # what the others say
@@ -120,6 +121,15 @@ class Evaluation:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Newest:
+    """Which of a window's latest hops are to be evaluated for themselves."""
+
+    window: SlidingWindow  # whose latest window is evaluated
+    wanted: tuple[int, ...]  # how many hops
+    news_alone: bool  # whether only what may differ from an unchanged machine is of use
+
+
 class WindowEvaluator(ABC):
     """Evaluates the windows of one machine.
 
@@ -137,15 +147,15 @@ class WindowEvaluator(ABC):
     """Whether correlations are needed at all lags, or at lag zero alone."""
 
     @abstractmethod
-    def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
+    def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window.
 
         Parameters
         ----------
         window : WindowStatistics
             The full window.
-        short : mapping of int to WindowStatistics
-            Its latest hops, by how many.
+        newest : Newest, optional
+            Where its latest hops are evaluated for themselves, too.
 
         Raises
         ------
@@ -185,9 +195,9 @@ class NoEvaluator(WindowEvaluator):
     by = "nobody"
     needs_lags = False
 
-    def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
+    def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Say that there is nothing to evaluate, see `WindowEvaluator`."""
-        _ = window, short
+        _ = window, newest
         raise EstimationError("only vibration levels are watched: the machine is neither known nor commissioned")
 
 
@@ -220,7 +230,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         others.append(RelationDiagnostician(machine, () if bundle is None else bundle.networks))
         self._others = tuple(others)
 
-    def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
+    def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`."""
         speed = self._speed(window)
         try:
@@ -229,20 +239,9 @@ class KnownMachineEvaluator(WindowEvaluator):
             reason = str(error)
             nothing = tuple(no_reading(name, self.by, reason) for name in PARAMETERS)
             deciding = Diagnosis(self.by, nothing, covariance=_EMPTY, unexplained=reason)
-        if deciding.unexplained:
-            # One machine or two in this window? If some of its data were explained, the shortest stretch says.
-            straddles = self._explained_ns is not None and window.start_ns < self._explained_ns
-            short = dict(sorted(short.items())[: int(straddles)])
-        else:
+        short = {} if newest is None else self._newest(window, newest, deciding)
+        if not deciding.unexplained:
             self._explained_ns = window.end_ns
-        # Where the window is outside the model it may be astride a change: then its newest hops are inside.
-        closely = deciding.misfit_z is not None and deciding.misfit_z > _OUTSIDE
-        evaluated = {}
-        for hops, statistics in short.items():
-            try:
-                evaluated[hops] = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
-            except EstimationError:
-                continue  # too little data for itself; the window has said what there is to say
         equations: tuple[Equation, ...] = ()
         opinions = []
         for other in self._others:
@@ -253,7 +252,26 @@ class KnownMachineEvaluator(WindowEvaluator):
                 continue
             equations = diagnosis.equations or equations
             opinions.append(_opinion(deciding, beside(deciding, diagnosis)))
-        return Evaluation(deciding, evaluated, equations, tuple(opinions), speed)
+        return Evaluation(deciding, short, equations, tuple(opinions), speed)
+
+    def _newest(self, window: WindowStatistics, newest: Newest, deciding: Diagnosis) -> dict[int, Diagnosis]:
+        """What the latest hops say for themselves, by how many."""
+        wanted, evaluated = newest.wanted, {}
+        # Where the window is outside the model it may be astride a change: then its newest hops are inside.
+        closely = deciding.misfit_z is not None and deciding.misfit_z > _OUTSIDE
+        if deciding.unexplained:
+            # One machine or two in this window? If some of its data were explained, the shortest stretch says.
+            straddles = self._explained_ns is not None and window.start_ns < self._explained_ns
+            wanted = tuple(sorted(wanted)[: int(straddles)])
+        elif newest.news_alone and not closely:
+            wanted = self._likelihood.news(newest.window, window, wanted)
+        for hops in wanted:
+            statistics = newest.window.statistics(hops)
+            if statistics is None:
+                continue
+            with suppress(EstimationError):  # too little data for itself; the window has said what there is to say
+                evaluated[hops] = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
+        return evaluated
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Where the likelihood's maximum is followed from, and what was explained; networks remember nothing."""
@@ -323,9 +341,9 @@ class BaselineEvaluator(WindowEvaluator):
         self._baselines = tuple((one.conditions, one.baseline.diagnostician()) for one in commissioned.baselines)
         self.by = self._baselines[0][1].by if self._baselines else _SHAPE
 
-    def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
+    def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`; outside the commissioned conditions it is not evaluable."""
-        _ = short
+        _ = newest
         outside = self._conditions.outside(window, self._naming)
         if outside:
             here = "not evaluable here" if self._diagnosed else "levels are judged by the nearest commissioned speed"

@@ -41,7 +41,7 @@ from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
 from service.monitor.alarms.operation import OperatorAction
-from service.monitor.evaluation import evaluator_for
+from service.monitor.evaluation import Newest, evaluator_for
 from service.monitor.levels import LevelWatch
 from service.monitor.parts import divided, joined
 from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, counted, identity_of
@@ -439,14 +439,15 @@ class MachineMonitor:
             return unread(HealthState.DATA_HEALTH, "; ".join(each.text for each in findings))
         if stood or skipped:
             return unread(HealthState.NOT_EVALUABLE, stood or _SKIPPED)
-        present = {hops: one for hops in self._test.wanted() if (one := self._window.statistics(hops)) is not None}
+        newest = Newest(self._window, self._test.wanted(), self._test.unchanged)
         try:
-            evaluation = self._evaluator.evaluate(statistics, present)
+            evaluation = self._evaluator.evaluate(statistics, newest)
         except EstimationError as error:
             return unread(HealthState.WATCHING if self._watching else HealthState.NOT_EVALUABLE, str(error))
         foreign = self._levels.foreign(self._window, statistics, named=bool(self._test.state.findings))
         evaluation = evaluation.named(self.machine.sensors, foreign.text)
-        looks = {hops: stretch_of(short, present[hops].start_ns, end_ns) for hops, short in evaluation.short.items()}
+        short, hops = evaluation.short, self._window.hops
+        looks = {count: stretch_of(one, hops[-count].start_ns, end_ns) for count, one in short.items()}
         whole = self._test.settings.window_hops
         looks[whole] = stretch_of(evaluation.deciding, start_ns, end_ns)
         verdict = self._test.update(looks, foreign=foreign.text != "")

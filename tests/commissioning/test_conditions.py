@@ -35,7 +35,7 @@ def at(speed_rpm: float) -> Event:
 def evaluated(made: Commissioning, seed: int, *events: Event) -> Evaluation:
     """A later window as the monitor evaluates it."""
     (window,) = windows_of(recording(NOTHING, stream(66.0, seed, *events)))
-    return evaluator_for(Installed(NOTHING, None, made.commissioned)).evaluate(window, {})
+    return evaluator_for(Installed(NOTHING, None, made.commissioned)).evaluate(window)
 
 
 def reading(found: Evaluation, name: str) -> Parameter:

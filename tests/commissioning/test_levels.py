@@ -139,7 +139,7 @@ def test_a_misfit_that_was_there_when_the_machine_was_healthy_is_none_of_a_later
 
     def judged(known: HealthyMisfit | None) -> Diagnosis:
         installed = Installed(machine, None, made.model_copy(update={"misfit": known}))
-        return evaluator_for(installed).evaluate(window, {}).deciding
+        return evaluator_for(installed).evaluate(window).deciding
 
     raw = judged(None)
     assert raw.goodness is not None

@@ -12,8 +12,9 @@ from hypothesis.extra import numpy as arrays_of
 
 from models.checkpoint import checked, from_bytes, prefixed, to_bytes, unprefixed
 from models.commissioning.commissioned import install
-from models.diagnosis.likelihood.fit import LengthFits, LikelihoodFit
+from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.following import Linearised
+from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import plan_for
 from models.diagnosis.verdict.sequential_state import SequentialState, finding, hop_arrays
 from models.diagnosis.verdict.stretch import Stretch

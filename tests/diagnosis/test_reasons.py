@@ -124,7 +124,7 @@ def test_a_speed_out_of_range_says_so_in_numbers(window: WindowStatistics, facto
     tolerance = MACHINE.operation.speed_tolerance
     off = replace(window, speed_rad_s=MACHINE.operation.speed_rad_s * (1 + (factor - 1) * max(1.0, tolerance / 0.05)))
     with pytest.raises(EstimationError) as caught:
-        KnownMachineEvaluator(MACHINE, None).evaluate(off, {})
+        KnownMachineEvaluator(MACHINE, None).evaluate(off)
     assert_beyond(str(caught.value))
 
 
@@ -133,7 +133,7 @@ def test_an_unsteady_speed_says_so_in_numbers(window: WindowStatistics) -> None:
     for part in (0.1501, 0.2, 0.6):
         swept = replace(window, speed_range=(nominal * (1 - part / 2), nominal * (1 + part / 2)))
         with pytest.raises(EstimationError) as caught:
-            KnownMachineEvaluator(MACHINE, None).evaluate(swept, {})
+            KnownMachineEvaluator(MACHINE, None).evaluate(swept)
         assert_beyond(str(caught.value))
 
 

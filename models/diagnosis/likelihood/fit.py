@@ -45,6 +45,9 @@ _PATIENCE, _HOPELESS = 30, 2.0
 _OUTSIDE = "a sensor is at fault, or something outside the model has changed"
 _STIFFEST, _SURELY = 0.5, 3.0  # no shaft becomes stiffer by half; in standard errors
 _SYNCHRONOUS_BINS = 3
+# Newest hops are not looked at closer while no part of the unbalance differs from the window's by more standard errors
+# than the first, and all parameters together from nominal by no more than the second: a change is named from five on.
+_DIFFERS, _STANDS_OUT = 3.0, 4.0
 _FOLLOWED = 12  # windows in a row that may start from one window's units and slopes before a search takes its own
 
 
@@ -72,6 +75,7 @@ class LikelihoodFit:
         self._line_segments = self._followed = 0
         self._line_band: tuple[FloatArray, npt.NDArray[np.bool_]] | None = None
         self._latest: tuple[WindowStatistics, SpectralModel, ModelPoint, FloatArray, float] | None = None
+        self._said: tuple[Diagnosis, Unbalance] | None = None
         self._groups: dict[bytes, BinGroups] = {}
 
     def reset(self) -> None:
@@ -187,7 +191,8 @@ class LikelihoodFit:
         # A search that has not converged adds the step it would still take to the uncertainty.
         structural = covariance[:n, :n] + np.diag(found.remaining**2)
         self._latest = window, model, found.whitened.point, structural, speed
-        read = self._read(*self._latest)
+        read, unbalance = self._read(*self._latest)
+        self._said = None if unbalance is None else (read, unbalance)
         unexplained = unexplained or self._too_stiff(read)
         return replace(
             read,
@@ -206,7 +211,7 @@ class LikelihoodFit:
         if self._latest is None:
             raise EstimationError(f"{machine.name}: no window has been diagnosed")
         self._machine = machine
-        read = self._read(*self._latest)
+        read, _ = self._read(*self._latest)
         return replace(diagnosis, parameters=read.parameters, covariance=read.covariance, unbalance=read.unbalance)
 
     def glance(self, stretch: WindowStatistics) -> Diagnosis | None:
@@ -234,16 +239,42 @@ class LikelihoodFit:
         if seen is None:
             return None
         try:
-            return self._read(stretch, line.model, seen.point, seen.structural, speed)
+            return self._read(stretch, line.model, seen.point, seen.structural, speed)[0]
         except EstimationError:
             return None
+
+    def may_be_news(self, segments: ComplexArray, synchronous: ComplexArray) -> bool:
+        """Whether the latest hops may say more than that the machine is as nominal, or as the latest window says.
+
+        Parameters
+        ----------
+        segments : ndarray, shape (n_bins, n_segments, n_states)
+            Their Fourier coefficients without the rotation.
+        synchronous : ndarray, shape (n_states,)
+            Their rotation-synchronous vector.
+        """
+        line = self._line
+        if line is None or self._latest is None or self._said is None or self._latest[0].synchronous is None:
+            return True
+        (window, model, *_), (read, unbalance) = self._latest, self._said
+        share = segments.shape[1] / window.n_segments
+        observed = model.motions.spectra(model.groups.cross_spectra(segments), model.centre)
+        seen, vector = line.glance(observed, share), unbalance.vector
+        moved = complex(unbalance.weights @ (synchronous - self._latest[0].synchronous))
+        along, across = moved.real**2 / vector.variance_real, moved.imag**2 / vector.variance_imaginary
+        if seen is None or share * max(along, across) > _DIFFERS**2:
+            return True
+        values = np.append(np.expm1(seen.point.theta[: len(STRUCTURAL)]), unbalance.change + moved.real)
+        chi2 = values @ np.linalg.solve(read.full_covariance, values)
+        chi2 += (vector.imaginary + moved.imag) ** 2 / vector.variance_imaginary
+        return not share * chi2 <= _STANDS_OUT**2
 
     def _speed(self, window: WindowStatistics) -> float:
         return window.speed_rad_s if np.isfinite(window.speed_rad_s) else self._machine.operation.speed_rad_s
 
     def _read(
         self, window: WindowStatistics, model: SpectralModel, point: ModelPoint, structural: FloatArray, speed: float
-    ) -> Diagnosis:
+    ) -> tuple[Diagnosis, Unbalance | None]:
         """Readings of the structural parameters at a point, and of e from the window's synchronous part."""
         ratio = np.exp(point.theta[: len(STRUCTURAL)])
         change, spread = ratio - 1, structural * np.outer(ratio, ratio)
@@ -252,15 +283,14 @@ class LikelihoodFit:
             parameter_reading(name, self.by, float(value), float(error))
             for name, value, error in zip(STRUCTURAL, change, errors, strict=True)
         ]
-        vector = None
+        e = None
         if window.synchronous is not None:
             e = self._unbalance(window, model, point, structural, speed)
             cross = (e.covariance * ratio)[:, None]
             spread = np.block([[spread, cross], [cross.T, np.array([[e.variance]])]])
             readings.append(parameter_reading("e", self.by, e.change, math.sqrt(e.variance), e.vector))
-            vector = e.vector
-        covariance = np.asarray(spread, dtype=np.float64)
-        return Diagnosis(self.by, tuple(readings), covariance=covariance, unbalance=vector)
+        covariance, vector = np.asarray(spread, dtype=np.float64), None if e is None else e.vector
+        return Diagnosis(self.by, tuple(readings), covariance=covariance, unbalance=vector), e
 
     def _unbalance(
         self, window: WindowStatistics, model: SpectralModel, point: ModelPoint, structural: FloatArray, speed: float
@@ -418,75 +448,3 @@ def _dead(states: tuple[str, ...], power: FloatArray) -> list[str]:
     rates = np.array([name.endswith("_dot") for name in states])
     largest = np.where(rates, power[rates].max(initial=0.0), power[~rates].max(initial=0.0))
     return [name for name, dead in zip(states, ~(power > 1e-6 * largest), strict=True) if dead]
-
-
-class LengthFits:
-    """One fit for the window, and one for every shorter length that has news."""
-
-    def __init__(self, machine: Machine) -> None:
-        self._machine = machine
-        self._window = LikelihoodFit(machine, follow=True)
-        self._short: dict[int, LikelihoodFit] = {}
-        self._searched: dict[int, int] = {}
-        self._hop = 0
-
-    def checkpoint(self) -> dict[str, np.ndarray]:
-        """Everything that the next hops' readings depend on, as named arrays."""
-        found = {
-            "hop": np.array(self._hop, dtype=np.int64),
-            "searched": np.array(list(self._searched.items()), dtype=np.int64).reshape(-1, 2),
-            **prefixed("window", self._window.checkpoint()),
-        }
-        for hops, fit in self._short.items():
-            found |= prefixed(f"short_{hops}", fit.checkpoint())
-        return found
-
-    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called: the next readings are the same to the last bit.
-
-        Raises
-        ------
-        CheckpointError
-            If they are not those of this machine; nothing is changed then.
-        """
-        hop = int(checked(arrays, "hop", np.int64, ()))
-        searched = dict(checked(arrays, "searched", np.int64, (None, 2)).tolist())
-        window = LikelihoodFit(self._machine, follow=True)
-        window.restore(unprefixed("window", arrays))
-        short = {hops: LikelihoodFit(self._machine) for hops in searched}
-        for hops, fit in short.items():
-            fit.restore(unprefixed(f"short_{hops}", arrays))
-        self._hop, self._searched, self._window, self._short = hop, searched, window, short
-
-    def window(self, window: WindowStatistics) -> Diagnosis:
-        """Estimate the parameters of the window at the next hop.
-
-        Raises
-        ------
-        EstimationError
-            As `LikelihoodFit.diagnose`.
-        """
-        self._hop += 1
-        return self._window.diagnose(window)
-
-    def short(self, hops: int, stretch: WindowStatistics, *, closely: bool = False) -> Diagnosis:
-        """Estimate the parameters of the window's latest hops: at a glance if they say what the window says.
-
-        Parameters
-        ----------
-        closely : bool
-            Not at a glance, which does not say whether the stretch is outside the model.
-
-        Raises
-        ------
-        EstimationError
-            As `LikelihoodFit.diagnose`.
-        """
-        seen = None if closely else self._window.glance(stretch)
-        if seen is not None:
-            return seen
-        fit = self._short.setdefault(hops, LikelihoodFit(self._machine))
-        if self._searched.get(hops) != self._hop - 1:
-            fit.start_near(self._window)
-        self._searched[hops] = self._hop
-        return fit.diagnose(stretch)

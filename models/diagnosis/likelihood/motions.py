@@ -22,6 +22,7 @@ Nothing is filtered in time.
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -70,9 +71,31 @@ class BinGroups:
         sums = np.add.reduceat(spectrum, places[: -1 if places[-1] == spectrum.shape[0] else None], axis=0)[::2]
         return divided(np.ascontiguousarray(sums), self.bins[:, None, None])
 
+    def cross_spectra(self, segments: ComplexArray) -> ComplexArray:
+        """The same from Fourier coefficients, shape (n_bins, n_segments, n): less work where there are few segments."""
+        groups = [
+            segments[first : first + n * width].reshape(n, -1, segments.shape[-1])
+            for first, n, width in _runs(self.edges)
+        ]
+        sums = np.concatenate([one.swapaxes(1, 2) @ one.conj() for one in groups])
+        return divided(sums, segments.shape[1] * self.bins[:, None, None])
+
     def same_as(self, other: "BinGroups") -> bool:
         """Whether other groups hold the same bins at the same frequencies."""
         return self.edges == other.edges and np.array_equal(self.centre_hz, other.centre_hz)
+
+
+@lru_cache(maxsize=8)
+def _runs(edges: tuple[tuple[int, int], ...]) -> list[tuple[int, int, int]]:
+    """First bin, number and width of groups that follow each other without a gap and hold equally many bins."""
+    runs: list[tuple[int, int, int]] = []
+    for first, end in edges:
+        at, count, width = runs[-1] if runs else (first, 0, end - first)
+        if width == end - first and at + count * width == first:
+            runs[max(0, len(runs) - 1) :] = [(at, count + 1, width)]
+        else:
+            runs.append((first, 1, end - first))
+    return runs
 
 
 def natural_frequencies(machine: Machine) -> tuple[FloatArray, FloatArray]:

@@ -35,6 +35,7 @@ class Unbalance:
     variance: float
     covariance: FloatArray  # (5,), with the logarithmic ratios of the structural parameters
     vector: UnbalanceVector
+    weights: ComplexArray  # see `UnbalanceRatios`
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,9 @@ class UnbalanceRatios:
     between: float  # covariance of the two parts
     covariance: FloatArray  # (3, 5), of the three with the logarithmic ratios of the structural parameters
     foreign: str  # see `UnbalanceVector`
+    weights: (
+        ComplexArray  # (n_states,): real and imaginary part are those of weights @ vector; none for several vectors
+    )
 
     def decided(self) -> Unbalance:
         """Take that of the descriptions which holds, see this module."""
@@ -60,12 +64,12 @@ class UnbalanceRatios:
         else:
             turned = turn > max(_TURNED * size * math.radians(vector.turned_error_deg), _LEAST_TURN)
         if not turned and known > 0:
-            return Unbalance(known - 1, float(self.variances[0]), self.covariance[0], vector)
+            return Unbalance(known - 1, float(self.variances[0]), self.covariance[0], vector, self.weights)
         if turned and turn > abs(size - 1):
             along = np.array([real - 1, imaginary]) / vector.change
-            return Unbalance(vector.change, vector.change_error**2, along @ self.covariance[1:], vector)
+            return Unbalance(vector.change, vector.change_error**2, along @ self.covariance[1:], vector, self.weights)
         along = np.array([real, imaginary]) / size
-        return Unbalance(size - 1, vector.magnitude_error**2, along @ self.covariance[1:], vector)
+        return Unbalance(size - 1, vector.magnitude_error**2, along @ self.covariance[1:], vector, self.weights)
 
 
 def estimate_unbalance(
@@ -107,9 +111,11 @@ def estimate_unbalance(
     slopes = -(model.dynamic_changes(structural, speed_rad_s) @ moved) @ H.T  # ∂H = -H ∂D H
     g, *slopes = model.measured(np.vstack([moved, slopes]).T[np.newaxis], w)[0].T
     noise = 4 * _around_rotation(machine, model, point, speed_rad_s, duration_s) / duration_s
-    q = (model.motions.combine(w) @ synchronous)[0]
+    combined = model.motions.combine(w)
+    q = (combined @ synchronous)[0]
     weighted = np.linalg.solve(noise, g)
-    ratio = complex(np.vdot(weighted, q)) / float(np.real(np.vdot(weighted, g)))
+    total_weight = float(np.real(np.vdot(weighted, g)))
+    ratio = complex(np.vdot(weighted, q)) / total_weight
     # Real representation: the structural uncertainty moves real and imaginary parts together.
     own = np.block([[noise.real, -noise.imag], [noise.imag, noise.real]]) / 2
     turned = 1j * g
@@ -130,7 +136,8 @@ def estimate_unbalance(
         with_structural[at] = -spread @ (weight @ J) @ covariance
         between = float(spread[0, -1])
     foreign = _foreign(machine.name, q2, design @ values[1:], total)
-    return UnbalanceRatios(values, variances, between, with_structural, foreign)
+    weights = np.asarray(weighted.conj() @ combined[0] / total_weight, dtype=np.complex128)
+    return UnbalanceRatios(values, variances, between, with_structural, foreign, weights)
 
 
 def _foreign(name: str, q2: FloatArray, explained: FloatArray, total: FloatArray) -> str:
@@ -196,6 +203,7 @@ def estimate_unbalance_by_hop(
         float(weight[:, 1] ** 2 @ between + left[1, 2]),
         together,
         next((hop.foreign for hop in hops if hop.foreign), ""),
+        np.empty(0, dtype=np.complex128),
     ).decided()
 
 

@@ -138,6 +138,14 @@ class SequentialTest:
                 return (max((hops for hops in short if hops <= next_hops), default=short[0]),)
         return short
 
+    @property
+    def unchanged(self) -> bool:
+        """Whether nothing is found changed, and no window is astride a change.
+
+        Then `update` needs only those of the short stretches that may stand out or differ from the window.
+        """
+        return not self.state.findings and self.wanted() == self.settings.short_hops
+
     def update(self, looks: Mapping[int, Stretch], *, foreign: bool = False) -> Verdict:
         """Judge one hop.
 

@@ -6,7 +6,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from models.diagnosis.likelihood.fit import LengthFits, LikelihoodFit
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import plan_for
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.window import SlidingWindow, WindowStatistics
@@ -70,6 +71,16 @@ def test_news_is_not_read_at_a_glance() -> None:
     assert fit.glance(stretch) is None
     change, error = values(fits.short(2, stretch))
     assert abs(change[0] + 0.2) < 4 * error[0] < 0.2
+
+
+@pytest.mark.parametrize(
+    ("step", "news"), [(None, ()), (("k_by", -0.2), (2, 4, 7)), (("EI", -0.1), (2, 4, 7)), (("e", 0.3), (2, 4, 7))]
+)
+def test_latest_hops_are_read_where_they_may_say_more(step: tuple[str, float] | None, news: tuple[int, ...]) -> None:
+    sliding, windows = slid(Layout.INDEPENDENT, step)
+    fits = LengthFits(LAB)
+    fits.window(windows[-1])
+    assert fits.news(sliding, windows[-1], (2, 4, 7)) == news
 
 
 def test_nothing_is_glanced_at_before_a_window_was_searched() -> None:

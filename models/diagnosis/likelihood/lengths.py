@@ -1,0 +1,115 @@
+"""One fit for the window and one for every shorter length that has news, and which lengths may have any."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from models.checkpoint import checked, prefixed, unprefixed
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.likelihood.motions import integrated
+from models.diagnosis.readings import Diagnosis
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.machine import Machine
+
+
+class LengthFits:
+    """One fit for the window, and one for every shorter length that has news."""
+
+    def __init__(self, machine: Machine) -> None:
+        self._machine = machine
+        self._window = LikelihoodFit(machine, follow=True)
+        self._short: dict[int, LikelihoodFit] = {}
+        self._searched: dict[int, int] = {}
+        self._hop = 0
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything that the next hops' readings depend on, as named arrays."""
+        found = {
+            "hop": np.array(self._hop, dtype=np.int64),
+            "searched": np.array(list(self._searched.items()), dtype=np.int64).reshape(-1, 2),
+            **prefixed("window", self._window.checkpoint()),
+        }
+        for hops, fit in self._short.items():
+            found |= prefixed(f"short_{hops}", fit.checkpoint())
+        return found
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called: the next readings are the same to the last bit.
+
+        Raises
+        ------
+        CheckpointError
+            If they are not those of this machine; nothing is changed then.
+        """
+        hop = int(checked(arrays, "hop", np.int64, ()))
+        searched = dict(checked(arrays, "searched", np.int64, (None, 2)).tolist())
+        window = LikelihoodFit(self._machine, follow=True)
+        window.restore(unprefixed("window", arrays))
+        short = {hops: LikelihoodFit(self._machine) for hops in searched}
+        for hops, fit in short.items():
+            fit.restore(unprefixed(f"short_{hops}", arrays))
+        self._hop, self._searched, self._window, self._short = hop, searched, window, short
+
+    def window(self, window: WindowStatistics) -> Diagnosis:
+        """Estimate the parameters of the window at the next hop.
+
+        Raises
+        ------
+        EstimationError
+            As `LikelihoodFit.diagnose`.
+        """
+        self._hop += 1
+        return self._window.diagnose(window)
+
+    def news(self, sliding: SlidingWindow, window: WindowStatistics, lengths: tuple[int, ...]) -> tuple[int, ...]:
+        """Those of the latest hops, by how many, that may say more than that the machine is as the window says.
+
+        Their spectra are not those of `SlidingWindow.statistics`: what the window's rotation leaves of them is a part
+        of the work, and hardly differs away from the rotation. All lengths where no one rotation is that of all hops,
+        or accelerations are measured.
+
+        Parameters
+        ----------
+        sliding : SlidingWindow
+            In which the window is the latest.
+        """
+        rotation, by_hop, plan = window.as_mounted.synchronous, window.hop_synchronous, sliding.plan
+        if (
+            rotation is None
+            or by_hop is None
+            or window.removed_by_hop
+            or integrated(window) is not window
+            or not lengths
+        ):
+            return lengths
+        n, hops = len(plan.states), sliding.hops[-max(lengths) :]
+        segments, each = np.concatenate([hop.segments for hop in hops]), hops[0].segments.shape[0]
+        rest = segments[:, :, :n] - segments[:, :, n + 1 :] @ np.stack([rotation.real, -rotation.imag])
+        by_bin = np.ascontiguousarray((rest if plan.turn is None else rest @ plan.turn.T).swapaxes(0, 1))
+        return tuple(
+            length
+            for length in lengths
+            if self._window.may_be_news(by_bin[:, -length * each :], by_hop[-length:].mean(axis=0))
+        )
+
+    def short(self, hops: int, stretch: WindowStatistics, *, closely: bool = False) -> Diagnosis:
+        """Estimate the parameters of the window's latest hops: at a glance if they say what the window says.
+
+        Parameters
+        ----------
+        closely : bool
+            Not at a glance, which does not say whether the stretch is outside the model.
+
+        Raises
+        ------
+        EstimationError
+            As `LikelihoodFit.diagnose`.
+        """
+        seen = None if closely else self._window.glance(stretch)
+        if seen is not None:
+            return seen
+        fit = self._short.setdefault(hops, LikelihoodFit(self._machine))
+        if self._searched.get(hops) != self._hop - 1:
+            fit.start_near(self._window)
+        self._searched[hops] = self._hop
+        return fit.diagnose(stretch)
