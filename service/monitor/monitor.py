@@ -453,7 +453,8 @@ class MachineMonitor:
         verdict = self._test.update(looks, foreign=foreign.text != "")
         unexplained = evaluation.deciding.unexplained
         suspect = foreign.text if unexplained else evaluation.deciding.suspect
-        self._alarms.found(verdict, self._test.unexplained, suspect, end_ns, hidden=foreign.hides)
+        astride_s = 0.0 if foreign.text else self._test.astride_s
+        self._alarms.found(verdict, self._test.unexplained, suspect, end_ns, hidden=foreign.hides, astride_s=astride_s)
         explained = bool(verdict.changed) and not verdict.outside_model
         self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=explained)
         reason = evaluation.reason(told=bool(verdict.current))

@@ -146,6 +146,14 @@ class SequentialTest:
         """
         return not self.state.findings and self.wanted() == self.settings.short_hops
 
+    @property
+    def astride_s(self) -> float:
+        """For how long windows that are outside the model may be astride a change, where no shorter stretch says; s."""
+        began_ns, windows = self.state.outside_ns, self.state.sums.get(1)
+        if self.settings.short_hops or began_ns is None or not windows:
+            return 0.0
+        return max(0.0, self.settings.window_hops * self.settings.hop_s - (windows[-1].end_ns - began_ns) / 1e9)
+
     def update(self, looks: Mapping[int, Stretch], *, foreign: bool = False) -> Verdict:
         """Judge one hop.
 

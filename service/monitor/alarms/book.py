@@ -93,7 +93,16 @@ class AlarmBook:
 
     # What the data say
 
-    def found(self, verdict: Verdict, unexplained: str, suspect: str, end_ns: int, *, hidden: bool = False) -> None:
+    def found(
+        self,
+        verdict: Verdict,
+        unexplained: str,
+        suspect: str,
+        end_ns: int,
+        *,
+        hidden: bool = False,
+        astride_s: float = 0.0,
+    ) -> None:
         """Judge what the sequential test has found at the end of a hop; without clean data alarms stay where they are.
 
         Parameters
@@ -104,6 +113,8 @@ class AlarmBook:
             What explains data outside the model best; empty if nothing does.
         hidden : bool
             Whether it hides what a parameter does, so that none is named.
+        astride_s : float
+            For how long the window may still hold the moment of a change, and be outside the model for that alone.
         """
         named = [finding.name for finding in verdict.changed]
         probability = {one.name: one.probability for one in verdict.candidates}
@@ -150,7 +161,8 @@ class AlarmBook:
             )
         if verdict.current or unexplained or verdict.outside_model:
             at_once = f"{', '.join(named)} seem to have changed at once, so none is named" if another else ""
-            note = "; ".join(filter(None, (unexplained, suspect and f"best explained by: {suspect}", at_once)))
+            just = f"if a parameter has just changed, it is named within {astride_s:.0f} s" if astride_s else ""
+            note = "; ".join(filter(None, (unexplained, suspect and f"best explained by: {suspect}", at_once, just)))
             outside = verdict.outside_model
             self.update_state(MODEL, outside, end_ns, note, evidence=evidence)
 

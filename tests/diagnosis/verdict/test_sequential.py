@@ -252,6 +252,21 @@ def test_what_is_outside_the_model_is_said_of_clean_data() -> None:
                 assert test.update(looks).outside_model == outside
 
 
+def test_how_long_a_window_that_is_outside_may_be_astride_a_change_is_known_where_no_shorter_stretch_says() -> None:
+    alone = SequentialTest(replace(SETTINGS, short_hops=()))
+    hops, left_s = gaussian(SEED + 48), []
+    for number in range(28):
+        looks = hops.looks(true())
+        if looks:
+            alone.update({12: replace(looks[12], misfit_z=8.0 if number >= 14 else 0.0)})
+            left_s.append(alone.astride_s)
+    assert left_s == [0.0] * 3 + [60.0 - 5.0 * hop for hop in range(12)] + [0.0, 0.0]
+    short = SequentialTest(SETTINGS)
+    play(short, gaussian(SEED + 48), (20, true()))
+    short.state.outside_ns = short.state.sums[1][-1].end_ns
+    assert short.astride_s == 0.0
+
+
 @pytest.mark.parametrize(("before", "lasting"), [(13, True), (4, False)])
 def test_what_has_long_been_outside_the_model_is_taken_back_by_a_whole_window_alone(before: int, lasting: bool) -> None:
     """Not by stretches too short to show it; but what is outside while a window is astride a change may be that."""

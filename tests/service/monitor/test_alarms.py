@@ -222,6 +222,15 @@ def test_what_levels_show_is_told_while_nothing_can_be_read() -> None:
     assert event.text == f"ALERT: outside the model: best explained by: {suspect}"
 
 
+def test_that_the_model_does_not_hold_may_be_the_moment_of_a_change() -> None:
+    book = AlarmBook(SETTINGS)
+    for number in range(3):
+        astride_s = 60.0 - 5.0 * number
+        book.found(verdict({}, outside=True, settled=False), "", "", number * 5_000_000_000, astride_s=astride_s)
+    (event,) = book.take()
+    assert event.text == "ALERT: outside the model: if a parameter has just changed, it is named within 50 s"
+
+
 def test_a_name_that_is_taken_back_is_cleared_however_large_its_reading() -> None:
     nothing = {"c_by": 0.02, "c_bz": 0.04}
     assert judged([SURE] * 3 + [nothing] * 3) == ["raised c_bz"]
