@@ -19,7 +19,7 @@ from models.commissioning.commissioned import (
     knowledge_of,
 )
 from models.commissioning.healthy import HealthyRecording, known_lines
-from models.commissioning.levels import LEVELS, NO_SUCH_ROTOR, HealthyPiece, Learned, Progress, pieces_of
+from models.commissioning.levels import NO_SUCH_ROTOR, HealthyPiece, Learned, Progress, learn, pieces_of
 from models.diagnosis.baseline.rows import Row, evaluable_rows
 from models.diagnosis.misfit import HealthyMisfit
 from models.diagnosis.moments import states_of
@@ -277,7 +277,7 @@ def commission(
             checks += [check_steady(machine, recordings, by_recording), check_lines(machine, recordings)]
         if states and all(check.verdict != "refused" for check in checks):
             try:
-                learned = LEVELS[knowledge.level](machine, pieces, progress)
+                learned = learn(knowledge.level, machine, pieces, progress)
             except EstimationError as error:
                 learned = Learned((_not_learned(knowledge.level, str(error)),))
             checks += learned.checks
@@ -298,6 +298,7 @@ def commission(
             recordings=tuple(entries),
             conditions=OperatingRange.of(windows),
             identified=learned.identified,
+            gyroscopic=learned.gyroscopic,
             misfit=_healthy_misfit(machine, learned, pieces),
             baselines=learned.baselines,
             shape=learned.shape,

@@ -164,6 +164,9 @@ _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _DESCRIBED = {"sensors", "rate_hz", "window", "rotor", "operation", "condition", "schedule"}
 
 
+Gyroscopic = Literal["Eq. 27", "opposite"]
+
+
 class HealthyEntry(BaseModel, extra="forbid", frozen=True):
     """One healthy recording that was used."""
 
@@ -224,6 +227,11 @@ class Commissioned(BaseModel, extra="forbid", frozen=True):
         exclude_if=lambda found: found is None,
         description="levels full and partial: of the healthy windows",
     )
+    gyroscopic: Gyroscopic = Field(
+        default="Eq. 27",
+        exclude_if=lambda found: found == "Eq. 27",
+        description="levels full and partial: sense of the gyroscopic moments",
+    )
     baselines: tuple[ConditionBaseline, ...] = Field(
         default=(), description="level none: one for all conditions, or one for each speed where they differ"
     )
@@ -251,6 +259,16 @@ class Commissioned(BaseModel, extra="forbid", frozen=True):
         if self.identified is None:
             return None
         return Machine.model_validate(machine.model_dump(mode="json") | self.identified.machine)
+
+
+def opposed(machine: Machine) -> Machine:
+    """The machine with gyroscopic moments of the opposite sense: as if its polar moment of inertia were negative.
+
+    In the sense of Eq. (27), as it is read here, natural frequencies of whirl with the rotation fall with the speed,
+    and those of a real rotor rise; see ``docs/decisions/0049-the-sense-of-the-gyroscopic-moments.md``.
+    """
+    rotor = machine.rotor.model_copy(update={"I2p_kg_m2": -machine.rotor.I2p_kg_m2})
+    return machine.model_copy(update={"rotor": rotor})
 
 
 def described(machine: MachineFile) -> dict[str, Any]:
@@ -308,7 +326,8 @@ class Installed:
         if not states_of(self.machine):
             return None
         if self.commissioned is not None:
-            return self.commissioned.completed(self.machine)
+            known = self.commissioned.completed(self.machine)
+            return opposed(known) if known is not None and self.commissioned.gyroscopic == "opposite" else known
         return self.machine if isinstance(self.machine, Machine) else None
 
     @property

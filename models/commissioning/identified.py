@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from models.commissioning.commissioned import Gyroscopic, opposed
 from models.diagnosis.baseline.learned import learn_baseline
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Diagnosis
@@ -42,7 +43,10 @@ class Identified:
 
 
 def identify(
-    machine: MachineFile, windows: Sequence[WindowStatistics], progress: Callable[[int, int], None] = lambda *_: None
+    machine: MachineFile,
+    windows: Sequence[WindowStatistics],
+    progress: Callable[[int, int], None] = lambda *_: None,
+    sense: Gyroscopic = "Eq. 27",
 ) -> Identified:
     """Identify stiffness, damping and unbalance.
 
@@ -52,6 +56,8 @@ def identify(
         With masses and shaft in its ``[rotor]``.
     windows : sequence of WindowStatistics
         Healthy ones that do not overlap.
+    sense : Gyroscopic
+        Of the gyroscopic moments.
 
     Raises
     ------
@@ -61,6 +67,7 @@ def identify(
         If masses or shaft are missing.
     """
     whole = _first_guess(machine, windows)
+    whole = whole if sense == "Eq. 27" else opposed(whole)
     diagnoses = [diagnosis for _, diagnosis in _read(whole, windows)]
     for number in range(_ROUNDS):
         together = added([stretch_of(each, w.start_ns, w.end_ns) for each, w in zip(diagnoses, windows, strict=True)])
@@ -78,7 +85,8 @@ def identify(
         )
     total = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     total[np.ix_(together.known, together.known)] = covariance
-    return Identified(whole, together.names, total, tuple(diagnoses))
+    as_described = whole if sense == "Eq. 27" else opposed(whole)
+    return Identified(as_described, together.names, total, tuple(diagnoses))
 
 
 def _read(machine: Machine, windows: Sequence[WindowStatistics]) -> list[tuple[LikelihoodFit, Diagnosis]]:

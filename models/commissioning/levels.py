@@ -1,10 +1,11 @@
 """What each level of knowledge makes of healthy windows."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from types import MappingProxyType
+from typing import get_args
 
 import numpy as np
 
@@ -18,7 +19,14 @@ from models.commissioning.checks import (
     check_shapes,
     check_sources,
 )
-from models.commissioning.commissioned import ConditionBaseline, IdentifiedRecord, KnowledgeLevel, OperatingRange
+from models.commissioning.commissioned import (
+    ConditionBaseline,
+    Gyroscopic,
+    IdentifiedRecord,
+    KnowledgeLevel,
+    OperatingRange,
+    opposed,
+)
 from models.commissioning.healthy import HealthyRecording
 from models.commissioning.identified import identify
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
@@ -48,6 +56,10 @@ from models.signals.channels import ACCELERATIONS
 Read = tuple[str, int, Diagnosis]  # recording, end of the window, and what was read in it
 Progress = Callable[[str, int, int], None]  # told what is being done, how much of it is done, and how much there is
 _TABLES = ("rotor", "operation", "condition")
+_OPPOSITE = (
+    "gyroscopic moments have the sense in which natural frequencies of whirl with the rotation rise with the speed; "
+    "in the other one, which is tried first, the machine file does not explain the recordings"
+)
 _SHORTEST_HOPS = 4  # fewer say too little of how they scatter
 
 
@@ -60,6 +72,7 @@ class Learned:
     compared: tuple[Read, ...] = ()
     machine: Machine | None = None
     identified: IdentifiedRecord | None = None
+    gyroscopic: Gyroscopic = "Eq. 27"
     baselines: tuple[ConditionBaseline, ...] = ()
     shape: HealthyShape | None = None
     notes: tuple[str, ...] = ()
@@ -102,9 +115,9 @@ def _read_known(machine: Machine, pieces: Sequence[HealthyPiece], progress: Prog
     return tuple(found)
 
 
-def _learn_full(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
+def _learn_full(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress, sense: Gyroscopic) -> Learned:
     assert isinstance(machine, Machine)  # noqa: S101  # the level says so
-    read = _read_known(machine, pieces, progress)
+    read = _read_known(machine if sense == "Eq. 27" else opposed(machine), pieces, progress)
     check = check_agreement([each for _, _, each in read], "the parameters in the machine file")
     if check.verdict == "refused":
         check = check.model_copy(
@@ -113,7 +126,7 @@ def _learn_full(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
                 "what is not known for certain, so that it is identified"
             }
         )
-    return Learned((check,), read, read, machine, notes=_integrated(pieces, machine))
+    return Learned((check,), read, read, machine, gyroscopic=sense, notes=_integrated(pieces, machine))
 
 
 NO_SUCH_ROTOR = (
@@ -122,9 +135,11 @@ NO_SUCH_ROTOR = (
 )
 
 
-def _learn_partial(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
+def _learn_partial(
+    machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress, sense: Gyroscopic
+) -> Learned:
     windows = [piece.window for piece in pieces]
-    identified = identify(machine, windows, partial(progress, "identifying the rotor"))
+    identified = identify(machine, windows, partial(progress, "identifying the rotor"), sense)
     read = tuple(
         (piece.recording, piece.window.end_ns, with_shared_error(stated, identified.covariance))
         for piece, diagnosis in zip(pieces, identified.diagnoses, strict=True)
@@ -138,7 +153,7 @@ def _learn_partial(machine: MachineFile, pieces: Sequence[HealthyPiece], progres
     if check.verdict == "refused":
         check = check.model_copy(update={"advice": f"{check.advice}; {NO_SUCH_ROTOR}"})
     notes = _integrated(pieces, identified.machine)
-    return Learned((check,), read, read, identified.machine, record, notes=notes)
+    return Learned((check,), read, read, identified.machine, record, sense, notes=notes)
 
 
 def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
@@ -331,7 +346,27 @@ def _halves(pieces: Sequence[HealthyPiece], rows: Sequence[Row]) -> tuple[Read, 
     return tuple(sorted(found, key=lambda read: read[1]))
 
 
-LEVELS: Mapping[KnowledgeLevel, Callable[[MachineFile, Sequence[HealthyPiece], Progress], Learned]] = MappingProxyType(
-    {KnowledgeLevel.FULL: _learn_full, KnowledgeLevel.PARTIAL: _learn_partial, KnowledgeLevel.NONE: _learn_none}
-)
-"""How to learn at each level."""
+_BY_THEORY = MappingProxyType({KnowledgeLevel.FULL: _learn_full, KnowledgeLevel.PARTIAL: _learn_partial})
+
+
+def learn(level: KnowledgeLevel, machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
+    """What a level of knowledge makes of the windows.
+
+    Where theory does not explain them, neither with gyroscopic moments of one sense nor with those of the other, what
+    is wrong is told of the first.
+    """
+    if level is KnowledgeLevel.NONE:
+        return _learn_none(machine, pieces, progress)
+    found: list[Learned | EstimationError] = []
+    for sense in get_args(Gyroscopic):
+        try:
+            learned = _BY_THEORY[level](machine, pieces, progress, sense)
+        except EstimationError as error:
+            found.append(error)
+            continue
+        if all(check.verdict != "refused" for check in learned.checks):
+            return learned if not found else replace(learned, notes=(*learned.notes, _OPPOSITE))
+        found.append(learned)
+    if isinstance(found[0], EstimationError):
+        raise found[0]
+    return found[0]

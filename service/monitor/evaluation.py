@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from models.checkpoint import checked, prefixed, unprefixed
-from models.commissioning.commissioned import Commissioned, Installed
+from models.commissioning.commissioned import Commissioned, Installed, opposed
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.likelihood.lengths import LengthFits
@@ -35,13 +35,16 @@ from models.signals.channels import Channel, with_channel_names
 from rotorwatch.records.health import HealthState
 from rotorwatch.records.windows import Equation, Opinion, Parameter, Shape
 
-_LIKELIHOOD, _SHAPE, _EXPLAINED = "likelihood", "shape", "explained_ns"
+_LIKELIHOOD, _SHAPE, _EXPLAINED, _SENSE = "likelihood", "shape", "explained_ns", "sense"
 _NO_EQUATION = "no equation can be evaluated on this machine; see what is said of each channel"
 _EMPTY = np.zeros((0, 0))
 _STEADY = 0.15
 """Range of speed within a window, relative, up to which the rotation taken out hop by hop leaves nothing behind: on the
 rotor kit readings stay unbiased at ramps of 5, 10 and 15 % (16 seeds each, ``tests/diagnosis/test_window.py``)."""
 
+_INSIDE, _BETTER, _SURELY_OUTSIDE = 2.0, 3.0, 8.0
+"""Standard deviations of the misfit with which a window is explained beyond doubt, by which one explanation is better
+than another, and of what is outside the model by something else than its spectra."""
 _OUTSIDE = 4.0
 """Standard deviations of the misfit from which the short stretches of a window are tested for themselves."""
 
@@ -217,13 +220,20 @@ class KnownMachineEvaluator(WindowEvaluator):
     takes_short = True
 
     def __init__(self, machine: Machine, bundle: Bundle | None, commissioned: Commissioned | None = None) -> None:
-        self._machine = machine
-        self._likelihood = LengthFits(machine)
         identified = None if commissioned is None else commissioned.identified
         self._shared = None if identified is None else identified.matrix()
+        self._commissioned = commissioned is not None
         self._healthy_misfit = None if commissioned is None else commissioned.misfit
         self.needs_lags = bundle is not None  # only the networks look at lags
         self._explained_ns: int | None = None
+        self._given, self._bundle = machine, bundle
+        # The sense of the gyroscopic moments is open until a window has been explained; when the other one was tried.
+        self._open, self._opposite, self._tried_ns = commissioned is None, False, 0
+        self._compare_with(machine)
+
+    def _compare_with(self, machine: Machine) -> None:
+        self._machine, bundle = machine, self._bundle
+        self._likelihood = LengthFits(machine)
         others: list[Diagnostician] = []
         if bundle is not None and bundle.amortised is not None:
             others.append(NetworkDiagnostician(machine, bundle.amortised))
@@ -233,12 +243,9 @@ class KnownMachineEvaluator(WindowEvaluator):
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`."""
         speed = self._speed(window)
-        try:
-            deciding = self._decide(window, self._likelihood.window)
-        except UnexplainedError as error:
-            reason = str(error)
-            nothing = tuple(no_reading(name, self.by, reason) for name in PARAMETERS)
-            deciding = Diagnosis(self.by, nothing, covariance=_EMPTY, unexplained=reason)
+        deciding = self._explained(window)
+        if self._open:
+            deciding = self._by_sense(window, deciding)
         short = {} if newest is None else self._newest(window, newest, deciding)
         if not deciding.unexplained:
             self._explained_ns = window.end_ns
@@ -253,6 +260,34 @@ class KnownMachineEvaluator(WindowEvaluator):
             equations = diagnosis.equations or equations
             opinions.append(_opinion(deciding, beside(deciding, diagnosis)))
         return Evaluation(deciding, short, equations, tuple(opinions), speed)
+
+    def _explained(self, window: WindowStatistics) -> Diagnosis:
+        try:
+            return self._decide(window, self._likelihood.window)
+        except UnexplainedError as error:
+            reason = str(error)
+            nothing = tuple(no_reading(name, self.by, reason) for name in PARAMETERS)
+            return Diagnosis(self.by, nothing, covariance=_EMPTY, unexplained=reason)
+
+    def _by_sense(self, window: WindowStatistics, given: Diagnosis) -> Diagnosis:
+        """The diagnosis with gyroscopic moments of that sense which explains the window, if either does.
+
+        The other sense is a search from nothing, and is tried once in a window's length.
+        """
+        misfit_z = _misfit_z(given)
+        if misfit_z <= _INSIDE or window.start_ns < self._tried_ns:
+            self._open = misfit_z > _INSIDE
+            return given
+        self._tried_ns = window.end_ns
+        before = self._machine, self._likelihood, self._others
+        self._compare_with(opposed(self._given))
+        with suppress(EstimationError):
+            other = self._explained(window)
+            if _misfit_z(other) <= min(_OUTSIDE, misfit_z - _BETTER):
+                self._open, self._opposite = False, True
+                return other
+        self._machine, self._likelihood, self._others = before
+        return given
 
     def _newest(self, window: WindowStatistics, newest: Newest, deciding: Diagnosis) -> dict[int, Diagnosis]:
         """What the latest hops say for themselves, by how many."""
@@ -276,13 +311,19 @@ class KnownMachineEvaluator(WindowEvaluator):
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Where the likelihood's maximum is followed from, and what was explained; networks remember nothing."""
         explained = np.array([] if self._explained_ns is None else [self._explained_ns], dtype=np.int64)
-        return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | {_EXPLAINED: explained}
+        sense = np.array([self._open, self._opposite, self._tried_ns], dtype=np.int64)
+        return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | {_EXPLAINED: explained, _SENSE: sense}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called, see `WindowEvaluator`."""
         explained = checked(arrays, _EXPLAINED, np.int64, (None,)).tolist()
-        self._likelihood.restore(unprefixed(_LIKELIHOOD, arrays))
-        self._explained_ns = next(iter(explained), None)
+        still_open, opposite, tried_ns = checked(arrays, _SENSE, np.int64, (3,)).tolist()
+        machine = opposed(self._given) if opposite else self._given
+        likelihood = LengthFits(machine)
+        likelihood.restore(unprefixed(_LIKELIHOOD, arrays))
+        self._compare_with(machine)
+        self._likelihood, self._explained_ns = likelihood, next(iter(explained), None)
+        self._open, self._opposite, self._tried_ns = bool(still_open), bool(opposite), tried_ns
 
     def _speed(self, window: WindowStatistics) -> float | None:
         """Mean speed, if it is one that is evaluated."""
@@ -316,7 +357,16 @@ class KnownMachineEvaluator(WindowEvaluator):
         if self._healthy_misfit is not None and stated.goodness is not None:
             left = self._healthy_misfit.beyond(stated.goodness, window.duration_s / self._machine.window_data_s)
             stated = replace(stated, misfit_z=left.misfit_z, suspect=left.suspect)
+        vector = stated.unbalance
+        if vector is not None and vector.foreign and not self._commissioned and stated.misfit_z is not None:
+            # Of a commissioned machine levels know what its 1x was.
+            misfit_z = max(stated.misfit_z, _SURELY_OUTSIDE)
+            stated = replace(stated, misfit_z=misfit_z, suspect=stated.suspect or vector.foreign)
         return stated if self._shared is None else with_shared_error(stated, self._shared)
+
+
+def _misfit_z(diagnosis: Diagnosis) -> float:
+    return np.inf if diagnosis.unexplained or diagnosis.misfit_z is None else diagnosis.misfit_z
 
 
 class BaselineEvaluator(WindowEvaluator):

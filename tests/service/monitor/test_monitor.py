@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from models.alarm_names import MODEL
 from models.commissioning.commissioned import install
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
@@ -293,3 +294,20 @@ def test_without_a_bundle_the_equations_say_so() -> None:
     _, machine = load_scenario("healthy")
     window = feed(MachineMonitor(install(machine, None)), healthy(63.0))[0][-1]
     assert {equation.reason for equation in window.equations} == {"no trained network"}
+
+
+def test_a_1x_that_no_unbalance_makes_is_outside_the_model() -> None:
+    _, machine = load_scenario("healthy")
+    blocks_, names = healthy(75.0), [channel.name for channel in machine.sensors]
+    samples = np.concatenate([block.samples for block in blocks_]).astype(np.float64)
+    turning = np.exp(1j * samples[:, names.index("theta")])
+    for place, side in (("y1", 1.0), ("z1", -1j)):  # at the bearing, where no force of the disc moves it alone
+        at, rate = names.index(place), names.index(f"{place}_dot")
+        wave = 1.4 * samples[:, at].std() * side * turning
+        samples[:, at] += wave.real
+        samples[:, rate] += (1j * machine.operation.speed_rad_s * 1e-3 * wave).real
+    cuts = np.cumsum([len(block.samples) for block in blocks_])[:-1]
+    parts = zip(blocks_, np.split(samples.astype(np.float32), cuts), strict=True)
+    windows, events = feed(MachineMonitor(install(machine, None)), [replace(a, samples=b) for a, b in parts])
+    assert "what turns with the shaft is not what an unbalance makes" in windows[-1].suspect
+    assert [event.alarm.name for event in events if event.alarm.name in {MODEL, *PARAMETERS}] == [MODEL]

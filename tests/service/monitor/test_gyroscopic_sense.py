@@ -1,0 +1,81 @@
+"""A rotor whose gyroscopic moments have the sense of nature, of which the theory takes the other one first."""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import pytest
+
+from models.commissioning.commissioned import Installed, opposed
+from models.physics.rotor import system_A
+from models.signals.block import SampleBlock
+from rotorwatch.records.health import HealthState
+from service.monitor.monitor import MachineMonitor
+from simulator.scenario import Event, load_scenario
+from simulator.stream import blocks
+from tests.commissioning.rotor_kit import LAB, PARTIAL, commissioned, recording
+from tests.service.monitor.test_monitor import feed
+
+SEED = 4_900_001
+
+
+@cache
+def stream(duration_s: float, seed: int, *events: Event) -> tuple[SampleBlock, ...]:
+    scenario, _ = load_scenario("healthy")
+    scenario = scenario.overridden(duration_s=duration_s, seed=seed, faults=events)
+    return tuple(block for block, _ in blocks(scenario, opposed(LAB)))
+
+
+def test_the_other_sense_is_another_rotor() -> None:
+    """Whirl with the rotation, from y to z, rises with the speed in nature; where y and z are alike it is a circle."""
+    forward: dict[float, list[float]] = {}
+    for machine in (LAB, opposed(LAB)):
+        rotor = machine.rotor.model_copy(update={"k_bz_N_per_m": machine.rotor.k_by_N_per_m})
+        rotor = rotor.model_copy(update={"c_by_N_s_per_m": 1e-3, "c_bz_N_s_per_m": 1e-3})
+        for speed_rad_s in (1.0, 300.0):
+            roots, shapes = np.linalg.eig(system_A(rotor, speed_rad_s))
+            turning = [root.imag for root, shape in zip(roots, shapes.T, strict=True) if (shape[4] / shape[1]).imag < 0]
+            forward.setdefault(rotor.I2p_kg_m2, []).append(max(turning))
+    assert forward[LAB.rotor.I2p_kg_m2][1] < forward[LAB.rotor.I2p_kg_m2][0]
+    assert forward[-LAB.rotor.I2p_kg_m2][1] > forward[-LAB.rotor.I2p_kg_m2][0]
+
+
+def test_the_healthy_machine_is_healthy_in_its_own_sense() -> None:
+    going = MachineMonitor(Installed(LAB))
+    windows, events = feed(going, stream(75.0, SEED)[:700])
+    assert not events
+    full = [window for window in windows if window.filled == 1.0]
+    assert {window.state for window in full} == {HealthState.HEALTHY}
+    assert max(abs(one.relative_change or 0.0) for one in full[-1].parameters) < 0.05
+    state = going.state(whole=True)
+    restored = MachineMonitor(Installed(LAB))
+    restored.restore(state.state, [part for _, part in state.new_parts])
+    assert feed(restored, stream(75.0, SEED)[700:]) == feed(going, stream(75.0, SEED)[700:])
+
+
+def test_what_has_changed_from_the_beginning_is_named() -> None:
+    softer = Event(at_s=0.0, parameter="k_by", relative_change=-0.2)
+    windows, events = feed(MachineMonitor(Installed(LAB)), stream(80.0, SEED + 1, softer))
+    assert [event.alarm.name for event in events if not event.alarm.name.startswith("level:")] == ["k_by"]
+    assert windows[-1].misfit_z is not None
+    assert windows[-1].misfit_z < 4.0
+
+
+@pytest.mark.parametrize("level", ["full", "partial"])
+def test_a_commissioning_finds_the_sense(level: str) -> None:
+    machine = LAB if level == "full" else PARTIAL
+    made = commissioned(machine, recording(machine, stream(75.0, SEED + 2)))
+    assert made.commissioned is not None, made.report.summary
+    assert made.commissioned.gyroscopic == "opposite"
+    assert "rise with the speed" in made.report.notes[-1]
+    known = Installed(machine, None, made.commissioned).known
+    assert known is not None
+    assert known.rotor.I2p_kg_m2 == -LAB.rotor.I2p_kg_m2
+    ours = commissioned(LAB, recording(LAB, before(75.0))) if level == "full" else None
+    assert ours is None or (ours.commissioned is not None and ours.commissioned.gyroscopic == "Eq. 27")
+
+
+def before(duration_s: float) -> Sequence[SampleBlock]:
+    """The rotor kit as it is simulated."""
+    scenario, machine = load_scenario("healthy")
+    return [block for block, _ in blocks(scenario.overridden(duration_s=duration_s, seed=SEED), machine)]
