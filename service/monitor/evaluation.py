@@ -25,7 +25,7 @@ from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading
 from models.diagnosis.sensors.reference import Naming
 from models.diagnosis.verdict.calibration import agreements, beside
-from models.diagnosis.verdict.sequential import SequentialSettings
+from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.stretch import determined, with_shared_error
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError, EstimationError, UnexplainedError
@@ -35,6 +35,8 @@ from models.signals.channels import Channel, with_channel_names
 from rotorwatch.records.health import HealthState
 from rotorwatch.records.windows import Equation, Opinion, Parameter, Shape
 
+Newest = tuple[SlidingWindow, SequentialTest]
+"""Where the window is the latest, and what wants its latest hops evaluated."""
 _LIKELIHOOD, _SHAPE, _EXPLAINED, _SENSE = "likelihood", "shape", "explained_ns", "sense"
 _NO_EQUATION = "no equation can be evaluated on this machine; see what is said of each channel"
 _EMPTY = np.zeros((0, 0))
@@ -122,15 +124,6 @@ class Evaluation:
                 one.model_copy(update={"text": with_channel_names(one.text, channels)}) for one in self.shapes
             ),
         )
-
-
-@dataclass(frozen=True, slots=True)
-class Newest:
-    """Which of a window's latest hops are to be evaluated for themselves."""
-
-    window: SlidingWindow  # whose latest window is evaluated
-    wanted: tuple[int, ...]  # how many hops
-    news_alone: bool  # whether only what may differ from an unchanged machine is of use
 
 
 class WindowEvaluator(ABC):
@@ -246,7 +239,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         deciding = self._explained(window)
         if self._open:
             deciding = self._by_sense(window, deciding)
-        short = {} if newest is None else self._newest(window, newest, deciding)
+        short = {} if newest is None else self._newest(window, *newest, deciding)
         if not deciding.unexplained:
             self._explained_ns = window.end_ns
         equations: tuple[Equation, ...] = ()
@@ -289,23 +282,23 @@ class KnownMachineEvaluator(WindowEvaluator):
         self._machine, self._likelihood, self._others = before
         return given
 
-    def _newest(self, window: WindowStatistics, newest: Newest, deciding: Diagnosis) -> dict[int, Diagnosis]:
+    def _newest(
+        self, window: WindowStatistics, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis
+    ) -> dict[int, Diagnosis]:
         """What the latest hops say for themselves, by how many."""
-        wanted, evaluated = newest.wanted, {}
+        wanted, evaluated = test.wanted(), {}
         # Where the window is outside the model it may be astride a change: then its newest hops are inside.
         closely = deciding.misfit_z is not None and deciding.misfit_z > _OUTSIDE
         if deciding.unexplained:
             # One machine or two in this window? If some of its data were explained, the shortest stretch says.
             straddles = self._explained_ns is not None and window.start_ns < self._explained_ns
             wanted = tuple(sorted(wanted)[: int(straddles)])
-        elif newest.news_alone and not closely:
-            wanted = self._likelihood.news(newest.window, window, wanted)
+        elif test.unchanged and not closely and not self._likelihood.has_news(sliding, window, wanted):
+            return {}
         for hops in wanted:
-            statistics = newest.window.statistics(hops)
-            if statistics is None:
-                continue
             with suppress(EstimationError):  # too little data for itself; the window has said what there is to say
-                evaluated[hops] = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
+                if (statistics := sliding.statistics(hops)) is not None:
+                    evaluated[hops] = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
         return evaluated
 
     def checkpoint(self) -> dict[str, np.ndarray]:

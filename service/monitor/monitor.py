@@ -41,7 +41,7 @@ from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
 from service.monitor.alarms.operation import OperatorAction
-from service.monitor.evaluation import Newest, evaluator_for
+from service.monitor.evaluation import evaluator_for
 from service.monitor.levels import LevelWatch
 from service.monitor.parts import divided, joined
 from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, counted, identity_of
@@ -439,9 +439,8 @@ class MachineMonitor:
             return unread(HealthState.DATA_HEALTH, "; ".join(each.text for each in findings))
         if stood or skipped:
             return unread(HealthState.NOT_EVALUABLE, stood or _SKIPPED)
-        newest = Newest(self._window, self._test.wanted(), self._test.unchanged)
         try:
-            evaluation = self._evaluator.evaluate(statistics, newest)
+            evaluation = self._evaluator.evaluate(statistics, (self._window, self._test))
         except EstimationError as error:
             return unread(HealthState.WATCHING if self._watching else HealthState.NOT_EVALUABLE, str(error))
         foreign = self._levels.foreign(self._window, statistics, named=bool(self._test.state.findings))

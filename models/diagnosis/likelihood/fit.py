@@ -45,9 +45,8 @@ _PATIENCE, _HOPELESS = 30, 2.0
 _OUTSIDE = "a sensor is at fault, or something outside the model has changed"
 _STIFFEST, _SURELY = 0.5, 3.0  # no shaft becomes stiffer by half; in standard errors
 _SYNCHRONOUS_BINS = 3
-# Newest hops are not looked at closer while no part of the unbalance differs from the window's by more standard errors
-# than the first, and all parameters together from nominal by no more than the second: a change is named from five on.
-_DIFFERS, _STANDS_OUT = 3.0, 4.0
+# Standard errors by which latest hops may differ from the window in the unbalance, and in all together from nominal.
+_DIFFERS, _STANDS_OUT = 3.0, 4.0  # a change is named from five on
 _FOLLOWED = 12  # windows in a row that may start from one window's units and slopes before a search takes its own
 
 
@@ -75,7 +74,7 @@ class LikelihoodFit:
         self._line_segments = self._followed = 0
         self._line_band: tuple[FloatArray, npt.NDArray[np.bool_]] | None = None
         self._latest: tuple[WindowStatistics, SpectralModel, ModelPoint, FloatArray, float] | None = None
-        self._said: tuple[Diagnosis, Unbalance] | None = None
+        self._said: tuple[Diagnosis, Unbalance, ComplexArray] | None = None  # with the window's synchronous vector
         self._groups: dict[bytes, BinGroups] = {}
 
     def reset(self) -> None:
@@ -192,7 +191,8 @@ class LikelihoodFit:
         structural = covariance[:n, :n] + np.diag(found.remaining**2)
         self._latest = window, model, found.whitened.point, structural, speed
         read, unbalance = self._read(*self._latest)
-        self._said = None if unbalance is None else (read, unbalance)
+        usual = window.synchronous
+        self._said = None if unbalance is None or usual is None else (read, unbalance, usual)
         unexplained = unexplained or self._too_stiff(read)
         return replace(
             read,
@@ -246,28 +246,23 @@ class LikelihoodFit:
     def may_be_news(self, segments: ComplexArray, synchronous: ComplexArray) -> bool:
         """Whether the latest hops may say more than that the machine is as nominal, or as the latest window says.
 
-        Parameters
-        ----------
-        segments : ndarray, shape (n_bins, n_segments, n_states)
-            Their Fourier coefficients without the rotation.
-        synchronous : ndarray, shape (n_states,)
-            Their rotation-synchronous vector.
+        What is known of them are Fourier coefficients without the rotation, (n_bins, n_segments, n_states), and the
+        vector of the rotation, (n_states,).
         """
         line = self._line
-        if line is None or self._latest is None or self._said is None or self._latest[0].synchronous is None:
+        if line is None or self._said is None:
             return True
-        (window, model, *_), (read, unbalance) = self._latest, self._said
-        share = segments.shape[1] / window.n_segments
-        observed = model.motions.spectra(model.groups.cross_spectra(segments), model.centre)
-        seen, vector = line.glance(observed, share), unbalance.vector
-        moved = complex(unbalance.weights @ (synchronous - self._latest[0].synchronous))
-        along, across = moved.real**2 / vector.variance_real, moved.imag**2 / vector.variance_imaginary
-        if seen is None or share * max(along, across) > _DIFFERS**2:
+        read, unbalance, usual = self._said
+        model, share, vector = line.model, segments.shape[1] / self._line_segments, unbalance.vector
+        seen = line.glance(model.motions.spectra(model.groups.cross_spectra(segments), model.centre), share)
+        moved = complex(unbalance.weights @ (synchronous - usual))
+        differs = max(moved.real**2 / vector.variance_real, moved.imag**2 / vector.variance_imaginary)
+        if seen is None or not share * differs <= _DIFFERS**2:
             return True
         values = np.append(np.expm1(seen.point.theta[: len(STRUCTURAL)]), unbalance.change + moved.real)
-        chi2 = values @ np.linalg.solve(read.full_covariance, values)
-        chi2 += (vector.imaginary + moved.imag) ** 2 / vector.variance_imaginary
-        return not share * chi2 <= _STANDS_OUT**2
+        stands_out = values @ np.linalg.solve(read.full_covariance, values)
+        stands_out += (vector.imaginary + moved.imag) ** 2 / vector.variance_imaginary
+        return not share * stands_out <= _STANDS_OUT**2
 
     def _speed(self, window: WindowStatistics) -> float:
         return window.speed_rad_s if np.isfinite(window.speed_rad_s) else self._machine.operation.speed_rad_s

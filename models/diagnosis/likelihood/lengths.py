@@ -61,35 +61,22 @@ class LengthFits:
         self._hop += 1
         return self._window.diagnose(window)
 
-    def news(self, sliding: SlidingWindow, window: WindowStatistics, lengths: tuple[int, ...]) -> tuple[int, ...]:
-        """Those of the latest hops, by how many, that may say more than that the machine is as the window says.
+    def has_news(self, sliding: SlidingWindow, window: WindowStatistics, lengths: tuple[int, ...]) -> bool:
+        """Whether the latest hops, of any of these lengths, may say more than that the machine is as the window says.
 
-        Their spectra are not those of `SlidingWindow.statistics`: what the window's rotation leaves of them is a part
-        of the work, and hardly differs away from the rotation. All lengths where no one rotation is that of all hops,
-        or accelerations are measured.
-
-        Parameters
-        ----------
-        sliding : SlidingWindow
-            In which the window is the latest.
+        The window is the latest of the sliding one. Its rotation is taken out of them, not their own: less work, and
+        hardly another spectrum away from it. Where no one rotation is that of all hops, or accelerations are measured,
+        they may.
         """
         rotation, by_hop, plan = window.as_mounted.synchronous, window.hop_synchronous, sliding.plan
-        if (
-            rotation is None
-            or by_hop is None
-            or window.removed_by_hop
-            or integrated(window) is not window
-            or not lengths
-        ):
-            return lengths
-        n, hops = len(plan.states), sliding.hops[-max(lengths) :]
+        if rotation is None or by_hop is None or window.removed_by_hop or integrated(window) is not window:
+            return True
+        n, hops = len(plan.states), sliding.hops[-max(lengths, default=1) :]
         segments, each = np.concatenate([hop.segments for hop in hops]), hops[0].segments.shape[0]
         rest = segments[:, :, :n] - segments[:, :, n + 1 :] @ np.stack([rotation.real, -rotation.imag])
         by_bin = np.ascontiguousarray((rest if plan.turn is None else rest @ plan.turn.T).swapaxes(0, 1))
-        return tuple(
-            length
-            for length in lengths
-            if self._window.may_be_news(by_bin[:, -length * each :], by_hop[-length:].mean(axis=0))
+        return any(
+            self._window.may_be_news(by_bin[:, -length * each :], by_hop[-length:].mean(axis=0)) for length in lengths
         )
 
     def short(self, hops: int, stretch: WindowStatistics, *, closely: bool = False) -> Diagnosis:

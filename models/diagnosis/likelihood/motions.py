@@ -73,11 +73,9 @@ class BinGroups:
 
     def cross_spectra(self, segments: ComplexArray) -> ComplexArray:
         """The same from Fourier coefficients, shape (n_bins, n_segments, n): less work where there are few segments."""
-        groups = [
-            segments[first : first + n * width].reshape(n, -1, segments.shape[-1])
-            for first, n, width in _runs(self.edges)
-        ]
-        sums = np.concatenate([one.swapaxes(1, 2) @ one.conj() for one in groups])
+        m, runs = segments.shape[-1], _runs(self.edges)
+        alike = [segments[first : first + n * width].reshape(n, -1, m) for first, n, width in runs]
+        sums = np.concatenate([one.swapaxes(1, 2) @ one.conj() for one in alike])
         return divided(sums, segments.shape[1] * self.bins[:, None, None])
 
     def same_as(self, other: "BinGroups") -> bool:
@@ -90,11 +88,9 @@ def _runs(edges: tuple[tuple[int, int], ...]) -> list[tuple[int, int, int]]:
     """First bin, number and width of groups that follow each other without a gap and hold equally many bins."""
     runs: list[tuple[int, int, int]] = []
     for first, end in edges:
-        at, count, width = runs[-1] if runs else (first, 0, end - first)
-        if width == end - first and at + count * width == first:
-            runs[max(0, len(runs) - 1) :] = [(at, count + 1, width)]
-        else:
-            runs.append((first, 1, end - first))
+        at, count, width = runs.pop() if runs else (first, 0, end - first)
+        joins = width == end - first and at + count * width == first
+        runs += [(at, count + 1, width)] if joins else [(at, count, width), (first, 1, end - first)]
     return runs
 
 

@@ -140,10 +140,7 @@ class SequentialTest:
 
     @property
     def unchanged(self) -> bool:
-        """Whether nothing is found changed, and no window is astride a change.
-
-        Then `update` needs only those of the short stretches that may stand out or differ from the window.
-        """
+        """Whether nothing is found changed, and no window is astride a change: `update` needs short ones with news."""
         return not self.state.findings and self.wanted() == self.settings.short_hops
 
     @property
