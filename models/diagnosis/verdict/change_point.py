@@ -54,7 +54,7 @@ def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, 
     Parameters
     ----------
     windows : sequence of Stretch
-        Of one length, which overlap, the latest one last; all know the same parameters.
+        Of as much data each, which overlap, the latest one last; all know the same parameters. A gap may be in some.
     named : sequence of int
         Parameters that changed, as indices into `PARAMETERS`.
     by_ns : int
@@ -74,10 +74,15 @@ def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, 
     watched = ends[0] <= starts[-1] + hop_ns / 2
     odds = max(1, moments.size - 1) * (1.0 if watched else _BEFORE)
     before = np.log(np.where(moments < starts[0], odds, 1.0))
-    length = ends[-1] - starts[-1]
-    overlap = np.clip((np.minimum(ends[:, None], ends) - np.maximum(starts[:, None], starts)) / length, 0.0, 1.0)
+    length = np.min(ends - starts)
+    # Gaps are taken out of the time: one comes in with an end that is late, and goes out with a start.
+    gone = np.append(0.0, np.cumsum(np.maximum(np.diff(ends) - np.diff(starts), 0.0)))
+    times, gaps = np.append(starts, ends), np.append(gone - (ends - starts - length), gone)
+    order = np.argsort(times)
+    ends, changed = ends - gone, moments - np.interp(moments, times[order], gaps[order])
+    overlap = np.clip((length - np.abs(ends[:, None] - ends)) / length, 0.0, 1.0)
     decorrelate = np.linalg.inv(np.linalg.cholesky(overlap + _FOLLOWED * np.eye(ends.size)))
-    share = np.clip((ends - moments[:, None]) / length, 0.0, 1.0)
+    share = np.clip((ends - changed[:, None]) / length, 0.0, 1.0)
     part = _POWERS[:, None, None] * share
     part /= part + 1 - share  # (n_powers, n_moments, n_windows)
     design = decorrelate @ np.stack([1 - part, part, 4 * part * (1 - part)], axis=-1)

@@ -224,6 +224,27 @@ def test_a_window_astride_a_change_says_how_much_it_does_not_know() -> None:
     assert sum(dates) >= 34
 
 
+@pytest.mark.parametrize("gap", [10, 25])
+def test_a_gap_changes_nothing_but_the_date_of_what_came_after_it(gap: int) -> None:
+    """Older windows span the gap, the latest one does not."""
+    hops, told = gaussian(SEED + 24), []
+    looks = [hops.looks(true(k_by=-0.2 * (number >= 17))) for number in range(27)]
+    for lost in (0, gap):
+        ends = np.array([5 * (number + 1) + lost * (number >= 15) for number in range(27)])
+        windows = [
+            replace(found[12], start_ns=int(ends[at - 11] - 5) * 10**9, end_ns=int(ends[at]) * 10**9)
+            for at, found in enumerate(looks)
+            if found
+        ]
+        found = read_changes(windows, [0], 5 * 10**9, int(ends[-1]) * 10**9)
+        told.append((found, [moment / 1e9 - lost for moment in found.since_ns or ()]))
+    (whole, since), (apart, later) = told
+    assert apart.values == pytest.approx(whole.values, abs=0.1 * whole.errors[0])
+    assert apart.errors == pytest.approx(whole.errors, rel=0.1)
+    assert later == pytest.approx(since, abs=2.5)
+    assert since[1] < 85 < since[2]
+
+
 def test_what_is_too_small_to_be_named_is_not_held_at_nothing() -> None:
     """Of two parameters that hang together one changed much and the other by too little: the first still reads true."""
     rng, cov = np.random.default_rng(SEED + 23), np.diag(np.full(6, 1e-4))
