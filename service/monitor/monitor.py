@@ -419,12 +419,13 @@ class MachineMonitor:
         self._data_path.conflict(self._senders.conflict, end_ns)
         self._levels.take(self._window)
         statistics = self.window = self._window.statistics()
+        there = statistics or self._window.statistics(len(self._window.hops))  # while it fills
+        stood = "" if there is None else self._standstill.found(there)
         if statistics is None:
-            self._levels.tell(self._alarms, end_ns)
+            self._levels.tell(self._alarms, end_ns, standing=bool(stood))
             return Report(**self._window_now(end_ns, end_ns, self._state(HealthState.WARMING)))
         speed_rad_s = statistics.speed_rad_s
         self._alarms.suppress(float(speed_rad_s * _RPM) if np.isfinite(speed_rad_s) else None, end_ns)
-        stood = self._standstill.found(statistics)
         findings = sensor_findings(statistics, self._sensors, self.machine.sensors, standing=bool(stood))
         self._data_path.sensors(findings, statistics, standing=bool(stood))
         start_ns, faulty = statistics.start_ns, implicated(findings)
@@ -445,8 +446,7 @@ class MachineMonitor:
             return unread(HealthState.WATCHING if self._watching else HealthState.NOT_EVALUABLE, str(error))
         foreign = self._levels.foreign(self._window, statistics, named=bool(self._test.state.findings))
         evaluation = evaluation.named(self.machine.sensors, foreign.text)
-        short, hops = evaluation.short, self._window.hops
-        looks = {count: stretch_of(one, hops[-count].start_ns, end_ns) for count, one in short.items()}
+        looks = {n: stretch_of(one, self._window.hops[-n].start_ns, end_ns) for n, one in evaluation.short.items()}
         whole = self._test.settings.window_hops
         looks[whole] = stretch_of(evaluation.deciding, start_ns, end_ns)
         verdict = self._test.update(looks, foreign=foreign.text != "")

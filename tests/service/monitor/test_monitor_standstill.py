@@ -15,6 +15,7 @@ from models.signals.channels import Quantity
 from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
+from tests.commissioning.rotor_kit import commissioned, recording
 from tests.service.rig.live import LAB, scenario_blocks
 
 STOPS_S, STANDS_S, STARTS_S, RUNS_S, END_S = 40.0, 50.0, 110.0, 120.0, 170.0
@@ -23,6 +24,7 @@ KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s":
 NEW = MachineFile.model_validate(
     KIT.model_dump(exclude={"rotor", "condition"}, exclude_none=True) | {"levels": {"reference_windows": 2}}
 )
+COMMISSIONED = NEW.model_copy(update={"levels": KIT.levels})
 WITHOUT_ANGLE = NEW.model_copy(update={"sensors": NEW.sensors[:-1]})
 
 
@@ -96,6 +98,19 @@ def test_without_a_shaft_angle_no_sensor_is_blamed_but_levels_have_fallen() -> N
     reports, events = watched(monitor_of(WITHOUT_ANGLE), list(stopping(WITHOUT_ANGLE, "machine")))
     assert any("all its sensors have lost their supply" in one.reason for one in reports)
     assert {name for _, name in events} == {f"level:{one.name}" for one in WITHOUT_ANGLE.sensors}
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_a_level_has_fallen_while_the_first_window_fills_only_where_the_machine_turns(turns: bool) -> None:
+    stream = scenario_blocks(END_S)
+    made = commissioned(COMMISSIONED, recording(COMMISSIONED, stream))
+    quiet = [NOISE] * (len(KIT.sensors) - 1) + [1.0]
+    first = [replace(block, samples=(block.samples * quiet).astype(np.float32)) for block in stream]
+    if not turns:
+        first = list(stopping(KIT, "machine"))[round(10 * STANDS_S) :]
+    reports, events = watched(MachineMonitor(Installed(COMMISSIONED, None, made.commissioned)), first[:180])
+    assert {one.state for one in reports} <= {HealthState.WARMING, HealthState.ALERT}
+    assert {name for _, name in events} == {f"level:{one.name}" for one in KIT.sensors[:-1] if turns}
 
 
 @pytest.mark.parametrize("machine", [NEW, WITHOUT_ANGLE])
