@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute
 import pyarrow.csv
 import pyarrow.parquet
 
@@ -13,6 +14,7 @@ from service.interchange.mapping import CsvFormat
 from service.interchange.source import CHUNK_ROWS, Array, Reference, Source, SourceError, readable
 
 _BYTES = 4 << 20
+_ZONED = r"(Z|[T ].*[+-]\d\d(:?\d\d)?)$"
 
 
 class _Table(Source):
@@ -47,14 +49,14 @@ class CsvSource(_Table):
         Column with the times. Where its first cells are whole numbers it is read as such, because nanoseconds since
         1970 have more digits than a float.
     datetimes : bool
-        Whether it has ISO 8601 times instead of numbers.
+        Whether it has ISO 8601 times instead of numbers: UTC where a cell names no zone.
     """
 
     kind = "CSV"
 
     def __init__(self, path: Path, form: CsvFormat, time_column: str | None, *, datetimes: bool) -> None:
         self._form, self._time_column = form, time_column
-        self._time_type = pa.timestamp("ns", tz="UTC") if datetimes else pa.float64()
+        self._time_type = pa.string() if datetimes else pa.float64()
         try:
             with readable(path, self.kind), self._reader(path, None) as reader:
                 schema = reader.schema
@@ -87,7 +89,7 @@ class CsvSource(_Table):
                 with self._reader(self.path, wanted) as reader:
                     for batch in reader:
                         count += batch.num_rows
-                        yield tuple(_array(batch.column(self._label(name))) for name in wanted)
+                        yield tuple(self._array(name, batch.column(self._label(name))) for name in wanted)
             except pa.ArrowInvalid as error:
                 raise SourceError(self._fault(wanted) or f"{self.path}: after row {count}: {error}") from error
 
@@ -113,9 +115,12 @@ class CsvSource(_Table):
                 include_columns=list(types) or None,
                 decimal_point=form.decimal,
                 null_values=["", "NaN", "nan", "NA", "N/A", "null"],
-                strings_can_be_null=as_text,
+                strings_can_be_null=True,
             ),
         )
+
+    def _array(self, name: str, column: Any) -> Array:
+        return _array(_utc(column) if self._is_datetime(name) else column)
 
     def _label(self, name: str) -> str:
         """Arrow's own name of a column; columns without names are numbered from 1."""
@@ -141,12 +146,12 @@ class CsvSource(_Table):
         return ""
 
     def _is_datetime(self, name: str) -> bool:
-        return name == self._time_column and bool(pa.types.is_timestamp(self._time_type))
+        return name == self._time_column and bool(pa.types.is_string(self._time_type))
 
     def _is_value(self, name: str, cell: str) -> bool:
         try:
             if self._is_datetime(name):
-                pa.scalar(cell).cast(pa.timestamp("ns", tz="UTC"))
+                _utc(pa.array([cell]))
             else:
                 float(cell.strip().replace(self._form.decimal, "."))
         except (ValueError, pa.ArrowInvalid):
@@ -180,6 +185,13 @@ class ParquetSource(_Table):
         with readable(self.path, self.kind), pa.parquet.ParquetFile(self.path, pre_buffer=False) as file:
             for batch in file.iter_batches(batch_size=CHUNK_ROWS, columns=wanted, use_threads=False):
                 yield tuple(_array(batch.column(name)) for name in wanted)
+
+
+def _utc(cells: Any) -> Any:
+    """ISO 8601 times as Arrow's."""
+    zoned = pa.compute.match_substring_regex(cells, _ZONED)
+    in_utc = pa.compute.binary_join_element_wise(cells, "Z", "")
+    return pa.compute.if_else(zoned, cells, in_utc).cast(pa.timestamp("ns", tz="UTC"))
 
 
 def _array(column: Any) -> Array:

@@ -225,25 +225,26 @@ def test_dates_in_a_parquet_file_are_the_times(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.samples, np.column_stack([x, v, angle]))
 
 
-@pytest.mark.parametrize("written", ["dates", "nanoseconds", "milliseconds"])
+@pytest.mark.parametrize("written", ["dates", "bare dates", "mixed dates", "nanoseconds", "milliseconds"])
 def test_a_text_table_without_names_counts_its_columns(tmp_path: Path, written: str) -> None:
     _, x, v, angle = signals(3000)
     with (tmp_path / "run.csv").open("w", encoding="utf-8") as file:
         for row in range(3000):
             time_ns = START_NS + 500_000 * row
             second, rest = divmod(time_ns, 1_000_000_000)
+            date = f"{datetime.fromtimestamp(second, UTC):%Y-%m-%dT%H:%M:%S}.{rest:09d}"
+            ahead = f"{datetime.fromtimestamp(second + 3600, UTC):%Y-%m-%d %H:%M:%S}.{rest:09d}+01:00"
             texts = {
-                "dates": f"{datetime.fromtimestamp(second, UTC):%Y-%m-%dT%H:%M:%S}.{rest:09d}Z",
+                "dates": f"{date}Z",
+                "bare dates": date.replace("T", " "),
+                "mixed dates": (date, f"{date}Z", ahead)[row % 3],
                 "nanoseconds": str(time_ns),
                 "milliseconds": str(row / 2),
             }
             file.write(f"{texts[written]},{float(x[row])!r},{float(v[row])!r},{float(angle[row])!r}\n")
-    times = {
-        "dates": 'unit = "datetime"',
-        "nanoseconds": 'unit = "ns"\nstart = "unix"',
-        "milliseconds": f'unit = "ms"\nstart = "{START}"',
-    }
-    mapping = f"[time]\ncolumn = 1\n{times[written]}\n[csv]\nheader = false\n" + CHANNELS.replace('"x"', "2")
+    times = {"nanoseconds": 'unit = "ns"\nstart = "unix"', "milliseconds": f'unit = "ms"\nstart = "{START}"'}
+    told = times.get(written, 'unit = "datetime"')
+    mapping = f"[time]\ncolumn = 1\n{told}\n[csv]\nheader = false\n" + CHANNELS.replace('"x"', "2")
     mapping = mapping.replace('"v"', "3").replace('"a"', "4")
     (found,) = stretches(imported(tmp_path, tmp_path / "run.csv", mapping)[1])
     assert found.start_ns == START_NS
