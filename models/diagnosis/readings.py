@@ -104,9 +104,9 @@ class UnbalanceVector:
         """The change in words."""
         if self.change_angle_deg is None:
             return "no change of its vector"
-        where = f"{self.change_angle_deg:.0f}° from the heavy spot".replace("-", "−")
+        where = f"{self.change_angle_deg:z.0f}° from the heavy spot".replace("-", "−")
         size = f"size {100 * self.magnitude_change:+.0f} %".replace("-", "−")
-        turned = "" if self.turned_deg is None else f", turned by {self.turned_deg:.0f}°".replace("-", "−")
+        turned = "" if self.turned_deg is None else f", turned by {self.turned_deg:z.0f}°".replace("-", "−")
         return f"a vector of {100 * self.change:.0f} % of the nominal unbalance at {where} ({size}{turned})"
 
     def _error(self, x: float, y: float) -> float:

@@ -1,11 +1,15 @@
 """An alarm, what happens to it, and the sentences operators read."""
 
+import math
 from dataclasses import dataclass
 
 from models.alarm_names import alarm_kind
 from models.diagnosis.readings import Z95
 from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
+
+_ROUNDED_TO_NOTHING = 0.0005
+"""An interval below this has two digits; 0.0 % would be none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +88,8 @@ class AlarmEvent:
             return f"{alarm.severity.upper()}: {words}" + (f": {said}" if said else "")
         what = f"{words} ({alarm.name})"
         half = Z95 * (alarm.standard_error or 0.0)
-        size = f"{alarm.change or 0.0:+.1%} ± {half:.1%}" + (f": {alarm.note}" if alarm.note else "")
+        digits = 1 - math.floor(math.log10(100 * half)) if 0 < half < _ROUNDED_TO_NOTHING else 1
+        size = f"{alarm.change or 0.0:+.{digits}%} ± {half:.{digits}%}" + (f": {alarm.note}" if alarm.note else "")
         reserve = " (low confidence: outside the model)" if alarm.low_confidence else ""
         match self.kind:
             case EventKind.RAISED:

@@ -69,6 +69,14 @@ def test_a_rotor_that_was_balanced_has_lost_its_unbalance_and_no_more() -> None:
         assert vector.turned_deg is None
 
 
+def test_an_angle_that_is_rounded_to_nothing_has_no_sign() -> None:
+    vector = UnbalanceVector(1.5, -1e-3, 1e-8, 0.0, 1e-8)
+    assert (
+        vector.sentence
+        == "a vector of 50 % of the nominal unbalance at 0° from the heavy spot (size +50 %, turned by 0°)"
+    )
+
+
 def test_vectors_that_no_unbalance_makes_are_not_read_as_one() -> None:
     window = drawn(2)
     foreign = np.abs(sure(window.synchronous)) * np.exp(1j * np.random.default_rng(5).uniform(0, 6, len(window.states)))

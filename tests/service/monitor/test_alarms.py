@@ -81,6 +81,15 @@ def test_a_large_change_clears_no_alarm_however_uncertain_it_is(error: float) ->
     assert book.alarms[0].raised
 
 
+@pytest.mark.parametrize(
+    ("error", "said"), [(0.0003, "-20.0% ± 0.1%"), (0.0002, "-19.999% ± 0.039%"), (0.00001234, "-19.9990% ± 0.0024%")]
+)
+def test_an_interval_that_would_be_rounded_to_nothing_has_two_digits(error: float, said: str) -> None:
+    book = AlarmBook(SETTINGS)
+    told = [event for n in range(3) for event in book.update("k_by", -0.19999, error, n * 5_000_000_000, named=True)]
+    assert [event.text for event in told] == [f"ALERT: bearing stiffness, horizontal (k_by) changed by {said}"]
+
+
 def test_events_carry_occurrence_sequence_severity_and_a_sentence() -> None:
     _, book, events = play("xxx....xxxX....")
     assert [event.sequence for event in events] == [0, 1, 2, 3, 4]
