@@ -1,5 +1,6 @@
 """Time of each row: from a column, or from a rate. Rates, order and gaps are judged here, for all formats."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -144,13 +145,14 @@ def _first_times(source: Source, column: Reference, columns: list[Reference]) ->
 
 
 def _measured_rate(path: Path, column: Reference, times: FloatArray) -> tuple[float, float]:
-    """Rate of a time column, gaps left out, and how uncertain the column's jitter makes it."""
+    """Rate of a time column, gaps left out, to the first uncertain digit; and how uncertain the jitter makes it."""
     steps = np.diff(times)
     check_order(path, column, times, 0)
     usual = float(np.median(steps))
     within = steps[np.abs(steps - usual) <= 0.5 * usual]
     step = float(within.mean())
-    return 1e9 / step, 2 * float(np.abs(within - step).max()) / (step * within.size)
+    rate_hz, error = 1e9 / step, 2 * float(np.abs(within - step).max()) / (step * within.size)
+    return (round(rate_hz, math.ceil(-math.log10(rate_hz * error))) if error else rate_hz), error
 
 
 def check_order(path: Path, column: Reference | None, times: FloatArray, first_row: int) -> None:

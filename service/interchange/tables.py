@@ -136,6 +136,8 @@ class CsvSource(_Table):
                         for offset, cell in enumerate(batch.column(self._label(name)).to_pylist()):
                             if cell is not None and not self._is_value(name, cell):
                                 what = "an ISO 8601 time" if self._is_datetime(name) else "a number"
+                                if name == self._time_column and not self._is_datetime(name):
+                                    what += ', or ISO 8601 times with time.unit = "datetime" in the mapping'
                                 return (
                                     f"{self.path}: row {row + offset + 1}, column {name!r}: found {cell!r}, "
                                     f"expected {what}"

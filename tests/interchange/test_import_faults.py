@@ -82,6 +82,12 @@ def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
         (GOOD, TIME + "rate_hz = 1000.0\n" + CHANNELS, HEADER, (
             "column t has 2000 rows per second, but 1000 are declared",
         )),
+        ([f"{number / 1980.2:.5f},1.0,2.0,3.0" for number in range(1000)], TEXT, HEADER, (
+            "run.csv: has 1980.22 samples per second",
+        )),
+        ([f"2026-01-31T12:00:{number / 2000:09.6f},1.0,2.0,3.0" for number in range(1000)], TEXT, HEADER, (
+            "row 1, column 't': found '2026-01-31T12:00:00.000000', expected a number", 'time.unit = "datetime"',
+        )),
         *((good_rows(count), TEXT, HEADER, (f"run.csv: has {count} rows, expected at least two",)) for count in (0, 1)),
         (GOOD, TEXT.replace(f'start = "{START}"', ""), HEADER, ("give time.start in the mapping",)),
         *((GOOD, TEXT.replace(START, f"{year}-01-01T00:00:00Z"), HEADER, (
@@ -90,8 +96,8 @@ def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
     ],
     ids=[
         *("missing column", "unmapped channel", "text", "two dots", "no number", "short row", "other signs"),
-        *("time goes back", "few decimals", "other rate", "rate contradicts times", "no row", "one row", "no start"),
-        *("1900", "2300", "9999"),
+        *("time goes back", "few decimals", "other rate", "rate contradicts times", "five decimals", "dates"),
+        *("no row", "one row", "no start", "1900", "2300", "9999"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_a_table_is_named(
