@@ -33,7 +33,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     help="Condition monitoring of rotating machines: which parameter changed, by how much, how sure.",
-    epilog="Exit codes: 0 fine, 1 trouble at run time, 2 a file or argument that cannot be used.",
+    epilog="Exit codes: 0 fine, 1 trouble at run time, 2 a file or argument that cannot be used. Of status "
+    "also: 3 no data, 4 no answer.",
 )
 
 

@@ -55,6 +55,10 @@ def test_every_command_has_an_example(command: str) -> None:
     assert ("[link]" in found.stdout) == (command in ("run", "watch", "router"))  # names of tables are no markup
 
 
+def test_the_help_has_all_exit_codes_of_status() -> None:
+    assert "3 no data, 4 no answer" in " ".join(run("--help").stdout.split())
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_run_says_where_it_is_needs_no_torch_and_stops_cleanly(tmp_path: Path, number: signal.Signals) -> None:
     address = endpoint()
