@@ -220,8 +220,9 @@ class KnownMachineEvaluator(WindowEvaluator):
         self.needs_lags = bundle is not None  # only the networks look at lags
         self._explained_ns: int | None = None
         self._given, self._bundle = machine, bundle
-        # The sense of the gyroscopic moments is open until a window has been explained; when the other one was tried.
-        self._open, self._opposite, self._tried_ns = commissioned is None, False, 0
+        # The sense of the gyroscopic moments is open until a window has been explained.
+        self._open, self._opposite = commissioned is None, False
+        self._tried_ns, self._tried_in_vain = 0, False  # end of the window that the other one was tried on
         self._compare_with(machine)
 
     def _compare_with(self, machine: Machine) -> None:
@@ -265,22 +266,27 @@ class KnownMachineEvaluator(WindowEvaluator):
     def _by_sense(self, window: WindowStatistics, given: Diagnosis) -> Diagnosis:
         """The diagnosis with gyroscopic moments of that sense which explains the window, if either does.
 
-        The other sense is a search from nothing, and is tried once in a window's length.
+        The other sense is a search from nothing: it is tried once in a window's length.
         """
         misfit_z = _misfit_z(given)
-        if misfit_z <= _INSIDE or window.start_ns < self._tried_ns:
+        tried = window.start_ns < self._tried_ns <= window.end_ns and (self._tried_in_vain or np.isinf(misfit_z))
+        if misfit_z <= _INSIDE or tried:
             self._open = misfit_z > _INSIDE
             return given
-        self._tried_ns = window.end_ns
+        # What neither sense explains, a disturbance for instance, says nothing of it: the next that is read does.
+        self._tried_ns, self._tried_in_vain = window.end_ns, bool(np.isfinite(misfit_z))
         before = self._machine, self._likelihood, self._others
         self._compare_with(opposed(self._given))
-        with suppress(EstimationError):
+        try:
             other = self._explained(window)
-            if _misfit_z(other) <= min(_OUTSIDE, misfit_z - _BETTER):
-                self._open, self._opposite = False, True
-                return other
-        self._machine, self._likelihood, self._others = before
-        return given
+            self._opposite = _misfit_z(other) <= min(_OUTSIDE, misfit_z - _BETTER)
+        except EstimationError:
+            other = given
+        finally:
+            if not self._opposite:
+                self._machine, self._likelihood, self._others = before
+        self._open = not self._opposite
+        return other if self._opposite else given
 
     def _newest(
         self, window: WindowStatistics, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis
@@ -304,19 +310,20 @@ class KnownMachineEvaluator(WindowEvaluator):
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Where the likelihood's maximum is followed from, and what was explained; networks remember nothing."""
         explained = np.array([] if self._explained_ns is None else [self._explained_ns], dtype=np.int64)
-        sense = np.array([self._open, self._opposite, self._tried_ns], dtype=np.int64)
+        sense = np.array([self._open, self._opposite, self._tried_in_vain, self._tried_ns], dtype=np.int64)
         return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | {_EXPLAINED: explained, _SENSE: sense}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called, see `WindowEvaluator`."""
         explained = checked(arrays, _EXPLAINED, np.int64, (None,)).tolist()
-        still_open, opposite, tried_ns = checked(arrays, _SENSE, np.int64, (3,)).tolist()
+        still_open, opposite, in_vain, tried_ns = checked(arrays, _SENSE, np.int64, (4,)).tolist()
         machine = opposed(self._given) if opposite else self._given
         likelihood = LengthFits(machine)
         likelihood.restore(unprefixed(_LIKELIHOOD, arrays))
         self._compare_with(machine)
         self._likelihood, self._explained_ns = likelihood, next(iter(explained), None)
-        self._open, self._opposite, self._tried_ns = bool(still_open), bool(opposite), tried_ns
+        self._open, self._opposite = bool(still_open), bool(opposite)
+        self._tried_ns, self._tried_in_vain = tried_ns, bool(in_vain)
 
     def _speed(self, window: WindowStatistics) -> float | None:
         """Mean speed, if it is one that is evaluated."""
@@ -351,7 +358,8 @@ class KnownMachineEvaluator(WindowEvaluator):
             left = self._healthy_misfit.beyond(stated.goodness, window.duration_s / self._machine.window_data_s)
             stated = replace(stated, misfit_z=left.misfit_z, suspect=left.suspect)
         vector = stated.unbalance
-        if vector is not None and vector.foreign and not self._commissioned and stated.misfit_z is not None:
+        seen = any(state.endswith("_dot") for state in window.states)  # displacements alone may have run-out
+        if vector is not None and vector.foreign and seen and not self._commissioned and stated.misfit_z is not None:
             # Of a commissioned machine levels know what its 1x was.
             misfit_z = max(stated.misfit_z, _SURELY_OUTSIDE)
             stated = replace(stated, misfit_z=misfit_z, suspect=stated.suspect or vector.foreign)

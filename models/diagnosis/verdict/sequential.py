@@ -149,7 +149,8 @@ class SequentialTest:
         began_ns, windows = self.state.outside_ns, self.state.sums.get(1)
         if self.settings.short_hops or began_ns is None or not windows:
             return 0.0
-        return max(0.0, self.settings.window_hops * self.settings.hop_s - (windows[-1].end_ns - began_ns) / 1e9)
+        lasts_ns = round(self.settings.window_hops * self.settings.hop_s * 1e9)
+        return max(0, lasts_ns - (windows[-1].end_ns - began_ns)) / 1e9
 
     def update(self, looks: Mapping[int, Stretch], *, foreign: bool = False) -> Verdict:
         """Judge one hop.

@@ -112,7 +112,7 @@ class AlarmBook:
         suspect : str
             What explains data outside the model best; empty if nothing does.
         hidden : bool
-            Whether it hides what a parameter does, so that none is named.
+            Whether it hides what a parameter does: none is named then, and none that was named is taken back.
         astride_s : float
             For how long the window may still hold the moment of a change, and be outside the model for that alone.
         """
@@ -132,7 +132,7 @@ class AlarmBook:
                     reading.standard_error,
                     end_ns,
                     named=reading.name in sure,
-                    taken_back=verdict.settled and (nameless or reading.name not in held),
+                    taken_back=verdict.settled and not hidden and (another or reading.name not in held),
                     low_confidence=verdict.outside_model,
                     evidence=evidence,
                     note="" if reading.vector is None else reading.vector.text,
@@ -161,7 +161,8 @@ class AlarmBook:
             )
         if verdict.current or unexplained or verdict.outside_model:
             at_once = f"{', '.join(named)} seem to have changed at once, so none is named" if another else ""
-            just = f"if a parameter has just changed, it is named within {astride_s:.0f} s" if astride_s else ""
+            within_s = astride_s + self._settings.on_delay_s
+            just = f"if a parameter has just changed, it can be named in {within_s:.0f} s" if astride_s else ""
             note = "; ".join(filter(None, (unexplained, suspect and f"best explained by: {suspect}", at_once, just)))
             outside = verdict.outside_model
             self.update_state(MODEL, outside, end_ns, note, evidence=evidence)
