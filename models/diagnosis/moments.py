@@ -13,6 +13,7 @@ to the line. Then every hop has its own, and a segment of the spectra those betw
 Without a phase reference the angle begins anew in every hop, and each of its segments has its own hop's.
 """
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,6 +33,7 @@ from models.machine import MachineFile
 from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray
 from models.signals.channels import ACCELERATIONS, parts_seen, state_name
+from models.signals.keyphasor import jump_within_a_turn
 from models.signals.waveform import Waveform, waveform_of
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -207,6 +209,7 @@ class HopMoments:
     # estimates the two-sided power spectral density per Hz
     segments: ComplexArray
     turned_rad: float  # shaft angle covered in the hop (nan without a phase reference)
+    jump_rad: float  # by which the angle jumped in it or just before (nan without a phase reference)
     # The most likely rotation where there is no phase reference. The regressors follow it, from an unknown angle.
     line: RotationLine | None
     # What the samples of each measured state look like and, last, those of the shaft angle if there is one.
@@ -223,7 +226,7 @@ class HopMoments:
             "times_ns": np.array([self.start_ns, self.end_ns], dtype=np.int64),
             "products": self.products,
             "segments": self.segments,
-            "turned_rad": np.array(self.turned_rad, dtype=np.float64),
+            "turned_rad": np.array([self.turned_rad, self.jump_rad], dtype=np.float64),
             "line": np.array([] if line is None else [line.speed_rad_s, line.sweep_rad_s2, line.strength], np.float64),
             "pair_powers": self.pair_powers,
             **prefixed("waveform", self.waveform.checkpoint()),
@@ -241,12 +244,14 @@ class HopMoments:
         """
         start_ns, end_ns = checked(arrays, "times_ns", np.int64, (2,)).tolist()
         line = checked(arrays, "line", np.float64, (None,)).tolist()
+        turned_rad, jump_rad = checked(arrays, "turned_rad", np.float64, (2,)).tolist()
         return cls(
             start_ns=start_ns,
             end_ns=end_ns,
             products=checked(arrays, "products", np.float64, (None, None, None)),
             segments=checked(arrays, "segments", np.complex128, (None, None, None)),
-            turned_rad=float(checked(arrays, "turned_rad", np.float64, ())),
+            turned_rad=turned_rad,
+            jump_rad=jump_rad,
             line=RotationLine(*line) if line else None,
             waveform=Waveform.restored(unprefixed("waveform", arrays)),
             pair_powers=checked(arrays, "pair_powers", np.complex128, (None, None, 3)),
@@ -272,12 +277,13 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
     a = np.empty((n_states + (1 if plan.angle_column is None and plan.speed_rad_s is None else 3), rows.shape[1]))
     np.subtract(rows[:n_states], level[:, np.newaxis], out=a[:n_states])
     a[n_states] = 1
-    turned_rad, line = np.nan, None
+    turned_rad, jump_rad, line = np.nan, np.nan, None
     theta = None
     if plan.angle_column is not None:
         theta = rows[-1]
-        steps = np.diff(theta[plan.preamble - 1 :])
-        turned_rad = float(np.sum((steps + np.pi) % (2 * np.pi) - np.pi))
+        steps = (np.diff(theta) + np.pi) % (2 * np.pi) - np.pi
+        turned_rad = float(np.sum(steps[plan.preamble - 1 :]))
+        jump_rad = jump_within_a_turn(steps)
     elif plan.speed_rad_s is not None:
         every = np.concatenate([a[:n_states], rows[n_states : plan.columns.size]])
         line = rotation_line(every, plan.rate_hz, plan.speed_rad_s, plan.speed_tolerance)
@@ -314,6 +320,7 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
         products=_lagged_products(a, plan),
         segments=segments,
         turned_rad=turned_rad,
+        jump_rad=jump_rad,
         line=line,
         waveform=waveform,
         pair_powers=pair_powers(segments[:, :, :n_states] - level_left, plan.frequencies_hz, plan.pairs),
@@ -446,6 +453,12 @@ def _between(hops: tuple[HopMoments, ...], beta: FloatArray, number: int, part: 
         if 0 <= neighbour < len(hops) and _adjoin(hops[min(number, neighbour)], hops[max(number, neighbour)]):
             return np.asarray(beta[number] + part * (neighbour - number) * (beta[neighbour] - beta[number]))
     return np.asarray(beta[number])
+
+
+def angle_jumps(hops: tuple[HopMoments, ...]) -> FloatArray:
+    """By how much the shaft angle jumped in each hop; nan where the one before it does not adjoin, and nobody knows."""
+    known = [one.jump_rad if _adjoin(before, one) else np.nan for before, one in itertools.pairwise(hops)]
+    return np.array([np.nan, *known])
 
 
 def _adjoin(earlier: HopMoments, later: HopMoments) -> bool:

@@ -20,6 +20,7 @@ from models.diagnosis.moments import (
     Plan,
     Rotation,
     SpeedSource,
+    angle_jumps,
     divided,
     hop_coefficients,
     hop_moments,
@@ -67,6 +68,7 @@ class WindowStatistics:
     speed_rad_s: float  # mean speed (nan if unknown)
     speed_range: tuple[float, float]  # slowest and fastest hop, rad/s (nan if unknown)
     hop_speed_rad_s: FloatArray  # (n_hops,), mean speed of each hop (nan if unknown)
+    hop_jump_rad: FloatArray  # (n_hops,), by which the shaft angle jumped in each (nan if unknown)
     removed_by_hop: bool  # whether the rotation was taken out hop by hop, each with its own amplitude
     # (n_bins, n): squared coherence of each bin with the angle or, where the rotation was taken out hop by hop, with
     # itself a segment later: none of noise, all of a line. None without a phase reference
@@ -80,6 +82,7 @@ class WindowStatistics:
     # The same window of the sensors as they are mounted, run-out included, where some of them are at an angle or have a
     # slow-roll vector. `waveforms` and `pair_powers` are those of mounted sensors in either.
     mounted: "WindowStatistics | None" = None
+    directed: bool = True  # whether vectors keep their directions: the shaft angle has not jumped since it was set up
 
     @property
     def as_mounted(self) -> "WindowStatistics":
@@ -166,6 +169,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         speed_rad_s=speed_rad_s,
         speed_range=speed_range,
         hop_speed_rad_s=rotation.hop_speed_rad_s,
+        hop_jump_rad=angle_jumps(hops),
         removed_by_hop=rotation.by_hop,
         phase_kept=phase_kept,
         duration_s=len(hops) * plan.hop / plan.rate_hz,
@@ -470,8 +474,7 @@ class SlidingWindow:
     def _check_fits(self, hop: HopMoments) -> None:
         """Raise CheckpointError for a hop of other channels, lags or frequencies."""
         plan = self.plan
-        turning = plan.angle_column is not None or plan.speed_rad_s is not None
-        n = len(plan.states) + (3 if turning else 1)
+        n = len(plan.states) + (1 if plan.angle_column is None and plan.speed_rad_s is None else 3)
         products, segments = (plan.lags.size, n, n), (plan.hop // (plan.segment // 2), plan.bins.size, n)
         if hop.products.shape != products or hop.segments.shape != segments:
             raise CheckpointError(

@@ -19,6 +19,33 @@ _TOO_SHORT = 0.5
 _WHOLE = 0.25
 
 
+def jump_within_a_turn(steps_rad: FloatArray) -> float:
+    """Largest angle by which a sampled shaft angle jumps, between two samples or in one turn of the mark, rad.
+
+    Two turns gain it over the two before, and lose it again to the next two; of a speed they gain, or lose, for good.
+
+    Parameters
+    ----------
+    steps_rad : ndarray, shape (n,)
+        From sample to sample, -π to π.
+
+    Examples
+    --------
+    >>> steps = np.full(1000, 0.05)
+    >>> steps[500] += 0.7
+    >>> round(jump_within_a_turn(steps), 3)
+    0.7
+    """
+    turned = np.cumsum(steps_rad)
+    two = round(4 * np.pi * turned.size / abs(turned[-1])) if turned[-1] else turned.size
+    if not 0 < 2 * two < turned.size:
+        return 0.0
+    gained = turned[2 * two :] - 2 * turned[two:-two] + turned[: -2 * two]
+    first, last = int(gained.argmax()), int(gained.argmin())
+    size = max(0.0, min(float(gained[first]), -float(gained[last])))
+    return size if first < last else -size
+
+
 class EdgeDetector:
     """Finds the pulses in a sampled tachometer signal, piece by piece.
 

@@ -33,11 +33,12 @@ from models.machine import Machine, MachineFile
 from models.physics.rotor import PARAMETERS
 from models.signals.channels import Channel, with_channel_names
 from rotorwatch.records.health import HealthState
-from rotorwatch.records.windows import Equation, Opinion, Parameter, Shape
+from rotorwatch.records.sensor_faults import FaultKind
+from rotorwatch.records.windows import Equation, Opinion, Parameter, SensorFault, Shape
 
 Newest = tuple[SlidingWindow, SequentialTest]
 """Where the window is the latest, and what wants its latest hops evaluated."""
-_LIKELIHOOD, _SHAPE, _EXPLAINED, _SENSE = "likelihood", "shape", "explained_ns", "sense"
+_LIKELIHOOD, _SHAPE, _EXPLAINED, _SENSE, _DIRECTED = "likelihood", "shape", "explained_ns", "sense", "directed"
 _NO_EQUATION = "no equation can be evaluated on this machine; see what is said of each channel"
 _EMPTY = np.zeros((0, 0))
 _STEADY = 0.15
@@ -136,6 +137,9 @@ class WindowEvaluator(ABC):
     takes_short: bool = False
     """Whether stretches shorter than the window can be evaluated."""
 
+    directed: bool = True
+    """Whether the directions of vectors say something: the shaft angle has not jumped since the monitor was set up."""
+
     by: str
     """Name of the diagnostician that decides."""
 
@@ -158,6 +162,10 @@ class WindowEvaluator(ABC):
         EstimationError
             If the window cannot be evaluated: outside the speed range, speed not steady, no fluctuation in a channel.
         """
+
+    def heard(self, findings: Sequence[SensorFault]) -> None:
+        """Take note of what is wrong with the sensors: what an angle that jumped costs stays lost."""
+        self.directed &= ("theta", FaultKind.OFFSET) not in {(*one.states, one.kind) for one in findings}
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything that the next evaluations depend on, as named arrays; empty if each stands for itself."""
@@ -237,6 +245,7 @@ class KnownMachineEvaluator(WindowEvaluator):
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`."""
         speed = self._speed(window)
+        window = window if self.directed else replace(window, directed=False)
         deciding = self._explained(window)
         if self._open:
             deciding = self._by_sense(window, deciding)
@@ -304,26 +313,29 @@ class KnownMachineEvaluator(WindowEvaluator):
         for hops in wanted:
             with suppress(EstimationError):  # too little data for itself; the window has said what there is to say
                 if (statistics := sliding.statistics(hops)) is not None:
+                    statistics = statistics if self.directed else replace(statistics, directed=False)
                     evaluated[hops] = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
         return evaluated
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """Where the likelihood's maximum is followed from, and what was explained; networks remember nothing."""
+        """Where the likelihood's maximum is followed from, and what is known; networks remember nothing."""
         explained = np.array([] if self._explained_ns is None else [self._explained_ns], dtype=np.int64)
         sense = np.array([self._open, self._opposite, self._tried_in_vain, self._tried_ns], dtype=np.int64)
-        return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | {_EXPLAINED: explained, _SENSE: sense}
+        known = {_EXPLAINED: explained, _SENSE: sense, _DIRECTED: np.array(self.directed)}
+        return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | known
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called, see `WindowEvaluator`."""
         explained = checked(arrays, _EXPLAINED, np.int64, (None,)).tolist()
         still_open, opposite, in_vain, tried_ns = checked(arrays, _SENSE, np.int64, (4,)).tolist()
+        directed = bool(checked(arrays, _DIRECTED, np.bool_, ()))
         machine = opposed(self._given) if opposite else self._given
         likelihood = LengthFits(machine)
         likelihood.restore(unprefixed(_LIKELIHOOD, arrays))
         self._compare_with(machine)
         self._likelihood, self._explained_ns = likelihood, next(iter(explained), None)
         self._open, self._opposite = bool(still_open), bool(opposite)
-        self._tried_ns, self._tried_in_vain = tried_ns, bool(in_vain)
+        self._tried_ns, self._tried_in_vain, self.directed = tried_ns, bool(in_vain), directed
 
     def _speed(self, window: WindowStatistics) -> float | None:
         """Mean speed, if it is one that is evaluated."""

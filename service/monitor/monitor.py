@@ -104,8 +104,7 @@ class MachineMonitor:
         self.window: WindowStatistics | None = None  # that of the latest report, if it was full
         self._newest = NewestBlocks(20_000)
         self._used: SampleBlock | None = None
-        self.used = False
-        self.could_use = self._gate.could_use
+        self.used, self.could_use = False, self._gate.could_use
 
     def step_payload(
         self, payload: bytes, attachment: bytes, encoding: str, dropped_before: int = 0
@@ -428,6 +427,7 @@ class MachineMonitor:
         self._alarms.suppress(float(speed_rad_s * _RPM) if np.isfinite(speed_rad_s) else None, end_ns)
         findings = sensor_findings(statistics, self._sensors, self.machine.sensors, standing=bool(stood))
         self._data_path.sensors(findings, statistics, standing=bool(stood))
+        self._evaluator.heard(findings)
         start_ns, faulty = statistics.start_ns, implicated(findings)
 
         def unread(state: HealthState, reason: str) -> Report:

@@ -294,10 +294,12 @@ class LikelihoodFit:
         known = (self._machine, model, point, structural)
         if window.removed_by_hop and window.hop_synchronous is not None:
             hop_s = window.duration_s / window.hop_speed_rad_s.size
-            return estimate_unbalance_by_hop(*known, window.hop_synchronous, window.hop_speed_rad_s, hop_s)
+            hops = window.hop_synchronous, window.hop_speed_rad_s, hop_s
+            return estimate_unbalance_by_hop(*known, *hops, directed=window.directed)
         if window.synchronous is None:
             raise EstimationError(f"{self._machine.name}: no phase reference")
-        return estimate_unbalance(*known, window.synchronous, speed, window.duration_s).decided()
+        ratios = estimate_unbalance(*known, window.synchronous, speed, window.duration_s)
+        return ratios.decided(directed=window.directed)
 
     def _followed_or_searched(
         self, window: WindowStatistics, excluded: npt.NDArray[np.bool_], scale: FloatArray, speed: float

@@ -3,7 +3,7 @@
 While the heavy spot is where it was, the unbalance is one real number times the nominal one, and is read as that. Once
 it has turned, that number would be the projection on the old direction: half a turn would read as -200 %. Then what is
 read is the complex ratio: how large the unbalance has become, or, where most of the change is the turn, the size of the
-vector by which it changed.
+vector by which it changed. Once the shaft angle itself has jumped, directions say nothing, and it is the size alone.
 """
 
 import math
@@ -52,8 +52,8 @@ class UnbalanceRatios:
         ComplexArray  # (n_states,): real and imaginary part are those of weights @ vector; none for several vectors
     )
 
-    def decided(self) -> Unbalance:
-        """Take that of the descriptions which holds, see this module."""
+    def decided(self, *, directed: bool = True) -> Unbalance:
+        """Take that of the descriptions which holds, see this module; the size alone where directions say nothing."""
         known, real, imaginary = self.values.tolist()
         variances = float(self.variances[1]), self.between, float(self.variances[2])
         vector = UnbalanceVector(real, imaginary, *variances, self.foreign)
@@ -63,9 +63,9 @@ class UnbalanceRatios:
             turned = False
         else:
             turned = turn > max(_TURNED * size * math.radians(vector.turned_error_deg), _LEAST_TURN)
-        if not turned and known > 0:
+        if directed and not turned and known > 0:
             return Unbalance(known - 1, float(self.variances[0]), self.covariance[0], vector, self.weights)
-        if turned and turn > abs(size - 1):
+        if directed and turned and turn > abs(size - 1):
             along = np.array([real - 1, imaginary]) / vector.change
             return Unbalance(vector.change, vector.change_error**2, along @ self.covariance[1:], vector, self.weights)
         along = np.array([real, imaginary]) / size
@@ -166,6 +166,8 @@ def estimate_unbalance_by_hop(
     hop_synchronous: ComplexArray,
     hop_speed_rad_s: FloatArray,
     hop_s: float,
+    *,
+    directed: bool = True,
 ) -> Unbalance:
     """Estimate e where the speed varies: every hop at its own speed, with its own vector.
 
@@ -177,6 +179,8 @@ def estimate_unbalance_by_hop(
         As for `estimate_unbalance`.
     hop_synchronous : ndarray of complex, shape (n_hops, n_states)
     hop_speed_rad_s : ndarray, shape (n_hops,)
+    directed : bool
+        See `UnbalanceRatios.decided`.
 
     Raises
     ------
@@ -204,7 +208,7 @@ def estimate_unbalance_by_hop(
         together,
         next((hop.foreign for hop in hops if hop.foreign), ""),
         np.empty(0, dtype=np.complex128),
-    ).decided()
+    ).decided(directed=directed)
 
 
 def _around_rotation(

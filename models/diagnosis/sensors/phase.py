@@ -1,8 +1,9 @@
 """The phase reference: a shaft angle that loses pulses, jumps, slips, jitters, or turns at another speed.
 
 What turns with the shaft stands still when seen from the shaft. If the rotation-synchronous vectors of all channels
-turn together and keep their lengths, it is the angle that moved: a machine that changes, changes them each in its own
-way, and an unbalance that grows keeps its place.
+turn together and keep their lengths, it is the angle that moved, or the heavy spot: a machine that changes, changes
+them each in its own way, and an unbalance that grows keeps its place. Where the angle went on as before, it is the
+heavy spot, and no fault of the angle; an angle that jumps does so within a turn, faster than any shaft.
 """
 
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
 MOST_ERRORS = 8.0  # standard errors beyond which the angle jumped or slips; the most probable of all moments is tested
+SEEN_ERRORS = 4.0  # the same where the angle itself jumps by as much at that moment
 LEAST_JUMP_RAD = 0.35  # a smaller jump costs little and may be the machine's
 LEAST_SLIP_RAD = 0.2  # slip from hop to hop; thermal bending turns vectors, too, but by less
 LEAST_JITTER = 0.05  # power of the line left at the speed over that of the line taken out: jitter of 0.47 rad
@@ -69,7 +71,7 @@ def phase_faults(
     if found is None and len(vectors) >= _FEWEST_HOPS:
         if not window.removed_by_hop:
             common = _common(columns, vectors)
-            found = _slip(window, common, name) or _jump(common, name)
+            found = _slip(window, common, name) or _jump(window, common, name)
         found = found or _jitter(window, columns, vectors, name)
     return [found] if found else []
 
@@ -189,8 +191,11 @@ def _slip(window: WindowStatistics, common: _Common, name: str) -> SensorFault |
     )
 
 
-def _jump(common: _Common, name: str) -> SensorFault | None:
-    """The vectors of all channels turned by one angle between two hops and kept their lengths."""
+def _jump(window: WindowStatistics, common: _Common, name: str) -> SensorFault | None:
+    """The vectors of all channels turned by one angle between two hops and kept their lengths, and the angle jumped.
+
+    Where data are missing between the hops, whether it jumped is not known, and the vectors alone decide.
+    """
     n = len(common.course)
     best, at = 0.0, 0
     for k in range(_FEWEST_SIDE, n - _FEWEST_SIDE + 1):
@@ -198,16 +203,23 @@ def _jump(common: _Common, name: str) -> SensorFault | None:
         z = abs(float(change[0])) / float(error[0])
         if z > best:
             best, at = z, k
-    if best < MOST_ERRORS:
+    if best < SEEN_ERRORS:
         return None
     change, error = _turn(common.course[:, None], at)
     value = float(change[0])
+    own = window.hop_jump_rad[max(1, at - 2) : at + 2]
+    seen = np.abs(np.angle(np.exp(1j * (own + value)))) < max(_STAY * float(error[0]), _ALIKE * abs(value))
+    if seen.any():
+        value = float(np.angle(np.exp(-1j * own[seen.argmax()])))
+    elif best < MOST_ERRORS or not np.isnan(own).any():
+        return None
     before, after = np.abs(common.course[: at - 1]), np.abs(common.course[at + 1 :])
     longer = abs(float(after.mean() / before.mean()) - 1)
     turns, errors = _turn(common.vectors, at)
     together = np.abs(np.angle(np.exp(1j * (turns - value)))) < np.maximum(_STAY * errors, _ALIKE * abs(value))
     clear = _STAY * errors < abs(value) / 2
-    if abs(value) < LEAST_JUMP_RAD or longer > _LENGTH or not np.all(together) or 2 * clear.sum() < clear.size:
+    known = seen.any() or 2 * clear.sum() >= clear.size
+    if abs(value) < LEAST_JUMP_RAD or longer > _LENGTH or not np.all(together) or not known:
         return None
     text = (
         f"{name}: jumped by {np.degrees(-value):+.0f}° (± {np.degrees(float(error[0])):.1f}°) within the window: every "

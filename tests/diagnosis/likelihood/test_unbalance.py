@@ -57,6 +57,16 @@ def test_a_turned_heavy_spot_is_read_as_a_vector_and_never_below_nothing(e: floa
     assert sure(reading.interval_95)[0] >= -1
 
 
+@pytest.mark.parametrize("removed_by_hop", [False, True])
+def test_once_the_angle_has_jumped_the_unbalance_is_judged_by_its_size(removed_by_hop: bool) -> None:
+    for e in (0.0, 0.3):
+        seen = turned(drawn(1, e), 90.0)
+        reading, vector = e_of(replace(seen, directed=False, removed_by_hop=removed_by_hop))
+        assert reading.relative_change == pytest.approx(vector.magnitude_change)
+        assert reading.standard_error == pytest.approx(vector.magnitude_error)
+        assert reading.relative_change == pytest.approx(e, abs=4.5 * vector.magnitude_error)
+
+
 @pytest.mark.slow
 def test_a_rotor_that_was_balanced_has_lost_its_unbalance_and_no_more() -> None:
     """The difference of two windows' vectors is their noise alone: which side of nothing it is on is chance."""

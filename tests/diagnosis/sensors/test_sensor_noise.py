@@ -235,6 +235,34 @@ def test_a_wrong_shaft_angle_is_named(
     assert finding.value == pytest.approx(value, rel=0.15)
 
 
+def test_a_heavy_spot_that_turns_is_no_fault_of_the_angle() -> None:
+    """The vectors turn together as where the angle jumps, but the angle goes on; over a gap nobody knows."""
+    samples = recorded("lab", 921).copy()
+    n, theta, after = samples.shape[1] - 1, samples[:, -1], round(0.55 * len(samples))
+    turning = np.stack([np.cos(theta), np.sin(theta)], axis=1)
+    cosine, sine = np.linalg.lstsq(turning, samples[:, :n], rcond=None)[0]
+    elsewhere = np.stack([sine - cosine, -sine - cosine])  # a quarter of a turn on, less what was there
+    samples[after:, :n] += turning[after:] @ elsewhere
+    assert found_in(samples) == ()
+    (window,) = windows_of("lab", samples)
+    unknown = replace(window, hop_jump_rad=np.full(window.hop_jump_rad.size, np.nan))
+    finding = only(sensor_findings(unknown))
+    assert (finding.kind, finding.states) == ("offset", ("theta",))
+
+
+def test_a_small_jump_in_loud_vibration_is_found_where_the_angle_shows_it() -> None:
+    samples, machine = recorded("lab", 922).copy(), machine_of("lab")
+    shaking = np.fft.rfft(np.random.default_rng(923).standard_normal(samples[:, :-1].shape), axis=0)
+    f = np.fft.rfftfreq(len(samples), 1 / machine.rate_hz)
+    shaking[np.abs(f - machine.operation.speed_rpm / 60) > 1] = 0
+    noise, after = np.fft.irfft(shaking, len(samples), axis=0), round(0.55 * len(samples))
+    samples[:, :-1] += 0.7 * samples[:, :-1].std(axis=0) * noise / noise.std()
+    samples[after:, -1] = np.mod(samples[after:, -1] + 0.4, 2 * np.pi)
+    (window,) = windows_of("lab", samples)
+    (finding,) = [one for one in sensor_findings(window) if one.states == ("theta",)]
+    assert finding.value == pytest.approx(0.4, abs=1e-3)
+
+
 def test_a_shaft_that_changes_its_speed_has_a_sound_angle() -> None:
     speed_rpm = machine_of("lab").operation.speed_rpm
     event = Event(at_s=25.0, ramp_s=10.0, speed_rpm=1.03 * speed_rpm)

@@ -195,6 +195,28 @@ def test_where_no_hop_is_whole_nothing_stays_healthy(torn: str) -> None:
     assert target.health().reason == ""
 
 
+@pytest.mark.parametrize("restarted", [False, True])
+def test_a_phase_reference_that_jumps_is_no_unbalance_for_good(restarted: bool) -> None:
+    """Nor after a restart; the same turn of the vectors without a jump of the angle is one."""
+    target, after = watching(), []
+    for block in healthy(180.0)[650:]:
+        samples = block.samples.copy()
+        samples[:, -1] = np.mod(samples[:, -1] + np.pi / 2, 2 * np.pi)
+        after.append(replace(block, samples=samples))
+    windows, events = feed(target, after[:650])
+    assert windows[-1].state is HealthState.HEALTHY
+    if restarted:
+        state, target = target.state(whole=True), monitor()
+        target.restore(state.state, [data for _, data in state.new_parts])
+        target.restore_alarms(state.alarms)
+    windows, more = feed(target, after[650:])
+    assert [(event.kind, event.alarm.name) for event in (*events, *more)] == [("raised", "data-phase-reference")]
+    e = next(one for one in windows[-1].parameters if one.name == "e")
+    assert e.vector is not None
+    assert e.vector.turned_deg == pytest.approx(-90, abs=10)
+    assert target.health().state is HealthState.HEALTHY
+
+
 def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
     _, machine = load_scenario("healthy")
     windows, events = feed(MachineMonitor(install(machine, None)), stream(75.0, Event(at_s=0.0, speed_rpm=2000.0)))
