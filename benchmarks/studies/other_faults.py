@@ -113,9 +113,7 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
     foreign = [row for row in rows if str(row["fault"]).startswith("no rotor")]
     yield r.at_most("k, c or e left named without reserve", r.share("without reserve")(other), 0.01)
     yield r.at_least("heard", r.share("heard")(other), 0.99)
-    yield r.at_most(
-        "no rotor of the file: k, c or e left named without reserve", r.share("without reserve")(foreign), 0.01
-    )
+    yield r.at_most("no rotor of the file: k, c or e alarmed", r.share("named")(foreign), 0.01)
 
 
 def other_faults(options: Options) -> Study:
