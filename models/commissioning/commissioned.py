@@ -261,12 +261,14 @@ class Commissioned(BaseModel, extra="forbid", frozen=True):
         return Machine.model_validate(machine.model_dump(mode="json") | self.identified.machine)
 
 
-def opposed(machine: Machine) -> Machine:
-    """The machine with gyroscopic moments of the opposite sense: as if its polar moment of inertia were negative.
+def in_sense(machine: Machine, sense: Gyroscopic) -> Machine:
+    """The machine with gyroscopic moments of this sense: the opposite one is a negative polar moment of inertia.
 
-    In the sense of Eq. (27), as it is read here, natural frequencies of whirl with the rotation fall with the speed,
-    and those of a real rotor rise; see ``docs/decisions/0049-the-sense-of-the-gyroscopic-moments.md``.
+    In the sense of Eq. (27), as it is read here, natural frequencies of forward whirl fall with the speed, and those of
+    a real rotor rise; see ``docs/decisions/0049-the-sense-of-the-gyroscopic-moments.md``.
     """
+    if sense == "Eq. 27":
+        return machine
     rotor = machine.rotor.model_copy(update={"I2p_kg_m2": -machine.rotor.I2p_kg_m2})
     return machine.model_copy(update={"rotor": rotor})
 
@@ -327,7 +329,7 @@ class Installed:
             return None
         if self.commissioned is not None:
             known = self.commissioned.completed(self.machine)
-            return opposed(known) if known is not None and self.commissioned.gyroscopic == "opposite" else known
+            return None if known is None else in_sense(known, self.commissioned.gyroscopic)
         return self.machine if isinstance(self.machine, Machine) else None
 
     @property

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.commissioning.commissioned import Gyroscopic, opposed
+from models.commissioning.commissioned import Gyroscopic, in_sense
 from models.diagnosis.baseline.learned import learn_baseline
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Diagnosis
@@ -56,8 +56,6 @@ def identify(
         With masses and shaft in its ``[rotor]``.
     windows : sequence of WindowStatistics
         Healthy ones that do not overlap.
-    sense : Gyroscopic
-        Of the gyroscopic moments.
 
     Raises
     ------
@@ -66,8 +64,7 @@ def identify(
     MachineFileError
         If masses or shaft are missing.
     """
-    whole = _first_guess(machine, windows)
-    whole = whole if sense == "Eq. 27" else opposed(whole)
+    whole = in_sense(_first_guess(machine, windows), sense)
     diagnoses = [diagnosis for _, diagnosis in _read(whole, windows)]
     for number in range(_ROUNDS):
         together = added([stretch_of(each, w.start_ns, w.end_ns) for each, w in zip(diagnoses, windows, strict=True)])
@@ -85,7 +82,7 @@ def identify(
         )
     total = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     total[np.ix_(together.known, together.known)] = covariance
-    as_described = whole if sense == "Eq. 27" else opposed(whole)
+    as_described = in_sense(whole, sense)  # the opposite of the opposite
     return Identified(as_described, together.names, total, tuple(diagnoses))
 
 

@@ -25,7 +25,7 @@ from models.commissioning.commissioned import (
     IdentifiedRecord,
     KnowledgeLevel,
     OperatingRange,
-    opposed,
+    in_sense,
 )
 from models.commissioning.healthy import HealthyRecording
 from models.commissioning.identified import identify
@@ -57,7 +57,7 @@ Read = tuple[str, int, Diagnosis]  # recording, end of the window, and what was 
 Progress = Callable[[str, int, int], None]  # told what is being done, how much of it is done, and how much there is
 _TABLES = ("rotor", "operation", "condition")
 _OPPOSITE = (
-    "gyroscopic moments have the sense in which natural frequencies of whirl with the rotation rise with the speed; "
+    "gyroscopic moments have the sense in which natural frequencies of forward whirl rise with the speed; "
     "in the other one, which is tried first, the machine file does not explain the recordings"
 )
 _SHORTEST_HOPS = 4  # fewer say too little of how they scatter
@@ -117,7 +117,7 @@ def _read_known(machine: Machine, pieces: Sequence[HealthyPiece], progress: Prog
 
 def _learn_full(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress, sense: Gyroscopic) -> Learned:
     assert isinstance(machine, Machine)  # noqa: S101  # the level says so
-    read = _read_known(machine if sense == "Eq. 27" else opposed(machine), pieces, progress)
+    read = _read_known(in_sense(machine, sense), pieces, progress)
     check = check_agreement([each for _, _, each in read], "the parameters in the machine file")
     if check.verdict == "refused":
         check = check.model_copy(

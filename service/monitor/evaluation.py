@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from models.checkpoint import checked, prefixed, unprefixed
-from models.commissioning.commissioned import Commissioned, Installed, opposed
+from models.commissioning.commissioned import Commissioned, Installed, in_sense
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.likelihood.lengths import LengthFits
@@ -285,7 +285,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         # What neither sense explains, a disturbance for instance, says nothing of it: the next that is read does.
         self._tried_ns, self._tried_in_vain = window.end_ns, bool(np.isfinite(misfit_z))
         before = self._machine, self._likelihood, self._others
-        self._compare_with(opposed(self._given))
+        self._compare_with(in_sense(self._given, "opposite"))
         try:
             other = self._explained(window)
             self._opposite = _misfit_z(other) <= min(_OUTSIDE, misfit_z - _BETTER)
@@ -329,7 +329,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         explained = checked(arrays, _EXPLAINED, np.int64, (None,)).tolist()
         still_open, opposite, in_vain, tried_ns = checked(arrays, _SENSE, np.int64, (4,)).tolist()
         directed = bool(checked(arrays, _DIRECTED, np.bool_, ()))
-        machine = opposed(self._given) if opposite else self._given
+        machine = in_sense(self._given, "opposite" if opposite else "Eq. 27")
         likelihood = LengthFits(machine)
         likelihood.restore(unprefixed(_LIKELIHOOD, arrays))
         self._compare_with(machine)

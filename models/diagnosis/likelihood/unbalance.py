@@ -48,9 +48,8 @@ class UnbalanceRatios:
     between: float  # covariance of the two parts
     covariance: FloatArray  # (3, 5), of the three with the logarithmic ratios of the structural parameters
     foreign: str  # see `UnbalanceVector`
-    weights: (
-        ComplexArray  # (n_states,): real and imaginary part are those of weights @ vector; none for several vectors
-    )
+    # (n_states,): real and imaginary part are those of weights @ vector; none for several vectors
+    weights: ComplexArray
 
     def decided(self, *, directed: bool = True) -> Unbalance:
         """Take that of the descriptions which holds, see this module; the size alone where directions say nothing."""

@@ -1,20 +1,19 @@
 """A rotor whose gyroscopic moments have the sense of nature, of which the theory takes the other one first."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from models.commissioning.commissioned import Installed, opposed
+from models.commissioning.commissioned import Installed, in_sense
 from models.physics.rotor import PARAMETERS, system_A
 from models.signals.block import SampleBlock
 from rotorwatch.records.health import HealthState
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
-from tests.commissioning.rotor_kit import LAB, PARTIAL, commissioned, recording
+from tests.commissioning.rotor_kit import LAB, PARTIAL, commissioned, healthy, recording
 from tests.service.monitor.test_monitor import feed
 
 SEED = 4_900_001
@@ -24,13 +23,13 @@ SEED = 4_900_001
 def stream(duration_s: float, seed: int, *events: Event) -> tuple[SampleBlock, ...]:
     scenario, _ = load_scenario("healthy")
     scenario = scenario.overridden(duration_s=duration_s, seed=seed, faults=events)
-    return tuple(block for block, _ in blocks(scenario, opposed(LAB)))
+    return tuple(block for block, _ in blocks(scenario, in_sense(LAB, "opposite")))
 
 
 def test_the_other_sense_is_another_rotor() -> None:
     """Whirl with the rotation, from y to z, rises with the speed in nature; where y and z are alike it is a circle."""
     forward: dict[float, list[float]] = {}
-    for machine in (LAB, opposed(LAB)):
+    for machine in (LAB, in_sense(LAB, "opposite")):
         rotor = machine.rotor.model_copy(update={"k_bz_N_per_m": machine.rotor.k_by_N_per_m})
         rotor = rotor.model_copy(update={"c_by_N_s_per_m": 1e-3, "c_bz_N_s_per_m": 1e-3})
         for speed_rad_s in (1.0, 300.0):
@@ -72,14 +71,13 @@ def test_a_commissioning_finds_the_sense(level: str) -> None:
     known = Installed(machine, None, made.commissioned).known
     assert known is not None
     assert known.rotor.I2p_kg_m2 == -LAB.rotor.I2p_kg_m2
-    ours = commissioned(LAB, recording(LAB, before(75.0))) if level == "full" else None
-    assert ours is None or (ours.commissioned is not None and ours.commissioned.gyroscopic == "Eq. 27")
 
 
-def before(duration_s: float) -> Sequence[SampleBlock]:
-    """The rotor kit as it is simulated."""
-    scenario, machine = load_scenario("healthy")
-    return [block for block, _ in blocks(scenario.overridden(duration_s=duration_s, seed=SEED), machine)]
+def test_a_commissioning_keeps_the_sense_that_explains_its_recordings() -> None:
+    made = commissioned(LAB, healthy(LAB, 75.0, SEED))
+    assert made.commissioned is not None
+    assert made.commissioned.gyroscopic == "Eq. 27"
+    assert "gyroscopic" not in made.commissioned.model_dump()
 
 
 def test_a_disturbance_in_the_first_window_does_not_keep_the_sense_from_being_found() -> None:
