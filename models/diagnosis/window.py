@@ -30,6 +30,7 @@ from models.diagnosis.moments import (
     through,
 )
 from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of
+from models.diagnosis.stationarity import segment_levels, summed
 from models.errors import CheckpointError
 from models.levels.measures import WindowLevels, window_levels
 from models.signals.block import FloatArray
@@ -144,12 +145,15 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
             synchronous = _synchronous(beta)
     if plan.angle_column is not None:
         hop_synchronous = _synchronous(regression(products[:, 0], n))
-    by_bin = np.ascontiguousarray(cleaned.transpose(1, 0, 2))
-    spectrum = np.asarray(by_bin.transpose(0, 2, 1) @ by_bin.conj(), dtype=np.complex128)
+    by_bin = np.ascontiguousarray(cleaned.transpose(1, 0, 2), dtype=np.complex128)
+    spectrum = summed(by_bin)
     if synchronous is not None and phase_kept is None:
         angle = segments[:, :, n + 1].T[:, :, None]
         powers = np.einsum("fii->fi", spectrum).real * (np.abs(angle) ** 2).sum(axis=1)
         phase_kept = _coherence((by_bin.transpose(0, 2, 1) @ angle.conj())[:, :, 0], powers)
+    levels = segment_levels(by_bin, spectrum, sorted({*range(n)} - {pair.second for pair in plan.pairs}))
+    if levels is not None:
+        spectrum = summed(by_bin / np.sqrt(levels)[:, np.newaxis])
     speed_rad_s, speed_range = _speeds(rotation, hops, plan)
     found = WindowStatistics(
         states=plan.mounted,

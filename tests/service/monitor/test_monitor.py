@@ -217,6 +217,12 @@ def test_a_phase_reference_that_jumps_is_no_unbalance_for_good(restarted: bool) 
     assert target.health().state is HealthState.HEALTHY
 
 
+def test_a_load_that_steps_is_inside_the_model() -> None:
+    windows, events = feed(monitor(), stream(125.0, Event(at_s=65.0, excitation_level=3.0)))
+    assert events == []
+    assert {one.verdict.outside_model for one in windows if one.verdict is not None} == {False}
+
+
 def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
     _, machine = load_scenario("healthy")
     windows, events = feed(MachineMonitor(install(machine, None)), stream(75.0, Event(at_s=0.0, speed_rpm=2000.0)))

@@ -1,0 +1,59 @@
+"""Random forces whose level changes within a window: the level of each of its segments.
+
+The cross-spectra of a window are taken for a mean over segments of one level. Where the level steps or drifts, few
+segments make up most of that mean; it scatters as one of fewer segments, which looks like a misfit. Segments of a rotor
+that are scaled to one level are alike; those with another rotor, a rub or a line are not, and remain a misfit.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from models.diagnosis.moments import ComplexArray
+from models.signals.block import FloatArray
+
+_BLOCK = 16  # bins that are compared at once: many more than channels, and few enough for one colour
+_CHANCE = 30.0  # variance of the levels, in parts of that of one value, up to which a window is stationary; 3 is usual
+_ROUNDS = 2  # in the first, loud segments weigh too much in the mean that all are compared with
+
+
+def summed(segments: ComplexArray) -> ComplexArray:
+    """Cross-products of Fourier coefficients, shape (..., n_segments, n), over the segments: shape (..., n, n)."""
+    return np.asarray(segments.swapaxes(-1, -2) @ segments.conj(), dtype=np.complex128)
+
+
+def segment_levels(segments: ComplexArray, spectrum: ComplexArray, columns: Sequence[int]) -> FloatArray | None:
+    """Powers of the segments of a window relative to their mean; None if it is stationary.
+
+    Parameters
+    ----------
+    segments : ndarray, shape (n_bins, n_segments, n)
+        Fourier coefficients without mean and rotation.
+    spectrum : ndarray, shape (n_bins, n, n)
+        `summed` of them.
+    columns : sequence of int
+        Channels that count: one of each motion.
+
+    Returns
+    -------
+    ndarray, shape (n_segments,), or None
+        Medians over the band and over motions that do not go together: lines that come, and forces on a part of either,
+        are not the level.
+    """
+    n, count = len(columns), segments.shape[1]
+    blocks = segments.shape[0] // _BLOCK
+    if not n or not blocks:
+        return None
+    own = segments[: blocks * _BLOCK, :, columns].reshape(blocks, _BLOCK, count, n)
+    mean = spectrum[: blocks * _BLOCK, columns][:, :, columns].reshape(blocks, _BLOCK, n, n).sum(axis=1)
+    levels = np.ones(count)
+    for _ in range(_ROUNDS):
+        motions = own @ np.linalg.eigh(mean)[1].conj()[:, np.newaxis]
+        powers = (motions.real**2 + motions.imag**2).sum(axis=1)  # (blocks, n_segments, n)
+        usual = np.maximum(powers.mean(axis=1, keepdims=True), np.finfo(float).tiny)
+        levels = np.median(powers / usual, axis=(0, 2))
+        levels /= max(float(levels.mean()), np.finfo(float).tiny)
+        if np.mean((levels - 1) ** 2) * own[:, :, 0].size < _CHANCE or not np.all(levels > 0):
+            return None
+        mean = summed((own / np.sqrt(levels)[:, np.newaxis]).reshape(blocks, -1, n))
+    return levels
