@@ -21,7 +21,8 @@ from models.diagnosis.moments import hop_moments, plan_for
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import load_bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
-from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.window import WindowStatistics
 from models.levels.judgement import LevelJudge
 from models.levels.measures import WindowLevels, hop_levels
 from models.levels.reference import learn_levels

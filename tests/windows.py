@@ -3,7 +3,8 @@
 from collections.abc import Iterable, Iterator
 
 from models.diagnosis.moments import Plan
-from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.window import WindowStatistics
 from models.signals.block import SampleBlock
 from tests.sure import sure
 

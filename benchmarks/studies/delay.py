@@ -21,10 +21,10 @@ from benchmarks.studies.study import Cell, Options, Study
 from models.commissioning.commissioned import KnowledgeLevel
 from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import plan_for
+from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.stretch import Stretch, determined, stretch_of, to_scale
-from models.diagnosis.window import SlidingWindow
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.rotor import PARAMETERS

@@ -17,7 +17,8 @@ from benchmarks.studies.paper import PAPER_EQUATIONS, PaperDiagnostician, train_
 from benchmarks.studies.results import Chart, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Over, Study
 from models.diagnosis.moments import plan_for
-from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray
 from simulator.scenario import Event

@@ -10,7 +10,8 @@ import numpy as np
 
 from models.diagnosis.lines import KnownLine, Line, steady_lines
 from models.diagnosis.moments import HopMoments, Plan, plan_for
-from models.diagnosis.window import SlidingWindow, window_statistics
+from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.window import window_statistics
 from models.errors import RecordingError, WireError
 from models.ingest import Gate
 from models.levels.measures import STANDS_RAD_S

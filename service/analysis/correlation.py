@@ -9,7 +9,8 @@ from models.diagnosis.moments import ComplexArray, plan_for
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.equations import EQUATIONS, Equation, SynchronousEquation
 from models.diagnosis.networks.relation import EquationNetwork, read_equation, window_view
-from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.window import WindowStatistics
 from models.errors import RotorwatchError, WireError
 from models.ingest import Gate
 from models.machine import Machine, MachineFile

@@ -5,7 +5,7 @@ from collections import deque
 import numpy as np
 
 from models.diagnosis.moments import Plan, plan_for
-from models.diagnosis.window import SlidingWindow
+from models.diagnosis.sliding_window import SlidingWindow
 from models.errors import RotorwatchError
 from models.machine import MachineFile
 from models.signals.block import SampleBlock

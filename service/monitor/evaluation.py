@@ -24,10 +24,11 @@ from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading
 from models.diagnosis.sensors.reference import Naming
+from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.verdict.calibration import agreements, beside
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.stretch import determined, with_shared_error
-from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.diagnosis.window import WindowStatistics
 from models.errors import CheckpointError, EstimationError, UnexplainedError
 from models.machine import Machine, MachineFile
 from models.physics.rotor import PARAMETERS

@@ -12,7 +12,8 @@ from models.commissioning.commissioned import Installed
 from models.diagnosis.likelihood.motions import natural_frequencies
 from models.diagnosis.lines import new_line, steady_lines
 from models.diagnosis.moments import Plan
-from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.window import WindowStatistics
 from models.levels.contact import LatestContact
 from models.levels.judgement import Foreign, LevelJudge, channel_state, fallen
 from models.levels.measures import WindowLevels

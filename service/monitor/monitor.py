@@ -25,11 +25,12 @@ from models.diagnosis.moments import plan_for
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import implicated
 from models.diagnosis.sensors.standstill import Standstill
+from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.verdict.calibration import detectable_changes
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.sequential_state import SequentialState
 from models.diagnosis.verdict.stretch import stretch_of
-from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.diagnosis.window import WindowStatistics
 from models.errors import CheckpointError, EstimationError, WireError
 from models.ingest import Admission, Gate, Reason
 from models.levels.judgement import growth_seen

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import Plan, hop_moments, plan_for
-from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.window import WindowStatistics
 from models.machine import load_machine
 from models.signals.block import FloatArray
 from models.signals.waveform import Waveform, waveform_of

@@ -10,7 +10,8 @@ from pydantic import ValidationError
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import plan_for
 from models.diagnosis.sensors.check import sensor_findings
-from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.window import WindowStatistics
 from models.levels.judgement import LevelJudge
 from models.levels.measures import WindowLevels
 from models.machine import Machine, MachineFile, load_machine, load_machine_file

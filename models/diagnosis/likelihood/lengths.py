@@ -8,7 +8,8 @@ from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.motions import integrated
 from models.diagnosis.readings import Diagnosis
-from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
 
 

@@ -10,7 +10,8 @@ from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import plan_for
 from models.diagnosis.readings import Diagnosis
-from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.window import WindowStatistics
 from models.errors import UnexplainedError
 from models.machine import load_machine
 from models.signals.block import FloatArray

@@ -13,7 +13,7 @@ from models.diagnosis.likelihood.scoring import FisherScoring
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed
 from models.diagnosis.moments import plan_for
 from models.diagnosis.readings import Diagnosis
-from models.diagnosis.window import SlidingWindow
+from models.diagnosis.sliding_window import SlidingWindow
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.rotor import M_matrix, P_matrix, Q_matrix, changed

@@ -10,7 +10,8 @@ from pydantic import ValidationError
 from models.diagnosis.moments import Plan, plan_for
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import SensorReference, implicated, learn_sensor_reference
-from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.signals.block import FloatArray

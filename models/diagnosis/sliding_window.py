@@ -1,0 +1,267 @@
+"""The sliding window: a ring of hop moments.
+
+What is remembered of a window with every hop is small: from where to where its hops reach, and which samples they are
+made of. The moments themselves, megabytes, are computed again from the same samples (`models.diagnosis.recall`), unless
+all of them were stored.
+"""
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from models.checkpoint import checked, prefixed, unprefixed
+from models.diagnosis.moments import HopMoments, Plan, hop_moments
+from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of
+from models.diagnosis.window import WindowStatistics, levels_of, window_statistics
+from models.errors import CheckpointError
+from models.levels.measures import WindowLevels
+from models.signals.block import FloatArray
+
+
+class SlidingWindow:
+    """Cuts a stream into hops and keeps the latest ones.
+
+    The same samples give the same hops, whatever blocks they come in. A gap costs the hop it falls into; earlier hops
+    stay until the window's allowed span has passed.
+
+    Parameters
+    ----------
+    plan : Plan
+    remembered : bool
+        Whether `checkpoint` will be asked for: the samples of every hop have their digest taken then.
+    """
+
+    def __init__(self, plan: Plan, *, remembered: bool = False) -> None:
+        self.plan = plan
+        self._remembered = remembered
+        self._hops: deque[HopMoments] = deque(maxlen=plan.hops)
+        self._pieces: deque[Piece] = deque(maxlen=plan.hops)  # what each of them is made of
+        self._pending: list[FloatArray] = []
+        self._pending_samples = 0
+        self._pending_start_ns = 0
+        self._blocks: deque[tuple[int, int]] = deque()  # start and length of those that the pending samples are of
+        self._row = 0  # of the first of them, with which the pending samples begin
+        self._level: FloatArray | None = None
+        self._recall: Recall | None = None
+
+    @property
+    def filled(self) -> float:
+        """Fraction of a full window that is there."""
+        return len(self._hops) / self.plan.hops
+
+    @property
+    def lacking(self) -> int:
+        """How many samples the next hop lacks, if none are left out before."""
+        return self.plan.need - self._pending_samples
+
+    @property
+    def hops(self) -> tuple[HopMoments, ...]:
+        """The hops that are in the window, oldest first."""
+        return tuple(self._hops)
+
+    @property
+    def latest_hop(self) -> HopMoments | None:
+        """The hop that was completed last."""
+        return self._hops[-1] if self._hops else None
+
+    def feed(self, samples: FloatArray, start_ns: int) -> Iterator[int]:
+        """Add samples that continue the previous ones, stopping at every completed hop.
+
+        Parameters
+        ----------
+        samples : ndarray, shape (n_samples, n_states [+ 1])
+            Finite SI samples as `Plan.to_si` gives them.
+
+        Yields
+        ------
+        int
+            End time of a hop that became complete and is in the window now. A long block may complete several: ask for
+            the statistics between them, and take all, or the rest of the block is lost.
+        """
+        self.give_up()
+        # Anchored anew by every block: the device's clock is the time, however its rate deviates from nominal.
+        self._pending_start_ns = start_ns - round(self._pending_samples * 1e9 / self.plan.rate_hz)
+        # Rows first, whatever the caller has: sums must not depend on how samples lie in memory.
+        self._pending.append(np.ascontiguousarray(samples))
+        self._pending_samples += samples.shape[0]
+        self._blocks.append((start_ns, samples.shape[0]))
+        if self._pending_samples == samples.shape[0]:  # they may be what is to be left after a snapshot
+            self._pending = self._pending[-1:]
+            self._leave(self._row)
+        while self._pending_samples >= self.plan.need:
+            first_ns = self._pending_start_ns
+            buffer = self._pending[0] if len(self._pending) == 1 else np.concatenate(self._pending)
+            block_ns, row = self._blocks[0][0], self._row
+            self._pending, self._row = [buffer], self._row + self.plan.stride
+            self._leave(self.plan.stride)
+            yield self._complete(buffer[: self.plan.need], first_ns, block_ns, row)
+        if self._pending and self._pending[0].base is not None:  # a rest would hold all that it is the rest of
+            self._pending[0] = self._pending[0].copy()
+
+    def _leave(self, count: int) -> None:
+        """Go on so many samples after the first pending one; those that have not come yet are left when they come."""
+        if not count:
+            return
+        (pending,) = self._pending
+        rest = pending[count:]
+        self._pending, self._pending_samples = [rest], rest.shape[0]
+        self._pending_start_ns += round(count * 1e9 / self.plan.rate_hz)
+        while self._blocks and self._row >= self._blocks[0][1]:
+            self._row -= self._blocks.popleft()[1]
+
+    def _complete(self, samples: FloatArray, first_ns: int, block_ns: int, row: int) -> int:
+        if self._level is None or not self._hops:
+            # The median: one wild sample must not become the level of everything that follows.
+            self._level = np.median(samples[:, : len(self.plan.states)], axis=0)
+        start_ns = first_ns + round((self.plan.need - self.plan.fresh) * 1e9 / self.plan.rate_hz)
+        hop = hop_moments(self.plan, samples, self._level, start_ns)
+        while self._hops and hop.end_ns - self._hops[0].start_ns > self.plan.max_span_ns:
+            self._hops.popleft()
+            if self._remembered:
+                self._pieces.popleft()
+        self._hops.append(hop)
+        if self._remembered:
+            self._pieces.append(Piece(start_ns, block_ns, row, samples.shape[0], digest_of(samples)))
+        return hop.end_ns
+
+    def gap(self) -> None:
+        """Forget the unfinished hop: what comes next does not continue it."""
+        self.give_up()
+        self._pending = []
+        self._pending_samples = self._row = 0
+        self._blocks.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self.gap()
+        self._hops.clear()
+        self._pieces.clear()
+
+    @property
+    def lacks(self) -> bool:
+        """Whether samples are to be taken again: `recall` wants them."""
+        return self._recall is not None
+
+    def recall(self, samples: npt.NDArray[np.float32] | FloatArray, start_ns: int, *, newest: bool) -> None:
+        """Take a block again that was in the window when `checkpoint` was called.
+
+        Parameters
+        ----------
+        samples : ndarray, shape (n_samples, n_channels)
+            As received, not yet in SI units.
+        newest : bool
+            Whether no later one has been there: everything may be complete now.
+        """
+        if self._recall is None:
+            return
+        self._recall.take(samples, start_ns)
+        if newest and self._recall.complete():
+            self.give_up()
+
+    def give_up(self) -> int:
+        """Go on with what could be recalled; how many hops could not."""
+        recall, self._recall = self._recall, None
+        if recall is None:
+            return 0
+        there = recall.hops()
+        self._pieces = deque((piece for piece, _ in there), maxlen=self.plan.hops)
+        self._hops = deque((hop for _, hop in there), maxlen=self.plan.hops)
+        found = recall.pending()
+        if found is not None:
+            samples, blocks = found
+            self._pending, self._pending_samples = [samples], samples.shape[0]
+            self._blocks, self._row = deque(blocks), recall.last.row
+            self._pending_start_ns = recall.last.start_ns
+        return len(recall.pieces) - len(there)
+
+    def checkpoint(self, *, whole: bool = False) -> dict[str, np.ndarray]:
+        """What a window goes on from, as named arrays, between two blocks.
+
+        Parameters
+        ----------
+        whole : bool
+            With moments and samples, megabytes; otherwise the same samples have to be taken again with `recall`.
+
+        Raises
+        ------
+        ValueError
+            If the window is not one that is remembered.
+        """
+        if not self._remembered:
+            raise ValueError("the window takes no digests: it cannot be remembered")
+        if self._recall is not None:
+            return dict(self._recall.arrays)
+        pending = np.concatenate(self._pending) if self._pending else np.empty((0, self.plan.width))
+        block_ns = self._blocks[0][0] if self._blocks else 0
+        start_ns = self._pending_start_ns if pending.size else 0  # that of what a gap has taken away is of no use
+        last = Piece(start_ns, block_ns, self._row, pending.shape[0], digest_of(pending))
+        found: dict[str, np.ndarray] = {
+            "level": np.array([] if self._level is None else self._level, dtype=np.float64),
+            **pieces_of((*self._pieces, last)),
+        }
+        if whole:
+            found |= {"pending": pending, "pending_blocks": np.array(self._blocks, dtype=np.int64).reshape(-1, 2)}
+            for number, hop in enumerate(self._hops):
+                found |= prefixed(f"hop_{number}", hop.checkpoint())
+        return found
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called; without moments the window `lacks` its samples until they are recalled.
+
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form, a hop is missing, or it does not fit the plan; nothing is
+            changed then.
+        """
+        level = checked(arrays, "level", np.float64, (None,))
+        if level.size not in (0, len(self.plan.states)):
+            raise CheckpointError(f"level has {level.size} values, expected {len(self.plan.states)} or none")
+        recall = Recall(self.plan, level, arrays)
+        if recall.pieces and level.size != len(self.plan.states):
+            raise CheckpointError(
+                f"level has no values, expected {len(self.plan.states)} for {len(recall.pieces)} hops"
+            )
+        if "pending" in arrays:
+            pending = checked(arrays, "pending", np.float64, (recall.last.rows, self.plan.width))
+            blocks = checked(arrays, "pending_blocks", np.int64, (None, 2))
+            ring = [HopMoments.restored(unprefixed(f"hop_{number}", arrays)) for number in range(len(recall.pieces))]
+            for hop in ring:
+                self._check_fits(hop)
+            self._hops, self._pieces = deque(ring, self.plan.hops), deque(recall.pieces, self.plan.hops)
+            self._pending, self._pending_samples = ([pending] if pending.size else []), pending.shape[0]
+            self._pending_start_ns = recall.last.start_ns
+            self._blocks, self._row = deque((start, rows) for start, rows in blocks.tolist()), recall.last.row
+        elif recall.pieces or recall.last.rows:
+            self._recall = recall
+        self._level = level if level.size else None
+
+    def _check_fits(self, hop: HopMoments) -> None:
+        """Raise CheckpointError for a hop of other channels, lags or frequencies."""
+        plan = self.plan
+        n = len(plan.states) + (1 if plan.angle_column is None and plan.speed_rad_s is None else 3)
+        products, segments = (plan.lags.size, n, n), (plan.hop // (plan.segment // 2), plan.bins.size, n)
+        if hop.products.shape != products or hop.segments.shape != segments:
+            raise CheckpointError(
+                f"the hop of start_ns {hop.start_ns} has moments of shape {hop.products.shape} and "
+                f"{hop.segments.shape}, expected {products} and {segments}: it is that of other channels or settings"
+            )
+
+    def levels(self, *, errors: bool = True) -> WindowLevels | None:
+        """Levels of the hops that are there, however few; None without any."""
+        return levels_of(self.plan, tuple(self._hops), errors=errors) if self._hops else None
+
+    def statistics(self, hops: int | None = None) -> WindowStatistics | None:
+        """Statistics of the window, or of its latest hops, or None while there are not so many.
+
+        Parameters
+        ----------
+        hops : int, optional
+            How many of the latest hops, with correlations at lag zero alone; all hops of a full window without it.
+        """
+        count = self.plan.hops if hops is None else hops
+        if not 0 < count <= len(self._hops):
+            return None
+        return window_statistics(self.plan, tuple(self._hops)[-count:], lagged=hops is None)
