@@ -1,5 +1,6 @@
 """What the commands share: exit codes, one thread for linear algebra, common options."""
 
+import errno
 import math
 import os
 import resource
@@ -137,6 +138,11 @@ def exit_codes() -> Iterator[None]:
     except RotorwatchError as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(1) from error
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        typer.echo(f"{error.filename}: {error.strerror}", err=True)
+        raise typer.Exit(2) from error
     except (MemoryError, RuntimeError) as error:
         limit, _ = resource.getrlimit(resource.RLIMIT_AS)
         if limit == resource.RLIM_INFINITY or (isinstance(error, RuntimeError) and _NO_THREAD not in str(error)):

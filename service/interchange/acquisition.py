@@ -44,8 +44,7 @@ class TdmsSource(Source):
         found: Timing | None = None
         for reference in columns:
             properties = self._column(reference).properties
-            increment_s = float(properties.get("wf_increment") or 0.0)
-            timing = Timing(1 / increment_s if increment_s > 0 else None, _tdms_start_ns(properties))
+            timing = Timing(_tdms_rate_hz(properties), _tdms_start_ns(properties))
             if found is not None and timing != found:
                 raise SourceError(
                     f"{self.path}: channel {reference} starts or is sampled otherwise than {columns[0]}: {timing} "
@@ -69,12 +68,25 @@ class TdmsSource(Source):
         return len(channel), lambda rows: channel.read_data(rows.start, rows.stop - rows.start)
 
 
+def _tdms_rate_hz(properties: Any) -> float | None:
+    """Rate of a waveform; a text that is no number says nothing, and the mapping has to."""
+    try:
+        increment_s = float(properties.get("wf_increment") or 0.0)
+    except (TypeError, ValueError):
+        return None
+    return 1 / increment_s if increment_s > 0 else None
+
+
 def _tdms_start_ns(properties: Any) -> int | None:
+    """Start of a waveform; the same of a text that is no ISO 8601 time."""
     start = properties.get("wf_start_time")
     if start is None:
         return None
-    offset_ns = round(float(properties.get("wf_start_offset") or 0.0) * 1e9)
-    return int(np.datetime64(start, "ns").astype(np.int64)) + offset_ns
+    try:
+        offset_ns = round(float(properties.get("wf_start_offset") or 0.0) * 1e9)
+        return int(np.datetime64(start, "ns").astype(np.int64)) + offset_ns
+    except (TypeError, ValueError):
+        return None
 
 
 class MdfSource(Source):
@@ -172,6 +184,12 @@ class UniversalSource(Source):
             read = file.read_sets(numbers) if numbers else []
         sets: list[dict[str, Any]] = [read] if isinstance(read, dict) else list(read)
         sets = [found for found in sets if found["func_type"] == _TIME_RESPONSE]
+        for found in sets:
+            if len(found["data"]) != found["num_pts"]:
+                raise SourceError(
+                    f"{path}: is cut: {len(found['data'])} samples of {str(found['id1']).strip()} are there, expected "
+                    f"the {found['num_pts']} that its header says"
+                )
         if not sets:
             raise SourceError(f"{path}: holds no time response (data set 58 with function type 1)")
         titles = [str(found["id1"]).strip() for found in sets]

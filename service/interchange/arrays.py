@@ -45,7 +45,8 @@ class _Arrays(Source):
 
     def _rows(self, reference: Reference) -> tuple[int, Callable[[slice], Any]]:
         array = self._column(Reference(reference.column))
-        return max(array.shape), columns_of(self.path, array, reference)
+        read = columns_of(self.path, array, reference)
+        return max(array.shape), read
 
 
 class NumpySource(_Arrays):
@@ -55,9 +56,10 @@ class NumpySource(_Arrays):
 
     def __init__(self, path: Path) -> None:
         with readable(path, self.kind):
-            with np.load(path, allow_pickle=False) as archive:
-                if not isinstance(archive, np.lib.npyio.NpzFile):
-                    raise SourceError(f"{path}: a single array, expected an archive of named arrays (.npz)")
+            archive = np.load(path, allow_pickle=False)
+            if not isinstance(archive, np.lib.npyio.NpzFile):
+                raise SourceError(f"{path}: a single array, expected an archive of named arrays (.npz)")
+            with archive:
                 arrays = {}
                 for name in archive.files:
                     try:
@@ -124,7 +126,7 @@ class WavSource(_Arrays):
             except ValueError:  # 24 bits cannot be mapped
                 rate, samples = wavfile.read(path)
         table = samples[:, None] if samples.ndim == 1 else samples
-        self._rate_hz = float(rate)
+        self._rate_hz = float(rate) or None  # 0 says nothing
         super().__init__(path, {str(number + 1): table[:, number] for number in range(table.shape[1])})
 
     def _check_whole(self, path: Path) -> None:

@@ -69,6 +69,8 @@ def import_file(
         If the recording cannot be written.
     """
     files = snapshot_files(path, mapping, machine) if path.is_dir() else (SnapshotFile(path, None),)
+    if any(recording.exists() and file.path.exists() and recording.samefile(file.path) for file in files):
+        raise SourceError(f"{recording}: is what is imported, expected another name for the recording")
     with open_source(files[0].path, mapping) as source:
         signals = signals_of(source, mapping, machine)
         columns = [signal.reference for signal in signals]

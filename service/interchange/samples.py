@@ -23,6 +23,7 @@ class Signal:
     offset: float
     integrations: int  # how often it is integrated: 0, or 1 or 2 for an accelerometer
     is_angle: bool  # whether it runs in circles
+    largest: float = float(np.finfo(np.float64).max)  # what the samples of the machine can hold
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +81,7 @@ def signals_of(source: Source, mapping: Mapping, machine: MachineFile) -> list[S
                 column.sign * column.offset * si,
                 (1 if channel.quantity is Quantity.VELOCITY else 2) if integrated else 0,
                 channel.quantity is Quantity.SHAFT_ANGLE,
+                float(np.finfo(machine.dtype).max),
             )
         )
     return found
@@ -117,6 +119,7 @@ class _Splitter:
         self._clock, self._base, self._signals, self._read = clock, mapping.time, signals, read
         self._step_ns = 1e9 / clock.rate_hz
         self._angles = [number for number, signal in enumerate(signals) if signal.is_angle]
+        self._largest = np.array([signal.largest for signal in signals])
         self._last: Piece | None = None
 
     def cut(self, entries: Array | None, samples: FloatArray) -> Iterator[Piece]:
@@ -126,7 +129,7 @@ class _Splitter:
         self._read.rows += samples.shape[0]
         rows = np.arange(first_row, self._read.rows)
         self._check_times(time_ns, entries, first_row)
-        finite = np.isfinite(samples).all(axis=1)
+        finite = (np.abs(samples) <= self._largest).all(axis=1)
         if not finite.all():
             self._judge_missing(samples, first_row)
             self._read.left_out += int(np.count_nonzero(~finite))
@@ -156,10 +159,11 @@ class _Splitter:
     def _judge_missing(self, samples: FloatArray, first_row: int) -> None:
         if self._base.not_finite == "gap":
             return
-        row, number = (int(where) for where in np.argwhere(~np.isfinite(samples))[0])
+        row, number = (int(where) for where in np.argwhere(~(np.abs(samples) <= self._largest))[0])
+        most = f" up to {self._largest[number]:.3g}" if np.isfinite(samples[row, number]) else ""
         raise SourceError(
             f"{self._clock.path}: row {first_row + row + 1}, column {self._signals[number].reference}: found "
-            f'{samples[row, number]}, expected a finite number (time.not_finite = "gap" leaves such rows out)'
+            f'{samples[row, number]}, expected a finite number{most} (time.not_finite = "gap" leaves such rows out)'
         )
 
     def _steps(self, time_ns: FloatArray, rows: npt.NDArray[np.intp]) -> npt.NDArray[np.int64]:

@@ -60,20 +60,20 @@ class CsvSource(_Table):
         try:
             with readable(path, self.kind), self._reader(path, None) as reader:
                 schema = reader.schema
+                labels = list(schema.names)
         except SourceError as error:
-            if not isinstance(error.__cause__, pa.ArrowInvalid) or not path.stat().st_size:
+            if not isinstance(error.__cause__, pa.ArrowInvalid | UnicodeError) or not path.stat().st_size:
                 raise
             raise SourceError(
-                f"{error}; taken with {form.delimiter!r} between cells and {form.skip_lines} lines before the table: "
-                "[csv] in the mapping says otherwise, with delimiter, decimal, header and skip_lines"
+                f"{error}; taken as {form.encoding} with {form.delimiter!r} between cells and {form.skip_lines} lines "
+                "before the table: [csv] in the mapping says otherwise, with encoding, delimiter, decimal, header and "
+                "skip_lines"
             ) from error
-        names = list(schema.names)
-        label = "" if time_column is None else self._label(time_column)
-        if not datetimes and label in names and schema.field(names.index(label)).type == pa.int64():
+        names = [label.strip() if form.header else str(number + 1) for number, label in enumerate(labels)]
+        if not datetimes and time_column in names and schema.field(names.index(time_column)).type == pa.int64():
             self._time_type = pa.int64()
-        if not form.header:
-            names = [str(number + 1) for number in range(len(names))]
-        super().__init__(path, [name.strip() for name in names])
+        self._labels: dict[str, str] = dict(zip(names, labels, strict=True))
+        super().__init__(path, names)
 
     def unit(self, column: Reference) -> str:
         """Unit in brackets at the end of a column's name, as in ``y1 [um]``."""
@@ -123,8 +123,8 @@ class CsvSource(_Table):
         return _array(_utc(column) if self._is_datetime(name) else column)
 
     def _label(self, name: str) -> str:
-        """Arrow's own name of a column; columns without names are numbered from 1."""
-        return name if self._form.header else f"f{int(name) - 1 if name.isdecimal() else name}"
+        """Arrow's own name of a column: with the blanks around it, or a number if there is no header."""
+        return self._labels[name]
 
     def _fault(self, wanted: list[str]) -> str:
         """Find the cell that is no number."""
@@ -155,7 +155,8 @@ class CsvSource(_Table):
             if self._is_datetime(name):
                 _utc(pa.array([cell]))
             else:
-                float(cell.strip().replace(self._form.decimal, "."))
+                whole, *parts = cell.strip().split(self._form.decimal)
+                float(".".join([whole.replace(".", "x"), *parts]))  # a point in another place makes it no number
         except (ValueError, pa.ArrowInvalid):
             return False
         return True

@@ -279,6 +279,17 @@ def test_a_data_set_that_is_cut_off_is_missing_not_without_a_unit(tmp_path: Path
         imported(tmp_path, tmp_path / "run.uff", f'[time]\nstart = "{START}"\n' + without_units(CHANNELS))
 
 
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # pyuff's own
+def test_a_data_set_with_fewer_samples_than_its_header_says_is_refused(tmp_path: Path) -> None:
+    t, x, v, a = signals(1000)
+    write_uff(tmp_path / "run.uff", {"t": t, "x": x, "v": v, "a": a})
+    content = (tmp_path / "run.uff").read_bytes()
+    assert content.count(b"         4      1000") == 3
+    (tmp_path / "run.uff").write_bytes(content.replace(b"         4      1000", b"         4      1200"))
+    with pytest.raises(SourceError, match=r"run.uff: is cut: 1000 samples of x are there, expected the 1200"):
+        imported(tmp_path, tmp_path / "run.uff", f'[time]\nstart = "{START}"\n' + without_units(CHANNELS))
+
+
 @pytest.mark.parametrize("suffix", ["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"])
 def test_a_file_that_is_none_of_its_kind_is_named(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"broken.{suffix}"

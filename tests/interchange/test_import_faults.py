@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import nptdms
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
@@ -14,7 +15,7 @@ from models.machine import load_machine_file
 from models.signals.block import integrated, lowest_valid_hz, settling_s
 from models.signals.channels import unit_factor
 from service.interchange.importing import summary_lines
-from tests.interchange.material import CHANNELS, START, START_NS, imported, signals, stretches
+from tests.interchange.material import CHANNELS, START, START_NS, imported, machine, signals, stretches
 from tests.service.rig.preloaded import rotorwatch as run
 
 TIME = f'[time]\ncolumn = "t"\nstart = "{START}"\n'
@@ -67,7 +68,7 @@ def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
         ([*GOOD[:500], "0.25,1.0", *GOOD[501:]], TEXT, HEADER, ("run.csv: ", "Expected 4 columns, got 2")),
         ([row.replace(",", ";").replace(".", ",") for row in GOOD], TEXT, "t;x;v;a", (
             "run.csv: damaged, or no CSV file",
-            "taken with ',' between cells and 0 lines before the table: [csv] in the mapping says otherwise",
+            "taken as utf-8 with ',' between cells and 0 lines before the table: [csv] in the mapping says otherwise",
         )),
         ([*GOOD[:600], GOOD[601], GOOD[600], *GOOD[602:]], TEXT, HEADER, (
             "row 602, column t: goes back by 0.0005 s",
@@ -180,6 +181,83 @@ def test_an_index_outside_the_table_is_named(tmp_path: Path) -> None:
     mapping = mapping.replace('"v"', '"x", index = 1').replace('"a"', '"x", index = 2')
     with pytest.raises(MachineFileError, match=r"x has 3 columns of 1000 samples, expected index = 0 to 2 \(found 3\)"):
         imported(tmp_path, tmp_path / "run.npz", mapping)
+
+
+def test_blanks_around_the_names_of_a_csv_file_are_none_of_the_names(tmp_path: Path) -> None:
+    done, _ = imported(tmp_path, table(tmp_path / "run.csv", GOOD, "t, x, v , a"), TEXT)
+    assert done.written.samples == 1000
+
+
+def test_a_header_in_another_encoding_is_told_with_the_field_that_says_it(tmp_path: Path) -> None:
+    source = tmp_path / "run.csv"
+    source.write_bytes("\n".join(["t,x,v,a,µ", *(f"{row},0" for row in GOOD), ""]).encode("latin-1"))
+    with pytest.raises(MachineFileError, match=r"run.csv: .*taken as utf-8 .*\[csv\] in the mapping .* encoding"):
+        imported(tmp_path, source, TEXT)
+    done, _ = imported(tmp_path, source, '[csv]\nencoding = "latin-1"\n' + TEXT)
+    assert done.written.samples == 1000
+
+
+def test_a_point_where_the_decimal_sign_is_a_comma_is_named_with_its_cell(tmp_path: Path) -> None:
+    rows = [row.replace(",", ";").replace(".", ",") for row in GOOD]
+    rows[736] = rows[736].replace(",", ".")
+    text = fault(tmp_path, rows, '[csv]\ndelimiter = ";"\ndecimal = ","\n' + TEXT, "t;x;v;a")
+    assert "run.csv: row 737, column 't': found '0.368', expected a number" in text
+
+
+def test_a_number_that_the_samples_of_the_machine_cannot_hold_is_refused(tmp_path: Path) -> None:
+    source = table(tmp_path / "run.csv", with_cell("-1e39"))
+    with pytest.raises(MachineFileError, match=r"row 737, column v: found -1e\+39, .* up to 3.4e\+38"):
+        imported(tmp_path, source, TEXT, machine(dtype="float32"))
+    done, _ = imported(tmp_path, source, TEXT)
+    assert done.written.samples == 1000
+
+
+def test_a_wav_file_whose_header_has_no_rate_asks_for_it(tmp_path: Path) -> None:
+    source = tmp_path / "run.wav"
+    wavfile.write(source, 2000, np.zeros((1000, 3), dtype=np.float32))
+    source.write_bytes(source.read_bytes()[:24] + bytes(4) + source.read_bytes()[28:])
+    mapping = f'[time]\nstart = "{START}"\n' + IN_ORDER
+    with pytest.raises(MachineFileError, match=r"nothing tells the rate; give time.column or time.rate_hz"):
+        imported(tmp_path, source, mapping)
+    done, _ = imported(tmp_path, source, mapping.replace("[time]", "[time]\nrate_hz = 2000.0"))
+    assert done.written.samples == 1000
+
+
+def test_texts_of_a_tdms_file_that_are_no_rate_and_no_time_are_left_to_the_mapping(tmp_path: Path) -> None:
+    source = tmp_path / "run.tdms"
+    told = {"wf_increment": "0,0005", "wf_start_time": "31.01.2026 12:00"}
+    with nptdms.TdmsWriter(source) as writer:
+        writer.write_segment(
+            [
+                nptdms.ChannelObject("run", name, column, properties=told)
+                for name, column in zip("xva", signals(1000)[1:], strict=True)
+            ]
+        )
+    with pytest.raises(MachineFileError, match=r"nothing tells the rate"):
+        imported(tmp_path, source, CHANNELS)
+    with pytest.raises(MachineFileError, match=r"give time.start in the mapping"):
+        imported(tmp_path, source, f"[time]\nrate_hz = 2000.0\n{CHANNELS}")
+    done, _ = imported(tmp_path, source, f'[time]\nrate_hz = 2000.0\nstart = "{START}"\n{CHANNELS}')
+    assert done.written.samples == 1000
+
+
+def test_a_single_number_is_no_channel_and_a_single_array_no_archive(tmp_path: Path) -> None:
+    mapping = f'[time]\nrate_hz = 2000.0\nstart = "{START}"\n' + CHANNELS
+    np.savez(tmp_path / "run.npz", x=3.0, v=np.zeros(1000), a=np.zeros(1000))
+    with pytest.raises(MachineFileError, match=r"run.npz: x has shape \(\), expected one column"):
+        imported(tmp_path, tmp_path / "run.npz", mapping)
+    with (tmp_path / "run.npz").open("wb") as file:
+        np.save(file, np.zeros((1000, 3)))
+    with pytest.raises(MachineFileError, match="a single array, expected an archive of named arrays"):
+        imported(tmp_path, tmp_path / "run.npz", mapping)
+
+
+def test_measurements_are_not_overwritten_by_their_own_recording(tmp_path: Path) -> None:
+    source = table(tmp_path / "imported.mcap", GOOD)
+    before = source.read_bytes()
+    with pytest.raises(MachineFileError, match=r"imported.mcap: is what is imported, expected another name"):
+        imported(tmp_path, source, 'format = "csv"\n' + TEXT)
+    assert source.read_bytes() == before
 
 
 ROOT = Path(__file__).parents[2]
