@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import date
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar, cast, get_args
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -234,6 +234,24 @@ def expectation(fault: ErrorDetails, info: FieldInfo | None = None) -> str:
         described = "" if info is None or info.description is None else f": {info.description}"
         wanted += described if kind.startswith(("tuple", "list")) else ""
     return f"expected {wanted}{_shown(fault)}{hint}"
+
+
+def plainly(fault: Mapping[str, Any]) -> str:
+    """What is wrong with an argument, a field of a body or of a message; its name goes before it.
+
+    Parameters
+    ----------
+    fault : mapping
+        One of `ValidationError.errors`, or an own one that has nothing but its place and ``msg``.
+    """
+    kind = fault.get("type", "value_error")
+    if kind in {"missing", "extra_forbidden"}:
+        return "missing" if kind == "missing" else "unknown"
+    if kind in {"value_error", "assertion_error"}:
+        return str(fault["msg"]).removeprefix("Value error, ")
+    if kind.startswith(("model", "dict")):
+        return "expected an object, {...}"
+    return expectation(cast("ErrorDetails", fault))
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

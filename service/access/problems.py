@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from models.mistakes import plainly
 from rotorwatch.records.example import example
 from rotorwatch.records.monitor import Problem
 from service.history.records import StoreError
@@ -37,7 +38,7 @@ _DETAILS = {
     409: "k_by is acknowledged (version 18), not as it was seen (version 17): look again",
     413: "the request body is too large, expected at most 1000000 bytes",
     415: "content type is text/plain, expected application/json",
-    422: "limit: Input should be less than or equal to 1000",
+    422: "limit: expected at most 1000 (found '5000')",
     428: "say how you saw the alarm: header If-Match with its ETag, or expected_state in the body",
     429: "more than 600 requests in a minute; try again in 3 s",
     500: "an error inside the service; its log says more",
@@ -136,7 +137,7 @@ def add_problems(app: FastAPI) -> None:
     async def on_invalid(request: Request, error: Exception) -> JSONResponse:
         if not isinstance(error, RequestValidationError):
             raise error
-        faults = [{"field": _field(fault["loc"]), "message": str(fault["msg"])} for fault in error.errors()]
+        faults = [{"field": _field(fault["loc"]), "message": plainly(fault)} for fault in error.errors()]
         detail = "; ".join(f"{fault['field']}: {fault['message']}" for fault in faults)
         return problem_answer(request, 422, detail, {"errors": faults})
 

@@ -3,6 +3,7 @@
 from pydantic import ValidationError
 
 from models.machine import MachineFile
+from models.mistakes import plainly
 from models.signals.channels import ChannelDescriptor
 
 MOST_BYTES = 65_536
@@ -39,9 +40,9 @@ def _differences(announced: bytes, machine: MachineFile) -> list[str]:
     try:
         found = ChannelDescriptor.model_validate_json(announced)
     except ValidationError as error:
-        faults = error.errors(include_url=False, include_context=False, include_input=False)
-        said = (f"{'.'.join(map(str, fault['loc'])) or 'descriptor'}: {fault['msg']}" for fault in faults)
-        return [f"descriptor cannot be read: {one[: 2 * _LONGEST]}" for one in said]
+        said = ((".".join(map(str, fault["loc"])), plainly(fault)) for fault in error.errors(include_url=False))
+        texts = [f"{place}: {text}" if place else text for place, text in said]
+        return [f"descriptor cannot be read: {text[: 2 * _LONGEST]}" for text in texts]
     expected = machine.descriptor
     differences = [
         f"{field} is {_shown(getattr(found, field))}, expected {getattr(expected, field)!r}"

@@ -57,7 +57,7 @@ _Before = Annotated[int | None, Query(ge=0, le=_LARGEST, description="`next_befo
 
 def _known_quantity(name: str) -> str:
     if name not in _QUANTITIES:
-        raise PydanticCustomError("enum", f"Input should be one of {', '.join(_QUANTITIES)}")
+        raise PydanticCustomError("enum", "expected {expected}", {"expected": ", ".join(_QUANTITIES)})
     return name
 
 

@@ -309,14 +309,14 @@ def test_what_matters_most_of_a_window(alarm: str, settled: bool, vibration: flo
 @pytest.mark.parametrize(
     ("query", "header", "status", "text"),
     [
-        ("?detail=all", "", 422, "detail: Input should be 'whole' or 'overview'"),
+        ("?detail=all", "", 422, "detail: expected one of whole, overview (found 'all')"),
         ("?machine=demo/pump", "", 404, "no machine demo/pump; there are: demo/lab, demo/heavy"),
         ("?last_event_id=17", "", 422, "Last-Event-ID: cursor: '17' is not site/machine=sequence"),
         ("?last_event_id=17", "demo/lab=0", 422, "Last-Event-ID: cursor: '17' is not site/machine=sequence"),
         ("", "demo/lab=1,demo/lab=2", 422, "Last-Event-ID: cursor: 'demo/lab=2' is not"),
         ("", "demo/lab=one", 422, "Last-Event-ID: cursor: 'demo/lab=one' is not"),
         ("", "demo/lab=1000000", 409, "Last-Event-ID: demo/lab=1000000, but the log of demo/lab ends at"),
-        ("?from=tomorrow", "", 422, "from: Input should be 'now' or 'beginning'"),
+        ("?from=tomorrow", "", 422, "from: expected one of now, beginning (found 'tomorrow')"),
     ],
 )
 def test_where_no_stream_can_begin_a_problem_says_why(

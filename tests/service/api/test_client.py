@@ -149,7 +149,7 @@ def test_snapshots(plant: Client) -> None:
         (lambda plant: plant.health("demo/pump"), NotFound, "no machine demo/pump; there are: demo/lab"),
         (lambda plant: plant.alarm(PLACE, "level:a.b"), NotFound, "no alarm level:a.b; there are: k_by"),
         (lambda plant: plant.alarm(PLACE, "k_bx"), NotFound, "no alarm k_bx; there are: k_by"),
-        (lambda plant: plant.detectable(PLACE, -2.0), RequestRefused, "change: Input should be greater than -1"),
+        (lambda plant: plant.detectable(PLACE, -2.0), RequestRefused, "change: expected above -1 (found '-2.0')"),
         (lambda plant: plant.health("demo/../../audit"), ClientError, "expected a machine as site/machine"),
         (lambda plant: plant.alarm(PLACE, "../health"), ClientError, "expected a name of letters"),
         (lambda plant: plant.health("lab"), ClientError, "expected a machine as site/machine"),

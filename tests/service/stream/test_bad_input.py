@@ -122,7 +122,7 @@ def test_refused_explained_and_carried_on(fed: tuple[Runtime, MachineWorker, Fee
         ({"dtype": "float64"}, "dtype is 'float64', expected 'float32'"),
         ({"machine": "pump"}, "machine is 'pump', expected 'lab'"),
         ({"channels": None}, "channels.2.unit (y1_dot) is 'm/s', expected 'mm/s'"),
-        ({"rate_hz": "fast"}, "descriptor cannot be read: rate_hz"),
+        ({"rate_hz": "fast"}, "descriptor cannot be read: rate_hz: expected a number (found 'fast')"),
     ],
 )
 def test_descriptor_that_differs_is_named(
