@@ -186,6 +186,10 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
                 broken += [f"{view}, {kind}: {one}" for one in violations(page)]
                 broken += [f"{view}: {one}" for one in unreached(page)] if kind == "light" else []
                 assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
+                if phone:  # nor is anything cut on a small one, or on a large one at 400 % zoom
+                    page.set_viewport_size({"width": 320, "height": 844})
+                    assert page.evaluate("document.documentElement.scrollWidth") == 320, view
+                    page.set_viewport_size({"width": 390, "height": 844})
                 ground = page.evaluate("getComputedStyle(document.documentElement).backgroundColor")
                 assert (int(re.findall(r"\d+", ground)[0]) < 80) is dark
     assert not broken, "\n".join(broken)
