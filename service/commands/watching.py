@@ -22,6 +22,7 @@ commands = typer.Typer()
 _ALARM, _NO_DATA, _NO_ANSWER = 1, 3, 4
 _SUMMARY = {0: "well", _ALARM: "alarm", _NO_DATA: "no-data", _NO_ANSWER: "no-answer"}
 _BAD_STATES = ("alert", "danger", "outside-model", "data-health", "no-data")
+_WIDEST, _FOLDED = 1000, 16
 _SILENT = ("shelved", "suppressed", "out-of-service")
 _STYLES = {
     "danger": "bold red",
@@ -148,7 +149,10 @@ def status(
         growth = None if health.report is None else health.report.level_growth
         remarks += [] if growth is None else [f"{place}: {growth.text}"]
         remarks += [f"{place}: {alarm.name} is {alarm.state}" for alarm in health.alarms if alarm.state in _SILENT]
-    Console(soft_wrap=True).print(table)
+    # Only names of machines are folded, to no less than a few characters: a line may be longer than the terminal's.
+    longest = max((len(f"{health.site}/{health.machine}") for health in healths), default=0)
+    least = Console(width=_WIDEST).measure(table).maximum - max(0, longest - _FOLDED)
+    Console(soft_wrap=True, width=max(Console().width, least)).print(table)
     for remark in remarks:
         typer.echo(remark)
     raise typer.Exit(code)

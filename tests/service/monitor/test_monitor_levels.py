@@ -237,6 +237,14 @@ def test_status_says_what_would_have_been_seen(monkeypatch: pytest.MonkeyPatch) 
     assert f"demo/lab: {growth.text}" in said
 
 
+def test_status_names_the_machines_in_a_narrow_terminal_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    health = Health.model_validate(example(Health)).model_copy(update={"site": "north", "machine": "feed-pump-7"})
+    monkeypatch.setattr(watching, "_fetch_healths", lambda *_: [health])
+    said = CliRunner().invoke(app, ["status"], env={"COLUMNS": "60"}).stdout
+    assert "│ north/feed-pump- │ alert │" in said
+    assert "│ 7                │       │" in said
+
+
 def held(stream: Iterator[SampleBlock], column: int, value: float) -> Iterator[SampleBlock]:
     """The stream with a channel that gives nothing but one value."""
     for block in stream:
