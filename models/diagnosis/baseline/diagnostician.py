@@ -22,8 +22,10 @@ from models.diagnosis.baseline.rows import Row, parameters_of
 from models.diagnosis.baseline.unbalance import (
     SPEED_TOLERANCE,
     ForceRow,
+    ForeignRotationError,
     SynchronousState,
     SynchronousVectors,
+    check_one_force,
     relative_force,
     rotation_of,
     slopes,
@@ -169,6 +171,7 @@ class BaselineDiagnostician:
         names = list(self._names)
         values, total, common = bearing.values, bearing.noise + bearing.common, bearing.common
         through = np.eye(values.size)  # from the bearing's changes to all
+        foreign = ""
         if "e" in self._parameters:
             names.append("e")
             reasons["e"] = ""
@@ -176,6 +179,7 @@ class BaselineDiagnostician:
                 e = self._unbalance(changes, bearing, window)
             except EstimationError as error:
                 reasons["e"] = str(error)
+                foreign = reasons["e"] if isinstance(error, ForeignRotationError) else ""
             else:
                 values = np.append(values, e.value)
                 total = _bordered(total, e.covariance, e.variance)
@@ -212,7 +216,7 @@ class BaselineDiagnostician:
             misfit_z=_misfit(changes),
         )
         # What is carried for another force makes no reading impossible.
-        impossible = _impossible(
+        impossible = foreign or _impossible(
             diagnosis, dict(zip(self._names, np.diag(bearing.noise + bearing.common), strict=True))
         )
         if impossible:
@@ -323,6 +327,7 @@ class BaselineDiagnostician:
         weight = np.linalg.inv(positive(spread - known))
         combine = np.linalg.solve(design.T @ weight @ design, design.T @ weight)
         vector = combine @ observed
+        check_one_force(observed, design @ vector, spread)
         size = math.hypot(1 + vector[0], vector[1])
         along = np.array([1 + vector[0], vector[1]]) / max(size, 1e-9) @ combine
         variance = float(along @ spread @ along)

@@ -89,3 +89,21 @@ def test_what_cannot_be_read_says_why() -> None:
     with pytest.raises(EstimationError, match="correlations reach"):
         learn_baseline([short])
     assert all(reading.reason for reading in monitor().diagnose(short).parameters)
+
+
+@pytest.mark.parametrize("plane", ["y", "z"])
+def test_a_rotation_that_no_unbalance_makes_names_nothing(plane: str) -> None:
+    """An unbalance is one force in both planes: a plane whose sensors are all reversed shows two."""
+    quiet = replace(OTHER, level_N=1.0)
+    reading = BaselineDiagnostician(learn_baseline(recorded(ROTOR, quiet, 1, 3)))
+    (window,) = recorded(ROTOR, quiet, 3)
+    q = sure(window.synchronous).copy()
+    assert not reading.diagnose(window).unexplained
+    q[[number for number, name in enumerate(window.states) if name.startswith(plane)]] *= -1
+    diagnosis = reading.diagnose(replace(window, synchronous=q))
+    assert "what turns with the shaft is not what an unbalance makes" in diagnosis.unexplained
+    reasons = {one.name: one.reason for one in diagnosis.parameters}
+    assert reasons["e"] == diagnosis.unexplained
+    for turned in (2.0, 0.5j, -1.0):  # another unbalance is one, wherever its heavy spot is
+        more = reading.diagnose(replace(window, synchronous=sure(window.synchronous) * turned))
+        assert not more.unexplained
