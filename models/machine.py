@@ -486,7 +486,7 @@ def load_machine_file(name_or_path: str | Path, changes: str = "") -> MachineFil
     found = checked(MachineFile, changed(read_toml(path), changes), path)
     if found.rotor is None or found.rotor.unknown or found.operation is None or found.condition is None:
         return found
-    return Machine.model_validate(found.model_dump())
+    return Machine.model_validate(found.model_dump() | {"operation": found.operation})  # and what it was given
 
 
 def _path(name_or_path: str | Path) -> Path:

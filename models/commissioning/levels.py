@@ -1,5 +1,7 @@
 """What each level of knowledge makes of healthy windows."""
 
+import cmath
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -56,6 +58,7 @@ from models.signals.channels import ACCELERATIONS
 Read = tuple[str, int, Diagnosis]  # recording, end of the window, and what was read in it
 Progress = Callable[[str, int, int], None]  # told what is being done, how much of it is done, and how much there is
 _TABLES = ("rotor", "operation", "condition")
+_SIZE = 0.05  # relative difference of the unbalance up to which it is the file's, at another angle
 _OPPOSITE = (
     "gyroscopic moments have the sense in which natural frequencies of forward whirl rise with the speed; "
     "in the other one, which is tried first, the machine file does not explain the recordings"
@@ -122,11 +125,27 @@ def _learn_full(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
     if check.verdict == "refused":
         check = check.model_copy(
             update={
-                "advice": "the file describes another machine than was recorded: correct it, or leave out of [rotor] "
+                "advice": _elsewhere(machine, [each for _, _, each in read])
+                or "the file describes another machine than was recorded: correct it, or leave out of [rotor] "
                 "what is not known for certain, so that it is identified"
             }
         )
     return Learned((check,), read, read, machine, gyroscopic=sense, notes=_integrated(pieces, machine))
+
+
+def _elsewhere(machine: Machine, read: Sequence[Diagnosis]) -> str:
+    """Advice where the heavy spot is as large as in the file and at another angle; empty where it is not so."""
+    vectors = [each.unbalance for each in read if each.unbalance is not None and not each.unbalance.foreign]
+    turned = [complex(one.real, one.imaginary) for one in vectors if one.turned and abs(one.magnitude_change) < _SIZE]
+    if 2 * len(turned) <= len(read):
+        return ""
+    phase_rad = machine.operation.unbalance_phase_rad
+    found_rad = math.remainder(phase_rad + cmath.phase(sum(turned)), 2 * math.pi)
+    return (
+        f"the unbalance is as large as in the file, but its heavy spot is {math.degrees(found_rad):z.0f}° from the "
+        f"phase reference, where the file has it at {math.degrees(phase_rad):z.0f}°: if nothing else differs, give "
+        f"unbalance_phase_rad = {found_rad:z.2f} in [operation]"
+    )
 
 
 NO_SUCH_ROTOR = (

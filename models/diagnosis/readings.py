@@ -36,6 +36,9 @@ def beyond(value: float, limit: float) -> tuple[str, str]:
 
 
 _SEEN = 3.0  # standard errors from which a vector has a direction
+# Standard errors, and part of the unbalance, by which the heavy spot must have moved to count as turned: angle sensors
+# and probes are not mounted better than to a few degrees.
+_TURNED, _LEAST_TURN = 6.0, 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +86,15 @@ class UnbalanceVector:
         if self.turned_deg is None:
             return None
         return math.degrees(self._error(-self.imaginary, self.real) / math.hypot(self.real, self.imaginary))
+
+    @property
+    def turned(self) -> bool:
+        """Whether the heavy spot is elsewhere."""
+        if self.turned_error_deg is None:  # so little is left that it has no direction
+            return False
+        size = math.hypot(self.real, self.imaginary)
+        turn = math.hypot(self.real - size, self.imaginary)
+        return turn > max(_TURNED * size * math.radians(self.turned_error_deg), _LEAST_TURN)
 
     @property
     def change(self) -> float:

@@ -139,7 +139,8 @@ class WindowEvaluator(ABC):
     """Whether stretches shorter than the window can be evaluated."""
 
     directed: bool = True
-    """Whether the directions of vectors say something: the shaft angle has not jumped since the monitor was set up."""
+    """Whether the directions of vectors say something: the shaft angle has not jumped since the monitor was set up, and
+    nothing has shown that the heavy spot is not where it was looked for without a word of the file."""
 
     by: str
     """Name of the diagnostician that decides."""
@@ -250,6 +251,9 @@ class KnownMachineEvaluator(WindowEvaluator):
         deciding = self._explained(window)
         if self._open:
             deciding = self._by_sense(window, deciding)
+        if self._elsewhere(deciding):
+            self.directed, window = False, replace(window, directed=False)
+            deciding = self._explained(window)
         short = {} if newest is None else self._newest(window, *newest, deciding)
         if not deciding.unexplained:
             self._explained_ns = window.end_ns
@@ -264,6 +268,16 @@ class KnownMachineEvaluator(WindowEvaluator):
             equations = diagnosis.equations or equations
             opinions.append(_opinion(deciding, beside(deciding, diagnosis)))
         return Evaluation(deciding, short, equations, tuple(opinions), speed)
+
+    def _elsewhere(self, first: Diagnosis) -> bool:
+        """Whether the first window that is explained shows the heavy spot where it was only supposed not to be.
+
+        Where the file does not say where it is, no turn of it can be told then: the unbalance is judged by its size.
+        """
+        told = self._commissioned or "unbalance_phase_rad" in self._given.operation.model_fields_set
+        if told or not self.directed or self._explained_ns is not None or first.unexplained or first.unbalance is None:
+            return False
+        return first.unbalance.turned and not first.unbalance.foreign
 
     def _explained(self, window: WindowStatistics) -> Diagnosis:
         try:

@@ -81,6 +81,15 @@ def test_where_no_motion_is_measured_levels_are_all_there_is_whatever_is_known(k
     assert "y1_dot: repeated the value 0.3 mm/s" in report.summary
 
 
+def test_a_heavy_spot_at_another_angle_than_in_the_file_is_refused_with_its_angle() -> None:
+    operation = LAB.operation.model_copy(update={"unbalance_phase_rad": 1.5})
+    elsewhere_now = LAB.model_copy(update={"operation": operation})
+    report = commissioned(elsewhere_now, healthy(LAB, 75.0, 4_910_011)).report
+    assert report.verdict == "refused"
+    assert "is 0° from the phase reference, where the file has it at 86°" in report.summary
+    assert "unbalance_phase_rad = " in report.summary
+
+
 @pytest.mark.slow
 def test_partial_knowledge_identifies_the_rotor_within_its_errors() -> None:
     made = made_at("partial")

@@ -20,9 +20,6 @@ from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray
 
-# Standard errors, and part of the unbalance, by which the heavy spot must have moved to count as turned: angle sensors
-# and probes are not mounted better than to a few degrees.
-_TURNED, _LEAST_TURN = 6.0, 0.05
 _GAIN = 0.15  # relative error of every motion: what sensors, and a rotor that is not quite that of the model, make
 _RATE = 1e-6  # probability that vectors of an unbalance are taken for those of something else
 
@@ -57,11 +54,7 @@ class UnbalanceRatios:
         variances = float(self.variances[1]), self.between, float(self.variances[2])
         vector = UnbalanceVector(real, imaginary, *variances, self.foreign)
         size = math.hypot(real, imaginary)
-        turn = math.hypot(real - size, imaginary)
-        if vector.turned_error_deg is None:  # so little is left that it has no direction
-            turned = False
-        else:
-            turned = turn > max(_TURNED * size * math.radians(vector.turned_error_deg), _LEAST_TURN)
+        turn, turned = math.hypot(real - size, imaginary), vector.turned
         if directed and not turned and known > 0:
             return Unbalance(known - 1, float(self.variances[0]), self.covariance[0], vector, self.weights)
         if directed and turned and turn > abs(size - 1):

@@ -1,0 +1,65 @@
+"""A heavy spot that is not where a machine file without its angle has it looked for."""
+
+import math
+from functools import cache
+
+import pytest
+
+from models.commissioning.commissioned import Installed
+from models.machine import Machine, load_machine, load_machine_file
+from models.signals.block import SampleBlock
+from rotorwatch.records.windows import Parameter
+from service.monitor.monitor import MachineMonitor
+from simulator.scenario import Event, load_scenario
+from simulator.stream import blocks
+from tests.service.monitor.test_monitor import feed
+
+LAB = load_machine("lab")
+SEED = 4_910_001
+
+
+def with_heavy_spot(phase_rad: float) -> Machine:
+    operation = LAB.operation.model_copy(update={"unbalance_phase_rad": phase_rad})
+    return LAB.model_copy(update={"operation": operation})
+
+
+@cache
+def stream(duration_s: float, phase_rad: float, *events: Event) -> tuple[SampleBlock, ...]:
+    scenario, _ = load_scenario("healthy")
+    scenario = scenario.overridden(duration_s=duration_s, seed=SEED, faults=events)
+    return tuple(block for block, _ in blocks(scenario, with_heavy_spot(phase_rad)))
+
+
+def e_of(parameters: tuple[Parameter, ...]) -> float:
+    (found,) = (one.relative_change for one in parameters if one.name == "e")
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("phase_rad", [0.15, 2.5])
+def test_where_the_file_does_not_say_where_the_heavy_spot_is_its_angle_is_no_unbalance(phase_rad: float) -> None:
+    larger = Event(at_s=80.0, parameter="e", relative_change=0.5)
+    going, parts = MachineMonitor(Installed(LAB)), stream(130.0, phase_rad, larger)
+    windows, events = feed(going, parts[:750])
+    assert not events
+    assert abs(e_of(windows[-1].parameters)) < 0.05
+    state, restored = going.state(whole=True), MachineMonitor(Installed(LAB))
+    restored.restore(state.state, [part for _, part in state.new_parts])
+    windows, events = feed(restored, parts[750:])
+    assert [event.alarm.name for event in events if event.kind == "raised"] == ["e"]
+    assert e_of(windows[-1].parameters) == pytest.approx(0.5, abs=0.1)
+
+
+def test_where_the_file_says_it_another_angle_is_a_change() -> None:
+    windows, events = feed(MachineMonitor(Installed(with_heavy_spot(0.0))), stream(75.0, 2.5))
+    assert [event.alarm.name for event in events] == ["e"]
+    assert e_of(windows[-1].parameters) == pytest.approx(2 * math.sin(2.5 / 2), abs=0.1)
+
+
+def test_loading_a_file_keeps_whether_it_says_it() -> None:
+    given = "unbalance_phase_rad"
+    assert given not in LAB.operation.model_fields_set
+    assert given not in load_machine_file("lab").operation.model_fields_set  # type: ignore[union-attr]
+    said = load_machine_file("lab", "[operation]\nspeed_rpm = 1320.0\nunbalance_phase_rad = 0.0\n")
+    assert isinstance(said, Machine)
+    assert given in said.operation.model_fields_set
