@@ -52,7 +52,7 @@ class Goodness:
     @property
     def misfit_z(self) -> float:
         """All tests in one number, standard normal (one-sided) where the model holds: the worst, Šidák-corrected."""
-        worst = max(-log_ndtr(-self.excess_z), *(-_two_sided(one.z) for one in self.alternatives))
+        worst = max([-log_ndtr(-self.excess_z), *(-_two_sided(one.z) for one in self.alternatives)])
         tests = self.tests
         log_p = np.log(-np.expm1(tests * np.log1p(-np.exp(-worst)))) if worst < 30 else np.log(tests) - worst
         return -float(ndtri(np.exp(max(log_p, -700.0))))

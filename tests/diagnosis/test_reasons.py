@@ -168,3 +168,7 @@ def test_a_suspect_that_cannot_be_is_none() -> None:
     assert suspect("shaft stiffer in y than in z", 1.2) == ""
     assert suspect("shaft stiffer in y than in z", -0.0003) == ""  # as true as that no machine is built
     assert suspect("mass of the disc", 0.07, z=4.0) == "gain of y1 (+10.0%)"
+
+
+def test_a_misfit_of_which_nothing_could_be_tried_is_that_of_the_spectra() -> None:
+    assert Goodness(4.5, (), 1).misfit_z == pytest.approx(4.5)

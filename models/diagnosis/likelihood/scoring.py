@@ -24,6 +24,9 @@ _LOOKS, _SAME_STRENGTH = 3, 0.5
 # The same for the low-pass: its logarithms have standard deviations of 1 and 0.3. A model without shapes of its own
 # keeps the order: on coarse groups a filter of order nought would pass for anything.
 _CUTOFF, _ORDER, _FIXED = 1.0, 10.0, 1e4
+# Stiffness and damping of a bearing in each plane, y and z, among what is diagnosed; and the same for those of a plane
+# without a sensor: their logarithms have a standard deviation of 0.3.
+_OF_PLANES, _UNSHOWN = (slice(0, 2), slice(2, 4)), 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +84,9 @@ class Weights:
         self.averages: FloatArray = AVERAGES_PER_BIN * n_segments * model.groups.bins
         self.ridge = np.full(model.size, _WEAK)
         self.ridge[: model.cutoff_at] = 0.0  # what is diagnosed is pulled nowhere
+        for plane, own in enumerate(_OF_PLANES):  # but for what no sensor shows, which would be anywhere
+            if not np.any(model.motions.dofs // 3 == plane):
+                self.ridge[own] = _UNSHOWN
         self.ridge[model.colour_at] = _COLOUR
         self.strength = float(_STRENGTHS[0]) if strength is None else strength
         self.ridge[model.shape_at] = self.strength

@@ -266,3 +266,15 @@ def test_the_bound_falls_with_the_root_of_time_and_rises_with_what_is_unknown() 
     for name in (*STRUCTURAL, "e"):
         assert short[name] == pytest.approx(2 * long[name], rel=1e-3)
         assert short[name] * 0.999 < unknown[name] < 2 * short[name]
+
+
+@pytest.mark.parametrize("state", ["y1", "y2"])
+def test_one_sensor_is_enough_and_what_it_does_not_show_is_no_misfit(state: str) -> None:
+    lab = load_machine("lab")
+    (sensor,) = (one for one in lab.sensors if one.name == state)
+    lone = lab.model_copy(update={"sensors": (sensor, lab.sensors[-1])})
+    for number in range(4):
+        window = simulate_window(Draw(lone, SEED, Purpose.EVALUATION, 0, layout=Layout.INDEPENDENT), number)
+        diagnosis = LikelihoodFit(lone).diagnose(window)
+        assert not diagnosis.unexplained
+        assert np.isfinite(sure(diagnosis.misfit_z))
