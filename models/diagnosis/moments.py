@@ -433,7 +433,7 @@ def hop_coefficients(plan: Plan, hops: tuple[HopMoments, ...], rotation: Rotatio
     beta = np.zeros((len(hops), n, 3))
     beta[:, :, 0] = mean
     for number, hop in enumerate(hops):
-        if np.isfinite(rotation.hop_speed_rad_s[number]):
+        if np.isfinite(rotation.hop_speed_rad_s[number]) and turns(hop):
             zero_lag = hop.products[0]
             of_x = zero_lag[n + 1 :, :n] - np.outer(zero_lag[n + 1 :, n], mean)
             beta[number, :, 1:] = np.linalg.lstsq(zero_lag[n + 1 :, n + 1 :], of_x, rcond=None)[0].T
@@ -453,6 +453,11 @@ def _between(hops: tuple[HopMoments, ...], beta: FloatArray, number: int, part: 
         if 0 <= neighbour < len(hops) and _adjoin(hops[min(number, neighbour)], hops[max(number, neighbour)]):
             return np.asarray(beta[number] + part * (neighbour - number) * (beta[neighbour] - beta[number]))
     return np.asarray(beta[number])
+
+
+def turns(hop: HopMoments) -> bool:
+    """Whether the shaft turned once: the rotation is not to be told from slow motion otherwise. True if unknown."""
+    return not abs(hop.turned_rad) < 2 * np.pi
 
 
 def angle_jumps(hops: tuple[HopMoments, ...]) -> FloatArray:

@@ -18,6 +18,7 @@ from models.diagnosis.moments import (
     relative_vectors,
     rotation_of,
     through,
+    turns,
 )
 from models.diagnosis.stationarity import segment_levels, summed
 from models.levels.measures import WindowLevels, window_levels
@@ -46,7 +47,7 @@ class WindowStatistics:
     spectrum: ComplexArray  # (n_bins, n, n), Hermitian cross-spectral matrices of the same part, two-sided, SI²/Hz
     frequencies_hz: FloatArray  # (n_bins,), their frequencies
     synchronous: ComplexArray | None  # (n,), q of x_n = Re{q e^{jθ}} over the window; None without a phase reference
-    hop_synchronous: ComplexArray | None  # (n_hops, n), the same of every hop alone
+    hop_synchronous: ComplexArray | None  # (n_hops, n), the same of every hop alone; 0 without a whole turn
     # (n_hops, n): where the speed is estimated: the same of every hop, from an angle at which one state is
     # largest. Lengths and angles between channels hold, the angle to the shaft is unknown; zero in hops without a
     # speed.
@@ -132,7 +133,8 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         if plan.angle_column is not None:
             synchronous = _synchronous(beta)
     if plan.angle_column is not None:
-        hop_synchronous = _synchronous(regression(products[:, 0], n))
+        turned = np.array([turns(hop) for hop in hops])[:, np.newaxis]
+        hop_synchronous = np.where(turned, _synchronous(regression(products[:, 0], n)), 0)
     by_bin = np.ascontiguousarray(cleaned.transpose(1, 0, 2), dtype=np.complex128)
     spectrum = summed(by_bin)
     if synchronous is not None and phase_kept is None:

@@ -163,7 +163,7 @@ class LikelihoodFit:
         """
         window = integrated(window)
         speed = self._speed(window)
-        excluded = _near_rotation(window.frequencies_hz, speed)
+        excluded = _near_rotation(window, speed)
         power = self._checked_power(window, ~excluded)
         no_maximum = f"{self._machine.name}: the likelihood has no maximum for this window: {_OUTSIDE}"
         try:
@@ -232,7 +232,7 @@ class LikelihoodFit:
         line, speed = self._line, self._speed(stretch)
         if line is None:
             return None
-        groups = self._grouped(stretch.frequencies_hz, _near_rotation(stretch.frequencies_hz, speed), 1.0)
+        groups = self._grouped(stretch.frequencies_hz, _near_rotation(stretch, speed), 1.0)
         if not groups.same_as(line.model.groups) or stretch.states != line.model.motions.states:
             return None
         seen = line.glance(_observed(line.model, stretch), stretch.n_segments / self._line_segments)
@@ -423,10 +423,12 @@ def _observed(model: SpectralModel, window: WindowStatistics) -> ComplexArray:
     return model.motions.spectra(model.groups.average(window.spectrum), model.centre)
 
 
-def _near_rotation(frequencies_hz: FloatArray, speed_rad_s: float) -> npt.NDArray[np.bool_]:
-    """Bins around the rotation: what is left of its line there is not stochastic."""
-    width_hz = _SYNCHRONOUS_BINS * (frequencies_hz[1] - frequencies_hz[0])
-    return np.asarray(np.abs(frequencies_hz - speed_rad_s / (2 * np.pi)) <= width_hz)
+def _near_rotation(window: WindowStatistics, speed_rad_s: float) -> npt.NDArray[np.bool_]:
+    """Bins around the rotation, wherever it went: what is left of its line there is not stochastic."""
+    f = window.frequencies_hz
+    slowest, fastest = window.speed_range if window.removed_by_hop else (speed_rad_s, speed_rad_s)
+    passed = np.clip(f, slowest / (2 * np.pi), fastest / (2 * np.pi))
+    return np.asarray(np.abs(f - passed) <= _SYNCHRONOUS_BINS * (f[1] - f[0]))
 
 
 def _twins(states: tuple[str, ...], observed: ComplexArray) -> tuple[str, ...]:

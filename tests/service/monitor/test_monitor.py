@@ -19,6 +19,7 @@ from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 
 SEED = 7_700_002
 
@@ -221,6 +222,18 @@ def test_a_load_that_steps_is_inside_the_model() -> None:
     windows, events = feed(monitor(), stream(125.0, Event(at_s=65.0, excitation_level=3.0)))
     assert events == []
     assert {one.verdict.outside_model for one in windows if one.verdict is not None} == {False}
+
+
+def test_a_machine_that_runs_down_raises_nothing() -> None:
+    """On one source, where the least that is left of the rotation would be a misfit; nor when it hardly turns."""
+    _, machine = load_scenario("healthy")
+    draw = Draw(machine, SEED, Purpose.EVALUATION, 0, layout=Layout.ONE_SOURCE)
+    scenario = draw_condition(draw, 1)
+    stop = Event(at_s=65.0, ramp_s=60.0, speed_rpm=0.1)
+    scenario = scenario.model_copy(update={"duration_s": 150.0, "events": (*scenario.events, stop)})
+    windows, events = feed(monitor(), [block for block, _ in blocks(scenario, machine)])
+    assert events == []
+    assert windows[-1].state is HealthState.NOT_EVALUABLE
 
 
 def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
