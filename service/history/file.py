@@ -16,6 +16,7 @@ from service.history.records import DamagedError, StoreError
 
 _DAMAGE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _COMPANIONS = ("", "-wal", "-shm")
+_HEADER = b"SQLite format 3\0"
 
 
 class HistoryFile:
@@ -33,9 +34,21 @@ class HistoryFile:
         self._opened: dict[str, tuple[int, int] | None] = {}
 
     def make(self) -> None:
-        """Make the file, if there is none, and its folder."""
+        """Make the file, if there is none, and its folder.
+
+        Raises
+        ------
+        StoreError
+            If a file is there that never was a history: no header, nor zeros in its place, nor a lock beside it.
+        """
         self.path.parent.mkdir(parents=True, exist_ok=True)
         _make(self.path)
+        with self.path.open("rb") as file:
+            header = file.read(len(_HEADER))
+        if header.strip(b"\0") and not _HEADER.startswith(header) and not self.locks():
+            raise StoreError(
+                f"{self.path} is no history (SQLite), and stays as it is: expected a new file, or a history"
+            )
 
     def opened(self) -> None:
         """Take note of the file that is in use from now on."""
@@ -90,6 +103,10 @@ class HistoryFile:
             if found is not None and (not only_opened or found == self._opened.get(end)):
                 self._beside(end).rename(kept.with_name(kept.name + end))
         return kept
+
+    def locks(self) -> list[Path]:
+        """The files that monitors lock, one for each machine of which they have written the history."""
+        return [Path(path) for path in glob.glob(f"{glob.escape(str(self.path))}.*.lock")]
 
     def _beside(self, end: str) -> Path:
         return Path(f"{self.path}{end}")
@@ -190,7 +207,7 @@ def restore(into: HistoryFile, backup: Path) -> Path | None:
     if found := faults(backup):
         raise StoreError(f"{backup}: {found[0]}")
     with ExitStack() as undo:
-        for path in map(Path, glob.glob(f"{glob.escape(str(file))}.*.lock")):
+        for path in into.locks():
             descriptor = lock_file(path)
             if descriptor is None:
                 raise StoreError(f"{file}: a monitor writes it ({path.name} is locked): stop it first")
