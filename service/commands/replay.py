@@ -244,7 +244,11 @@ def _evaluate(source: "RecordingSource", request: _Offline, control: "Control") 
     else:
         for line in summary_lines(summary):
             typer.echo(line, err=True)
-    if summary.blocks == 0 and not summary.stopped:
+    if summary.stopped:
+        if request.out is not None:
+            typer.echo(f"{request.out} holds the lines up to there", err=True)
+        raise typer.Exit(130)
+    if summary.blocks == 0:
         raise RotorwatchError(f"no block was accepted: {summary.last_refusal or 'there was none'}")
 
 

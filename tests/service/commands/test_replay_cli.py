@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import signal
 from functools import partial
 from pathlib import Path
 
@@ -39,6 +40,16 @@ def test_lines_go_to_a_file_or_to_the_terminal_and_are_the_same(faulty: Path, tm
     again = run(faulty, "--offline", "--out", out)
     assert (again.returncode, "exists already" in again.stderr) == (2, True)
     assert out.read_text(encoding="utf-8") == text
+
+
+def test_interrupted_offline_replay_is_no_success_and_says_what_it_leaves(faulty: Path, tmp_path: Path) -> None:
+    out = tmp_path / "reports.jsonl"
+    command = ("service.rotorwatch", "replay", str(faulty), "--offline", "--progress", "json", "--out", str(out))
+    with program(tmp_path, *command) as started:
+        started.wait_for('"progress"')
+        assert started.stop(signal.SIGINT) == 130
+        assert '"stopped":true' in started.output()
+        assert f"{out} holds the lines up to there" in started.errors()
 
 
 def test_what_if_with_another_machine_file_and_another_limit(faulty: Path, tmp_path: Path) -> None:
