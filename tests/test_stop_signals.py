@@ -1,4 +1,4 @@
-"""SIGTERM stops both programs wherever it finds them, in the middle of a wait as well."""
+"""Signals stop the programs wherever they find them, in the middle of a wait as well, or while they load."""
 
 import subprocess
 import sys
@@ -29,3 +29,21 @@ def test_a_signal_in_the_middle_of_a_wait_stops(module: str, name: str) -> None:
     script = _SCRIPT.format(module=module, name=name)
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60.0, check=True)
     assert run.stdout == "True\n"
+
+
+_LOADING = """
+import signal, sys
+from service.__main__ import main
+
+def interrupt(frame, event, argument):
+    if frame.f_code.co_filename.endswith("service/rotorwatch.py"):
+        signal.raise_signal(signal.SIGINT)
+
+sys.settrace(interrupt)
+main()
+"""
+
+
+def test_an_interrupt_while_the_program_loads_ends_it_quietly() -> None:
+    run = subprocess.run([sys.executable, "-c", _LOADING], capture_output=True, text=True, timeout=60.0, check=False)
+    assert (run.returncode, run.stdout, run.stderr) == (130, "", "")
