@@ -65,6 +65,9 @@ def restore(
     """
     from service.history.file import restore as put_back  # noqa: PLC0415  # keeps --help quick
 
+    if not backup_file.is_file():
+        why = "is a folder, expected a file" if backup_file.is_dir() else "no such file"
+        raise MachineFileError(f"{backup_file}: {why}")
     file = _chosen(config)
     kept = put_back(file, backup_file)
     typer.echo(f"{file.path} is that of {backup_file} now" + (f"; the former is kept as {kept}" if kept else ""))

@@ -13,7 +13,7 @@ import typer
 
 from models.errors import MachineFileError, RecordingError
 from service.commands.replay import link_of
-from service.commands.running import ConnectOption, ListenOption, prepare_numerics
+from service.commands.running import ConnectOption, ListenOption, exit_code, prepare_numerics
 
 if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from models.machine import MachineFile
@@ -135,15 +135,15 @@ def recover(
     """
     if out is not None and len(files) > 1:
         raise MachineFileError(f"--out names one file, and there are {len(files)} to recover")
-    failed = False
+    code = 0
     for file in files:
         try:
             _recover(file, out)
         except RecordingError as error:
-            failed = True
+            code = max(code, exit_code(error))
             typer.echo(str(error), err=True)
-    if failed:
-        raise typer.Exit(1)
+    if code:
+        raise typer.Exit(code)
 
 
 def _tell_changes(recorders: "list[MachineRecorder]", told: dict[Path, str]) -> None:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from models.errors import BundleError, MachineFileError, RotorwatchError
+from models.errors import BundleError, MachineFileError, RecordingError, RotorwatchError
 from service.terminal.memory import prepare_memory
 
 ENDPOINT = "tcp/127.0.0.1:7447"
@@ -127,17 +127,20 @@ def _too_small(limit: int) -> str:
     )
 
 
+def exit_code(error: RotorwatchError) -> int:
+    """2 for a file or argument that cannot be used, such as a recording that is not there; 1 for everything else."""
+    absent = isinstance(error, RecordingError) and isinstance(error.__cause__, FileNotFoundError)
+    return 2 if absent or isinstance(error, MachineFileError | BundleError) else 1
+
+
 @contextmanager
 def exit_codes() -> Iterator[None]:
     """Exit 2 for a file or argument that cannot be used, 1 for what goes wrong later, each with one message."""
     try:
         yield
-    except (MachineFileError, BundleError) as error:
-        typer.echo(str(error), err=True)
-        raise typer.Exit(2) from error
     except RotorwatchError as error:
         typer.echo(str(error), err=True)
-        raise typer.Exit(1) from error
+        raise typer.Exit(exit_code(error)) from error
     except OSError as error:
         if error.errno != errno.ENAMETOOLONG:
             raise

@@ -196,7 +196,7 @@ def test_recover_goes_on_after_a_file_that_it_cannot_recover(tmp_path: Path) -> 
     with RecordingWriter(tmp_path / "whole.mcap") as writer:
         writer.write(RecordedMessage("k", b"data", b"", "x", 1, 1))
     done = recover(tmp_path / "none.part", part, tmp_path / "whole.mcap")
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert "none.part: cannot be read (No such file" in done.stderr
     assert "run.mcap.part:" in done.stdout
     assert "whole.mcap: complete, nothing to recover" in done.stdout
