@@ -283,7 +283,7 @@ def writing(path: Path) -> Iterator[None]:
         raise RecordingError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
-_RECOVER = "; rotorwatch recover writes what can be read of it into another"
+_RECOVER = "; rotorwatch recover writes the parts of it that are whole, if any is, into another"
 
 
 @contextmanager
