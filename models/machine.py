@@ -304,7 +304,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
     condition: ConditionRange | None = None
     rate_hz: float = Field(gt=0, le=1e6, strict=True, description="samples per second and channel")
     dtype: Literal["float32", "float64"] = "float32"
-    sensors: tuple[Sensor, ...] = Field(min_length=1)
+    sensors: tuple[Sensor, ...] = Field(min_length=1, max_length=64)
     window: WindowSettings = WindowSettings()
     ingest: IngestSettings = IngestSettings()
     alarms: AlarmSettings = AlarmSettings()

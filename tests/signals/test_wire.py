@@ -128,7 +128,8 @@ PAYLOAD = b"\0" * 48
         (PAYLOAD, _header(dtype=3), BLOCK_ENCODING, "dtype is 3, expected 1"),
         (b"", _header(samples=0), BLOCK_ENCODING, "samples is 0, expected 1 to 1000000"),
         (b"", _header(samples=1_000_001), BLOCK_ENCODING, "samples is 1000001, expected 1 to 1000000"),
-        (b"", _header(channels=0), BLOCK_ENCODING, "channels is 0, expected 1 to 255"),
+        (b"", _header(channels=0), BLOCK_ENCODING, "channels is 0, expected 1 to 64"),
+        (b"", _header(channels=65), BLOCK_ENCODING, "channels is 65, expected 1 to 64"),
         (PAYLOAD[:-1], _header(), BLOCK_ENCODING, "payload has 47 bytes, expected 48 for 4 samples × 3 channels"),
         (PAYLOAD, _header(dtype=2), BLOCK_ENCODING, "payload has 48 bytes, expected 96"),
         (PAYLOAD, _header(rate_hz=0.0), BLOCK_ENCODING, "rate_hz is 0.0, expected 0.001 to 1000000.0"),
@@ -229,6 +230,7 @@ def test_the_page_c_struct_and_table_are_the_header() -> None:
     table = [(name, int(offset), int(size)) for offset, size, name in rows]
     in_c = [(name, getattr(_CHeader, name)) for name, _ in _C_FIELDS]
     assert table == [(name, field.offset, field.size) for name, field in in_c]
+    assert ("0.001 to 1e6 |" in PAGE, "N, 1 to 64 |" in PAGE) == (True, True)  # what the refusals above expect
 
 
 def test_the_page_names_encodings_and_units() -> None:
