@@ -5,6 +5,7 @@ Universal File Format data set 58 (functions at nodal degrees of freedom), time 
 """
 
 import logging
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -182,6 +183,9 @@ class UniversalSource(Source):
             file = pyuff.UFF(str(path))
             numbers = [number for number, kind in enumerate(file.get_set_types()) if kind == 58]
             read = file.read_sets(numbers) if numbers else []
+            # Each data set stands between two such lines.
+            whole = len(re.findall(rb"    -1 *(?:[\r\n]|$)", path.read_bytes())) % 2 == 0
+            self._cut = "" if whole else "; the file is cut, it ends within a further one"
         sets: list[dict[str, Any]] = [read] if isinstance(read, dict) else list(read)
         sets = [found for found in sets if found["func_type"] == _TIME_RESPONSE]
         for found in sets:
@@ -191,7 +195,7 @@ class UniversalSource(Source):
                     f"the {found['num_pts']} that its header says"
                 )
         if not sets:
-            raise SourceError(f"{path}: holds no time response (data set 58 with function type 1)")
+            raise SourceError(f"{path}: holds no time response (data set 58 with function type 1){self._cut}")
         titles = [str(found["id1"]).strip() for found in sets]
         self._sets = {f"set {number + 1}": found for number, found in enumerate(sets)}
         for title, found in zip(titles, sets, strict=True):
@@ -214,6 +218,13 @@ class UniversalSource(Source):
         """Label of the ordinate's unit."""
         label = str(self._sets[column.column]["ordinate_axis_units_lab"]).strip()
         return "" if label == "NONE" else label
+
+    def named(self, column: str) -> str:
+        """Return the name of a data set that there is; of a file that is cut, say so where it is not."""
+        try:
+            return super().named(column)
+        except SourceError as error:
+            raise SourceError(f"{error}{self._cut}") from error
 
     def _rate_hz(self, reference: Reference) -> float:
         self._column(reference)  # refuses what is not there

@@ -11,7 +11,7 @@ from models.signals.block import FloatArray
 from models.signals.channels import Quantity, same_unit, unit_factor
 from service.interchange.clock import Clock, check_order
 from service.interchange.mapping import Column, Mapping
-from service.interchange.source import Array, Reference, Source, SourceError, as_numbers, named
+from service.interchange.source import Array, Reference, Source, SourceError, as_numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +212,7 @@ def _unit(source: Source, reference: Reference, column: Column, name: str, quant
     """Unit of a column; what the mapping says must not contradict what the file says."""
     stated = source.unit(reference) if reference.column in source.names() else ""
     if column.unit is None:
-        named(source.path, reference.column, source.names(), source.entry)
+        source.named(reference.column)
         if not stated:
             raise SourceError(
                 f"{source.path}: column {reference}: the file states no unit for channel {name}; give unit in the "

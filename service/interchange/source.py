@@ -75,6 +75,20 @@ class Source:
         """Columns that there are."""
         return tuple(self._columns)
 
+    def named(self, column: str) -> str:
+        """Return the name of a column that there is.
+
+        Raises
+        ------
+        SourceError
+            For another one, naming those that there are.
+        """
+        names = self.names()
+        if column not in names:
+            there = ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "")
+            raise SourceError(f"{self.path}: no {self.entry} {column!r}; there are {there or 'none'}")
+        return column
+
     def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002  # others need them
         """What the file says of the time of these columns; raises `SourceError` if they contradict each other."""
         return Timing()
@@ -114,7 +128,7 @@ class Source:
 
     def _column(self, reference: Reference) -> Any:
         """What the library has for a column that has no index."""
-        found = self._columns[named(self.path, reference.column, self.names(), self.entry)]
+        found = self._columns[self.named(reference.column)]
         if reference.index is not None:
             raise SourceError(f"{self.path}: {self.entry} {reference}: index is for tables within .npz and .mat files")
         return found
@@ -139,20 +153,6 @@ def equally_long(path: Path, columns: Sequence[Reference], lengths: Sequence[int
                 f"{path}: column {reference} has {length} rows, column {columns[0]} has {lengths[0]}; expected the same"
             )
     return lengths[0] if lengths else 0
-
-
-def named(path: Path, name: str, names: Sequence[str], what: str = "column") -> str:
-    """Return `name` if it is one of `names`.
-
-    Raises
-    ------
-    SourceError
-        Naming those that there are.
-    """
-    if name not in names:
-        there = ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "")
-        raise SourceError(f"{path}: no {what} {name!r}; there are {there or 'none'}")
-    return name
 
 
 @contextmanager

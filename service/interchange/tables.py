@@ -1,5 +1,6 @@
 """Sources that hold tables: CSV and Parquet, read piece by piece through Arrow."""
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -65,7 +66,7 @@ class CsvSource(_Table):
             if not isinstance(error.__cause__, pa.ArrowInvalid | UnicodeError) or not path.stat().st_size:
                 raise
             raise SourceError(
-                f"{error}; taken as {form.encoding} with {form.delimiter!r} between cells and {form.skip_lines} lines "
+                f"{self._told(error)}; taken as {form.encoding} with {form.delimiter!r} between cells and {form.skip_lines} lines "
                 "before the table: [csv] in the mapping says otherwise, with encoding, delimiter, decimal, header and "
                 "skip_lines"
             ) from error
@@ -91,7 +92,9 @@ class CsvSource(_Table):
                         count += batch.num_rows
                         yield tuple(self._array(name, batch.column(self._label(name))) for name in wanted)
             except pa.ArrowInvalid as error:
-                raise SourceError(self._fault(wanted) or f"{self.path}: after row {count}: {error}") from error
+                raise SourceError(
+                    self._fault(wanted) or f"{self.path}: after row {count}: {self._told(error)}"
+                ) from error
 
     def _reader(self, path: Path, wanted: list[str] | None, *, as_text: bool = False) -> Any:
         form = self._form
@@ -126,6 +129,11 @@ class CsvSource(_Table):
         """Arrow's own name of a column: with the blanks around it, or a number if there is no header."""
         return self._labels[name]
 
+    def _told(self, error: Exception) -> str:
+        """What Arrow says, with rows counted from 1, without header lines."""
+        before = self._form.skip_lines + self._form.header + self._form.skip_lines_after_header
+        return re.sub(r"Row #(\d+)", lambda found: f"row {int(found[1]) - before}", str(error))
+
     def _fault(self, wanted: list[str]) -> str:
         """Find the cell that is no number."""
         row = 0
@@ -144,7 +152,7 @@ class CsvSource(_Table):
                                 )
                     row += batch.num_rows
             except pa.ArrowInvalid as error:
-                return f"{self.path}: after row {row}: {error}"
+                return f"{self.path}: after row {row}: {self._told(error)}"
         return ""
 
     def _is_datetime(self, name: str) -> bool:

@@ -271,11 +271,13 @@ def test_pickled_objects_are_not_loaded(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # pyuff's own
-def test_a_data_set_that_is_cut_off_is_missing_not_without_a_unit(tmp_path: Path) -> None:
+def test_a_data_set_that_is_cut_off_is_missing_and_said_to_be_cut(tmp_path: Path) -> None:
     t, x, v, a = signals(1000)
     write_uff(tmp_path / "run.uff", {"t": t, "x": x, "v": v, "a": a})
     (tmp_path / "run.uff").write_bytes((tmp_path / "run.uff").read_bytes()[:-100])
-    with pytest.raises(SourceError, match=r"run.uff: no data set 'a'; there are set 1, set 2, x, v"):
+    with pytest.raises(
+        SourceError, match=r"no data set 'a'; there are set 1, set 2, x, v; the file is cut, it ends with"
+    ):
         imported(tmp_path, tmp_path / "run.uff", f'[time]\nstart = "{START}"\n' + without_units(CHANNELS))
 
 

@@ -65,7 +65,9 @@ def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
         )),
         *((with_cell(cell), TEXT, HEADER, (f"row 737, column 'v': found {cell!r}, expected a number",))
           for cell in ("OVERLOAD", "1.2.3", "--")),
-        ([*GOOD[:500], "0.25,1.0", *GOOD[501:]], TEXT, HEADER, ("run.csv: ", "Expected 4 columns, got 2")),
+        ([*GOOD[:500], "0.25,1.0", *GOOD[501:]], TEXT, HEADER, (
+            "run.csv: ", "row 501: Expected 4 columns, got 2",
+        )),
         ([row.replace(",", ";").replace(".", ",") for row in GOOD], TEXT, "t;x;v;a", (
             "run.csv: damaged, or no CSV file",
             "taken as utf-8 with ',' between cells and 0 lines before the table: [csv] in the mapping says otherwise",
@@ -316,9 +318,9 @@ def test_a_file_that_cannot_be_imported_is_exit_code_2(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.mcap*"))
 
 
-def test_a_recording_that_is_not_there_is_exit_code_1(tmp_path: Path) -> None:
+def test_a_recording_that_is_not_there_is_exit_code_2(tmp_path: Path) -> None:
     found = run("export", tmp_path / "none.mcap", "--to", "csv", "--out", tmp_path / "out.csv")
-    assert found.returncode == 1
+    assert found.returncode == 2
     assert "none.mcap: cannot be read" in found.stderr
 
 
