@@ -74,7 +74,7 @@ class PlantView extends HTMLElement {
     const sites = new Map();
     for (const one of chosen) if (!apart(one.health)) sites.set(one.health.site, [...(sites.get(one.health.site) ?? []), one]);
     arrange(this.#sites, [...sites.keys()], this.#sections, (site) => html("site-section", { site }));
-    for (const [site, machines] of sites) /** @type {import("./site-section.js").SiteSection} */ (this.#sections.get(site)).show(machines);
+    for (const [site, machines] of sites) /** @type {import("./site-section.js").SiteSection} */ (this.#sections.get(site)).show(machines, chosen.filter(({ health }) => health.site === site).length - machines.length);
     const silent = chosen.filter(({ health }) => apart(health));
     arrange(this.#silent, silent.map(({ place }) => place), this.#tiles, (place) => html("machine-tile", { place }));
     this.#summary.textContent = `${silent.length} without data`;

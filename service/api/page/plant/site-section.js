@@ -29,12 +29,13 @@ export class SiteSection extends HTMLElement {
     this.replaceChildren(this.#details);
   }
 
-  /** @param {Machine[]} machines in the order they are to be in */
-  show(machines) {
+  /** @param {Machine[]} machines in the order they are to be in @param {number} silent how many others have no data, and are shown elsewhere */
+  show(machines, silent) {
     this.#machines = machines;
     const worst = machines.map(({ health }) => health.state).sort((one, other) => urgency(one) - urgency(other))[0];
     const abnormal = machines.filter(({ health }) => ABNORMAL.has(health.state)).length;
-    const said = [worst, `${machines.length} ${machines.length === 1 ? "machine" : "machines"}${abnormal ? `, ${abnormal} abnormal` : ""}`];
+    const count = machines.length + silent;
+    const said = [worst, `${count} ${count === 1 ? "machine" : "machines"}${abnormal ? `, ${abnormal} abnormal` : ""}${silent ? `, ${silent} without data` : ""}`];
     if (said.join() !== this.#summary.dataset.said) {
       this.#summary.dataset.said = said.join();
       lay(this.#summary, html("h2", {}, this.site), html("state-mark", { state: said[0] }), html("span", { class: "note" }, said[1]));

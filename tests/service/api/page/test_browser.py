@@ -283,8 +283,9 @@ def test_machines_stand_by_site_and_only_lines_that_are_seen_are_asked_for(brows
     asked: list[list[str]] = []
 
     def health(number: int) -> dict[str, object]:
-        state = {"state": "healthy", "alarms": []} if number != 70 else {}
-        return {**dict(example(Health)), "site": f"site-{number // 40}", "machine": f"m{number}", **state}
+        place = {"site": f"site-{number // 40}", "machine": f"m{number}"}
+        state: dict[str, object] = {"state": "healthy" if number < 119 else "no-data", "alarms": []}
+        return {**dict(example(Health)), **place, **(state if number != 70 else {})}
 
     def lines(route: Route) -> None:
         asked.append(parse_qs(urlsplit(route.request.url).query)["of"])
@@ -298,6 +299,7 @@ def test_machines_stand_by_site_and_only_lines_that_are_seen_are_asked_for(brows
         expect(tiles).to_have_count(120)
         expect(page.locator("site-section h2")).to_have_text(["site-1", "site-0", "site-2"])
         expect(sites.first.locator("summary")).to_contain_text("40 machines, 1 abnormal")
+        expect(sites.last.locator("summary")).to_contain_text("40 machines, 1 without data")
         expect(tiles.first).to_have_attribute("place", "site-1/m70")
         expect(tiles.first.locator("polyline")).to_be_attached()
         assert 1 <= sum(map(len, asked)) < 60
