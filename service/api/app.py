@@ -105,7 +105,7 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     add_snapshot_routes(app, reader, guard)
     add_plot_routes(app, reader, guard)
     add_event_routes(app, service, guard)
-    add_recording_routes(app, service.catalogue, guard)
+    add_recording_routes(app, service.catalogue, guard, lambda: [one.machine.title for one in service.machines()])
     add_replay_routes(app, service.replays, guard)
     add_service_routes(app, service, guard)
     add_session_routes(app, guard)

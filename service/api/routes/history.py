@@ -42,6 +42,7 @@ from service.api.views import (
     check_alarm,
     found_machine,
 )
+from service.history.records import AuditEntry
 from service.stream.monitored import Monitored
 
 _LARGEST = 2**63 - 1
@@ -190,7 +191,9 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
         """What was read lately of many machines at once, for an overview of the plant."""
         return TrendList(trends=tuple(_trend(service, each, hours, points) for each in of))
 
-    @app.get("/api/v1/audit", tags=["service"], dependencies=[guard.configure], responses=responses(AuditList, 422))
+    @app.get(
+        "/api/v1/audit", tags=["service"], dependencies=[guard.configure], responses=responses(AuditList, 404, 422)
+    )
     def audit(
         before: _Before = None,
         machine: Annotated[_Plain, Query(description="only about this machine, as site/machine")] = None,
@@ -199,6 +202,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
     ) -> AuditList:
         """Who asked for what and what came of it, newest first; kept for ever."""
         found = service.store.audit.entries(before, limit, machine=machine, actor=actor)
+        _check_audited(service, machine, found)
         entries = tuple(AuditRecord(**asdict(one)) for one in found)
         return AuditList(entries=entries, next_before=found[-1].number if len(found) == limit else None)
 
@@ -224,6 +228,12 @@ def _trend(service: ServiceView, of: str, hours: int, points: int) -> Trend:
         starts_ns=tuple(one.start_ns for one in buckets),
         means=tuple(one.mean for one in buckets),
     )
+
+
+def _check_audited(service: ServiceView, place: str | None, found: Sequence[AuditEntry]) -> None:
+    """Refuse a machine that is not there and to which nothing was ever done."""
+    if place is not None and not found and not service.store.audit.entries(None, 1, machine=place):
+        found_machine(service, *place.rpartition("/")[::2])
 
 
 def _check_logged(view: Monitored, name: str | None) -> None:

@@ -1,5 +1,6 @@
 """Recordings over HTTP: list, look at, download."""
 
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from itertools import groupby
 from operator import attrgetter
@@ -25,7 +26,7 @@ _NONE = "no recordings: the settings name no directory for them ([recording] dir
 
 
 _Site = Annotated[str | None, Query(description="only of this site")]
-_Machine = Annotated[str | None, Query(description="only of this machine")]
+_Machine = Annotated[str | None, Query(description="only of this machine, its name or site/machine")]
 _SinceNs = Annotated[int | None, Query(ge=0, description="only what reaches this time, ns since 1970-01-01 UTC")]
 _UntilNs = Annotated[int | None, Query(ge=0, description="only what begins before this time")]
 _Latest = Annotated[int | None, Query(ge=1, le=10_000, description="at most so many of each machine, the latest")]
@@ -34,8 +35,16 @@ _DataTimes = Annotated[
 ]
 
 
-def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) -> None:
-    """Add the routes; without an index they answer with a problem that names the setting."""
+def add_recording_routes(
+    app: FastAPI, index: Catalogue | None, guard: Guard, monitored: Callable[[], Sequence[str]]
+) -> None:
+    """Add the routes; without an index they answer with a problem that names the setting.
+
+    Parameters
+    ----------
+    monitored : callable
+        The machines, as site/machine, of which there may be no recordings yet.
+    """
     common: dict[str, Any] = {"tags": ["recordings"], "dependencies": [guard.read]}
 
     @app.get(_PLACE, responses=responses(RecordingList, 404, 422), **common)
@@ -48,7 +57,17 @@ def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) ->
         data_times: _DataTimes = False,
     ) -> RecordingList:
         """Recordings, by site, machine and time."""
+        if machine is not None and site is None and "/" in machine:
+            site, machine = machine.split("/", 1)
         listed = _present(index).recordings(site, machine)
+        if machine is not None and not listed:
+            there = monitored()
+            if not any(one.endswith(f"/{machine}") if site is None else one == f"{site}/{machine}" for one in there):
+                raise HTTPException(
+                    404,
+                    f"no machine {machine[:64]} has recordings, and of those monitored none has "
+                    f"that name: {', '.join(there)}",
+                )
         chosen = [
             one
             for one in listed

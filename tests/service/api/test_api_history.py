@@ -23,7 +23,7 @@ from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.reports import MachineHealth, identity_of, machine_hash
 from service.runtime.runtime import Runtime
 from tests.service.rig.live import LAB, START_NS, Feed, until
-from tests.service.rig.monitored import PLACE, answered, client, fed
+from tests.service.rig.monitored import PLACE, answered, client, fed, problem
 from tests.sure import sure
 
 IDENTITY = identity_of(Installed(LAB))
@@ -122,7 +122,8 @@ def test_audit_log_tells_who_did_what(busy: tuple[Runtime, httpx.Client]) -> Non
     assert older.next_before is None
     assert {one.alarm for one in older.entries} == {*NAMES, ""}
     assert len(answered(http.get("/api/v1/audit?machine=demo/lab"), AuditList).entries) == 12
-    assert answered(http.get("/api/v1/audit?actor=nobody"), AuditList).entries == ()
+    assert answered(http.get("/api/v1/audit?actor=nobody&machine=demo/lab"), AuditList).entries == ()
+    assert "there are: demo/lab" in problem(http.get("/api/v1/audit?machine=lab"), 404).detail
 
 
 def test_infinite_and_undefined_numbers_become_null() -> None:

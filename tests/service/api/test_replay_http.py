@@ -90,7 +90,11 @@ def test_recordings_are_listed(client: httpx.Client) -> None:
     assert not part.complete
     by_time = get(client, RECORDINGS, RecordingList, since_ns=second.start_ns, until_ns=second.end_ns)
     assert by_time.recordings == (second,)
-    assert get(client, RECORDINGS, RecordingList, site="demo", machine="fan").recordings == ()
+    one_of_two = get(client, RECORDINGS, RecordingList, machine="demo/pump").recordings
+    assert one_of_two == get(client, RECORDINGS, RecordingList, site="demo", machine="pump").recordings == (part,)
+    assert get(client, RECORDINGS, RecordingList, site="demo", machine="lab", until_ns=1).recordings == ()
+    for unknown in ({"site": "demo", "machine": "fan"}, {"machine": "plant/lab"}):
+        assert "demo/lab" in problem(client.get(RECORDINGS, params=unknown), 404).detail
     assert first.data_start_ns is None
     timed = get(client, RECORDINGS, RecordingList, until_ns=START_NS + DAY_NS, latest=1, data_times=True).recordings
     assert [(one.id, one.data_end_ns) for one in timed] == [(second.id, START_NS + 3603 * 10**9), (part.id, None)]
