@@ -136,7 +136,7 @@ def _first_times(source: Source, column: Reference, columns: list[Reference]) ->
         raise SourceError(f"{source.path}: column {column} holds {entries.dtype}, expected times")
     if entries.size < 2:
         raise SourceError(f"{source.path}: has {entries.size} rows, expected at least two to tell the rate")
-    missing = np.flatnonzero(np.isnat(entries) if entries.dtype.kind == "M" else ~np.isfinite(entries))
+    missing = np.flatnonzero(np.isnat(entries) if entries.dtype.kind == "M" else ~(np.abs(entries) < _LATEST_NS))
     if missing.size:
         raise SourceError(
             f"{source.path}: row {int(missing[0]) + 1}, column {column}: found {entries[missing[0]]}, expected a time"
@@ -198,7 +198,8 @@ def _since(entries: Array, first: Array, unit_ns: float) -> FloatArray:
         return np.where(np.isnat(entries), np.nan, since.astype(np.float64))
     if entries.dtype.kind in "iu":
         return np.asarray((entries.astype(np.int64) - first.astype(np.int64)) * unit_ns, dtype=np.float64)
-    return np.asarray((entries.astype(np.float64) - first.astype(np.float64)) * unit_ns)
+    numbers = np.where(np.abs(entries) < _LATEST_NS, entries, np.nan)  # others are no times, whatever the unit
+    return np.asarray((numbers.astype(np.float64) - first.astype(np.float64)) * unit_ns)
 
 
 def _nanoseconds(entry: np.generic, unit_ns: float) -> int:

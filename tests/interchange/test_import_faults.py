@@ -75,6 +75,9 @@ def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
         ([*GOOD[:600], GOOD[601], GOOD[600], *GOOD[602:]], TEXT, HEADER, (
             "row 602, column t: goes back by 0.0005 s",
         )),
+        *(([*GOOD[:at], "7e306,1.0,2.0,3.0", *GOOD[at + 1:]], TEXT, HEADER, (
+            f"row {at + 1}, column t: found 7e+306, expected a time",
+        )) for at in (1, 600)),
         # Times with too few decimals.
         ([f"{number // 2 * 0.001:.3f},1.0,2.0,3.0" for number in range(1000)], TEXT, HEADER, (
             "row 2, column t: repeats the time of the row before", "time.rate_hz",
@@ -99,7 +102,8 @@ def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
     ],
     ids=[
         *("missing column", "unmapped channel", "text", "two dots", "no number", "short row", "other signs"),
-        *("time goes back", "few decimals", "other rate", "rate contradicts times", "five decimals", "dates"),
+        *("time goes back", "no second time", "no time", "few decimals"),
+        *("other rate", "rate contradicts times", "five decimals", "dates"),
         *("no row", "one row", "no start", "1900", "2300", "9999"),
     ],
 )  # fmt: skip
