@@ -9,6 +9,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,8 @@ from service.monitor.alarm_conversion import rfc3339
 
 _NOTED = 0.01
 """Part of the rows whose loss is pointed out."""
+_MOST_ALONE = 0.1
+"""Part of the rows that may have a gap on either side."""
 _LISTED = 10
 
 
@@ -105,6 +108,13 @@ def import_file(
                     writer.write(message)
                 if maker.written.blocks == 0:
                     raise SourceError(_nothing(path, machine, read, sum(overlap.cut_rows for overlap in overlaps)))
+                alone = [one.row for one, following in pairwise(read.gaps) if following.row == one.row + 1]
+                if len(alone) > _MOST_ALONE * read.rows:
+                    raise SourceError(
+                        f"{path}: from row {alone[0] + 1} on rows stand alone at {clock.rate_hz:.9g} Hz, {len(alone)} "
+                        "of them; expected one rate throughout: import what has another rate by itself, with "
+                        "time.resample = true in the mapping, or fill such gaps with time.fill_gaps_up_to_s"
+                    )
         except BaseException:
             writer.part.unlink(missing_ok=True)
             raise

@@ -78,6 +78,9 @@ def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
         *(([*GOOD[:at], "7e306,1.0,2.0,3.0", *GOOD[at + 1:]], TEXT, HEADER, (
             f"row {at + 1}, column t: found 7e+306, expected a time",
         )) for at in (1, 600)),
+        ([*GOOD[:500], *GOOD[500::2]], TEXT, HEADER, (
+            "run.csv: from row 502 on rows stand alone at 2000 Hz", "time.resample", "time.fill_gaps_up_to_s",
+        )),
         # Times with too few decimals.
         ([f"{number // 2 * 0.001:.3f},1.0,2.0,3.0" for number in range(1000)], TEXT, HEADER, (
             "row 2, column t: repeats the time of the row before", "time.rate_hz",
@@ -102,7 +105,7 @@ def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
     ],
     ids=[
         *("missing column", "unmapped channel", "text", "two dots", "no number", "short row", "other signs"),
-        *("time goes back", "no second time", "no time", "few decimals"),
+        *("time goes back", "no second time", "no time", "half the rate", "few decimals"),
         *("other rate", "rate contradicts times", "five decimals", "dates"),
         *("no row", "one row", "no start", "1900", "2300", "9999"),
     ],
