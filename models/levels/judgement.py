@@ -31,7 +31,7 @@ from models.levels.measures import LevelPlan, WindowLevels
 from models.levels.reference import LevelReference, OperatingState
 from models.levels.settings import LevelSettings
 from models.levels.zones import ZONES, zone_of
-from models.signals.channels import Channel, Quantity
+from models.signals.channels import Channel, Quantity, unit_in_text
 from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth, LevelLimits
 
 _ERRORS_OF_CONTACT = 5.0
@@ -249,7 +249,7 @@ class LevelJudge:
                 )
                 out = (
                     f"phase lag {values[_ROW['x1_phase_lag_deg']]:.0f}°: out of its acceptance region about "
-                    f"{shown_level(channel, 'x1', region.mean):.3g} {channel.unit} at {was_deg:.0f}°"
+                    f"{shown_level(channel, 'x1', region.mean):.3g} {unit_in_text(channel.unit)} at {was_deg:.0f}°"
                 )
         key, words = (column, alike, standard, zone, edge), _WORDS
         limits = self._limits.get(key)
@@ -356,7 +356,7 @@ class LevelJudge:
                 "absolute": decided.absolute,
                 "source": decided.source,
                 "state": state,
-                "text": f"{said} {value:.3g} {unit}, {what}",
+                "text": f"{said} {value:.3g} {unit_in_text(unit)}, {what}",
             }
         )
 
@@ -460,7 +460,7 @@ def growth_seen(levels: Sequence[ChannelLevels]) -> LevelGrowth:
         word = "strongest band"
     text = (
         f"every channel that had grown by {growth:.0%} would have raised an alert; {one.channel} last, whose {word} is "
-        f"{value:.3g} {unit} and its alert from {limit:.3g}"
+        f"{value:.3g} {unit_in_text(unit)} and its alert from {limit:.3g}"
     ).replace("%", " %")
     return LevelGrowth(growth=rounded(growth), channel=one.channel, measure=measure, text=text)
 

@@ -460,6 +460,17 @@ def same_unit(quantity: str, one: str, other: str) -> bool:
     return True
 
 
+def unit_in_text(unit: str) -> str:
+    """A unit as texts have it.
+
+    Examples
+    --------
+    >>> unit_in_text("um pp")
+    'µm pp'
+    """
+    return unit.replace("um", "µm")
+
+
 def time_unit_ns(unit: str) -> float:
     """Nanoseconds in a unit of time.
 

@@ -16,6 +16,7 @@ from models.commissioning.commissioned import Commissioned, KnowledgeLevel
 from models.commissioning.healthy import HealthyRecording
 from models.errors import RecordingError
 from models.machine import MachineFile
+from models.signals.channels import unit_in_text
 from simulator.commission import verdict
 from simulator.commission.plots import draw_budget, draw_readings, inline_svg
 from simulator.commission.recording_plots import Portrait, draw_levels, draw_spectra, ordered, portrait
@@ -236,7 +237,9 @@ def _growths(report: CommissioningReport) -> tuple[tuple[str, ...], ...]:
     found = []
     for one in report.levels:
         state = "any" if one.speed_rpm is None else _speeds(one.speed_rpm)
-        healthy, alert = (f"{verdict.significant(edge, 3)} {one.unit}" for edge in (one.healthy, one.alert))
+        healthy, alert = (
+            f"{verdict.significant(edge, 3)} {unit_in_text(one.unit)}" for edge in (one.healthy, one.alert)
+        )
         growth = "–" if one.growth is None else f"{100 * one.growth:.0f}%"
         found.append((state, str(one.windows), one.channel, one.measure, healthy, alert, growth))
     return tuple(found)

@@ -219,7 +219,7 @@ def test_outside_the_commissioned_conditions_is_said_so() -> None:
     assert conditions.outside(window, naming).startswith("speed is 1478 rpm, commissioned is 1320 rpm")
     quiet = Event(at_s=0.0, excitation_level=0.01)
     (window,) = windows_of(recording(NOTHING, stream(66.0, 45, quiet)))
-    assert re.match(r"random vibration of y1 is \S+ um rms, commissioned is", conditions.outside(window, naming))
+    assert re.match(r"random vibration of y1 is \S+ µm rms, commissioned is", conditions.outside(window, naming))
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from models.diagnosis.sensors.kinematics import Banded, PairReading, banded, rea
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
-from models.signals.channels import Channel, state_name
+from models.signals.channels import Channel, state_name, unit_in_text
 from rotorwatch.records.windows import SensorFault
 
 
@@ -54,7 +54,7 @@ class Naming:
         if state not in self._channels:
             return f"{value_SI:.3g} (SI)"
         channel = self._channels[state]
-        return f"{value_SI / channel.to_si:.3g} {channel.unit}"
+        return f"{value_SI / channel.to_si:.3g} {unit_in_text(channel.unit)}"
 
 
 _FLAT = 2.0  # bands within this factor of the lowest lie on the floor

@@ -15,6 +15,7 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.signals.block import FloatArray
+from models.signals.channels import unit_in_text
 from rotorwatch.records.windows import SensorFault
 from simulator.scenario import NamedSource, Scenario, Sensors
 from simulator.stream import blocks
@@ -111,7 +112,7 @@ def test_a_stuck_sensor_is_named_with_its_value_and_for_how_long(state: str) -> 
     assert (finding.kind, finding.states) == ("stuck", (state,))
     assert finding.value == pytest.approx(30.0, abs=5.0)
     channel = next(one for one in machine_of("lab").sensors if one.name == state)
-    assert f"{samples[50_000, column(state)] / channel.to_si:.3g} {channel.unit}" in finding.text
+    assert f"{samples[50_000, column(state)] / channel.to_si:.3g} {unit_in_text(channel.unit)}" in finding.text
 
 
 def test_a_sensor_that_has_just_stuck_is_named_without_a_value_that_it_never_had() -> None:

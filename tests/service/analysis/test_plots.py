@@ -308,7 +308,7 @@ def test_a_trend_of_recorded_reports_needs_no_samples(
         np.testing.assert_array_equal(one.change, other.change)
         np.testing.assert_array_equal(one.high, other.high)
     levels = read_trend(Recorded(source, keys, source.span().start_ns, source.span().end_ns + 1), levels=True)
-    assert (levels.parameters, levels.levels[0].title) == ((), "y1   um pp")  # instead of parameters
+    assert (levels.parameters, levels.levels[0].title) == ((), "y1   µm pp")  # instead of parameters
     assert all(np.isfinite(one.level).all() and np.isnan(one.danger).all() for one in levels.levels)
     with pytest.raises(RotorwatchError, match="no sample blocks to compute them from"):
         read_trend(Recorded(source, keys, source.span().start_ns, source.span().end_ns + 1), "lab")
