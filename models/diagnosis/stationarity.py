@@ -46,6 +46,8 @@ def segment_levels(segments: ComplexArray, spectrum: ComplexArray, columns: Sequ
         return None
     own = segments[: blocks * _BLOCK, :, columns].reshape(blocks, _BLOCK, count, n)
     mean = spectrum[: blocks * _BLOCK, columns][:, :, columns].reshape(blocks, _BLOCK, n, n).sum(axis=1)
+    if not np.all(np.isfinite(mean)):
+        return None
     levels = np.ones(count)
     for _ in range(_ROUNDS):
         motions = own @ np.linalg.eigh(mean)[1].conj()[:, np.newaxis]

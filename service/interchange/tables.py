@@ -66,9 +66,9 @@ class CsvSource(_Table):
             if not isinstance(error.__cause__, pa.ArrowInvalid | UnicodeError) or not path.stat().st_size:
                 raise
             raise SourceError(
-                f"{self._told(error)}; taken as {form.encoding} with {form.delimiter!r} between cells and {form.skip_lines} lines "
-                "before the table: [csv] in the mapping says otherwise, with encoding, delimiter, decimal, header and "
-                "skip_lines"
+                f"{self._told(error)}; taken as {form.encoding} with {form.delimiter!r} between cells and "
+                f"{form.skip_lines} lines before the table: [csv] in the mapping says otherwise, with encoding, "
+                "delimiter, decimal, header and skip_lines"
             ) from error
         names = [label.strip() if form.header else str(number + 1) for number, label in enumerate(labels)]
         if not datetimes and time_column in names and schema.field(names.index(time_column)).type == pa.int64():

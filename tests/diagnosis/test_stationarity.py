@@ -38,13 +38,15 @@ def test_a_steady_load_is_left_alone() -> None:
     assert levels_of(segments(np.ones(SEGMENTS))) is None
 
 
-@pytest.mark.parametrize("kind", ["line", "a tenth of the band", "dead channels"])
+@pytest.mark.parametrize("kind", ["line", "a tenth of the band", "dead channels", "too large"])
 def test_what_is_not_the_load(kind: str) -> None:
     found = segments(np.ones(SEGMENTS))
     if kind == "line":
         found[100, 18:] += 1000.0
     elif kind == "a tenth of the band":
         found[660:, 18:] *= 3
-    else:
+    elif kind == "dead channels":
         found[:] = 0
+    else:
+        found[:, 5] = np.nan
     assert levels_of(found) is None
