@@ -49,6 +49,9 @@ rotor kit readings stay unbiased at ramps of 5, 10 and 15 % (16 seeds each, ``te
 _INSIDE, _BETTER, _SURELY_OUTSIDE = 2.0, 3.0, 8.0
 """Standard deviations of the misfit with which a window is explained beyond doubt, by which one explanation is better
 than another, and of what is outside the model by something else than its spectra."""
+_HEAVIEST, _SURELY = 20.0, 3.0
+"""Times the unbalance of the machine file, in standard errors: a lost blade makes ten of it, millimetres in place of
+micrometres a thousand."""
 _OUTSIDE = 4.0
 """Standard deviations of the misfit from which the short stretches of a window are tested for themselves."""
 
@@ -254,6 +257,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         if self._elsewhere(deciding):
             self.directed, window = False, replace(window, directed=False)
             deciding = self._explained(window)
+        deciding = self._within(deciding)
         short = {} if newest is None else self._newest(window, *newest, deciding)
         if not deciding.unexplained:
             self._explained_ns = window.end_ns
@@ -312,6 +316,19 @@ class KnownMachineEvaluator(WindowEvaluator):
         self._open = not self._opposite
         return other if self._opposite else given
 
+    def _within(self, decided: Diagnosis) -> Diagnosis:
+        """The diagnosis, unexplained where it takes an unbalance that means wrong units, or a wrong e_m."""
+        vector = decided.unbalance
+        if vector is None or decided.unexplained or vector.foreign:
+            return decided
+        times = 1 + vector.magnitude_change
+        if times - _SURELY * vector.magnitude_error < _HEAVIEST:
+            return decided
+        why = (
+            f"{self._machine.title}: it would take {times:.1f} times the unbalance of the machine file, evaluated is at"
+        )
+        return replace(decided, unexplained=f"{why} most {_HEAVIEST:g} times: check the units of the channels and e_m")
+
     def _newest(
         self, window: WindowStatistics, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis
     ) -> dict[int, Diagnosis]:
@@ -329,7 +346,8 @@ class KnownMachineEvaluator(WindowEvaluator):
             with suppress(EstimationError):  # too little data for itself; the window has said what there is to say
                 if (statistics := sliding.statistics(hops)) is not None:
                     statistics = statistics if self.directed else replace(statistics, directed=False)
-                    evaluated[hops] = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
+                    decided = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
+                    evaluated[hops] = self._within(decided)
         return evaluated
 
     def checkpoint(self) -> dict[str, np.ndarray]:

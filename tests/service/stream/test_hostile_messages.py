@@ -443,3 +443,15 @@ def test_no_parameter_is_blamed_where_the_file_is_that_of_another_rotor(
     samples = simulated(machine.model_copy(update={"rotor": other}), SEED, 110.0)
     events = [one for block in as_blocks(machine, samples) for one in monitor.step(block).events]
     assert {one.alarm.name for one in events if one.kind is EventKind.RAISED} == {MODEL}
+
+
+@pytest.mark.parametrize(("gain", "unbalance", "named"), [(25.4, 1.0, MODEL), (1000.0, 1.0, MODEL), (1.0, 10.0, "e")])
+def test_an_unbalance_of_wrong_units_is_none(gain: float, unbalance: float, named: str) -> None:
+    machine = load_machine("lab")
+    rotor = machine.rotor.model_copy(update={"e_m": unbalance * machine.rotor.e_m})
+    samples = simulated(machine.model_copy(update={"rotor": rotor}), SEED, 80.0).copy()
+    samples[:, [channel.name != "theta" for channel in machine.sensors]] *= gain
+    monitor = MachineMonitor(install(machine, None))
+    events = [one for block in as_blocks(machine, samples) for one in monitor.step(block).events]
+    assert [one.alarm.name for one in events if one.kind is EventKind.RAISED] == [named]
+    assert ("check the units of the channels and e_m" in events[0].text) == (named == MODEL)
