@@ -12,6 +12,8 @@ from pydantic import BaseModel, Field
 from models.commissioning.healthy import HealthyRecording, foreign_lines
 from models.diagnosis.baseline.relation import one_source
 from models.diagnosis.readings import Diagnosis
+from models.diagnosis.sensors.level import at_range_end
+from models.diagnosis.sensors.reference import Naming
 from models.diagnosis.shape import SEEN_GROWTH, ShapePower
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
@@ -75,13 +77,22 @@ def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> 
     return told(verdict="passed", text=found)
 
 
-def check_sensors_of(findings: Mapping[str, Sequence[SensorFault]]) -> Check:
-    """Whether a sensor was at fault while the recordings were made."""
+def check_sensors_of(
+    machine: MachineFile,
+    findings: Mapping[str, Sequence[SensorFault]],
+    windows: Mapping[str, Sequence[WindowStatistics]],
+) -> Check:
+    """Whether a sensor was at fault while the recordings were made, or at the end of its range."""
     told = partial(Check, name="sensors")
     faults: dict[tuple[str, str, tuple[str, ...]], list[str]] = {}
     for recording, found in findings.items():
         for finding in found:
             faults.setdefault((recording, finding.kind, finding.states), []).append(finding.text)
+    naming = Naming(machine.sensors)
+    ends = [f"{name}: {end}" for name, found in windows.items() for end in at_range_end(found, naming)]
+    if not faults and ends:
+        text = f"{'; '.join(ends)}: the range ends there, and a machine that vibrates more is cut off (data-clipped)"
+        return told(verdict="limited", text=text, advice="choose a wider measuring range, and record again")
     if not faults:
         return told(verdict="passed", text="no sensor stuck, clipped, swapped, delayed or in contradiction")
     return told(

@@ -270,7 +270,7 @@ def commission(
         }
         if not states:  # levels of a machine that stands are levels, too
             findings = {name: [f for f in found if f.states != ("theta",)] for name, found in findings.items()}
-        checks.append(check_sensors_of(findings))
+        checks.append(check_sensors_of(machine, findings, by_recording))
         if not states:
             checks.append(_only_levels(machine, knowledge.text))
         else:

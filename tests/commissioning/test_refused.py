@@ -82,6 +82,18 @@ def test_clipped() -> None:
     assert "record again" in advice
 
 
+@pytest.mark.parametrize(("bits", "limit", "verdict"), [(16, 2.8, "limited"), (16, 5.0, "passed"), (8, 5.0, "passed")])
+def test_a_channel_that_reaches_the_end_of_its_range_is_told(bits: int, limit: float, verdict: str) -> None:
+    blocks = stream(HEALTHY_S, 52)
+    samples = samples_of(blocks)
+    end = limit * samples[:, 0].std()
+    step = end / 2 ** (bits - 1)
+    samples[:, 0] = np.clip(np.round(samples[:, 0] / step) * step, -end, end)
+    found, text, _ = verdict_of(made_of(with_samples(blocks, samples)), "sensors")
+    assert found == verdict
+    assert ("y1 stands at exactly" in text) == (verdict == "limited")
+
+
 def test_a_stuck_channel() -> None:
     blocks = stream(HEALTHY_S, 52)
     samples = samples_of(blocks)

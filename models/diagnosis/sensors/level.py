@@ -7,6 +7,7 @@ or with the other channels moving too, cannot be told from the machine and is le
 """
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,7 @@ from models.diagnosis.motion import motion_pairs
 from models.diagnosis.sensors.reference import Naming, SensorReference
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
+from models.signals.waveform import stacked_waveform
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
@@ -23,6 +25,9 @@ STILL_S = 0.25  # longest time for which equal samples are put down to quantisat
 _HELD, _FEWEST_HELD = 40.0, 12
 # Part of a hop's samples at its own limit that is put down to chance, beside what a quantised sine has there.
 FLAT_PART = 0.005
+# Part of the hops, and how many at least, whose tops end at one and the same value where the range ends there; what is
+# coarse, or as regular as a sine, ends at one value without it (in rms: step of the converter, distance of the value).
+_LIMITED_PART, _FEWEST_LIMITED, _FINE, _BEYOND_SINE = 0.25, 4, 0.05, 2.0
 STEP_SPREADS = 8.0  # healthy standard deviations of a hop's mean that a step of it must exceed
 STEP_PART = 0.3  # part of the channel's rms that it must exceed besides
 # A slow drift of the mean over a window, as of a gap voltage, is allowed up to this many rms of the channel.
@@ -126,6 +131,24 @@ def clipped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
             )
             findings.append(SensorFault(states=(state,), kind=FaultKind.CLIPPED, text=text, value=flat))
     return findings
+
+
+def at_range_end(windows: Sequence[WindowStatistics], naming: Naming) -> list[str]:
+    """Say which channels reach the end of their range again and again, but for too few samples for `clipped`."""
+    hops, found = stacked_waveform([each for window in windows for each in window.waveforms]), []
+    least = max(_FEWEST_LIMITED, _LIMITED_PART * len(hops.rms))
+    for column, state in enumerate(windows[0].sensors):
+        mean, rms, steps = hops.mean[:, column].mean(), hops.rms[:, column].mean(), hops.step[:, column]
+        if state == "theta" or np.any(steps > _FINE * rms):
+            continue
+        for values, flat in ((hops.maximum, hops.at_maximum), (hops.minimum, hops.at_minimum)):
+            furthest = values[np.argmax(np.abs(values[:, column] - mean)), column]
+            hit = np.count_nonzero((values[:, column] == furthest) & (flat[:, column] > 1))
+            if hit >= least and abs(furthest - mean) > _BEYOND_SINE * rms:
+                name, value = naming.name(state), naming.value(state, float(furthest))
+                found.append(f"{name} stands at exactly {value} in {hit} of {len(hops.rms)} hops")
+                break
+    return found
 
 
 def offset(window: WindowStatistics, naming: Naming, reference: SensorReference | None) -> list[SensorFault]:
