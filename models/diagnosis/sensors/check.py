@@ -7,7 +7,7 @@ import numpy as np
 from models.diagnosis.motion import motion_pairs
 from models.diagnosis.sensors.disagreement import BROKEN, gain_and_delay, suspect_pairs, swapped
 from models.diagnosis.sensors.kinematics import PairReading, banded, read_pair
-from models.diagnosis.sensors.level import clipped, gain_jump, offset, stuck
+from models.diagnosis.sensors.level import clipped, gain_jump, offset, spiked, stuck
 from models.diagnosis.sensors.noise import noisy
 from models.diagnosis.sensors.phase import phase_faults
 from models.diagnosis.sensors.reference import Naming, SensorReference, implicated
@@ -47,6 +47,7 @@ def sensor_findings(
     if stood.any():
         return tuple(findings)
     findings += [found for found in offset(window, naming, reference) if not set(found.states) & implicated(findings)]
+    findings += [found for found in spiked(window, naming) if not set(found.states) & implicated(findings)]
     bad = implicated(findings)
 
     def sound(*columns: int) -> bool:

@@ -28,6 +28,10 @@ FLAT_PART = 0.005
 # Part of the hops, and how many at least, whose tops end at one and the same value where the range ends there; what is
 # coarse, or as regular as a sine, ends at one value without it (in rms: step of the converter, distance of the value).
 _LIMITED_PART, _FEWEST_LIMITED, _FINE, _BEYOND_SINE = 0.25, 4, 0.05, 2.0
+# Rms of a displacement that peaks reach, of which a sensor of the same motion shows no more than so many, and part of
+# the hops with such peaks: to get there and back the shaft is fast, and normal noise hardly reaches five. Rarer ones do
+# not matter to what is read of the machine.
+_PEAKS, _NO_PEAKS, _PEAKED_PART = 10.0, 6.0, 0.5
 STEP_SPREADS = 8.0  # healthy standard deviations of a hop's mean that a step of it must exceed
 STEP_PART = 0.3  # part of the channel's rms that it must exceed besides
 # A slow drift of the mean over a window, as of a gap voltage, is allowed up to this many rms of the channel.
@@ -148,6 +152,25 @@ def at_range_end(windows: Sequence[WindowStatistics], naming: Naming) -> list[st
                 name, value = naming.name(state), naming.value(state, float(furthest))
                 found.append(f"{name} stands at exactly {value} in {hit} of {len(hops.rms)} hops")
                 break
+    return found
+
+
+def spiked(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
+    """Displacements with peaks that are no motion: velocity or acceleration of the same motion do not show them."""
+    hops, found = window.hop_waveform, []
+    reach = np.maximum(hops.maximum - hops.mean, hops.mean - hops.minimum)
+    crest = reach / np.where(hops.rms > 0, hops.rms, np.inf)
+    for pair in motion_pairs(window.states):
+        first, second = window.states[pair.first], window.states[pair.second]
+        alone = (crest[:, pair.first] > _PEAKS) & (crest[:, pair.second] < _NO_PEAKS)
+        if first.endswith("_dot") or not alone.mean() >= _PEAKED_PART:
+            continue
+        text = (
+            f"{naming.name(first)}: peaks of up to {crest[alone, pair.first].max():.3g} times its rms in "
+            f"{np.count_nonzero(alone)} of {len(alone)} hops, of which {naming.name(second)} shows nothing: a loose "
+            "connector, or a bad cable"
+        )
+        found.append(SensorFault(states=(first,), kind=FaultKind.INCOHERENT, text=text, value=None))
     return found
 
 

@@ -159,6 +159,20 @@ def test_steps_of_a_converter_are_no_fault() -> None:
         assert found_in(coarse) == ()
 
 
+@pytest.mark.parametrize(("also", "every"), [((), 5_000), ((), 25_000), (("y2_dot",), 5_000)])
+def test_peaks_that_are_no_motion_are_named(also: tuple[str, ...], every: int) -> None:
+    samples = recorded("lab", 1).copy()
+    for name in ("y2", *also):
+        samples[::every, column(name)] += 20 * samples[:, column(name)].std()
+    findings = found_in(samples)
+    if also or every > 10_000:  # an impact, or too rare to matter
+        assert not any("peaks of up to" in finding.text for finding in findings)
+        return
+    finding = only(findings)
+    assert (finding.kind, finding.states) == ("incoherent", ("y2",))
+    assert "of which y2_dot shows nothing" in finding.text
+
+
 @pytest.mark.parametrize("deviations", [1.5, 2.0])
 def test_a_clipped_sensor_is_named(deviations: float) -> None:
     samples = recorded("lab", 1).copy()
