@@ -25,6 +25,9 @@ from models.levels.measures import WindowLevels, window_levels
 from models.signals.block import FloatArray
 from models.signals.waveform import Waveform, stacked_waveform
 
+_DRIFT = 0.1  # rms of a channel by which its mean may drift before that of every hop is taken out of it
+_SMOOTH = 0.5  # squares of a drift's steps from hop to hop over those about its mean, at most; of chance 2
+
 
 @dataclass(frozen=True)
 class WindowStatistics:
@@ -129,6 +132,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         remove = np.hstack([np.eye(n), -beta])
         hop_correlation = remove @ through(remove, products) / plan.hop
         correlation = (remove @ total @ remove.T) / (len(hops) * plan.hop)
+        hop_correlation, correlation = _undrifted(plan, hops, products, remove, (hop_correlation, correlation))
         cleaned = through(remove, segments)
         if plan.angle_column is not None:
             synchronous = _synchronous(beta)
@@ -245,3 +249,30 @@ def _speeds(rotation: Rotation, hops: tuple[HopMoments, ...], plan: Plan) -> tup
 
 def _synchronous(beta: FloatArray) -> ComplexArray:
     return np.asarray(beta[..., 1] - 1j * beta[..., 2], dtype=np.complex128)
+
+
+def _undrifted(
+    plan: Plan,
+    hops: tuple[HopMoments, ...],
+    products: FloatArray,
+    remove: FloatArray,
+    usual: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Correlations of every hop, and of all: about its own mean where means drift, the usual ones where they do not.
+
+    A drift is no vibration, though it correlates at any lag; means that scatter from hop to hop are none.
+    """
+    n = len(remove)
+    means = products[:, 0, n, :n] / plan.hop
+    steps, deviations = np.diff(means, axis=0), means - means.mean(axis=0)
+    smooth = (steps**2).sum(axis=0) < _SMOOTH * (deviations**2).sum(axis=0)
+    if not np.any(smooth & (np.ptp(means, axis=0) > _DRIFT * np.sqrt(np.abs(np.diag(usual[1][0]))))):
+        return usual
+    own = np.broadcast_to(remove, (len(hops), *remove.shape)).copy()
+    own[:, :, n] = -means - products[:, 0, n, n + 1 :] @ remove[:, n + 1 :].T / plan.hop
+    at_hops = np.array([hop.start_ns - hops[0].start_ns for hop in hops]) * 1e-9 * plan.rate_hz / plan.hop
+    trend = np.gradient(means, at_hops, axis=0)[:, np.newaxis]
+    within = trend.swapaxes(1, 2) @ trend / 12  # of a straight line about its mean
+    own = own[:, np.newaxis]
+    by_hop = own @ products @ own.swapaxes(2, 3) / plan.hop - within[:, np.newaxis]
+    return by_hop, by_hop.sum(axis=0) / len(hops)

@@ -175,6 +175,17 @@ def test_synchronous_part_and_speed_are_recovered_and_removed() -> None:
     np.testing.assert_allclose(louder.spectrum, statistics.spectrum, atol=1e-10)
 
 
+@pytest.mark.parametrize(("drift", "most"), [(np.array([1.0, -0.7]), 0.02), (np.array([4.0, 0.0]), 0.05)])
+def test_a_drift_of_the_mean_is_no_vibration(drift: FloatArray, most: float) -> None:
+    plan, samples = replace(small_plan(hops=20), hop=400, stride=400), signal(8_200, 17)
+    (still,) = feed(SlidingWindow(plan), samples)[-1:]
+    samples[:, :2] += np.outer(np.linspace(-1, 1, len(samples)), drift * samples[:, :2].std(axis=0))
+    (drifting,) = feed(SlidingWindow(plan), samples)[-1:]
+    power = np.sqrt(np.outer(*[np.diag(still.correlation[0])] * 2))
+    assert np.abs((drifting.correlation - still.correlation) / power).max() < most
+    assert np.abs((drifting.hop_correlation.mean(axis=0) - still.correlation) / power).max() < most
+
+
 def test_spectrum_is_the_two_sided_density() -> None:
     """White noise of unit variance has density 1/rate; 400 averages make the standard error of the mean 0.1 %."""
     plan = small_plan(angle=False, hops=200)
