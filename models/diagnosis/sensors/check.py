@@ -9,7 +9,7 @@ from models.diagnosis.sensors.disagreement import BROKEN, gain_and_delay, suspec
 from models.diagnosis.sensors.kinematics import PairReading, banded, read_pair
 from models.diagnosis.sensors.level import clipped, gain_jump, offset, spiked, stuck
 from models.diagnosis.sensors.noise import noisy
-from models.diagnosis.sensors.phase import phase_faults
+from models.diagnosis.sensors.phase import no_angle, phase_faults
 from models.diagnosis.sensors.reference import Naming, SensorReference, implicated
 from models.diagnosis.sensors.standstill import runs_down
 from models.diagnosis.window import WindowStatistics
@@ -44,8 +44,9 @@ def sensor_findings(
     window, naming = window.as_mounted, Naming(channels)
     stood = np.full(len(window.waveforms), True) if standing else runs_down(window)
     findings = [*stuck(window, naming, stood), *clipped(window, naming)]
-    if stood.any():
-        return tuple(findings)
+    wrong_angle = no_angle(window, naming)
+    if stood.any() or wrong_angle:
+        return (*findings, *wrong_angle)
     findings += [found for found in offset(window, naming, reference) if not set(found.states) & implicated(findings)]
     findings += [found for found in spiked(window, naming) if not set(found.states) & implicated(findings)]
     bad = implicated(findings)

@@ -33,6 +33,9 @@ _JITTER_ERRORS = 6.0
 _SHAFTS_PHASE, _LINES_PHASE = 0.5, 0.9
 # Turns of a hop by which a steady shaft's may differ, and by which a loss may differ from a whole number.
 _STEADY_TURNS, _WHOLE_TURNS = 0.02, 0.05
+# An angle that runs within the same bounds in every hop, by this part of them and at least so far, is none in radians
+# where the bounds are so many turns from whole ones.
+_BOUNDED, _LEAST_RANGE_RAD, _OFF_TURNS = 0.95, 0.5, 0.2
 _FEWEST_HOPS, _FEWEST_SIDE = 6, 3
 _ALIKE = 0.25
 _STAY = 3.0
@@ -74,6 +77,26 @@ def phase_faults(
             found = _slip(window, common, name) or _jump(window, common, name)
         found = found or _jitter(window, columns, vectors, name)
     return [found] if found else []
+
+
+def no_angle(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
+    """Whether the shaft angle runs to and fro within other bounds than whole turns of 2π in every hop."""
+    if "theta" not in window.sensors:
+        return []
+    hops, column = window.hop_waveform, window.sensors.index("theta")
+    low, high = hops.minimum[:, column], hops.maximum[:, column]
+    turns, least = np.ptp([low, high]) / (2 * np.pi), (high - low).min()
+    if least < max(_LEAST_RANGE_RAD, _BOUNDED * 2 * np.pi * turns):  # it stands still, or counts on
+        return []
+    rate_hz = hops.n_samples * len(low) / window.duration_s
+    step = abs(window.speed_rad_s) / (2 * np.pi * rate_hz) if np.isfinite(window.speed_rad_s) else 0.0
+    if abs(turns - max(1, round(turns))) <= _OFF_TURNS + (step if turns < 1 else 0):
+        return []
+    text = (
+        f"{naming.name('theta')}: runs from {low.min():.1f} to {high.max():.1f} rad in every hop, expected 0 to 2π: "
+        "turns, degrees or the volts of a pulse are not an angle in radians"
+    )
+    return [_theta(FaultKind.INCOHERENT, text, turns)]
 
 
 def _theta(kind: FaultKind, text: str, value: float, z: float | None = None) -> SensorFault:

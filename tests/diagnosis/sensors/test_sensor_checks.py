@@ -1,5 +1,6 @@
 """Each fault of a sensor is found, named where it can be, and healthy sensors are left alone."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -171,6 +172,26 @@ def test_peaks_that_are_no_motion_are_named(also: tuple[str, ...], every: int) -
     finding = only(findings)
     assert (finding.kind, finding.states) == ("incoherent", ("y2",))
     assert "of which y2_dot shows nothing" in finding.text
+
+
+@pytest.mark.parametrize(
+    ("bounds", "angle"),
+    [
+        ("0.0 to 1.0", lambda theta: theta / (2 * np.pi)),
+        ("0.0 to 359.6", np.degrees),
+        ("-10.0 to -8.0", lambda theta: np.where(theta < 0.3, -8.0, -10.0)),
+        ("", lambda theta: theta - np.pi),
+        ("", np.unwrap),
+        ("", lambda theta: np.mod(np.unwrap(theta), 20 * np.pi)),
+    ],
+)
+def test_what_is_no_angle_in_radians_is_told(bounds: str, angle: Callable[[FloatArray], FloatArray]) -> None:
+    samples = recorded("lab", 1).copy()
+    samples[:, -1] = angle(samples[:, -1])
+    told = [finding.text for finding in found_in(samples) if finding.states == ("theta",) and "2π" in finding.text]
+    assert bool(told) == bool(bounds)
+    assert not told or len(found_in(samples)) == 1
+    assert all(f"theta: runs from {bounds} rad in every hop" in text for text in told)
 
 
 @pytest.mark.parametrize("deviations", [1.5, 2.0])
