@@ -32,7 +32,7 @@ from models.commissioning.commissioned import (
 from models.commissioning.healthy import HealthyRecording
 from models.commissioning.identified import identify
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.lag_moments import passband_hz
+from models.diagnosis.baseline.lag_moments import LONGEST_LAG_STEP_S, passband_hz
 from models.diagnosis.baseline.learned import (
     Baseline,
     disagreements,
@@ -177,8 +177,8 @@ def _learn_partial(
 
 def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
     windows = [piece.window for piece in pieces]
-    wrong = unsuitable(windows[0])
-    if wrong:
+    wrong, too_slow = unsuitable(windows[0]), machine.rate_hz * LONGEST_LAG_STEP_S < 1
+    if wrong and not too_slow:
         advice = "change lag_step_s, lag_to_s or length_s in [window] of the machine file; the recordings can stay"
         return Learned((Check(name="window settings", verdict="refused", text=wrong, advice=advice),))
     try:
@@ -191,6 +191,10 @@ def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
         for row, reason in evaluable_rows(windows[0].states, bool(np.isfinite(windows[0].speed_rad_s)))
         if not reason
     ]
+    if too_slow:
+        why = f"a sampling rate of {machine.rate_hz:g} Hz allows no equation"
+        least_hz = math.ceil(1 / LONGEST_LAG_STEP_S)
+        return _without_equations(machine, shape, no_shape, why, f"sample at {least_hz} Hz or faster")
     if not evaluable:
         return _without_equations(machine, shape, no_shape)
     try:
@@ -329,20 +333,18 @@ def _by_speed(pieces: Sequence[HealthyPiece]) -> list[list[HealthyPiece]]:
     return groups
 
 
-def _without_equations(machine: MachineFile, shape: HealthyShape | None, no_shape: str) -> Learned:
-    advice = (
-        "for the bearing in one plane: a displacement, velocity or acceleration at the bearing and at the disc in that "
-        "plane"
-    )
+def _without_equations(
+    machine: MachineFile,
+    shape: HealthyShape | None,
+    no_shape: str,
+    why: str = "these sensors allow no equation",
+    advice: str = "for the bearing in one plane: a displacement, velocity or acceleration at the bearing and at the "
+    "disc in that plane",
+) -> Learned:
     if shape is None:
-        check = Check(
-            name="equations", verdict="refused", text=f"these sensors allow no equation; {no_shape}", advice=advice
-        )
+        check = Check(name="equations", verdict="refused", text=f"{why}; {no_shape}", advice=advice)
         return Learned((check,))
-    text = (
-        "these sensors allow no equation: each channel will only be called changed or not changed, and no part of the "
-        "machine will be named"
-    )
+    text = f"{why}: each channel will only be called changed or not changed, and no part of the machine will be named"
     powers = shape.powers(SequentialSettings.for_machine(machine, short=False).shape_rate)
     equations = Check(name="equations", verdict="limited", text=text, advice=advice)
     return Learned((equations, check_shapes(machine, powers, shape.windows)), shape=shape)

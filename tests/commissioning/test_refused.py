@@ -182,6 +182,20 @@ def test_a_window_that_no_relation_can_be_read_in_is_a_matter_of_the_machine_fil
     assert "change lag_step_s" in advice
 
 
+@pytest.mark.slow
+def test_a_rate_too_low_for_relations_leaves_the_shapes_of_the_channels() -> None:
+    fields = NOTHING.model_dump(exclude={"window"}) | {"rate_hz": 500.0}
+    machine = MachineFile.model_validate(fields)
+    blocks = [replace(b, rate_hz=500.0, samples=b.samples[::4]) for b in stream(250.0, 60)]
+    made = made_of(blocks, machine)
+    verdict, text, advice = verdict_of(made, "equations")
+    assert verdict == "limited"
+    assert text.startswith("a sampling rate of 500 Hz allows no equation: each channel will only be called changed")
+    assert advice == "sample at 794 Hz or faster"
+    assert made.commissioned is not None
+    assert made.commissioned.shape is not None
+
+
 def test_the_usual_lag_spacing_fits_every_rate() -> None:
     fields = NOTHING.model_dump(exclude={"window"}) | {"rate_hz": 2560.0}
     machine = MachineFile.model_validate(fields)
