@@ -281,6 +281,9 @@ def commission(
             except EstimationError as error:
                 learned = Learned((_not_learned(knowledge.level, str(error)),))
             checks += learned.checks
+            if knowledge.level is not KnowledgeLevel.NONE and any(one.verdict == "refused" for one in learned.checks):
+                lines = check_lines(machine, recordings, unexplained=True)
+                checks = [lines if one.name == lines.name else one for one in checks]
     refused = any(check.verdict == "refused" for check in checks)
     windows = [piece.window for piece in pieces]
     commissioned = None
