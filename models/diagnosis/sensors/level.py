@@ -21,8 +21,6 @@ from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
 STILL_S = 0.25  # longest time for which equal samples are put down to quantisation
-# So many times as long as at a usual turning point may a quantised motion stay within a step, and samples that any may.
-_HELD, _FEWEST_HELD = 40.0, 12
 # Part of a hop's samples at its own limit that is put down to chance, beside what a quantised sine has there.
 FLAT_PART = 0.005
 # Part of the hops, and how many at least, whose tops end at one and the same value where the range ends there; what is
@@ -52,7 +50,6 @@ def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]
     hops, findings = window.hop_waveform, []
     rate_hz = hops.n_samples * len(window.waveforms) / window.duration_s
     limit = max(3, min(round(STILL_S * rate_hz), hops.n_samples))
-    explained = _explained(window, rate_hz, limit)
     for column, state in enumerate(window.sensors):
         runs, rms, step = hops.longest_run[:, column], hops.rms[:, column], hops.step[:, column]
         name, coarse = naming.name(state), rms < step
@@ -74,37 +71,16 @@ def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]
                 f"{quiet_s:.3g} s, expected a vibration of several steps: the sensor is dead or its range far too wide"
             )
             findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=quiet_s))
-        elif np.any(runs >= explained[:, column]):
+        elif runs.max() >= limit:
             still = int(runs.argmax())  # the mean of a hop is the value that was repeated, if all of the hop was
             known = runs[still] >= hops.n_samples
             what = f"the value {naming.value(state, float(hops.mean[still, column]))}" if known else "one value"
             text = (
                 f"{name}: repeated {what} for {longest_s:.3g} s, "
-                f"expected to move within {explained[:, column].min() / rate_hz:.2g} s: the sensor or its line is stuck"
+                f"expected to move within {STILL_S:g} s: the sensor or its line is stuck"
             )
             findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=longest_s))
     return findings
-
-
-def _explained(window: WindowStatistics, rate_hz: float, limit: int) -> FloatArray:
-    """Samples in a row that the steps of a channel can make equal, shape (n_hops, n_sensors); `limit` at most.
-
-    A motion of curvature a stays within a step q for (8q/a)¹ᐟ² where it turns. A flat top is for `clipped`.
-    """
-    hops, n = window.hop_waveform, len(window.states)
-    w = 2 * np.pi * window.frequencies_hz
-    curvature2 = 2 * np.ptp(window.frequencies_hz[:2]) * (w**4 @ np.einsum("fii->fi", window.spectrum).real)
-    if window.rotation_vectors is not None:
-        turning = np.abs(window.rotation_vectors) * np.nan_to_num(window.hop_speed_rad_s)[:, np.newaxis] ** 2
-        curvature2 = curvature2 + (turning**2).mean(axis=0) / 2
-    rms = hops.rms[:, :n]
-    part = rms / np.maximum(np.sqrt((rms**2).mean(axis=0)), np.finfo(float).tiny)
-    curvature = np.maximum(part * np.sqrt(curvature2), np.finfo(float).tiny)
-    turns = _HELD * rate_hz * np.sqrt(8 * np.nan_to_num(hops.step[:, :n], nan=np.inf) / curvature)
-    found = np.full(hops.longest_run.shape, float(limit))
-    flat = np.maximum(hops.at_minimum, hops.at_maximum)[:, :n] >= hops.longest_run[:, :n]
-    found[:, :n] = np.where(flat, limit, np.clip(turns, _FEWEST_HELD, limit))
-    return found
 
 
 def clipped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:

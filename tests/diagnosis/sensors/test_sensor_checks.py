@@ -122,21 +122,6 @@ def test_a_sensor_that_has_just_stuck_is_named_without_a_value_that_it_never_had
     assert "y1: repeated one value for 1.5 s" in only(found_in(samples)).text
 
 
-@pytest.mark.parametrize("steps", [0, 100, 1000])
-def test_samples_that_are_missing_in_between_are_told_and_no_quantisation_is(steps: int) -> None:
-    """Zeros for 60 ms every two seconds, as of a loose connector; `steps` of the converter in an rms."""
-    samples = recorded("lab", 1).copy()
-    at = column("y2_dot")
-    if steps:
-        step = samples[:, at].std() / steps
-        samples[:, at] = np.round(samples[:, at] / step) * step
-    assert found_in(samples) == ()
-    samples[(np.arange(len(samples)) % 4000 < 120), at] = 0.0
-    finding = only(found_in(samples))
-    assert (finding.kind, finding.states) == ("stuck", ("y2_dot",))
-    assert finding.value == pytest.approx(0.06, abs=0.001)
-
-
 def test_a_channel_that_shows_only_its_quantisation_is_dead() -> None:
     samples = recorded("lab", 1).copy()
     step = 10 * samples[:, column("z1")].std()
