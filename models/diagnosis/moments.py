@@ -456,8 +456,8 @@ def _between(hops: tuple[HopMoments, ...], beta: FloatArray, number: int, part: 
 
 
 def turns(hop: HopMoments) -> bool:
-    """Whether the shaft turned once: the rotation is not to be told from slow motion otherwise. True if unknown."""
-    return not abs(hop.turned_rad) < 2 * np.pi
+    """Whether the shaft made a quarter turn: rotation cannot be told from slow motion otherwise. True if unknown."""
+    return not abs(hop.turned_rad) < np.pi / 2
 
 
 def angle_jumps(hops: tuple[HopMoments, ...]) -> FloatArray:

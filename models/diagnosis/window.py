@@ -50,7 +50,7 @@ class WindowStatistics:
     spectrum: ComplexArray  # (n_bins, n, n), Hermitian cross-spectral matrices of the same part, two-sided, SI²/Hz
     frequencies_hz: FloatArray  # (n_bins,), their frequencies
     synchronous: ComplexArray | None  # (n,), q of x_n = Re{q e^{jθ}} over the window; None without a phase reference
-    hop_synchronous: ComplexArray | None  # (n_hops, n), the same of every hop alone; 0 without a whole turn
+    hop_synchronous: ComplexArray | None  # (n_hops, n), the same of every hop alone; 0 without a quarter turn
     # (n_hops, n): where the speed is estimated: the same of every hop, from an angle at which one state is
     # largest. Lengths and angles between channels hold, the angle to the shaft is unknown; zero in hops without a
     # speed.

@@ -16,6 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from models.mistakes import plainly
 from rotorwatch.records.example import example
 from rotorwatch.records.monitor import Problem
+from service.access.tokens import masked
 from service.history.records import StoreError
 from service.terminal.logs import logger
 
@@ -137,7 +138,7 @@ def add_problems(app: FastAPI) -> None:
     async def on_invalid(request: Request, error: Exception) -> JSONResponse:
         if not isinstance(error, RequestValidationError):
             raise error
-        faults = [{"field": _field(fault["loc"]), "message": plainly(fault)} for fault in error.errors()]
+        faults = [{"field": _field(fault["loc"]), "message": masked(plainly(fault))} for fault in error.errors()]
         detail = "; ".join(f"{fault['field']}: {fault['message']}" for fault in faults)
         return problem_answer(request, 422, detail, {"errors": faults})
 

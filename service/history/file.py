@@ -39,13 +39,13 @@ class HistoryFile:
         Raises
         ------
         StoreError
-            If a file is there that never was a history: no header, nor zeros in its place, nor a lock beside it.
+            If a file is there that never was a history: text, and neither a header nor zeros in its place.
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
         _make(self.path)
         with self.path.open("rb") as file:
             header = file.read(len(_HEADER))
-        if header.strip(b"\0") and not _HEADER.startswith(header) and not self.locks():
+        if header.strip(b"\0") and not _HEADER.startswith(header) and header.isascii():
             raise StoreError(
                 f"{self.path} is no history (SQLite), and stays as it is: expected a new file, or a history"
             )
@@ -103,10 +103,6 @@ class HistoryFile:
             if found is not None and (not only_opened or found == self._opened.get(end)):
                 self._beside(end).rename(kept.with_name(kept.name + end))
         return kept
-
-    def locks(self) -> list[Path]:
-        """The files that monitors lock, one for each machine of which they have written the history."""
-        return [Path(path) for path in glob.glob(f"{glob.escape(str(self.path))}.*.lock")]
 
     def _beside(self, end: str) -> Path:
         return Path(f"{self.path}{end}")
@@ -207,7 +203,7 @@ def restore(into: HistoryFile, backup: Path) -> Path | None:
     if found := faults(backup):
         raise StoreError(f"{backup}: {found[0]}")
     with ExitStack() as undo:
-        for path in into.locks():
+        for path in map(Path, glob.glob(f"{glob.escape(str(file))}.*.lock")):
             descriptor = lock_file(path)
             if descriptor is None:
                 raise StoreError(f"{file}: a monitor writes it ({path.name} is locked): stop it first")

@@ -184,7 +184,7 @@ class UniversalSource(Source):
             numbers = [number for number, kind in enumerate(file.get_set_types()) if kind == 58]
             read = file.read_sets(numbers) if numbers else []
             # Each data set stands between two such lines.
-            whole = len(re.findall(rb"    -1 *(?:[\r\n]|$)", path.read_bytes())) % 2 == 0
+            whole = len(re.findall(rb"(?m)^    -1 *\r?$", path.read_bytes())) % 2 == 0
             self._cut = "" if whole else "; the file is cut, it ends within a further one"
         sets: list[dict[str, Any]] = [read] if isinstance(read, dict) else list(read)
         sets = [found for found in sets if found["func_type"] == _TIME_RESPONSE]

@@ -235,6 +235,9 @@ class KnownMachineEvaluator(WindowEvaluator):
         self._given, self._bundle = machine, bundle
         # The sense of the gyroscopic moments is open until a window has been explained.
         self._open, self._opposite = commissioned is None, False
+        # Where the file does not say where the heavy spot is, it is looked for in the first window that shows it.
+        given = "unbalance_phase_rad" in machine.operation.model_fields_set
+        self._sought = commissioned is None and not given
         self._tried_ns, self._tried_in_vain = 0, False  # end of the window that the other one was tried on
         self._compare_with(machine)
 
@@ -273,15 +276,16 @@ class KnownMachineEvaluator(WindowEvaluator):
             opinions.append(_opinion(deciding, beside(deciding, diagnosis)))
         return Evaluation(deciding, short, equations, tuple(opinions), speed)
 
-    def _elsewhere(self, first: Diagnosis) -> bool:
-        """Whether the first window that is explained shows the heavy spot where it was only supposed not to be.
+    def _elsewhere(self, deciding: Diagnosis) -> bool:
+        """Whether the first window that shows the heavy spot shows it where it was only supposed not to be.
 
         Where the file does not say where it is, no turn of it can be told then: the unbalance is judged by its size.
         """
-        told = self._commissioned or "unbalance_phase_rad" in self._given.operation.model_fields_set
-        if told or not self.directed or self._explained_ns is not None or first.unexplained or first.unbalance is None:
+        vector = deciding.unbalance
+        if not self._sought or self._open or deciding.unexplained or vector is None or vector.foreign:
             return False
-        return first.unbalance.turned and not first.unbalance.foreign
+        self._sought = vector.turned_error_deg is None
+        return self.directed and vector.turned
 
     def _explained(self, window: WindowStatistics) -> Diagnosis:
         try:
@@ -353,21 +357,21 @@ class KnownMachineEvaluator(WindowEvaluator):
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Where the likelihood's maximum is followed from, and what is known; networks remember nothing."""
         explained = np.array([] if self._explained_ns is None else [self._explained_ns], dtype=np.int64)
-        sense = np.array([self._open, self._opposite, self._tried_in_vain, self._tried_ns], dtype=np.int64)
-        known = {_EXPLAINED: explained, _SENSE: sense, _DIRECTED: np.array(self.directed)}
+        sense = [self._open, self._opposite, self._tried_in_vain, self._tried_ns, self._sought]
+        known = {_EXPLAINED: explained, _SENSE: np.array(sense, dtype=np.int64), _DIRECTED: np.array(self.directed)}
         return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | known
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called, see `WindowEvaluator`."""
         explained = checked(arrays, _EXPLAINED, np.int64, (None,)).tolist()
-        still_open, opposite, in_vain, tried_ns = checked(arrays, _SENSE, np.int64, (4,)).tolist()
+        still_open, opposite, in_vain, tried_ns, sought = checked(arrays, _SENSE, np.int64, (5,)).tolist()
         directed = bool(checked(arrays, _DIRECTED, np.bool_, ()))
         machine = in_sense(self._given, "opposite" if opposite else "Eq. 27")
         likelihood = LengthFits(machine)
         likelihood.restore(unprefixed(_LIKELIHOOD, arrays))
         self._compare_with(machine)
         self._likelihood, self._explained_ns = likelihood, next(iter(explained), None)
-        self._open, self._opposite = bool(still_open), bool(opposite)
+        self._open, self._opposite, self._sought = bool(still_open), bool(opposite), bool(sought)
         self._tried_ns, self._tried_in_vain, self.directed = tried_ns, bool(in_vain), directed
 
     def _speed(self, window: WindowStatistics) -> float | None:

@@ -293,6 +293,8 @@ class LikelihoodFit:
         """Change of e; hop by hop where the speed varies."""
         known = (self._machine, model, point, structural)
         if window.removed_by_hop and window.hop_synchronous is not None:
+            if not window.hop_synchronous.any(axis=1).all():
+                raise EstimationError(f"{self._machine.name}: the shaft turned by less than a quarter turn in a hop")
             hop_s = window.duration_s / window.hop_speed_rad_s.size
             hops = window.hop_synchronous, window.hop_speed_rad_s, hop_s
             return estimate_unbalance_by_hop(*known, *hops, directed=window.directed)

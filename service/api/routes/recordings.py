@@ -57,6 +57,7 @@ def add_recording_routes(
         data_times: _DataTimes = False,
     ) -> RecordingList:
         """Recordings, by site, machine and time."""
+        asked = "" if machine is None else machine if site is None else f"{site}/{machine}"
         if machine is not None and site is None and "/" in machine:
             site, machine = machine.split("/", 1)
         listed = _present(index).recordings(site, machine)
@@ -65,8 +66,8 @@ def add_recording_routes(
             if not any(one.endswith(f"/{machine}") if site is None else one == f"{site}/{machine}" for one in there):
                 raise HTTPException(
                     404,
-                    f"no machine {machine[:64]} has recordings, and of those monitored none has "
-                    f"that name: {', '.join(there)}",
+                    f"no machine {asked[:128]!r} has recordings, and of those monitored none has that name: "
+                    f"{', '.join(there)}",
                 )
         chosen = [
             one

@@ -97,7 +97,7 @@ def test_a_deleted_history_is_written_again_with_all_it_held(tmp_path: Path) -> 
 def test_a_history_that_was_replaced_goes_on_with_the_numbers_of_the_alarms(tmp_path: Path, damaged: bool) -> None:
     other = tmp_path / "other"
     if damaged:
-        other.write_bytes(b"no database " * 1000)
+        other.write_bytes(b"\xff no database " * 1000)
     else:
         with opened(f"sqlite:///{other}"):
             pass
