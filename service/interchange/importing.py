@@ -144,7 +144,7 @@ def summary_lines(done: Imported) -> list[str]:
         *_pulse_lines(done),
     ]
     if read.left_out:
-        lines.append(f"rows left out for an empty cell, NaN or infinity: {read.left_out}")
+        lines.append(f"rows left out for an empty cell, NaN, infinity or a number beyond the dtype: {read.left_out}")
     if written.too_short:
         lines.append(f"samples left out in stretches shorter than a block: {written.too_short}")
     length_s = written.samples / machine.rate_hz

@@ -53,7 +53,7 @@ class Read:
     rows: int = 0  # of all files together
     gaps: list[Gap] = field(default_factory=list)
     filled: int = 0  # rows that were put into short gaps
-    left_out: int = 0  # rows left out for an empty cell, NaN or infinity
+    left_out: int = 0  # rows left out for an empty cell, NaN, infinity or a number beyond the dtype
 
 
 def signals_of(source: Source, mapping: Mapping, machine: MachineFile) -> list[Signal]:
