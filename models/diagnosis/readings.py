@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
+from scipy.special import chdtri
 
 from models.diagnosis.misfit import Goodness
 from models.diagnosis.window import WindowStatistics
@@ -33,6 +34,33 @@ def beyond(value: float, limit: float) -> tuple[str, str]:
         if (float(text) > limit) == (value > limit) and float(text) != limit:
             break
     return text, f"{limit:g}"
+
+
+_GAIN = 0.15  # relative error of every vector: what sensors, and a rotor that is not quite that of the model, make
+_RATE = 1e-6  # probability that vectors of an unbalance are taken for those of something else
+
+
+def foreign_rotation(observed: FloatArray, explained: FloatArray, spread: FloatArray) -> str:
+    """By how much what turns with the shaft is not what an unbalance makes; empty if it is.
+
+    Parameters
+    ----------
+    observed, explained : ndarray, shape (2n,)
+        Real parts of the vectors, then imaginary ones; and those of the unbalance that is nearest.
+    spread : ndarray, shape (2n, 2n)
+        Covariance of what was observed.
+    """
+    n = observed.size // 2
+    if n < 2:
+        return ""
+    size = np.maximum(np.hypot(observed[:n], observed[n:]), np.hypot(explained[:n], explained[n:]))
+    left = observed - explained
+    allowed = spread + np.diag(np.tile((_GAIN * size) ** 2 / 2, 2))
+    chi2, most = float(left @ np.linalg.solve(allowed, left)), float(chdtri(2 * n - 2, _RATE))
+    if chi2 <= most:
+        return ""
+    text, limit = beyond(chi2, round(most, 1))
+    return f"its misfit χ² is {text} with {2 * n - 2} degrees of freedom, evaluated is at most {limit}"
 
 
 _SEEN = 3.0  # standard errors from which a vector has a direction

@@ -25,12 +25,11 @@ from models.diagnosis.baseline.unbalance import (
     ForeignRotationError,
     SynchronousState,
     SynchronousVectors,
-    check_one_force,
     relative_force,
     rotation_of,
     slopes,
 )
-from models.diagnosis.readings import Diagnosis, beyond, no_reading, parameter_reading
+from models.diagnosis.readings import Diagnosis, beyond, foreign_rotation, no_reading, parameter_reading
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
@@ -327,7 +326,12 @@ class BaselineDiagnostician:
         weight = np.linalg.inv(positive(spread - known))
         combine = np.linalg.solve(design.T @ weight @ design, design.T @ weight)
         vector = combine @ observed
-        check_one_force(observed, design @ vector, spread)
+        usual = design @ [1.0, 0.0]
+        if foreign := foreign_rotation(usual + observed, usual + design @ vector, spread):
+            raise ForeignRotationError(
+                "what turns with the shaft is not what an unbalance makes, as with sensors of one plane that are "
+                f"swapped or reversed: {foreign}"
+            )
         size = math.hypot(1 + vector[0], vector[1])
         along = np.array([1 + vector[0], vector[1]]) / max(size, 1e-9) @ combine
         variance = float(along @ spread @ along)

@@ -10,19 +10,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
 
 from models.diagnosis.baseline.rows import Row, lowest, state_of
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.readings import beyond
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 
 SPEED_TOLERANCE = 0.03  # relative deviation of the speed within which synchronous vectors are compared
 _NEIGHBOURS = (2, 8)
-_GAIN = 0.15  # relative error of every force: what sensors, and relations that do not quite hold, make
-_RATE = 1e-6  # probability that forces of an unbalance are taken for those of something else
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,38 +155,6 @@ def relative_force(
 
 class ForeignRotationError(EstimationError):
     """What turns with the shaft is not what an unbalance makes."""
-
-
-def check_one_force(observed: FloatArray, explained: FloatArray, spread: FloatArray) -> None:
-    """See that what turns with the shaft is what an unbalance makes: one force in all planes.
-
-    Parameters
-    ----------
-    observed : ndarray
-        As `relative_force` gives it.
-    explained : ndarray
-        The same of that one unbalance which is nearest.
-    spread : ndarray
-        Covariance of `observed`.
-
-    Raises
-    ------
-    ForeignRotationError
-        If it is not.
-    """
-    n = observed.size // 2
-    if n < 2:
-        return
-    size = np.maximum(*(np.hypot(1 + each[:n], each[n:]) for each in (observed, explained)))
-    left = observed - explained
-    chi2 = float(left @ np.linalg.solve(spread + np.diag(np.tile((_GAIN * size) ** 2 / 2, 2)), left))
-    if chi2 <= (most := float(chdtri(2 * n - 2, _RATE))):
-        return
-    text, limit = beyond(chi2, round(most, 1))
-    raise ForeignRotationError(
-        "what turns with the shaft is not what an unbalance makes, as with sensors of one plane that are swapped or "
-        f"reversed: its misfit χ² is {text} with {2 * n - 2} degrees of freedom, evaluated is at most {limit}"
-    )
 
 
 def _forces(

@@ -10,18 +10,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
 
 from models.diagnosis.likelihood.motions import BinGroups
 from models.diagnosis.likelihood.spectral_model import STRUCTURAL, ModelPoint, SpectralModel
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.readings import UnbalanceVector, beyond
+from models.diagnosis.readings import UnbalanceVector, foreign_rotation
 from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray
-
-_GAIN = 0.15  # relative error of every motion: what sensors, and a rotor that is not quite that of the model, make
-_RATE = 1e-6  # probability that vectors of an unbalance are taken for those of something else
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,27 +123,11 @@ def estimate_unbalance(
         variances[at] = np.diag(spread)
         with_structural[at] = -spread @ (weight @ J) @ covariance
         between = float(spread[0, -1])
-    foreign = _foreign(machine.name, q2, design @ values[1:], total)
+    foreign = foreign_rotation(q2, design @ values[1:], total)
+    if foreign:
+        foreign = f"{machine.name}: what turns with the shaft is not what an unbalance makes on this rotor: {foreign}"
     weights = np.asarray(weighted.conj() @ combined[0] / total_weight, dtype=np.complex128)
     return UnbalanceRatios(values, variances, between, with_structural, foreign, weights)
-
-
-def _foreign(name: str, q2: FloatArray, explained: FloatArray, total: FloatArray) -> str:
-    """Why what turns with the shaft is not what an unbalance makes on this rotor; empty if it is."""
-    n = q2.size // 2
-    if n < 2:
-        return ""
-    amplitude = np.maximum(np.hypot(q2[:n], q2[n:]), np.hypot(explained[:n], explained[n:]))
-    allowed = total + np.diag(np.tile((_GAIN * amplitude) ** 2 / 2, 2))
-    left = q2 - explained
-    chi2, most = float(left @ np.linalg.solve(allowed, left)), float(chdtri(2 * n - 2, _RATE))
-    if chi2 <= most:
-        return ""
-    text, limit = beyond(chi2, round(most, 1))
-    return (
-        f"{name}: what turns with the shaft is not what an unbalance makes on this rotor: its misfit χ² is {text} "
-        f"with {2 * n - 2} degrees of freedom, evaluated is at most {limit}"
-    )
 
 
 def estimate_unbalance_by_hop(
