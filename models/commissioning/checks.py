@@ -142,14 +142,11 @@ def check_steady(
     )
 
 
-def check_lines(machine: MachineFile, recordings: Sequence[HealthyRecording], *, unexplained: bool = False) -> Check:
-    """Whether something else than noise and the rotation drives the machine.
-
-    Where theory does not explain the recordings, `unexplained`, any line is told: it has none but the rotation.
-    """
+def check_lines(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> Check:
+    """Whether something else than noise and the rotation drives the machine."""
     told = partial(Check, name="second excitation")
     found = [(one.name, line) for one in recordings for line in foreign_lines(one)]
-    loud = [(recording, line) for recording, line in found if unexplained or line.share > _LOUD_LINE]
+    loud = [(recording, line) for recording, line in found if line.share > _LOUD_LINE]
     if not loud:
         return told(verdict="passed", text="no line but those of the rotation stands out")
     text = "; ".join(
@@ -167,7 +164,7 @@ def check_lines(machine: MachineFile, recordings: Sequence[HealthyRecording], *,
             "without a phase reference this may be the rotation itself: give speed_rpm in [operation], or measure the "
             f"shaft angle; if it is not, {advice}"
         )
-    dominant = unexplained or unknown_speed or any(line.share > _DOMINANT_LINE for _, line in loud)
+    dominant = unknown_speed or any(line.share > _DOMINANT_LINE for _, line in loud)
     return told(verdict="refused" if dominant else "limited", text=text, advice=advice)
 
 

@@ -27,8 +27,10 @@ from models.diagnosis.networks.equations import EQUATIONS, Equation, Synchronous
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import learn_sensor_reference
+from models.diagnosis.stationarity import KnownLine
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import from_scale, slope, to_scale
+from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.levels.gains import learn_gains, place_of
 from models.levels.limits import alerts_of
@@ -281,9 +283,6 @@ def commission(
             except EstimationError as error:
                 learned = Learned((_not_learned(knowledge.level, str(error)),))
             checks += learned.checks
-            if knowledge.level is not KnowledgeLevel.NONE and any(one.verdict == "refused" for one in learned.checks):
-                lines = check_lines(machine, recordings, unexplained=True)
-                checks = [lines if one.name == lines.name else one for one in checks]
     refused = any(check.verdict == "refused" for check in checks)
     windows = [piece.window for piece in pieces]
     commissioned = None
@@ -303,6 +302,7 @@ def commission(
             identified=learned.identified,
             gyroscopic=learned.gyroscopic,
             misfit=_healthy_misfit(machine, learned, pieces),
+            lines=() if knowledge.level is KnowledgeLevel.NONE else _excluded(windows),
             baselines=learned.baselines,
             shape=learned.shape,
             sensors=learn_sensor_reference(windows),
@@ -317,6 +317,16 @@ def commission(
     return Commissioning(
         _report(machine, recordings, checks, learned, commissioned, pieces, wished), commissioned, learned.machine
     )
+
+
+def _excluded(windows: Sequence[WindowStatistics]) -> tuple[KnownLine, ...]:
+    """Lines that the likelihood has left out, which it leaves out from now on."""
+    found = {
+        (round(line.frequency_hz, 4), round(line.frequency_hz * 2 * np.pi / abs(window.speed_rad_s), 4))
+        for window in windows
+        for line in window.lines
+    }
+    return tuple(sorted(found))
 
 
 def _only_levels(machine: MachineFile, text: str) -> Check:

@@ -29,6 +29,7 @@ from models.diagnosis.moments import states_of
 from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.sensors.reference import Naming, SensorReference
 from models.diagnosis.shape import HealthyShape
+from models.diagnosis.stationarity import KnownLine
 from models.diagnosis.window import WindowStatistics
 from models.errors import BundleError
 from models.levels.reference import LevelReference
@@ -232,6 +233,11 @@ class Commissioned(BaseModel, extra="forbid", frozen=True):
         exclude_if=lambda found: found == "Eq. 27",
         description="levels full and partial: sense of the gyroscopic moments",
     )
+    lines: tuple[KnownLine, ...] = Field(
+        default=(),
+        exclude_if=lambda found: not found,
+        description="levels full and partial: steady lines of the healthy windows, which theory does not explain",
+    )
     baselines: tuple[ConditionBaseline, ...] = Field(
         default=(), description="level none: one for all conditions, or one for each speed where they differ"
     )
@@ -344,6 +350,11 @@ class Installed:
             return self.known is not None  # by theory
         levels = self.commissioned.levels
         return levels is not None and any(state.contact or state.lines for state in levels.states)
+
+    @property
+    def lines(self) -> tuple[KnownLine, ...]:
+        """Lines of the healthy machine that theory does not explain."""
+        return () if self.commissioned is None else self.commissioned.lines
 
     @property
     def identity(self) -> str | None:

@@ -102,9 +102,10 @@ def pieces_of(recordings: Sequence[HealthyRecording]) -> list[HealthyPiece]:
                 continue
             cuts = np.linspace(0, len(stretch), count + 1).round().astype(int)
             parts = [stretch[a:b] for a, b in pairwise(cuts.tolist())]
+            windows = [window_statistics(plan, part, lines=None) for part in parts]
             found += [
-                HealthyPiece(recording.name, 2 * number >= count, window_statistics(plan, part), levels_of(plan, part))
-                for number, part in enumerate(parts)
+                HealthyPiece(recording.name, 2 * number >= count, window, levels_of(plan, part))
+                for number, (window, part) in enumerate(zip(windows, parts, strict=True))
             ]
     return found
 

@@ -20,6 +20,7 @@ import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
 
 from models.diagnosis.moments import ComplexArray, HopMoments, Plan
+from models.diagnosis.stationarity import KnownLine
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
@@ -34,10 +35,6 @@ _NEARLY_ALL, _OTHER_WAY, _TURNS = 0.8, 0.2, 1.5
 """Least part that turns one way, most of it that turns the other way, and how often it gets round at least."""
 _LOUD, _SAME = 0.02, 0.02
 """Part of a channel's random power from which on a new line is told, and relative distance of a line from itself."""
-
-
-KnownLine = tuple[float, float]
-"""A line of the healthy machine: its frequency, Hz, and the same over the running speed."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ all of them were stored.
 """
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,7 @@ import numpy.typing as npt
 from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.moments import HopMoments, Plan, hop_moments
 from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of
+from models.diagnosis.stationarity import KnownLine
 from models.diagnosis.window import WindowStatistics, levels_of, window_statistics
 from models.errors import CheckpointError
 from models.levels.measures import WindowLevels
@@ -31,10 +32,13 @@ class SlidingWindow:
     plan : Plan
     remembered : bool
         Whether `checkpoint` will be asked for: the samples of every hop have their digest taken then.
+    lines : sequence of KnownLine
+        Those of the healthy machine.
     """
 
-    def __init__(self, plan: Plan, *, remembered: bool = False) -> None:
+    def __init__(self, plan: Plan, *, remembered: bool = False, lines: Sequence[KnownLine] = ()) -> None:
         self.plan = plan
+        self._lines = lines
         self._remembered = remembered
         self._hops: deque[HopMoments] = deque(maxlen=plan.hops)
         self._pieces: deque[Piece] = deque(maxlen=plan.hops)  # what each of them is made of
@@ -264,4 +268,4 @@ class SlidingWindow:
         count = self.plan.hops if hops is None else hops
         if not 0 < count <= len(self._hops):
             return None
-        return window_statistics(self.plan, tuple(self._hops)[-count:], lagged=hops is None)
+        return window_statistics(self.plan, tuple(self._hops)[-count:], lagged=hops is None, lines=self._lines)

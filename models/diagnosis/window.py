@@ -1,5 +1,6 @@
 """Statistics of a window, from the moments of its hops."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -20,7 +21,7 @@ from models.diagnosis.moments import (
     through,
     turns,
 )
-from models.diagnosis.stationarity import segment_levels, summed
+from models.diagnosis.stationarity import ExcludedLine, KnownLine, excluded_lines, segment_levels, summed
 from models.levels.measures import WindowLevels, window_levels
 from models.signals.block import FloatArray
 from models.signals.waveform import Waveform, stacked_waveform
@@ -75,6 +76,7 @@ class WindowStatistics:
     # The same window of the sensors as they are mounted, run-out included, where some of them are at an angle or have a
     # slow-roll vector. `waveforms` and `pair_powers` are those of mounted sensors in either.
     mounted: "WindowStatistics | None" = None
+    lines: tuple[ExcludedLine, ...] = ()  # that say nothing of the machine
     directed: bool = True  # whether vectors keep their directions: the shaft angle has not jumped since it was set up
 
     @property
@@ -93,10 +95,13 @@ class WindowStatistics:
         return stacked_waveform(self.waveforms)
 
 
-def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool = True) -> WindowStatistics:
+def window_statistics(
+    plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool = True, lines: Sequence[KnownLine] | None = ()
+) -> WindowStatistics:
     """Add hops up to a window and take out its mean and its rotation-synchronous part.
 
-    Without `lagged`, correlations are at lag zero alone: the spectra are all that the likelihood asks for.
+    Without `lagged`, correlations are at lag zero alone: the spectra are all that the likelihood asks for. For `lines`
+    see `excluded_lines`.
 
     With a = (x, n) and β the least-squares coefficients of x on n over the window, the sum of
     (x - βn)(t-τ) (x - βn)ᵀ(t) is the product sum seen through the matrix (I, -β) from both sides.
@@ -174,6 +179,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         waveforms=tuple(hop.waveform for hop in hops),
         sensors=plan.sensors,
         pair_powers=tuple(hop.pair_powers for hop in hops),
+        lines=excluded_lines(by_bin, spectrum, plan.frequencies_hz, abs(speed_rad_s) / (2 * np.pi), lines),
     )
     shaft = found if plan.runout is None else _without(found, plan.runout)
     return shaft if plan.turn is None else _turned(shaft, plan.states, plan.turn)

@@ -349,7 +349,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         for hops in wanted:
             with suppress(EstimationError):  # too little data for itself; the window has said what there is to say
                 if (statistics := sliding.statistics(hops)) is not None:
-                    statistics = statistics if self.directed else replace(statistics, directed=False)
+                    statistics = replace(statistics, directed=self.directed, lines=window.lines)
                     decided = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
                     evaluated[hops] = self._within(decided)
         return evaluated

@@ -87,7 +87,7 @@ class MachineMonitor:
         self._due: deque[Arrived] = deque()
         self._done: list[MonitorReport] = []
         self._gate = Gate(machine)
-        self._window = SlidingWindow(self._plan, remembered=remembered)
+        self._window = SlidingWindow(self._plan, remembered=remembered, lines=installed.lines)
         self._test = SequentialTest(SequentialSettings.for_machine(machine, short=judge.takes_short), by=judge.by)
         self._alarms = AlarmBook(machine.alarms)
         self._data_path = DataPathAlarms(self._alarms, machine)

@@ -1,6 +1,6 @@
 """Healthy recordings of the shipped rotor kit, and machine files that tell less of it than is known."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -84,6 +84,18 @@ def humming(stream_: Sequence[SampleBlock], line_hz: float, bearing_m: float = 6
         moved_m = bearing_m if channel.location == "bearing" else 60e-6
         hum = 2 * np.pi * line_hz * np.cos(turned) if channel.quantity == "velocity" else np.sin(turned)
         samples[:, column] += moved_m * hum / channel.to_si
+    return with_samples(stream_, samples)
+
+
+def with_lines(stream_: Sequence[SampleBlock], parts: Mapping[float, float], order: float = 0.0) -> list[SampleBlock]:
+    """The same with lines of these frequencies, Hz, and parts of each channel's rms, or at an order with part 0.05."""
+    samples = samples_of(stream_)
+    spread, at_s = samples[:, :8].std(axis=0), np.arange(len(samples)) / LAB.rate_hz
+    phases = np.random.default_rng(5200).uniform(0, 2 * np.pi, 8)
+    for line_hz, part in parts.items():
+        samples[:, :8] += part * spread * np.sin(2 * np.pi * line_hz * at_s[:, np.newaxis] + phases)
+    if order:
+        samples[:, :8] += 0.05 * spread * np.sin(order * samples[:, 8:9] + phases)
     return with_samples(stream_, samples)
 
 

@@ -39,6 +39,7 @@ from tests.commissioning.rotor_kit import (
     samples_of,
     stream,
     windows_of,
+    with_lines,
     with_samples,
 )
 from tests.sure import sure
@@ -88,6 +89,18 @@ def test_a_heavy_spot_at_another_angle_than_in_the_file_is_refused_with_its_angl
     assert report.verdict == "refused"
     assert "is 0° from the phase reference, where the file has it at 86°" in report.summary
     assert "unbalance_phase_rad = " in report.summary
+
+
+def test_lines_of_the_healthy_machine_hide_no_rotor() -> None:
+    """A gear, hum, and the second harmonic that every real machine has: theory knows none of them."""
+    made = commissioned(PARTIAL, recording(PARTIAL, with_lines(stream(70.0, 41), {50.03: 0.1, 37.3: 0.1}, order=2)))
+    found = sure(made.commissioned)
+    assert {round(line_hz) for line_hz, _ in found.lines} == {37, 44, 50}
+    errors = np.sqrt(np.diag(sure(found.identified).matrix()))
+    for name, error in zip(PARAMETERS[:4], errors.tolist(), strict=False):
+        known, true = (getattr(machine.rotor, FAULT_FIELDS[name]) for machine in (sure(made.machine), LAB))
+        assert abs(np.log(known / true)) < 4 * error, name
+    assert Commissioned.model_validate_json(found.model_dump_json()) == found
 
 
 @pytest.mark.slow

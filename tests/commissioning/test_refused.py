@@ -94,18 +94,6 @@ def test_a_channel_that_reaches_the_end_of_its_range_is_told(bits: int, limit: f
     assert ("y1 stands at exactly" in text) == (verdict == "limited")
 
 
-def test_a_faint_line_is_told_where_theory_does_not_explain_the_recording() -> None:
-    blocks = stream(HEALTHY_S, 52)
-    samples = samples_of(blocks)
-    hum = 0.1 * np.sin(2 * np.pi * 50 * np.arange(len(samples)) / LAB.rate_hz)
-    samples[:, :8] += np.outer(hum, samples[:, :8].std(axis=0))
-    made = made_of(with_samples(blocks, samples), PARTIAL)
-    assert refused(made)
-    verdict, text, _ = verdict_of(made, "second excitation")
-    assert verdict == "refused"
-    assert re.search(r"a steady line at 50\.00 Hz makes [0-4]\.\d+ % of the random vibration of", text)
-
-
 def test_a_stuck_channel() -> None:
     blocks = stream(HEALTHY_S, 52)
     samples = samples_of(blocks)

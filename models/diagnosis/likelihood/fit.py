@@ -44,7 +44,7 @@ _GROUPS = 150  # the band over the widest group
 _PATIENCE, _HOPELESS = 30, 2.0
 _OUTSIDE = "a sensor is at fault, or something outside the model has changed"
 _STIFFEST, _SURELY = 0.5, 3.0  # no shaft becomes stiffer by half; in standard errors
-_SYNCHRONOUS_BINS = 3
+_SYNCHRONOUS_BINS, _FEWEST_BINS = 3, 20
 # Standard errors by which latest hops may differ from the window in the unbalance, and in all together from nominal.
 _DIFFERS, _STANDS_OUT = 3.0, 4.0  # a change is named from five on
 _FOLLOWED = 12  # windows in a row that may start from one window's units and slopes before a search takes its own
@@ -163,7 +163,7 @@ class LikelihoodFit:
         """
         window = integrated(window)
         speed = self._speed(window)
-        excluded = _near_rotation(window, speed)
+        excluded = _near_lines(window, speed)
         power = self._checked_power(window, ~excluded)
         no_maximum = f"{self._machine.name}: the likelihood has no maximum for this window: {_OUTSIDE}"
         try:
@@ -232,7 +232,7 @@ class LikelihoodFit:
         line, speed = self._line, self._speed(stretch)
         if line is None:
             return None
-        groups = self._grouped(stretch.frequencies_hz, _near_rotation(stretch, speed), 1.0)
+        groups = self._grouped(stretch.frequencies_hz, _near_lines(stretch, speed), 1.0)
         if not groups.same_as(line.model.groups) or stretch.states != line.model.motions.states:
             return None
         seen = line.glance(_observed(line.model, stretch), stretch.n_segments / self._line_segments)
@@ -335,6 +335,11 @@ class LikelihoodFit:
 
     def _checked_power(self, window: WindowStatistics, used: npt.NDArray[np.bool_]) -> FloatArray:
         """Mean density of every state; raises EstimationError for dead or doubled channels."""
+        if np.count_nonzero(used) < _FEWEST_BINS:
+            raise EstimationError(
+                f"{self._machine.name}: steady lines and the rotation leave {np.count_nonzero(used)} of the "
+                f"{used.size} frequencies in band_hz, expected at least {_FEWEST_BINS}"
+            )
         observed = window.spectrum[used]
         power = np.einsum("fii->i", observed).real / observed.shape[0]
         twins = _twins(window.states, observed)
@@ -425,12 +430,15 @@ def _observed(model: SpectralModel, window: WindowStatistics) -> ComplexArray:
     return model.motions.spectra(model.groups.average(window.spectrum), model.centre)
 
 
-def _near_rotation(window: WindowStatistics, speed_rad_s: float) -> npt.NDArray[np.bool_]:
-    """Bins around the rotation, wherever it went: what is left of its line there is not stochastic."""
+def _near_lines(window: WindowStatistics, speed_rad_s: float) -> npt.NDArray[np.bool_]:
+    """Bins around the rotation, wherever it went, and other lines: what is left of these there is not stochastic."""
     f = window.frequencies_hz
     slowest, fastest = window.speed_range if window.removed_by_hop else (speed_rad_s, speed_rad_s)
     passed = np.clip(f, slowest / (2 * np.pi), fastest / (2 * np.pi))
-    return np.asarray(np.abs(f - passed) <= _SYNCHRONOUS_BINS * (f[1] - f[0]))
+    near = np.abs(f - passed) <= _SYNCHRONOUS_BINS * (f[1] - f[0])
+    for line in window.lines:
+        near |= np.abs(f - line.frequency_hz) <= line.reach_hz
+    return np.asarray(near)
 
 
 def _twins(states: tuple[str, ...], observed: ComplexArray) -> tuple[str, ...]:

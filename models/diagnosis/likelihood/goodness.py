@@ -108,6 +108,7 @@ _MOST_EXCESS = 100.0
 # Deviation of the spectra from the theory (relative, rms, less what sampling makes) up to which readings mean a thing.
 # Where parameters of the model changed, by whatever, it stays below 0.05; a rub or a small mass makes up to 0.17.
 _MOST_DEVIATION = 0.2
+_SKIRTS = 2  # groups on either side in which a line is seen besides
 # The same where a parameter would have changed by more than a factor of two: a rub or a mass hardly moves them, and a
 # change as large as that must explain the window.
 _LARGE, _MOST_DEVIATION_LARGE = float(np.log(2)), 0.1
@@ -144,7 +145,14 @@ def unexplained_at(
     most = _MOST_DEVIATION if abs(log_ratio) <= _LARGE else _MOST_DEVIATION_LARGE
     if far or deviation > times * most:
         text, limit = beyond(100 * deviation, 100 * most)
-        why = f"its spectra deviate from it by {text} % (rms, sampling aside), evaluated is at most {limit} %"
+        where = int(squared.argmax())
+        there = slice(max(0, where - _SKIRTS), where + _SKIRTS + 1)
+        line = (
+            f", most of it at {model.groups.centre_hz[where]:.3g} Hz"
+            if 2 * squared[there].sum() > squared.sum()
+            else ""
+        )
+        why = f"its spectra deviate from it by {text} % (rms, sampling aside){line}, evaluated is at most {limit} %"
         return why, far or impossible
     # Noise is a sensor's own: what both sensors of a motion show is motion, and this one the theory does not explain.
     shared = np.maximum(model.noise(point.theta) - _UNSHARED * model.motions.rest(states, model.centre), 0)

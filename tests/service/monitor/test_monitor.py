@@ -20,6 +20,8 @@ from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition
+from tests.commissioning.rotor_kit import with_lines
+from tests.sure import sure
 
 SEED = 7_700_002
 
@@ -222,6 +224,14 @@ def test_a_load_that_steps_is_inside_the_model() -> None:
     windows, events = feed(monitor(), stream(125.0, Event(at_s=65.0, excitation_level=3.0)))
     assert events == []
     assert {one.verdict.outside_model for one in windows if one.verdict is not None} == {False}
+
+
+def test_mains_hum_hides_no_rotor_and_another_line_is_told_with_its_frequency() -> None:
+    windows, events = feed(monitor(), with_lines(healthy(75.0), {50.02: 0.1, 150.06: 0.03}))
+    assert {one.state for one in windows if one.filled == 1.0} == {HealthState.HEALTHY}
+    assert events == []
+    (last,) = feed(monitor(), with_lines(healthy(63.0), {37.3: 0.3}))[0][-1:]
+    assert "most of it at 37" in sure(last.parameters[0].reason)
 
 
 def test_a_machine_that_runs_down_raises_nothing() -> None:
