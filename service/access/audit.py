@@ -17,7 +17,6 @@ from dataclasses import asdict, dataclass
 from models.errors import RotorwatchError
 from service.access.rates import MovingWindow
 from service.access.tokens import masked
-from service.history.records import AuditEntry
 from service.history.shared import AuditLog
 from service.terminal.logs import logger
 
@@ -112,9 +111,9 @@ class AuditTrail:
         return withheld
 
     def _write(self, visit: Visit, status: int, note: AuditNote) -> None:
-        said = {name: _short(text) for name, text in asdict(note).items()}
-        method, path = _short(visit.method), _short(visit.path)
-        self._journal.append(AuditEntry(0, visit.at_ns, visit.actor, visit.address, method, path, status, **said))
+        texts = asdict(note) | {"method": visit.method, "path": visit.path}
+        said = {name: _short(text) for name, text in texts.items()}
+        self._journal.append(visit.at_ns, status, actor=visit.actor, address=visit.address, **said)
 
 
 def _short(text: str) -> str:

@@ -20,7 +20,7 @@ from models.errors import MachineFileError
 from service.commands.running import HistoryOption
 
 if TYPE_CHECKING:  # these import sqlalchemy, which --help must not wait for
-    from service.history.records import AuditEntry
+    from rotorwatch.records.history import AuditRecord
     from service.history.store import Store
     from service.settings.service import HistorySettings
 
@@ -172,7 +172,7 @@ def audit(
         typer.echo(_audit_line(entry, who, origin))
 
 
-def _with_outcomes(store: "Store", machine: str | None, actor: str | None) -> "Iterator[AuditEntry]":
+def _with_outcomes(store: "Store", machine: str | None, actor: str | None) -> "Iterator[AuditRecord]":
     """Entries, newest first, without the beginnings whose outcome is there too."""
     from service.access.audit import STARTED  # noqa: PLC0415  # keeps --help quick
 
@@ -187,7 +187,7 @@ def _with_outcomes(store: "Store", machine: str | None, actor: str | None) -> "I
         before = page[-1].number
 
 
-def _audit_line(entry: "AuditEntry", who: int, origin: int) -> str:
+def _audit_line(entry: "AuditRecord", who: int, origin: int) -> str:
     """One entry in a line, which nothing is cut off from; `who` and `origin` are widths of columns."""
     from service.access.audit import STARTED  # noqa: PLC0415  # keeps --help quick
 
@@ -220,14 +220,12 @@ def _opened(config: Path | None) -> "Iterator[Store]":
 
 def _write(store: "Store", action: str, reason: str) -> None:
     """Into the audit log, before it is done."""
-    from service.history.records import AuditEntry  # noqa: PLC0415  # keeps --help quick
-
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a container whose user has no name
         user = f"user {os.getuid()}"
-    said = {"action": action, "reason": reason}
-    store.audit.append(AuditEntry(0, time.time_ns(), user, "", "command", "rotorwatch token", status=200, **said))
+    said = {"action": action, "reason": reason, "method": "command", "path": "rotorwatch token"}
+    store.audit.append(time.time_ns(), 200, actor=user, address="", machine="", alarm="", **said)
 
 
 def _utc(time_ns: int) -> str:

@@ -124,27 +124,6 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class AuditEntry:
-    """Who asked for what over the API, and what came of it.
-
-    `number` is given by the database in the order of arrival; `actor` is the name of the token; `machine` is
-    ``site/name``, and empty, as `action`, `alarm` and `reason` are, where it does not apply.
-    """
-
-    number: int
-    at_ns: int
-    actor: str
-    address: str
-    method: str
-    path: str
-    status: int
-    action: str = ""
-    machine: str = ""
-    alarm: str = ""
-    reason: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class TokenRecord:
     """A token of access, without its secret, of which only a hash is kept."""
 

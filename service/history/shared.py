@@ -4,9 +4,10 @@ from typing import Any
 
 from sqlalchemy import func, insert, select, update
 
+from rotorwatch.records.history import AuditRecord
 from service.history.claim import unpack
 from service.history.database import Database
-from service.history.records import AuditEntry, StoredEvent, StoreError, TokenRecord
+from service.history.records import StoredEvent, StoreError, TokenRecord
 from service.history.tables import alarm_events, audit_log, machines, reports, tokens, webhook_cursors
 
 EVENT = [alarm_events.c[name] for name in StoredEvent.__dataclass_fields__]
@@ -73,7 +74,7 @@ class ReportLog:
         return [unpack(text) for (text,) in self._database.rows(query)]
 
 
-_ENTRY = [audit_log.c[name] for name in AuditEntry.__dataclass_fields__]
+_ENTRY = [audit_log.c[name] for name in AuditRecord.model_fields]
 
 
 class AuditLog:
@@ -85,17 +86,18 @@ class AuditLog:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def append(self, entry: AuditEntry) -> int:
-        """Write an entry and return its number; the number in the entry is not looked at."""
-        values = {name: _storable(getattr(entry, name)) for name in AuditEntry.__dataclass_fields__ if name != "number"}
+    def append(self, at_ns: int, status: int, **texts: str) -> int:
+        """Write an entry and return its number; `texts` are all other fields of an `AuditRecord`."""
+        storable = {name: _storable(text) for name, text in texts.items()}
+        entry = insert(audit_log).values(at_ns=at_ns, status=status, **storable)
         with self._database.writing() as connection:
-            made = connection.execute(insert(audit_log).values(values).returning(audit_log.c.number))
+            made = connection.execute(entry.returning(audit_log.c.number))
             number: int = made.scalar_one()
         return number
 
     def entries(
         self, before: int | None = None, limit: int = 100, *, machine: str | None = None, actor: str | None = None
-    ) -> tuple[AuditEntry, ...]:
+    ) -> tuple[AuditRecord, ...]:
         """Entries, newest first.
 
         Parameters
@@ -116,12 +118,12 @@ class AuditLog:
             query = query.where(audit_log.c.machine == machine)
         if actor is not None:
             query = query.where(audit_log.c.actor == actor)
-        return tuple(AuditEntry(*row) for row in self._database.rows(query))
+        return tuple(AuditRecord.model_validate(dict(row._mapping)) for row in self._database.rows(query))
 
 
-def _storable(value: str | int) -> str | int:
-    """A value without what a stranger can put into a request and no database takes."""
-    return value if isinstance(value, int) else value.replace("\0", "\\0").encode("utf-8", "backslashreplace").decode()
+def _storable(text: str) -> str:
+    """A text without what a stranger can put into a request and no database takes."""
+    return text.replace("\0", "\\0").encode("utf-8", "backslashreplace").decode()
 
 
 _TOKEN = [tokens.c[name] for name in TokenRecord.__dataclass_fields__]

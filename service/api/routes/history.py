@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Annotated, Any
 
 from fastapi import FastAPI, HTTPException, Path, Query
@@ -42,7 +41,6 @@ from service.api.views import (
     check_alarm,
     found_machine,
 )
-from service.history.records import AuditEntry
 from service.stream.monitored import Monitored
 
 _LARGEST = 2**63 - 1
@@ -203,8 +201,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
         """Who asked for what and what came of it, newest first; kept for ever."""
         found = service.store.audit.entries(before, limit, machine=machine, actor=actor)
         _check_audited(service, machine, found)
-        entries = tuple(AuditRecord(**asdict(one)) for one in found)
-        return AuditList(entries=entries, next_before=found[-1].number if len(found) == limit else None)
+        return AuditList(entries=found, next_before=found[-1].number if len(found) == limit else None)
 
     @app.get("/api/v1/history", tags=["service"], dependencies=[guard.configure], responses=responses(HistoryStatus))
     def history() -> HistoryStatus:
@@ -230,7 +227,7 @@ def _trend(service: ServiceView, of: str, hours: int, points: int) -> Trend:
     )
 
 
-def _check_audited(service: ServiceView, place: str | None, found: Sequence[AuditEntry]) -> None:
+def _check_audited(service: ServiceView, place: str | None, found: Sequence[AuditRecord]) -> None:
     """Refuse a machine that is not there and to which nothing was ever done."""
     if place is not None and not found and not service.store.audit.entries(None, 1, machine=place):
         found_machine(service, *place.rpartition("/")[::2])

@@ -73,7 +73,7 @@ def test_a_deleted_history_is_written_again_with_all_it_held(tmp_path: Path) -> 
     with bench(tmp_path) as at:
         at.put(*map(block, range(12)), block(40, run=2, sequence=0))
         at.store.tokens.add(TOKEN)
-        at.store.audit.append(AUDIT)
+        at.store.audit.append(**AUDIT)
         before = at.log()
         assert before
         history_of(tmp_path).unlink()

@@ -191,7 +191,7 @@ def test_what_is_not_finite_is_kept_and_has_no_mean(store: Store) -> None:
 def test_everything_goes_in_its_time_but_alarms_and_audit(store: Store, clock: Clock) -> None:
     lab = store.machine("demo", "lab")
     assert lab.commit(Step(events=(alarm_event(0),)))
-    store.audit.append(AUDIT)
+    store.audit.append(**AUDIT)
     write(lab, clock, 1200, per_step=1200 // 8)
     written = T0 + 1200 * HOP + NS
     assert store.reduction.run(written + 13 * DAY) == Dropped()

@@ -17,13 +17,14 @@ from fastapi import APIRouter, FastAPI, Request
 from fastapi.responses import HTMLResponse, StreamingResponse
 from pydantic import BaseModel
 
+from rotorwatch.records.history import AuditRecord
 from service.access.audit import AuditNote
 from service.access.guard import Guard
 from service.access.problems import add_problems
 from service.access.scopes import Caller, Scope
 from service.access.tls import server_arguments
 from service.access.tokens import new_token
-from service.history.records import AuditEntry, TokenRecord
+from service.history.records import TokenRecord
 from service.history.store import Store
 from service.settings.access import AccessSettings
 from tests.service.rig.postgres import opened
@@ -72,7 +73,7 @@ class Guarded:
         self.store.tokens.add(record)
         return record, text
 
-    def entries(self) -> list[AuditEntry]:
+    def entries(self) -> list[AuditRecord]:
         """Everything in the audit log, oldest first."""
         return list(reversed(self.store.audit.entries(limit=1000)))
 

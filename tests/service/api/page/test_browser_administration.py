@@ -11,7 +11,6 @@ from playwright.sync_api import Browser, Page, expect
 from rotorwatch.records.example import example
 from rotorwatch.records.monitor import MachineReadiness, Readiness, WebhookList
 from service.access.scopes import Scope
-from service.history.records import AuditEntry
 from service.runtime.runtime import Runtime
 from tests.service.api.page.browsing import PATIENCE_MS, kept, looking, unreached, violations
 from tests.service.rig.monitored import GUARDED, fed, token
@@ -26,7 +25,16 @@ def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
         feed.put_good()
         for number in range(OLD):
             running.store.audit.append(
-                AuditEntry(0, number, "anna", "", "POST", "/api/v1/x", 200, "reset", "demo/lab", "k_by", "long ago")
+                number,
+                200,
+                actor="anna",
+                address="",
+                method="POST",
+                path="/api/v1/x",
+                action="reset",
+                machine="demo/lab",
+                alarm="k_by",
+                reason="long ago",
             )
         yield running
 
