@@ -2,8 +2,9 @@
 
 from typing import Annotated, Any
 
-from fastapi import Depends, FastAPI, Query, Request
-from fastapi.responses import JSONResponse
+from fastapi import Depends, FastAPI, Query, Request, Response
+from fastapi.responses import JSONResponse, PlainTextResponse
+from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import AfterValidator, Field, WithJsonSchema
 
 from models.machine import MachineFile, load_machine
@@ -11,9 +12,9 @@ from rotorwatch import __version__
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health
 from rotorwatch.records.machines import DetectableChanges, MachineConfiguration, MachineDescription, MachineList
-from rotorwatch.records.monitor import Alive, Readiness
+from rotorwatch.records.monitor import Alive, Readiness, WebhookList
 from service.access.guard import Guard
-from service.access.problems import add_problems, problem_answer, responses
+from service.access.problems import add_problems, problem_answer, problem_responses, responses
 from service.api.description import DescribedApp, only_known_arguments
 from service.api.routes.events import add_event_routes
 from service.api.routes.history import add_history_routes
@@ -22,7 +23,6 @@ from service.api.routes.page import add_docs_routes, add_page_routes
 from service.api.routes.plots import add_plot_routes
 from service.api.routes.recordings import add_recording_routes
 from service.api.routes.replays import add_replay_routes
-from service.api.routes.service import add_service_routes
 from service.api.routes.snapshots import add_snapshot_routes
 from service.api.routes.tokens import add_session_routes, add_token_routes
 from service.api.samples import SampleReader
@@ -49,6 +49,11 @@ _TAGS = [
     {"name": "service", "description": "The monitor itself."},
 ]
 _SMALLEST_CHANGE = 1e-6
+_METRICS = (
+    "# HELP rotorwatch_blocks_accepted_total Blocks accepted\n"
+    "# TYPE rotorwatch_blocks_accepted_total counter\n"
+    'rotorwatch_blocks_accepted_total{machine="lab",site="demo"} 2051.0\n'
+)
 
 
 def _sizeable(change: float) -> float:
@@ -107,7 +112,7 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     add_event_routes(app, service, guard)
     add_recording_routes(app, service.catalogue, guard, lambda: [one.machine.title for one in service.machines()])
     add_replay_routes(app, service.replays, guard)
-    add_service_routes(app, service, guard)
+    _add_service_routes(app, service, guard)
     add_session_routes(app, guard)
     add_token_routes(app, guard)
     _add_readiness_routes(app, service, guard)
@@ -151,6 +156,27 @@ def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
     def detectable(view: InPath, change: _Change = None) -> DetectableChanges:
         """Smallest changes that would be found in a window as the machine runs now, and the data a wished one takes."""
         return view.detectable(change)
+
+
+def _add_service_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+    @app.get(
+        "/metrics",
+        tags=["service"],
+        dependencies=[guard.read],
+        response_class=PlainTextResponse,
+        responses={
+            200: {"content": {"text/plain": {"schema": {"type": "string"}, "example": _METRICS}}},
+            **problem_responses(),
+        },
+    )
+    def metrics() -> Response:
+        """Numbers for Prometheus; a list of them is in the documentation."""
+        return Response(service.metrics.text(), media_type=CONTENT_TYPE_LATEST)
+
+    @app.get("/api/v1/webhooks", tags=["service"], dependencies=[guard.read], responses=responses(WebhookList))
+    def webhooks() -> WebhookList:
+        """Programs that are told of alarm events, and whether they take them."""
+        return service.webhooks.statuses()
 
 
 def _add_readiness_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:

@@ -1,18 +1,15 @@
 """What the HTTP API needs to know about the service and its machines, and the arguments its routes share."""
 
 import re
-from collections.abc import Sequence
 from typing import Annotated, Protocol
 
 from fastapi import Depends, HTTPException, Path, Query, Request
 from pydantic import AfterValidator
 
 from models.alarm_names import ALARMS, LEVEL, is_alarm
-from rotorwatch.records.monitor import Readiness
 from service.api.routes.replays import ReplayRequests
 from service.delivery.event_feed import EventFeed
-from service.delivery.metrics.collector import Metrics
-from service.delivery.webhooks.webhooks import Webhooks
+from service.delivery.metrics.collector import MeasuredService, Metrics
 from service.history.store import Store
 from service.recordings.catalogue import Catalogue
 from service.stream.monitored import Monitored
@@ -41,17 +38,10 @@ AlarmName = Annotated[
 ]
 
 
-class ServiceView(Protocol):
+class ServiceView(MeasuredService, Protocol):
     """What the API needs to know about the service; `service.runtime.runtime.Runtime` is one."""
 
-    def machines(self) -> Sequence[Monitored]:
-        """Every monitored machine."""
-
-    def readiness(self) -> Readiness:
-        """Whether the service can do its work."""
-
     metrics: Metrics
-    webhooks: Webhooks
     feed: EventFeed
     store: Store
     catalogue: Catalogue | None  # None if no directory for recordings is set
