@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated, Self
 
 import numpy as np
-from pydantic import BaseModel, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.motion import motion_pairs, pair_bands
@@ -224,14 +224,9 @@ class NoiseReference(BaseModel, extra="forbid", frozen=True, strict=True, allow_
 class _WithNoise(BaseModel, extra="forbid", frozen=True, strict=True, allow_inf_nan=False):
     """A reference that may be older than the check of noise; then it is written as it was read."""
 
-    noise: NoiseReference | None = Field(default=None, description="None where it was not learned")
-
-    @model_serializer(mode="wrap")
-    def _as_read(self, handler: SerializerFunctionWrapHandler) -> dict[str, object]:
-        content: dict[str, object] = handler(self)
-        if self.noise is None:
-            content.pop("noise", None)
-        return content
+    noise: NoiseReference | None = Field(
+        default=None, exclude_if=lambda noise: noise is None, description="None where it was not learned"
+    )
 
 
 class ChannelReference(_WithNoise):
