@@ -52,46 +52,33 @@ _SlowRoll = Annotated[
 _Values = TypeVar("_Values", WaveformSnapshot, FullSpectrumSnapshot, WaterfallSnapshot, VectorSeries, CentrelineSeries)
 
 
-def _of_samples(
+def _made(
     reader: SampleReader,
     view: Monitored,
     chosen: Chosen,
     kind: type[_Values],
-    make: Callable[[Sampled], _Values],
+    make: Callable[[Any], _Values],
     reach_s: float | None = None,
+    *,
+    of_history: bool = False,
     **asked: Any,
 ) -> _Values:
-    """What is made of samples; where there is nothing to make it of, why, beside what was asked for."""
+    """What is made of samples, or of the history; where there is nothing to make it of, why, beside what was asked for.
+
+    Without recordings it is of the newest samples, or of the history: every so many windows of a long time.
+    """
+    source = "recordings" if chosen.recorded else "history" if of_history else "newest samples"
     try:
+        if of_history and not chosen.recorded:
+            between = chosen.since_ns, chosen.until_ns
+            return make(Past.of(view.machine, view.history.report_log, *between, _MOST_REPORTS))
         with reader.samples(view, chosen, reach_s) as data:
             return make(data)
     except SnapshotError:
         raise
     except RotorwatchError as error:
-        return _without(view, kind, "recordings" if chosen.recorded else "newest samples", error, asked)
-
-
-def _of_past(
-    reader: SampleReader,
-    view: Monitored,
-    names: list[str],
-    between: tuple[int | None, int | None],
-    kind: type[_Values],
-    make: Callable[[Sampled | Past], _Values],
-    **asked: Any,
-) -> _Values:
-    """What is made of recordings, or without names of the history, every so many windows of a long time."""
-    if names:
-        return _of_samples(reader, view, Chosen(tuple(names), None, *between), kind, make, **asked)
-    try:
-        return make(Past.of(view.machine, view.history.report_log, *between, _MOST_REPORTS))
-    except RotorwatchError as error:
-        return _without(view, kind, "history", error, asked)
-
-
-def _without(view: Monitored, kind: type[_Values], source: str, error: RotorwatchError, asked: Any) -> _Values:
-    machine = view.machine
-    return kind(site=machine.site, machine=machine.name, source=source, reason=str(error), **asked)
+        site, machine = view.machine.site, view.machine.name
+        return kind(site=site, machine=machine, source=source, reason=str(error), **asked)
 
 
 def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
@@ -113,12 +100,12 @@ def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
         def made(found: Sampled) -> WaveformSnapshot:
             return waveform_snapshot(found, found.channels(names), revolutions, speed)
 
-        return _of_samples(reader, view, chosen, WaveformSnapshot, made, _SOON_S)
+        return _made(reader, view, chosen, WaveformSnapshot, made, _SOON_S)
 
     @app.get(f"{PLACE}/full-spectra", responses=responses(FullSpectrumSnapshot, 404, 422), **common)
     def full_spectra(view: InPath, chosen: ChosenWindow) -> FullSpectrumSnapshot:
         """Full spectra of the newest seconds: forward precession and reverse, at each place with two displacements."""
-        return _of_samples(reader, view, chosen, FullSpectrumSnapshot, full_spectrum_snapshot, _SOON_S)
+        return _made(reader, view, chosen, FullSpectrumSnapshot, full_spectrum_snapshot, _SOON_S)
 
     @app.get(f"{PLACE}/waterfalls", responses=responses(WaterfallSnapshot, 404, 422), **common)
     def waterfalls(
@@ -137,7 +124,7 @@ def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
                 raise RotorwatchError("no channel measures a vibration")
             return waterfall_snapshot(found, found.channels([shown[0].name])[0], over)
 
-        return _of_samples(reader, view, chosen, WaterfallSnapshot, made, over=over)
+        return _made(reader, view, chosen, WaterfallSnapshot, made, over=over)
 
     @app.get(f"{PLACE}/vectors", responses=responses(VectorSeries, 404, 422), **common)
     def vectors(
@@ -160,11 +147,13 @@ def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
 
         if slow_roll_rpm is not None and not recording:
             raise HTTPException(422, "slow_roll_rpm: needs samples, so name a recording")
-        return _of_past(reader, view, recording, (since_ns, until_ns), VectorSeries, made, order=order)
+        chosen = Chosen(tuple(recording), None, since_ns, until_ns)
+        return _made(reader, view, chosen, VectorSeries, made, of_history=True, order=order)
 
     @app.get(f"{PLACE}/centrelines", responses=responses(CentrelineSeries, 404, 422), **common)
     def centrelines(
         view: InPath, since_ns: SinceNs = None, until_ns: UntilNs = None, recording: Recordings = _NONE
     ) -> CentrelineSeries:
         """Where the shaft was on average, over time and speed, from the history or recordings."""
-        return _of_past(reader, view, recording, (since_ns, until_ns), CentrelineSeries, centreline_series)
+        chosen = Chosen(tuple(recording), None, since_ns, until_ns)
+        return _made(reader, view, chosen, CentrelineSeries, centreline_series, of_history=True)
