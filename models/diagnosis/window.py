@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from models.diagnosis.moments import (
     ComplexArray,
@@ -27,6 +28,7 @@ from models.signals.block import FloatArray
 from models.signals.waveform import Waveform, stacked_waveform
 
 _DRIFT = 0.1  # rms of a channel by which its mean may drift before that of every hop is taken out of it
+_BESIDE = 3  # bins beside a line whose mean is where the spectra go over it
 _SMOOTH = 0.5  # squares of a drift's steps from hop to hop over those about its mean, at most; of chance 2
 
 
@@ -88,6 +90,25 @@ class WindowStatistics:
     def rotation_vectors(self) -> ComplexArray | None:
         """Rotation-synchronous vectors of each hop, from an angle that may be another one in each; None if unknown."""
         return self.hop_synchronous if self.relative_synchronous is None else self.relative_synchronous
+
+    @cached_property
+    def line_bins(self) -> npt.NDArray[np.bool_]:
+        """Bins in which `lines` are seen, shape (n_bins,)."""
+        away = [np.abs(self.frequencies_hz - line.frequency_hz) <= line.reach_hz for line in self.lines]
+        return np.logical_or.reduce(away, axis=0) if away else np.zeros(self.frequencies_hz.size, dtype=np.bool_)
+
+    @property
+    def spectrum_without_lines(self) -> ComplexArray:
+        """Spectra that go straight over the bins of `lines`, for what needs a value in every bin."""
+        found = self.spectrum
+        edges = np.flatnonzero(np.diff(self.line_bins, prepend=False, append=False)).reshape(-1, 2).tolist()
+        for first, end in edges:
+            before, after = found[max(0, first - _BESIDE) : first], found[end : end + _BESIDE]
+            ends = [part.mean(axis=0) for part in (before, after) if part.size]
+            way = (np.arange(1, end - first + 1) / (end - first + 1))[:, np.newaxis, np.newaxis]
+            found = found.copy() if found is self.spectrum else found
+            found[first:end] = ends[0] + way * (ends[-1] - ends[0])
+        return found
 
     @cached_property
     def hop_waveform(self) -> Waveform:

@@ -435,10 +435,7 @@ def _near_lines(window: WindowStatistics, speed_rad_s: float) -> npt.NDArray[np.
     f = window.frequencies_hz
     slowest, fastest = window.speed_range if window.removed_by_hop else (speed_rad_s, speed_rad_s)
     passed = np.clip(f, slowest / (2 * np.pi), fastest / (2 * np.pi))
-    near = np.abs(f - passed) <= _SYNCHRONOUS_BINS * (f[1] - f[0])
-    for line in window.lines:
-        near |= np.abs(f - line.frequency_hz) <= line.reach_hz
-    return np.asarray(near)
+    return np.asarray((np.abs(f - passed) <= _SYNCHRONOUS_BINS * (f[1] - f[0])) | window.line_bins)
 
 
 def _twins(states: tuple[str, ...], observed: ComplexArray) -> tuple[str, ...]:

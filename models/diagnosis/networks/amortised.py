@@ -176,7 +176,8 @@ class NetworkDiagnostician:
 
     def _measured(self, window: WindowStatistics) -> tuple[ComplexArray, ComplexArray | None]:
         """Spectra, shape (1, n_bins, n, n), and rotation-synchronous vectors of the states trained with."""
-        wanted, spectrum, synchronous = self._amortised.states, window.spectrum[None], window.synchronous
+        wanted, synchronous = self._amortised.states, window.synchronous
+        spectrum = window.spectrum_without_lines[None]
         if wanted == window.states:
             return spectrum, synchronous
         columns = [window.states.index(name) for name in wanted]

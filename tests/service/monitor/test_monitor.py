@@ -230,6 +230,7 @@ def test_mains_hum_hides_no_rotor_and_another_line_is_told_with_its_frequency() 
     windows, events = feed(monitor(), with_lines(healthy(75.0), {50.02: 0.1, 150.06: 0.03}))
     assert {one.state for one in windows if one.filled == 1.0} == {HealthState.HEALTHY}
     assert events == []
+    assert not [each for one in windows[-1].opinions for each in one.agreement if each.verdict == "disagree"]
     (last,) = feed(monitor(), with_lines(healthy(63.0), {37.3: 0.3}))[0][-1:]
     assert "most of it at 37" in sure(last.parameters[0].reason)
 
