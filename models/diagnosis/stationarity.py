@@ -87,7 +87,7 @@ def excluded_lines(
     segments: ComplexArray,
     spectrum: ComplexArray,
     frequencies_hz: FloatArray,
-    speed_hz: float,
+    speed_rad_s: float,
     known: Sequence[KnownLine] | None = (),
 ) -> tuple[ExcludedLine, ...]:
     """Steady lines that say nothing of the machine: the healthy one had them, or they are mains hum.
@@ -101,12 +101,13 @@ def excluded_lines(
         Fourier coefficients without mean and rotation.
     spectrum : ndarray, shape (n_bins, n, n)
         Their cross-spectra, in any unit.
-    speed_hz : float
+    speed_rad_s : float
         Where it is nan no line can be told from the rotation.
     known : sequence of KnownLine, optional
         Those of the healthy machine. None: all lines are taken for such, multiples of the speed too.
     """
     reach, size, step_hz = _BESIDE.stop - 1, frequencies_hz.size, frequencies_hz[1] - frequencies_hz[0]
+    speed_hz = abs(speed_rad_s) / (2 * np.pi)
     enough = segments.shape[1] >= _FEWEST_SEGMENTS and segments.shape[2] and size > 2 * reach
     if not np.isfinite(speed_hz) or not enough:
         return ()

@@ -121,8 +121,8 @@ def window_statistics(
 ) -> WindowStatistics:
     """Add hops up to a window and take out its mean and its rotation-synchronous part.
 
-    Without `lagged`, correlations are at lag zero alone: the spectra are all that the likelihood asks for. For `lines`
-    see `excluded_lines`.
+    Without `lagged`, correlations are at lag zero alone, and no lines are looked for: the spectra are all that is asked
+    for. For `lines` see `excluded_lines`.
 
     With a = (x, n) and β the least-squares coefficients of x on n over the window, the sum of
     (x - βn)(t-τ) (x - βn)ᵀ(t) is the product sum seen through the matrix (I, -β) from both sides.
@@ -200,7 +200,7 @@ def window_statistics(
         waveforms=tuple(hop.waveform for hop in hops),
         sensors=plan.sensors,
         pair_powers=tuple(hop.pair_powers for hop in hops),
-        lines=excluded_lines(by_bin, spectrum, plan.frequencies_hz, abs(speed_rad_s) / (2 * np.pi), lines),
+        lines=excluded_lines(by_bin, spectrum, plan.frequencies_hz, speed_rad_s, lines) if lagged else (),
     )
     shaft = found if plan.runout is None else _without(found, plan.runout)
     return shaft if plan.turn is None else _turned(shaft, plan.states, plan.turn)

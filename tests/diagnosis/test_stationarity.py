@@ -70,7 +70,7 @@ def with_line(hz: float, size: float = 0.3, wander_hz: float = 0.0) -> ComplexAr
 
 
 def lines_of(found: ComplexArray, speed_hz: float = 22.0, known: Sequence[KnownLine] | None = ()) -> list[float]:
-    lines = excluded_lines(found, summed(found), FREQUENCIES_HZ, speed_hz, known)
+    lines = excluded_lines(found, summed(found), FREQUENCIES_HZ, 2 * np.pi * speed_hz, known)
     return [round(line.frequency_hz, 1) for line in lines]
 
 
@@ -101,7 +101,7 @@ def test_a_multiple_of_the_speed_is_no_hum_but_may_be_known() -> None:
 
 def test_the_louder_a_line_the_further_it_reaches() -> None:
     faint, loud = (with_line(50.1, size) for size in (0.3, 30.0))
-    (near,), (far,) = (excluded_lines(found, summed(found), FREQUENCIES_HZ, 22.0) for found in (faint, loud))
+    (near,), (far,) = (excluded_lines(found, summed(found), FREQUENCIES_HZ, 138.0) for found in (faint, loud))
     assert near.reach_hz < far.reach_hz < 3.0
 
 
