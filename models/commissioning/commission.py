@@ -21,13 +21,13 @@ from models.commissioning.commissioned import (
 from models.commissioning.healthy import HealthyRecording, known_lines
 from models.commissioning.levels import NO_SUCH_ROTOR, HealthyPiece, Learned, Progress, learn, pieces_of
 from models.diagnosis.baseline.rows import Row, evaluable_rows
+from models.diagnosis.excluded import KnownLine
 from models.diagnosis.misfit import HealthyMisfit
 from models.diagnosis.moments import states_of
 from models.diagnosis.networks.equations import EQUATIONS, Equation, SynchronousEquation, missing
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import learn_sensor_reference
-from models.diagnosis.stationarity import KnownLine
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import from_scale, slope, to_scale
 from models.diagnosis.window import WindowStatistics
@@ -322,7 +322,7 @@ def commission(
 def _excluded(windows: Sequence[WindowStatistics]) -> tuple[KnownLine, ...]:
     """Lines that the likelihood has left out, which it leaves out from now on."""
     found = {
-        (round(line.frequency_hz, 4), round(line.frequency_hz * 2 * np.pi / abs(window.speed_rad_s), 4))
+        (round(line.frequency_hz, 1), round(line.frequency_hz * 2 * np.pi / abs(window.speed_rad_s), 2))
         for window in windows
         for line in window.lines
     }

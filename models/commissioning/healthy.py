@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from models.diagnosis.excluded import KnownLine
 from models.diagnosis.lines import Line, steady_lines
 from models.diagnosis.moments import HopMoments, Plan, plan_for
 from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.stationarity import KnownLine
 from models.diagnosis.window import window_statistics
 from models.errors import RecordingError, WireError
 from models.ingest import Gate

@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
 
+from models.diagnosis.excluded import KnownLine
 from models.diagnosis.moments import ComplexArray, HopMoments, Plan
-from models.diagnosis.stationarity import KnownLine
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 

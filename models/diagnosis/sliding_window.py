@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from models.checkpoint import checked, prefixed, unprefixed
+from models.diagnosis.excluded import KnownLine
 from models.diagnosis.moments import HopMoments, Plan, hop_moments
 from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of
-from models.diagnosis.stationarity import KnownLine
 from models.diagnosis.window import WindowStatistics, levels_of, window_statistics
 from models.errors import CheckpointError
 from models.levels.measures import WindowLevels

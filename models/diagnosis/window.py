@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from models.diagnosis.excluded import ExcludedLine, KnownLine, excluded_lines
 from models.diagnosis.moments import (
     ComplexArray,
     HopMoments,
@@ -22,7 +23,7 @@ from models.diagnosis.moments import (
     through,
     turns,
 )
-from models.diagnosis.stationarity import ExcludedLine, KnownLine, excluded_lines, segment_levels, summed
+from models.diagnosis.stationarity import segment_levels, summed
 from models.levels.measures import WindowLevels, window_levels
 from models.signals.block import FloatArray
 from models.signals.waveform import Waveform, stacked_waveform
@@ -200,7 +201,16 @@ def window_statistics(
         waveforms=tuple(hop.waveform for hop in hops),
         sensors=plan.sensors,
         pair_powers=tuple(hop.pair_powers for hop in hops),
-        lines=excluded_lines(by_bin, spectrum, plan.frequencies_hz, speed_rad_s, lines) if lagged else (),
+        lines=excluded_lines(
+            by_bin,
+            spectrum,
+            plan.frequencies_hz,
+            speed_range,
+            lines,
+            None if plan.angle_column is None else segments[:, :, n + 1],
+        )
+        if lagged
+        else (),
     )
     shaft = found if plan.runout is None else _without(found, plan.runout)
     return shaft if plan.turn is None else _turned(shaft, plan.states, plan.turn)

@@ -1,0 +1,162 @@
+"""Lines that say nothing of the machine, which theory leaves out: mains hum, and what the healthy machine had.
+
+A line of a hundredth of a channel's rms matters where one force moves all channels: what is left between them is sensor
+noise alone. So all channels are looked at together, in parts of what surrounds a bin. The phase of a steady line goes
+on from segment to segment, and that of a multiple of the speed goes with the shaft; that of noise does neither.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import scipy  # its sub-packages are loaded when they are first used
+
+from models.diagnosis.moments import ComplexArray
+from models.signals.block import FloatArray
+
+_LOBE = 2  # a Hann window spreads a line over two bins on either side
+_BESIDE = range(_LOBE + 1, _LOBE + 4)  # bins away, that are the surroundings
+_STANDS_OUT = 4.0  # power of the motion that does so most, over that of its surroundings; of noise up to 2.5
+_CHANCE = 1e-4  # of one bin that stands out
+_FEWEST_SEGMENTS = 6
+_ORDERS = range(2, 13)
+_MAINS_HZ, _MAINS_VARY = (50.0, 60.0), 0.004  # frequencies of electric supplies, and how far these are off, relative
+_SAME = 0.02  # relative distance of a line from itself
+
+KnownLine = tuple[float, float]
+"""A line of the healthy machine: its frequency, Hz, and the same over the running speed."""
+
+
+class ExcludedLine(NamedTuple):
+    """A line, and how far from it its skirts are seen: the louder it is, the further."""
+
+    frequency_hz: float
+    reach_hz: float
+
+
+def excluded_lines(
+    segments: ComplexArray,
+    spectrum: ComplexArray,
+    frequencies_hz: FloatArray,
+    speeds_rad_s: tuple[float, float],
+    known: Sequence[KnownLine] | None = (),
+    turning: ComplexArray | None = None,
+) -> tuple[ExcludedLine, ...]:
+    """Lines that say nothing of the machine.
+
+    Parameters
+    ----------
+    segments : ndarray, shape (n_bins, n_segments, n)
+        Fourier coefficients without mean and rotation.
+    spectrum : ndarray, shape (n_bins, n, n)
+        Their cross-spectra, in any unit.
+    speeds_rad_s : tuple of float
+        Slowest and fastest hop. Where they are nan no line can be told from the rotation.
+    known : sequence of KnownLine, optional
+        Those of the healthy machine. None: all lines are taken for such, multiples of the speed too.
+    turning : ndarray, shape (n_segments, n_bins), optional
+        Fourier coefficients of the cosine of the shaft angle.
+    """
+    slowest_hz, fastest_hz = sorted(abs(speed) / (2 * np.pi) for speed in speeds_rad_s)
+    enough = segments.shape[1] >= _FEWEST_SEGMENTS and segments.shape[2] and frequencies_hz.size > 2 * _BESIDE.stop
+    if not np.isfinite(slowest_hz) or not enough:
+        return ()
+    step_hz, speed_hz = frequencies_hz[1] - frequencies_hz[0], (slowest_hz + fastest_hz) / 2
+    found = []
+    try:
+        at = np.flatnonzero(_wanted(frequencies_hz, slowest_hz, fastest_hz, known))
+        strength, motions = _outstanding(spectrum, at, (at, at))
+        peaks = np.zeros(frequencies_hz.size)
+        peaks[at] = strength
+        highest = scipy.ndimage.maximum_filter1d(peaks, 2 * _LOBE + 1)[at]
+        for n in np.flatnonzero((strength > _STANDS_OUT) & (strength == highest)):
+            if _keeps_course(segments[at[n]] @ motions[n]):
+                found.append(ExcludedLine(float(frequencies_hz[at[n]]), step_hz * _skirt(strength[n])))
+        if turning is None:
+            return tuple(found)
+        rotation = _unit(turning[:, np.abs(frequencies_hz - speed_hz).argmin()])
+        for order in _ORDERS:
+            half_hz = order * (fastest_hz - slowest_hz) / 2
+            at = np.flatnonzero(np.abs(frequencies_hz - order * speed_hz) <= half_hz + step_hz)
+            had = known is not None and any(abs(one / order - 1) <= _SAME for _, one in known)
+            if at.size and (had or known is None):
+                strength, motions = _outstanding(spectrum, at, (at[:1], at[-1:]))
+                # The phase in the middle of a segment is that of all bins of a lobe, with a sign that alternates.
+                own = ((-1.0) ** at[:, np.newaxis] * (segments[at] @ motions[strength.argmax()])).sum(axis=0)
+                if had or (strength.max() > _STANDS_OUT and _goes_with(own, rotation, order)):
+                    found.append(ExcludedLine(order * speed_hz, half_hz + step_hz * _skirt(strength.max())))
+    except np.linalg.LinAlgError:  # a dead channel, or one that is there twice
+        return ()
+    return tuple(found)
+
+
+def _wanted(
+    frequencies_hz: FloatArray, slowest_hz: float, fastest_hz: float, known: Sequence[KnownLine] | None
+) -> npt.NDArray[np.bool_]:
+    """Bins that are looked at: where a known line may be, or hum that is no multiple of the speed; not the rotation."""
+    near_hz = _LOBE * (frequencies_hz[1] - frequencies_hz[0])
+
+    def away_hz(order: int) -> FloatArray:
+        return np.abs(frequencies_hz - np.clip(frequencies_hz, order * slowest_hz, order * fastest_hz))
+
+    if known is None:
+        wanted = np.ones(frequencies_hz.size, dtype=np.bool_)
+    else:
+        mains = np.array(_MAINS_HZ)[:, np.newaxis]
+        off = np.abs(frequencies_hz - mains * np.maximum(np.round(frequencies_hz / mains), 1.0)).min(axis=0)
+        wanted = off <= _MAINS_VARY * frequencies_hz + near_hz / (2 * _LOBE)
+        wanted &= np.minimum.reduce([away_hz(order) for order in _ORDERS]) > near_hz
+        for line_hz, order in known:
+            for then in (line_hz, order * (slowest_hz + fastest_hz) / 2):
+                wanted |= np.abs(frequencies_hz - then) <= _SAME * then
+    return np.asarray(wanted & (away_hz(1) > near_hz))
+
+
+def _outstanding(
+    spectrum: ComplexArray, at: npt.NDArray[np.intp], between: tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]
+) -> tuple[FloatArray, ComplexArray]:
+    """Power of the motion that stands out most in each bin, and the weights of the channels that make it from them.
+
+    In parts of what surrounds the first and the last of the bins that it is `between`.
+    """
+    low, high = between
+    size = spectrum.shape[0]
+    beside = np.array([one for k in _BESIDE for one in (low - k, high + k)])
+    beside = np.where((beside < 0) | (beside >= size), low + high - beside, beside)  # of one side at the band's ends
+    unit = np.linalg.inv(np.linalg.cholesky(spectrum[np.clip(beside, 0, size - 1)].mean(axis=0)))
+    powers, motions = np.linalg.eigh(unit @ spectrum[at] @ unit.conj().swapaxes(1, 2))
+    weights = (motions[:, :, -1:].conj().swapaxes(1, 2) @ unit)[:, 0]
+    return powers[:, -1], np.asarray(weights, dtype=np.complex128)
+
+
+def _skirt(strength: float) -> float:
+    """How many bins from a line its skirts are seen: those of a Hann window fall with the sixth power."""
+    return float(max(_LOBE + 1, 2 * strength ** (1 / 6)))
+
+
+def _keeps_course(own: ComplexArray) -> bool:
+    """Whether the phase of segments, shape (n_segments,), goes on by one angle each time, as that of noise does not.
+
+    The frequency may be off the bin, and wander slowly. The mean of unit vectors that turn by what the angle changes is
+    of length u or more with about the probability (1 - u²)ⁿ⁻⁴, of n pieces of noise that overlap by half.
+    """
+    unit = _unit(own)
+    return bool((1 - _length(unit[:-2] * unit[1:-1].conj() ** 2 * unit[2:]) ** 2) ** (own.size - 4) < _CHANCE)
+
+
+def _goes_with(own: ComplexArray, rotation: ComplexArray, order: int) -> bool:
+    """Whether the phase of segments, shape (n_segments,), goes with a multiple of the rotation.
+
+    The mean of n unit vectors is of length u or more with the probability (1 - u²)ⁿ⁻¹; of segments that overlap one of
+    two is evidence.
+    """
+    return bool((1 - _length(_unit(own) * rotation.conj() ** order) ** 2) ** (own.size / 2) < _CHANCE)
+
+
+def _unit(coefficients: ComplexArray) -> ComplexArray:
+    return np.asarray(coefficients / np.maximum(np.abs(coefficients), np.finfo(float).tiny), dtype=np.complex128)
+
+
+def _length(unit: ComplexArray) -> float:
+    return min(1.0, float(abs(unit.mean())))
