@@ -285,7 +285,6 @@ def _checked(file: Path) -> str:
     from models.commissioning.commissioned import install  # noqa: PLC0415  # keeps --help quick
     from models.machine import load_machine_file  # noqa: PLC0415
     from models.mistakes import read_toml  # noqa: PLC0415
-    from service.history.store import Store  # noqa: PLC0415
     from service.settings.service import load_settings  # noqa: PLC0415
 
     fields = read_toml(file)
@@ -300,7 +299,6 @@ def _checked(file: Path) -> str:
         machine = entry.load()
         install(machine, entry.bundle)
         names.append(machine.title)
-    Store(settings.history.database, settings.history.retention)  # knows which addresses it can use
     return f"settings for {', '.join(names)}"
 
 

@@ -78,9 +78,9 @@ class Database:
 
     def __init__(self, url: str, timeout_s: float) -> None:
         self.timeout_s = timeout_s
-        self._url = _checked(url)
+        self._url = checked_url(url)
         self.is_sqlite = self._url.get_backend_name() == "sqlite"
-        self.in_memory = self.is_sqlite and self._url.database in {None, "", ":memory:"}
+        self.in_memory = self.is_sqlite and self._url.database == ":memory:"
         self.file = HistoryFile(Path(self._url.database or "")) if self.is_sqlite and not self.in_memory else None
         self.shown = self._url.render_as_string(hide_password=True)
         self.answer_s = max(_ANSWER_S, 10.0 * timeout_s)
@@ -398,16 +398,24 @@ class Database:
             line.shutdown(socket.SHUT_RDWR)
 
 
-def _checked(url: str) -> URL:
+def checked_url(url: str) -> URL:
+    """The address, taken apart.
+
+    Raises
+    ------
+    StoreError
+        If it is of no known form; without its password.
+    """
     try:
         made = make_url(url)
     except (ArgumentError, ValueError):
         # The text may hold a password, and so may the error: neither is shown.
-        raise StoreError(f"history: the URL cannot be read; {_FORMS}") from None
+        raise StoreError(f"the URL cannot be read; {_FORMS}") from None
     if made.drivername not in {"sqlite", "postgresql"}:
-        raise StoreError(f"history: the URL begins with {made.drivername}; {_FORMS}")
-    if made.drivername == "postgresql" and not made.database:
-        raise StoreError(f"history: the URL {made.render_as_string(hide_password=True)} names no database; {_FORMS}")
+        raise StoreError(f"the URL begins with {made.drivername}; {_FORMS}")
+    if not made.database or (made.drivername == "sqlite" and made.host):
+        wanted = "file" if made.drivername == "sqlite" else "database"
+        raise StoreError(f"the URL {made.render_as_string(hide_password=True)} names no {wanted}; {_FORMS}")
     return made
 
 

@@ -16,7 +16,7 @@ from models.errors import MachineFileError
 from models.machine import MachineFile, load_machine_file
 from models.mistakes import in_folder, mistakes, read_toml
 from models.signals.link import LinkSettings, TlsSettings, endpoint_fault
-from service.history.records import Retention
+from service.history.records import Retention, StoreError
 from service.settings.access import AccessSettings, check_access
 from service.settings.webhooks import WebhookSettings
 
@@ -96,6 +96,18 @@ class HistorySettings(BaseModel, extra="forbid", frozen=True):
         "folder",
     )
     retention: Retention = Field(default=Retention(), description="how long what is kept; alarms are kept for ever")
+
+    @field_validator("url")
+    @classmethod
+    def _known(cls, url: str | None) -> str | None:
+        if url is not None:
+            from service.history.database import checked_url  # noqa: PLC0415  # many commands need no sqlalchemy
+
+            try:
+                checked_url(url)
+            except StoreError as error:
+                raise ValueError(str(error)) from None
+        return url
 
     @property
     def database(self) -> str:

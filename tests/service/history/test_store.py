@@ -367,6 +367,8 @@ def test_history_in_memory_serves_readers_and_writers_at_once() -> None:
         ("mysql://root:secret@host/db", "the URL begins with mysql; expected sqlite"),
         ("history.sqlite", "the URL cannot be read; expected sqlite"),
         ("postgresql://anna:secret@host", "names no database"),
+        ("sqlite://history.sqlite", "names no file"),
+        ("sqlite://", "names no file; expected sqlite:////folder/file"),
         ("postgresql+asyncpg://anna:secret@host/db", "begins with postgresql.asyncpg"),
         ("postgresql://anna:secret@host:port/db", "the URL cannot be read"),
     ],
