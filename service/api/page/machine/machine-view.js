@@ -40,7 +40,11 @@ class MachineView extends MachineElement {
 
   show() {
     const health = this.health;
-    if (!health) return lay(this, html("h1", {}, this.place), html("p", { class: "note" }, monitor.machines.has(this.place) ? "Loading …" : "Nothing has been heard of this machine yet."));
+    if (!health) {
+      this.#built = false;
+      const awaited = monitor.watched?.has(this.place) ?? true;
+      return lay(this, html("h1", {}, this.place), html("p", { class: "note" }, awaited ? "Loading …" : "The monitor has no machine of this name."));
+    }
     if (!this.#built) this.#build();
     const { report, stream } = health;
     const said = report?.verdict && `${report.verdict.text}.${report.suspect ? ` Best explained by: ${report.suspect}.` : ""}`;

@@ -1,9 +1,11 @@
-/** @typedef {{kind: "start" | "overview" | "health" | "alarm" | "lost" | "ended" | "renewed", text: string, at: number}} Told what is told: `at` is when it came, ms since 1970; lost is tried again by the browser, ended is not */
+/** @typedef {{kind: "start" | "overview" | "health" | "alarm" | "lost" | "ended" | "renewed", text: string, at: number}} Told what is told: `at` is when it came, ms since 1970; the text of start names the machines; lost is tried again by the browser, ended is not */
 /** @typedef {(told: Told) => void} Listener */
 /** @typedef {"listen" | "look" | "leave" | "renew"} Order */
 
 /** Machines that everything may be asked of at once. */
 const MOST = 64;
+/** Machines that the start of a stream names: its id says of each how far it has been heard. @param {string} text */
+export const named = (text) => new Set(text.split(",").map((entry) => entry.split("=")[0]));
 /** Characters of what has been heard that are sent along: it names every machine, and an address may not be any length. Health is told anew without, too. */
 const LONGEST = 4000;
 
@@ -66,7 +68,7 @@ export class EventStream {
     for (const kind of /** @type {const} */ (["start", "overview", "health", "alarm"]))
       source.addEventListener(kind, (event) => {
         this.#heard = event.lastEventId;
-        this.#tell(kind, event.data);
+        this.#tell(kind, kind === "start" ? event.lastEventId : event.data);
       });
     source.addEventListener("error", () => {
       const ended = source.readyState === EventSource.CLOSED;
@@ -85,6 +87,10 @@ export class EventStream {
   #tell(kind, text) {
     const told = { kind, text, at: Date.now() };
     if (kind === "start" || kind === "lost") this.#state = told;
+    if (kind === "start") {
+      const there = named(text);
+      for (const place of this.#latest.keys()) if (!there.has(place)) this.#latest.delete(place);
+    }
     if (kind === "overview" || kind === "health") {
       const { site, machine } = JSON.parse(text);
       this.#latest.set(`${site}/${machine}`, told);

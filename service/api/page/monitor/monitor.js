@@ -1,6 +1,6 @@
 /** What the page knows of the monitor: asked over HTTP, kept up to date by the stream of events. */
 
-import { EventStream } from "./event-stream.js";
+import { EventStream, named } from "./event-stream.js";
 
 /** @typedef {import("./records.js").Health} Health */
 /** @typedef {import("./records.js").Alarm} Alarm */
@@ -43,6 +43,8 @@ export const pathOf = (place) => `${API}/machines/${place}`;
 export class Monitor extends EventTarget {
   /** What was heard last of each machine: of its latest window everything, or only the reading that matters most. @type {Map<string, {health: Health, heard: number, whole: boolean}>} */
   machines = new Map();
+  /** Those that are monitored; null before that is known. @type {Set<string> | null} */
+  watched = null;
   /** @type {{name: string, scopes: string[]} | null} who is signed in */
   caller = null;
   /** Why somebody has to sign in; empty if nobody has to. */
@@ -86,7 +88,7 @@ export class Monitor extends EventTarget {
 
   /** @param {import("./event-stream.js").Told} told */
   #hear({ kind, text, at }) {
-    if (kind === "start") this.#found();
+    if (kind === "start") this.#found(text);
     else if (kind === "health" || kind === "overview") this.#health(JSON.parse(text), at - performance.timeOrigin, kind === "health");
     else if (kind === "alarm") this.#tell("alarm", JSON.parse(text).data);
     else if (kind === "renewed") {
@@ -193,9 +195,17 @@ export class Monitor extends EventTarget {
     this.#tell("caller", stranger);
   }
 
-  #found() {
+  /** @param {string} text names the machines; one that the monitor has no longer must not be shown as if it had */
+  #found(text) {
     this.connected = true;
     this.lostAt = null;
+    this.watched = named(text);
+    for (const place of [...this.machines.keys(), this.#looked])
+      if (!this.watched.has(place)) {
+        this.machines.delete(place);
+        this.#tell(`health:${place}`, place);
+      }
+    this.#tell("health", "");
     this.#tell("connection", "");
   }
 

@@ -129,11 +129,12 @@ def kept(page: Page, name: str) -> None:
 
 
 def tell_instead(page: Page, *healths: Mapping[str, Any]) -> None:
-    """Tell a page health other than the monitor does, as it is when the page asks, and end that."""
+    """Tell a page health other than the monitor does, of these machines when the page asks, and end that."""
 
     def instead(route: Route) -> None:
         told = "".join(f"event: health\ndata: {json.dumps(health)}\n\n" for health in healths)
-        route.fulfill(body=f"event: start\ndata: {{}}\n\n{told}", content_type="text/event-stream")
+        named = ",".join(f"{health['site']}/{health['machine']}=-1" for health in healths)
+        route.fulfill(body=f"id: {named}\nevent: start\ndata: {{}}\n\n{told}", content_type="text/event-stream")
 
     page.add_init_script("delete window.SharedWorker")  # what it asks for cannot be routed
     page.route("**/api/v1/events?*", instead)

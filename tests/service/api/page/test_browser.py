@@ -278,6 +278,20 @@ def test_a_view_that_comes_late_does_not_take_the_place_of_the_one_chosen_since(
         expect(page.locator("machine-view h1")).to_have_text("demo/lab")
 
 
+def test_a_machine_that_the_monitor_has_no_longer_is_not_shown(browser: Browser, plant: Plant) -> None:
+    url = plant.runtime.http_url
+    told = [{**dict(example(Health)), "machine": name} for name in ("lab", "spare")]
+    with looking(browser, url) as page:
+        tell_instead(page, *told)
+        page.goto(f"{url}/#/machines/demo/nowhere")
+        expect(page.locator("machine-view")).to_contain_text("no machine of this name")
+        page.goto(f"{url}/#/")
+        expect(page.locator("machine-tile")).to_have_count(2)
+        tell_instead(page, told[0])  # the stream begins anew, as after a restart
+        expect(page.locator("machine-tile")).to_have_count(1)
+        expect(page.get_by_role("link", name="Alarms 1")).to_be_visible()
+
+
 def test_machines_stand_by_site_and_only_lines_that_are_seen_are_asked_for(browser: Browser, plant: Plant) -> None:
     url = plant.runtime.http_url
     asked: list[list[str]] = []
