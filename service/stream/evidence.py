@@ -10,7 +10,7 @@ from rotorwatch.records.health import Health, HealthState, Report
 from rotorwatch.records.history import AlarmEvidence, Picture
 from rotorwatch.records.snapshots import CorrelationSnapshot
 from service.stream.worker import MachineWorker
-from service.terminal.logs import logger
+from service.terminal.logs import Limiter, logger
 
 _CALM = {HealthState.HEALTHY, HealthState.UNCHANGED, HealthState.WATCHING}
 _CALM_NS = 3_600 * 10**9  # between pictures of a machine that nothing is wrong with
@@ -27,6 +27,7 @@ class EvidenceCollector:
         self._looked_ns: int | None = None
         self._before: Picture | None = None
         self._standing: dict[tuple[str, int], AlarmEvidence] = {}
+        self._limiter = Limiter()
 
     def look(self, health: Health) -> None:
         """Take pictures, if the latest window is worth any; at most once for a window."""
@@ -47,7 +48,8 @@ class EvidenceCollector:
                 self._worker.history.keep_evidence(_BEFORE, 0, self._before.model_dump_json())
             self._looked_ns = report.end_ns
         except RotorwatchError as error:  # tried again at the next look
-            _log.warning("evidence could not be kept", machine=f"{health.site}/{health.machine}", why=str(error))
+            place = f"{health.site}/{health.machine}"
+            self._limiter.say("", _log.warning, "evidence is not kept yet", machine=place, why=str(error))
 
     def _keep(self, name: str, occurrence: int, alarm: Alarm, report: Report) -> None:
         kept = self._standing.get((name, occurrence))

@@ -2,12 +2,17 @@
 
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
+from structlog.testing import capture_logs
 
-from rotorwatch.records.health import HealthState
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Health, HealthState
 from rotorwatch.records.history import AlarmEvidence
+from service.history.records import StoreError
 from service.runtime.runtime import running
+from service.stream.evidence import EvidenceCollector
 from simulator.scenario import parse_fault
 from tests.service.rig.live import (
     LAB,
@@ -87,6 +92,16 @@ def test_an_alarm_can_be_understood_long_after_its_window_is_gone(tmp_path: Path
     # A monitor that is started again knows it.
     with running(plan) as runtime:
         assert runtime.machines()[0].history.evidence("k_by", 1) == answer.text
+
+
+def test_a_database_that_is_away_does_not_fill_the_log() -> None:
+    away = Mock()
+    away.history.evidence.side_effect = StoreError("the database is away")
+    collector = EvidenceCollector(away)
+    with capture_logs() as logged:
+        for _ in range(40):  # looks of ten seconds
+            collector.look(Health.model_validate(example(Health)))
+    assert [one["why"] for one in logged] == ["the database is away"]
 
 
 def test_evidence_of_many_occurrences_does_not_grow_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
