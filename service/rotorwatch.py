@@ -182,7 +182,7 @@ def check_config(
 ) -> None:
     """Check settings and machine files; says what is wrong with which field.
 
-    Machine files and trained networks that a settings file names are checked with it.
+    Machine files, trained networks, certificates, secrets and passwords that a settings file names are checked with it.
 
     [bold]Example[/bold]
 
@@ -285,6 +285,8 @@ def _checked(file: Path) -> str:
     from models.commissioning.commissioned import install  # noqa: PLC0415  # keeps --help quick
     from models.machine import load_machine_file  # noqa: PLC0415
     from models.mistakes import read_toml  # noqa: PLC0415
+    from service.access.tls import tls_context  # noqa: PLC0415
+    from service.delivery.webhooks.webhooks import Webhooks  # noqa: PLC0415
     from service.settings.service import load_settings  # noqa: PLC0415
 
     fields = read_toml(file)
@@ -299,6 +301,11 @@ def _checked(file: Path) -> str:
         machine = entry.load()
         install(machine, entry.bundle)
         names.append(machine.title)
+    # Files and variables that are read when the monitor starts.
+    settings.link.zenoh_items()
+    Webhooks(settings.webhooks)
+    if settings.access.tls is not None:
+        tls_context(settings.access.tls)
     return f"settings for {', '.join(names)}"
 
 
