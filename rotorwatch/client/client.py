@@ -4,6 +4,7 @@ import os
 import re
 import ssl
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Self, TypeVar
 
@@ -61,8 +62,8 @@ class Client:
     Raises
     ------
     ClientError
-        If a certificate cannot be read, or the token cannot be one. Every method raises `NoAnswer` if nobody answers
-        in time, and `RequestRefused` or one of its kinds with the service's own words if it says no.
+        If the address or the token cannot be one, or a certificate cannot be read. Every method raises `NoAnswer` if
+        nobody answers in time, and `RequestRefused` or one of its kinds with the service's own words if it says no.
 
     Examples
     --------
@@ -83,7 +84,7 @@ class Client:
         if not text.isascii() or not text.isprintable() or " " in text:
             raise ClientError("the token has characters that no token has; expected rw_ and what follows, on one line")
         self._http = httpx.Client(
-            base_url=url,
+            base_url=_checked(url),
             headers={"Authorization": f"Bearer {text}"} if text else {},
             verify=_tls(url, ca, certificate),
             timeout=timeout_s,
@@ -350,9 +351,27 @@ class Client:
             answer = self._http.request(method, path, params=given, json=body, headers=headers)
         except httpx.TransportError as error:
             raise NoAnswer(f"{self._http.base_url}: {str(error) or type(error).__name__}") from error
+        except ValueError as error:  # NaN and infinity are no JSON
+            raise ClientError(f"{path}: expected finite numbers (found {body})") from error
         if answer.status_code != httpx.codes.OK:
             raise refusal(answer)
         return answer
+
+
+def _checked(url: str) -> httpx.URL:
+    """An address that a service can have.
+
+    Raises
+    ------
+    ClientError
+        With what was expected.
+    """
+    with suppress(httpx.InvalidURL):
+        found = httpx.URL(url)
+        if found.scheme in {"http", "https"} and found.host and (found.port or 0) < 65_536:
+            return found
+    meant = f"; did you mean http://{url}?" if url and "://" not in url else ""
+    raise ClientError(f"url is {url!r}, expected http://HOST:PORT or https://HOST:PORT{meant}")
 
 
 def _path(place: str, below: str) -> str:

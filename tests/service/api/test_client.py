@@ -194,6 +194,12 @@ def test_tokens(seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyP
         assert "screen has read" in str(caught.value)
 
 
+@pytest.mark.parametrize("url", ["127.0.0.1:8080", "", "ftp://plant", "http://", "http://[::1", "http://plant:99999"])
+def test_an_address_that_no_service_can_have_is_an_error_of_the_client(url: str) -> None:
+    with pytest.raises(ClientError, match=re.escape(f"url is {url!r}, expected http://HOST:PORT")):
+        Client(url)
+
+
 def test_nobody_there() -> None:
     url = endpoint().replace("tcp/", "http://")
     with Client(url, "rw_x") as plant:
@@ -230,6 +236,8 @@ def test_operators_work(tmp_path: Path) -> None:
         assert (done.alarm.state, done.events[0].data.reason) == ("acknowledged", "cable was moved")
         with pytest.raises(Conflict, match="not as it was seen"):
             plant.shelve(PLACE, first, "by somebody who saw it earlier")
+        with pytest.raises(ClientError, match="expected finite numbers"):
+            plant.shelve(PLACE, first, "is being repaired", duration_s=float("nan"))
         done = plant.shelve(PLACE, done.alarm, "is being repaired", duration_s=60.0, one_shot=True)
         assert done.alarm.shelf is not None
         assert (done.alarm.shelf.one_shot, done.alarm.shelf.reason) == (True, "is being repaired")
