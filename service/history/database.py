@@ -36,7 +36,7 @@ _WATCH_S = 0.5
 _IMMEDIATE = "rotorwatch_immediate"
 _NEEDED = ("machines", "alarm_events", "checkpoints", "checkpoint_parts", "series", "tokens", "webhook_cursors")
 """Tables without which a monitor cannot go on; to look through the others would take minutes."""
-_POSTGRESQL = {"application_name": "rotorwatch", "tcp_user_timeout": 25_000} | {
+_POSTGRESQL = {"application_name": "rotorwatch", "client_encoding": "UTF8", "tcp_user_timeout": 25_000} | {
     "keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 3
 }  # fmt: skip
 _SERVER_KEEPALIVES = {
@@ -361,6 +361,11 @@ class Database:
         @event.listens_for(engine, "connect")
         def limit(connection: Any, record: object) -> None:
             _ = record
+            encoding = connection.info.parameter_status("server_encoding")
+            if encoding != "UTF8":  # a reason or a name that it cannot hold would stop all that is written
+                raise StoreError(
+                    f"{self.shown}: the encoding of the database is {encoding}, expected UTF8 (createdb -E)"
+                )
             # The server ends by itself what `_break_off` has turned away from.
             connection.execute(f"SET statement_timeout = {round(1000 * self.answer_s)}")
             # So that it lets go of the locks of a computer that was lost; without effect on a socket of its own.

@@ -227,6 +227,16 @@ def hanging(store: Store) -> Iterator[None]:
         os.kill(pid, signal.SIGCONT)
 
 
+@pytest.mark.parametrize("encoding", ["SQL_ASCII", "LATIN1"])
+def test_a_database_that_cannot_hold_every_text_is_refused(server: PostgresServer, encoding: str) -> None:
+    name = f"history_{encoding.lower()}"
+    place = ("-h", str(server.folder), "-U", USER)
+    server.run("createdb", *place, "-T", "template0", "-E", encoding, "--locale=C", name)
+    database = Database(server.url(name), QUICK_S)
+    with pytest.raises(StoreError, match=f"{name}.*: the encoding of the database is {encoding}, expected UTF8"):
+        database.start()
+
+
 def test_a_server_that_hangs_is_turned_away_from(server: PostgresServer) -> None:
     with opened(server.new_database(f"history_{uuid.uuid4().hex}")) as store:
         lab = store.machine("demo", "lab")
