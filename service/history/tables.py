@@ -225,9 +225,9 @@ def bring_up_to_date(connection: sa.Connection) -> None:
         from service.history.migrations import migrate  # noqa: PLC0415  # Alembic takes long to import
 
         migrate(connection)
-    elif not found and sa.inspect(connection).has_table("machines"):
+    elif not found and (others := sa.inspect(connection).get_table_names()):
         raise StoreError(
-            "the database holds a table 'machines' that is not ours: give the history a database of its own"
+            f"the database holds a table {min(others)!r} that is not ours: give the history a database of its own"
         )
     elif not found:
         _create(connection)

@@ -80,7 +80,7 @@ def test_a_database_that_is_up_to_date_is_opened_without_what_only_migrations_ne
     ("change", "message"),
     [
         ("UPDATE alembic_version SET version_num = '9999'", "revision 9999, which this version of rotorwatch does not"),
-        ("DROP TABLE alembic_version", "a table 'machines' that is not ours"),
+        ("DROP TABLE alembic_version", "a table 'alarm_events' that is not ours"),
     ],
 )
 def test_a_database_of_others_is_left_alone(url: str, change: str, message: str) -> None:
@@ -88,6 +88,13 @@ def test_a_database_of_others_is_left_alone(url: str, change: str, message: str)
     executed(url, change)
     with pytest.raises(StoreError, match=message):
         opened_and_closed(url)
+
+
+def test_nothing_is_put_into_the_database_of_another_program(url: str) -> None:
+    executed(url, "CREATE TABLE orders (number INTEGER)")
+    with pytest.raises(StoreError, match="a table 'orders' that is not ours"):
+        opened_and_closed(url)
+    assert executed(url, "SELECT * FROM orders") == []
 
 
 def test_reports_that_were_compressed_by_themselves_are_read() -> None:
