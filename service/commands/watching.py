@@ -1,6 +1,7 @@
 """``rotorwatch watch`` and ``rotorwatch status``: look at what monitors say."""
 
 import json
+import os
 import re
 import sys
 from pathlib import Path
@@ -71,7 +72,15 @@ def watch(
     base = LinkSettings(mode="client", connect=(ENDPOINT,)) if link is None else load_link(link)
     ends = {"connect": tuple(connect)} if connect else {}
     settings = in_namespace(base.model_copy(update=ends), namespace)
-    show = _show_json if as_json else _Lines()
+    say = _show_json if as_json else _Lines()
+
+    def show(message: "TopicMessage") -> None:
+        try:
+            say(message)
+        except (BrokenPipeError, SystemExit):  # whoever read has seen enough; rich makes the one of the other
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            stop.ask()
+
     with stop_request() as stop, follow(settings, machine, topics, show) as connected:
         there = True
         while not stop.wait(0.5):

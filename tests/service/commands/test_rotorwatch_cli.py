@@ -31,6 +31,7 @@ from tests.service.rig.live import (
     until,
 )
 from tests.service.rig.preloaded import rotorwatch as run
+from tests.sure import sure
 
 
 def test_numpy_computes_in_one_thread() -> None:
@@ -175,6 +176,22 @@ def test_watch_notices_a_monitor_that_goes_and_comes_back(tmp_path: Path) -> Non
         with service(address):
             until(lambda: "connected again" in watcher.errors(), "return noticed")
         assert watcher.stop() == 0
+
+
+@pytest.mark.parametrize("form", [(), ("--json",)])
+def test_watch_ends_when_nobody_reads_any_more(form: tuple[str, ...]) -> None:
+    address = endpoint()
+    command = [sys.executable, "-m", "service.rotorwatch", "watch", "--connect", address, *form]
+    with (
+        service(address),
+        subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as watcher,
+    ):
+        sure(watcher.stdout).close()
+        try:
+            assert watcher.wait(60) == 0
+        finally:
+            watcher.kill()
+        assert sure(watcher.stderr).read() == b""
 
 
 def test_router_runs_until_it_is_told_to_stop(tmp_path: Path) -> None:
