@@ -129,8 +129,9 @@ def _too_small(limit: int) -> str:
 
 def exit_code(error: RotorwatchError) -> int:
     """2 for a file or argument that cannot be used, such as a recording that is not there; 1 for everything else."""
-    absent = isinstance(error, RecordingError) and isinstance(error.__cause__, FileNotFoundError)
-    return 2 if absent or isinstance(error, MachineFileError | BundleError) else 1
+    absent = FileNotFoundError | IsADirectoryError | NotADirectoryError
+    unusable = isinstance(error, RecordingError) and isinstance(error.__cause__, absent)
+    return 2 if unusable or isinstance(error, MachineFileError | BundleError) else 1
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from pydantic import ValidationError
 
-from models.errors import RecordingError, WireError
+from models.errors import MachineFileError, RecordingError, WireError
 from models.mistakes import mistakes
 from models.physics.rotor import PARAMETER_TEXT
 from models.signals.block import SampleBlock
@@ -49,19 +49,21 @@ class Selection:
 
         Raises
         ------
-        RecordingError
+        MachineFileError
             If the recordings hold several machines and none is chosen, or not the chosen one.
+        RecordingError
+            If they hold none, or cannot be read.
         """
         keys = {key for path in self.recordings for key in summarize_recording(path).messages}
         parts = {tuple(key.split("/")[:3]) for key in keys if key.startswith(f"{PREFIX}/") and key.count("/") >= 3}
         machines = sorted("/".join(part[1:]) for part in parts)
         names = ", ".join(str(path) for path in self.recordings)
         if self.machine is not None and self.machine not in machines:
-            raise RecordingError(f"{names}: no machine {self.machine}; there are {', '.join(machines) or 'none'}")
+            raise MachineFileError(f"{names}: no machine {self.machine}; there are {', '.join(machines) or 'none'}")
         if not machines:
             raise RecordingError(f"{names}: no message of a machine in there")
         if self.machine is None and len(machines) != 1:
-            raise RecordingError(
+            raise MachineFileError(
                 f"{names}: expected one machine, there are {', '.join(machines)}; choose one with --machine"
             )
         return f"{PREFIX}/{self.machine or machines[0]}"

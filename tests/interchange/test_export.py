@@ -10,7 +10,7 @@ import pyarrow.parquet
 import pytest
 from scipy.io import loadmat
 
-from models.errors import RecordingError
+from models.errors import MachineFileError, RecordingError
 from models.machine import Machine, load_machine
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.recording import RecordedMessage, RecordingWriter
@@ -173,9 +173,9 @@ def test_one_of_several_machines_must_be_chosen(tmp_path: Path) -> None:
     recording(tmp_path / "a.mcap", blocks=2)
     recording(tmp_path / "b.mcap", heavy, blocks=3)
     both = (tmp_path / "a.mcap", tmp_path / "b.mcap")
-    with pytest.raises(RecordingError, match="there are demo/heavy, demo/lab; choose one with --machine"):
+    with pytest.raises(MachineFileError, match="there are demo/heavy, demo/lab; choose one with --machine"):
         export(Selection(both), "stream", "csv", tmp_path / "out.csv")
-    with pytest.raises(RecordingError, match="no machine demo/light; there are demo/heavy, demo/lab"):
+    with pytest.raises(MachineFileError, match="no machine demo/light; there are demo/heavy, demo/lab"):
         export(Selection(both, machine="demo/light"), "stream", "csv", tmp_path / "out.csv")
     assert export(Selection(both, machine="demo/heavy"), "stream", "csv", tmp_path / "out.csv").rows == 600
 

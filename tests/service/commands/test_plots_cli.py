@@ -147,7 +147,7 @@ def test_names_of_pictures(faulty: Path, tmp_path: Path) -> None:
     assert run("orbit", faulty, "--out", out, "--overwrite", "--size", "4x3")[0] == 0
     assert pixels(out)[0] > 0
     code, said = run("orbit", faulty, "--out", tmp_path / "nowhere" / "orbit.png")
-    assert (code, "cannot be written" in said) == (1, True)
+    assert (code, "cannot be written" in said) == (2, True)
     code, said = run("orbit", tmp_path / "missing.mcap", "--out", tmp_path / "other.png")
     assert (code, "missing.mcap" in said) == (2, True)
 
