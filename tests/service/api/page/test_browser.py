@@ -54,6 +54,7 @@ def test_who_signs_in_with_a_token_sees_the_machine_until_signing_out(browser: B
         page.goto(f"{url}/#/alarms")
         said = page.locator("sign-in [role=status]")
         expect(said).to_contain_text("an access token is needed")
+        expect(page.locator("sign-in code")).to_have_text("rotorwatch token create NAME --scope read --scope operate")
         page.get_by_label("Access token").fill("rw_wrong")
         page.get_by_role("button", name="Sign in").click()
         expect(said).to_contain_text("not valid")
@@ -186,6 +187,7 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
                 broken += [f"{view}, {kind}: {one}" for one in violations(page)]
                 broken += [f"{view}: {one}" for one in unreached(page)] if kind == "light" else []
                 assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
+                assert page.evaluate("document.querySelector('header').offsetHeight") < 100
                 if phone:  # nor is anything cut on a small one, or on a large one at 400 % zoom
                     page.set_viewport_size({"width": 320, "height": 844})
                     assert page.evaluate("document.documentElement.scrollWidth") == 320, view
