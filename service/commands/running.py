@@ -19,6 +19,8 @@ ENDPOINT = "tcp/127.0.0.1:7447"
 """Where a monitor listens unless it is told otherwise."""
 
 _FILES = 65_536
+_UNUSABLE = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.EROFS}
+"""What the system says of a file that somebody has named, and that this program cannot use."""
 _NO_THREAD = "can't start new thread"
 _MB = 1_000_000
 _ADDRESS_SPACE_MB = 2_000
@@ -129,8 +131,8 @@ def _too_small(limit: int) -> str:
 
 def exit_code(error: RotorwatchError) -> int:
     """2 for a file or argument that cannot be used, such as a recording that is not there; 1 for everything else."""
-    absent = FileNotFoundError | IsADirectoryError | NotADirectoryError
-    unusable = isinstance(error, RecordingError) and isinstance(error.__cause__, absent)
+    kinds = FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError
+    unusable = isinstance(error, RecordingError) and isinstance(error.__cause__, kinds)
     return 2 if unusable or isinstance(error, MachineFileError | BundleError) else 1
 
 
@@ -143,7 +145,7 @@ def exit_codes() -> Iterator[None]:
         typer.echo(str(error), err=True)
         raise typer.Exit(exit_code(error)) from error
     except OSError as error:
-        if error.errno != errno.ENAMETOOLONG:
+        if error.errno not in _UNUSABLE or error.filename is None:
             raise
         typer.echo(f"{error.filename}: {error.strerror}", err=True)
         raise typer.Exit(2) from error

@@ -1,6 +1,7 @@
 """The command `rotorwatch` as a process: what it prints, where, and its exit codes."""
 
 import ctypes
+import errno
 import json
 import signal
 import subprocess
@@ -10,10 +11,12 @@ from pathlib import Path
 
 import httpx
 import pytest
+import typer
 
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, Report
+from service.commands.running import exit_codes
 from service.terminal.lines import alarm_event_line, alarm_state_lines, health_line, report_line
 from simulator.scenario import parse_fault
 from tests.service.rig.live import (
@@ -54,6 +57,15 @@ def test_every_command_has_an_example(command: str) -> None:
     assert "Example" in found.stdout
     assert f"rotorwatch {command}" in found.stdout
     assert ("[link]" in found.stdout) == (command in ("run", "watch", "router"))  # names of tables are no markup
+
+
+def test_a_file_of_somebody_else_is_told_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit) as ended, exit_codes():
+        raise PermissionError(errno.EACCES, "Permission denied", "/var/lib/rotorwatch/history.sqlite")
+    assert ended.value.exit_code == 2
+    assert capsys.readouterr().err == "/var/lib/rotorwatch/history.sqlite: Permission denied\n"
+    with pytest.raises(PermissionError), exit_codes():  # of no file: a defect
+        raise PermissionError(errno.EPERM, "Operation not permitted")
 
 
 def test_the_help_has_all_exit_codes_of_status() -> None:
