@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from models.errors import MachineFileError, RotorwatchError
+from models.errors import RotorwatchError
 from service.commands import access, history, installation, interchange, plot, record, replay, size, watching, webhook
 from service.commands.replay import NamespaceOption, in_namespace
 from service.commands.running import (
@@ -290,8 +290,6 @@ def _checked(file: Path) -> str:
     from service.settings.service import load_settings  # noqa: PLC0415
 
     fields = read_toml(file)
-    if not fields:
-        raise MachineFileError(f"{file}: nothing is in it, expected settings or a machine (TOML)")
     if {"site", "rotor", "sensors"} & set(fields):
         machine = load_machine_file(file)
         return f"machine {machine.title}, {len(machine.sensors)} channels at {machine.rate_hz:g} Hz"

@@ -277,6 +277,8 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
         Naming the file or environment variable, the field and the value found, one fault per line.
     """
     fields = {} if path is None else read_toml(path)
+    if path is not None and not fields:  # of an editor that found the disk full, for example
+        raise MachineFileError(f"{path}: nothing is in it, expected settings (TOML)")
     place = Path("default settings") if path is None else path
     try:
         settings = ServiceSettings(**fields)  # type: ignore[arg-type]  # checked by pydantic, that is the point
