@@ -27,9 +27,10 @@ class AlarmsView extends HTMLElement {
   /** Every machine that has been heard of, the one with the most urgent alarm chosen first. */
   #offer() {
     this.#rights.textContent = !monitor.connected || monitor.may("operate") ? "" : "You may look: whoever acknowledges or shelves needs the scope operate.";
-    if (this.#choice.options.length === monitor.machines.size) return;
+    const places = [...monitor.machines.keys()].sort();
+    if ([...this.#choice.options].map((one) => one.value).join() === places.join()) return;
     const chosen = this.#chosen || standing()[0]?.place; // machines are heard of one after the other
-    this.#choice.replaceChildren(...[...monitor.machines.keys()].sort().map((place) => html("option", { value: place, selected: place === chosen }, place)));
+    this.#choice.replaceChildren(...places.map((place) => html("option", { value: place, selected: place === chosen }, place)));
     if (this.#history.firstElementChild?.getAttribute("place") !== this.#choice.value) this.#show();
   }
 

@@ -294,6 +294,19 @@ def test_a_machine_that_the_monitor_has_no_longer_is_not_shown(browser: Browser,
         expect(page.get_by_role("link", name="Alarms 1")).to_be_visible()
 
 
+def test_names_as_long_as_they_may_be_fit_a_phone(browser: Browser, plant: Plant) -> None:
+    told = {**dict(example(Health)), "site": "Compressor" * 6, "machine": "BoilerFeed" * 6}
+    with browser.new_context(viewport={"width": 390, "height": 844}) as context:
+        page = context.new_page()
+        tell_instead(page, told)
+        place = f"{told['site']}/{told['machine']}"
+        views = {"": "alarm-strip li", "alarms": "alarms-view option", f"machines/{place}": "machine-view h1 small"}
+        for view, there in views.items():
+            page.goto(f"{plant.runtime.http_url}/#/{view}")
+            expect(page.locator(there).first).to_be_attached()
+            assert page.evaluate("document.documentElement.scrollWidth") == 390
+
+
 def test_machines_stand_by_site_and_only_lines_that_are_seen_are_asked_for(browser: Browser, plant: Plant) -> None:
     url = plant.runtime.http_url
     asked: list[list[str]] = []
