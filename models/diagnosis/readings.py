@@ -162,6 +162,18 @@ class UnbalanceVector:
 
 
 Z95 = 1.959964  # standard errors on either side of a 95 % interval
+_ROUNDED_TO_NOTHING = 0.0005
+
+
+def percent_digits(half: float) -> int:
+    """Digits after the point of a change in percent: one, or two of the half of its interval where that is smaller.
+
+    Examples
+    --------
+    >>> percent_digits(0.014), percent_digits(0.00039)
+    (1, 3)
+    """
+    return 1 - math.floor(math.log10(100 * half)) if 0 < half < _ROUNDED_TO_NOTHING else 1
 
 
 def interval_95(value: float, standard_error: float, least: float = -math.inf) -> tuple[float, float]:

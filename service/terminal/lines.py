@@ -3,7 +3,7 @@
 import re
 from datetime import UTC, datetime
 
-from models.diagnosis.readings import Z95
+from models.diagnosis.readings import Z95, percent_digits
 from models.physics.rotor import PARAMETERS
 from rotorwatch.records.alarms import Alarm, AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report
@@ -171,4 +171,6 @@ def _change(name: str, change: float | None, standard_error: float | None) -> st
 def _percent(change: float | None, standard_error: float | None) -> str:
     if change is None or standard_error is None:
         return "n/a"
-    return with_minus_signs(f"{100 * change:+.1f}±{100 * Z95 * standard_error:.1f}".rjust(9))
+    half = Z95 * standard_error
+    digits = percent_digits(half)
+    return with_minus_signs(f"{100 * change:+.{digits}f}±{100 * half:.{digits}f}".rjust(9))

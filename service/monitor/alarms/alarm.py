@@ -1,14 +1,12 @@
 """An alarm, what happens to it, and the sentences operators read."""
 
-import math
 from dataclasses import dataclass
 
 from models.alarm_names import alarm_kind
-from models.diagnosis.readings import Z95
+from models.diagnosis.readings import Z95, percent_digits
 from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
 
-_ROUNDED_TO_NOTHING = 0.0005
 """An interval below this has two digits; 0.0 % would be none."""
 
 
@@ -88,7 +86,7 @@ class AlarmEvent:
             return f"{alarm.severity.upper()}: {words}" + (f": {said}" if said else "")
         what = f"{words} ({alarm.name})"
         half = Z95 * (alarm.standard_error or 0.0)
-        digits = 1 - math.floor(math.log10(100 * half)) if 0 < half < _ROUNDED_TO_NOTHING else 1
+        digits = percent_digits(half)
         size = f"{alarm.change or 0.0:+.{digits}%} ± {half:.{digits}%}" + (f": {alarm.note}" if alarm.note else "")
         reserve = " (low confidence: outside the model)" if alarm.low_confidence else ""
         match self.kind:

@@ -224,6 +224,8 @@ def test_lines_for_terminals() -> None:
     settled = report.model_copy(update={"verdict": report.verdict.model_copy(update={"settled": True})})
     small = report.parameters[0].model_copy(update={"relative_change": 0.005})
     assert report_line(settled.model_copy(update={"parameters": (small,)})) == f"{start}k_by  +0.5±1.4 %{tail}"
+    sharp = small.model_copy(update={"standard_error": 0.0002})
+    assert report_line(settled.model_copy(update={"parameters": (sharp,)})) == f"{start}k_by +0.500±0.039 %{tail}"
     blind = report.parameters[0].model_copy(update={"relative_change": None})
     assert report_line(settled.model_copy(update={"parameters": (blind,)})) == f"{start}k_by n/a{tail}"
     just = report.model_copy(update={"verdict": report.verdict.model_copy(update={"current": (), "changed": ()})})

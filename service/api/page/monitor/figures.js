@@ -21,16 +21,20 @@ export function figure(value) {
 /**
  * A relative change, with its sign.
  * @param {number | null | undefined} ratio
+ * @param {number} [digits] after the point
  */
-export function percent(ratio) {
+export function percent(ratio, digits = 1) {
   if (ratio === null || ratio === undefined) return "–";
-  const text = (100 * ratio).toFixed(1);
-  if (!Number(text)) return "0.0 %";
+  const text = (100 * ratio).toFixed(digits);
+  if (!Number(text)) return `${(0).toFixed(digits)} %`;
   return `${ratio > 0 ? "+" : ""}${signed(text)} %`;
 }
 
-/** A relative change with half its interval. @param {number} ratio @param {number} error */
-export const within = (ratio, error) => `${percent(ratio)} ± ${(100 * error).toFixed(1)} %`;
+/** A relative change with half its interval, which is never rounded to nothing. @param {number} ratio @param {number} error */
+export function within(ratio, error) {
+  const digits = error > 0 && error < 0.0005 ? 1 - Math.floor(Math.log10(100 * error)) : 1;
+  return `${percent(ratio, digits)} ± ${(100 * error).toFixed(digits)} %`;
+}
 
 /** @param {[number, number]} interval */
 export const interval = ([low, high]) => `${percent(low)} … ${percent(high)}`;

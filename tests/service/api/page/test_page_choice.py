@@ -119,3 +119,14 @@ def test_what_is_nearest_to_its_limit_is_that_by_the_same_number(
         assert whole["nearness"] == pytest.approx(near[first], rel=1e-12)
         series = str(whole["series"])
         assert first == (series if whole["quantity"] == "parameter" else f"level:{series.partition(':')[0]}")
+
+
+def test_a_narrow_interval_is_not_rounded_to_nothing(tmp_path: Path) -> None:
+    script = tmp_path / "ask.js"
+    figures = STATES.with_name("figures.js").as_uri()
+    script.write_text(
+        f'import {{ within }} from "{figures}";\n'
+        "console.log([0.0006, 0.00039, 0.0000241].map((error) => within(-0.19999, error)).join());"
+    )
+    done = run_deno(tmp_path, "run", str(script))
+    assert done.stdout == "−20.0 % ± 0.1 %,−19.999 % ± 0.039 %,−19.9990 % ± 0.0024 %\n", done.stderr
