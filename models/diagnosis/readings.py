@@ -162,7 +162,7 @@ class UnbalanceVector:
 
 
 Z95 = 1.959964  # standard errors on either side of a 95 % interval
-_ROUNDED_TO_NOTHING = 0.0005
+_ROUNDED_TO_NOTHING = 0.0005  # one digit would leave 0.0 % of half an interval below it
 
 
 def percent_digits(half: float) -> int:

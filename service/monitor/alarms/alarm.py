@@ -7,8 +7,6 @@ from models.diagnosis.readings import Z95, percent_digits
 from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
 
-"""An interval below this has two digits; 0.0 % would be none."""
-
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
