@@ -306,9 +306,10 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
         levels = hop_levels(plan.levels, waveform, deviations, turned, spectrum)
         if plan.thorough and turned is not None and plan.states:
             speed_rad_s = turned_rad * plan.rate_hz / plan.hop if line is None else line.speed_rad_s
-            for pair, skew in zip(map(list, plan.levels.pairs), plan.levels.skew, strict=True):
-                turning, turns = a[-2:, -plan.fresh :], speed_rad_s * plan.fresh / plan.rate_hz / (2 * np.pi)
-                levels.sums[CONTACT, pair] = contact(deviations[pair], turning, turns, plan.rate_hz, skew)
+            turning, turns = a[-2:, -plan.fresh :], speed_rad_s * plan.fresh / plan.rate_hz / (2 * np.pi)
+            for *pair, skew in plan.levels.contacts:
+                how = skew, bool(plan.levels.velocities[pair[0]])
+                levels.sums[CONTACT, pair] = contact(deviations[pair], turning, turns, plan.rate_hz, *how)
     if plan.angle_column is not None and plan.others:
         last = own.shape[1] - 1
         waveform = waveform.of([*range(n_states), last, *range(n_states, last)])

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
+import scipy  # its sub-packages are loaded when they are first used
 
 from models.checkpoint import checked
 from models.signals.block import FloatArray
@@ -38,13 +39,15 @@ _PER_TURN, _LEAST_HZ = 64, 1000.0
 """Sampled faster than both, neighbours are averaged: between them a force hardly moves the shaft."""
 
 
-def contact(pair: FloatArray, turning: FloatArray, revolutions: float, rate_hz: float, skew: float = 0.0) -> FloatArray:
+def contact(
+    pair: FloatArray, turning: FloatArray, revolutions: float, rate_hz: float, skew: float = 0.0, velocity: bool = False
+) -> FloatArray:
     """How much of a push towards the centre there is where a shaft is far out.
 
     Parameters
     ----------
     pair : ndarray, shape (2, n_samples)
-        Displacements in two directions, from their mean.
+        Displacements or velocities in two directions, from their mean.
     turning : ndarray, shape (2, n_samples)
         Cosine and sine of the shaft angle.
     revolutions : float
@@ -53,6 +56,8 @@ def contact(pair: FloatArray, turning: FloatArray, revolutions: float, rate_hz: 
         Sampling rate.
     skew : float
         Cosine of the angle between the directions.
+    velocity : bool
+        Whether they are velocities.
 
     Returns
     -------
@@ -74,8 +79,15 @@ def contact(pair: FloatArray, turning: FloatArray, revolutions: float, rate_hz: 
         return np.full(len(_FAR_OUT), np.nan)
     x, first = pair / largest, max(_LAGS)
     latest = [x[:, first - lag : kept - 1 - lag] for lag in _LAGS]
-    now, angle = latest[0], (turning[0] + 1j * turning[1])[first : kept - 1]
-    square, before = (y * y + z * z - 2 * skew * y * z for y, z in (now, latest[_LAGS.index(_BEFORE)]))
+    angle = (turning[0] + 1j * turning[1])[first : kept - 1]
+    now, then = latest[0], latest[_LAGS.index(_BEFORE)]
+    if velocity:
+        # Where the shaft is, by its velocities of about one turn: a function of the past as the samples themselves are.
+        place = scipy.signal.lfilter([1.0], [1.0, -np.exp(-max(abs(revolutions), 1.0) / kept)], x, axis=1)
+        place /= np.abs(place).max()
+        now, then = place[:, first : kept - 1], place[:, first - _BEFORE : kept - 1 - _BEFORE]
+        latest += [now, then]
+    square, before = (y * y + z * z - 2 * skew * y * z for y, z in (now, then))
     far = np.minimum(square, before)
     at = [round((1 - part) * far.size) for part in _FAR_OUT]
     limits = np.partition(far, at)[at]

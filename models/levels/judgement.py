@@ -182,7 +182,7 @@ class LevelJudge:
 
     def _contact(self, levels: WindowLevels, state: OperatingState, latest: LatestContact, number: int) -> str:
         """Where the shaft is pushed back far out, as it was not on the healthy machine; empty if nowhere."""
-        columns = [(column, pair) for pair in self._plan.pairs for column in pair]
+        columns = [(column, (y, z)) for y, z, _ in self._plan.contacts for column in (y, z)]
         if levels.contact is None or not columns:
             return ""
         window = levels.contact[:, [column for column, _ in columns]]

@@ -94,6 +94,8 @@ class LevelPlan:
         What is taken out of 1x: q of x = Re{q e^{jθ}} at slow roll, for an angle that grows.
     lines : bool
         Whether the strongest line of every narrow band is wanted.
+    contacts : tuple of (int, int, float)
+        Columns that show a contact and their skew: the pairs, and velocities of the rotor where there is none.
     """
 
     rate_hz: float
@@ -103,6 +105,7 @@ class LevelPlan:
     skew: tuple[float, ...]
     runout: _ComplexArray | None = None
     lines: bool = False
+    contacts: tuple[tuple[int, int, float], ...] = ()
 
     @property
     def high_hz(self) -> tuple[float, float] | None:
@@ -152,23 +155,30 @@ def level_plan(
     lines : bool
         See `LevelPlan`.
     """
-    shaft = [(n, one) for n, one in enumerate(channels) if one.quantity is Quantity.DISPLACEMENT]
-    at = {(one.location, one.direction): n for n, one in shaft if one.angle_deg is None}
-    pairs = [(at[place, "y"], at[place, "z"]) for place, way in at if way == "y" and (place, "z") in at]
-    for place in dict.fromkeys(one.location for _, one in shaft):
-        angled = [n for n, one in shaft if one.location == place and one.angle_deg is not None]
-        if len(angled) == 2 and apart_deg(*(channels[n] for n in angled)) >= LEAST_APART_DEG:
-            pairs.append((angled[0], angled[1]))
-    low, high = band_hz
+    pairs = _pairs(channels, Quantity.DISPLACEMENT)
+    unseen = {"bearing", "disc"} - {channels[first].location for first, _ in pairs}
+    moving = [one for one in _pairs(channels, Quantity.VELOCITY) if channels[one[0]].location in unseen]
     return LevelPlan(
         rate_hz,
         tuple(one.quantity for one in channels),
-        (low, min(high, NYQUIST_PART * rate_hz / 2)),
+        (band_hz[0], min(band_hz[1], NYQUIST_PART * rate_hz / 2)),
         tuple(pairs),
         tuple(_skew(channels[first], channels[second]) for first, second in pairs),
         runout if runout is not None and np.any(runout) else None,
         lines,
+        tuple((first, second, _skew(channels[first], channels[second])) for first, second in pairs + moving),
     )
+
+
+def _pairs(channels: Sequence[Channel], quantity: Quantity) -> list[tuple[int, int]]:
+    own = [(n, one) for n, one in enumerate(channels) if one.quantity is quantity]
+    at = {(one.location, one.direction): n for n, one in own if one.angle_deg is None}
+    pairs = [(at[place, "y"], at[place, "z"]) for place, way in at if way == "y" and (place, "z") in at]
+    for place in dict.fromkeys(one.location for _, one in own):
+        angled = [n for n, one in own if one.location == place and one.angle_deg is not None]
+        if len(angled) == 2 and apart_deg(*(channels[n] for n in angled)) >= LEAST_APART_DEG:
+            pairs.append((angled[0], angled[1]))
+    return pairs
 
 
 def _skew(first: Channel, second: Channel) -> float:

@@ -27,6 +27,7 @@ def told(
     spikes: float = 0.0,
     angle_deg: float = 90.0,
     rate_hz: float = 2000.0,
+    velocity: bool = False,
 ) -> FloatArray:
     """Of a disc on a shaft of stiffness one, shaken at random to an rms of about one, with noise of one per cent."""
     rng, omega, dt = np.random.default_rng(seed), 2 * np.pi * MODE_HZ, 1 / rate_hz
@@ -44,13 +45,13 @@ def told(
             stiffness += stiff * np.maximum(0, 1 - clearance / np.sqrt(r2 + 1e-9))
         v += kick - (dt * omega**2) * stiffness * x - (0.1 * omega * dt) * v
         x += dt * v
-        seen[at] = x
+        seen[at] = v / omega if velocity else x
     seen += 0.01 * rng.standard_normal(seen.shape)
     seen += spikes * (rng.random(seen.shape) < 2e-4)
     skew = np.cos(np.radians(angle_deg))
     seen[:, 1] = skew * seen[:, 0] + np.sqrt(1 - skew**2) * seen[:, 1]  # as a probe at that angle to the other sees it
     pairs = (seen - seen.mean(axis=0)).transpose(2, 1, 0)
-    return np.array([contact(pair, circle, SPEED_HZ * n * dt, rate_hz, skew) for pair in pairs])
+    return np.array([contact(pair, circle, SPEED_HZ * n * dt, rate_hz, skew, velocity) for pair in pairs])
 
 
 def z(found: FloatArray) -> FloatArray:
@@ -72,6 +73,29 @@ def test_a_contact_is_seen(clearance: float, stiff: float, which: int) -> None:
 @pytest.mark.parametrize("how", [{"rate_hz": 4000.0}, {"angle_deg": 60.0}])
 def test_a_contact_is_seen_as_well_at_another_sampling_rate_or_angle(how: dict[str, float]) -> None:
     assert z(told(20261128, clearance=2.5, stiff=1.0, **how))[0] > 6  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("how", [{}, {"line": (0.5, 0.6)}, {"unbalance": 3.0}, {"rate_hz": 4000.0}, {"spikes": 6.0}])
+def test_velocities_show_no_contact_where_there_is_none(how: dict[str, float]) -> None:
+    found = told(20261131, velocity=True, **how)  # type: ignore[arg-type]
+    assert np.all(z(found) < 4.5)
+    assert np.all((found.std(axis=0) > 0.6) & (found.std(axis=0) < 1.5))
+
+
+@pytest.mark.parametrize(("clearance", "stiff", "which"), [(2.5, 1.0, 0), (1.5, 2.0, 1)])
+def test_a_contact_is_seen_in_velocities_alone(clearance: float, stiff: float, which: int) -> None:
+    assert z(told(20261132, clearance=clearance, stiff=stiff, velocity=True))[which] > 6
+
+
+def test_velocities_are_looked_at_where_a_place_has_no_two_displacements() -> None:
+    def contacts(*channels: tuple[str, str, str]) -> list[tuple[int, int]]:
+        plan = level_plan([channel(one, way, place) for one, way, place in channels], 2000.0, (10.0, 1000.0))
+        return [(first, second) for first, second, _ in plan.contacts]
+
+    velocities = [("velocity", way, place) for place in ("bearing", "disc", "casing") for way in "yz"]
+    assert contacts(*velocities) == [(0, 1), (2, 3)]
+    assert contacts(*velocities, ("displacement", "y", "disc"), ("displacement", "z", "disc")) == [(6, 7), (0, 1)]
+    assert contacts(*velocities, ("displacement", "y", "disc")) == [(0, 1), (2, 3)]
 
 
 def test_single_samples_that_are_off_are_no_contact() -> None:
