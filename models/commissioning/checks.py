@@ -108,8 +108,16 @@ def check_sensors_of(
 def check_steady(
     machine: MachineFile, recordings: Sequence[HealthyRecording], windows: Mapping[str, Sequence[WindowStatistics]]
 ) -> Check:
-    """Whether speed and level held still within each recording."""
+    """Whether speed and level held still within each recording, of a shaft whose angle grows."""
     told = partial(Check, name="stationary")
+    falling = [one.name for one in recordings if any(window.speed_rad_s < 0 for window in windows[one.name])]
+    if falling:
+        return told(
+            verdict="refused",
+            text=f"{', '.join(falling)}: the shaft angle falls, expected to grow from 0 to 2π in every turn",
+            advice="send 2π minus the angle; where the shaft turns from z to y, take y to point the other way, as seen "
+            "from the shaft's other end",
+        )
     moved = []
     for recording in recordings:
         for window in windows[recording.name]:

@@ -113,6 +113,17 @@ def test_speed_that_runs_away() -> None:
     assert "one file for each speed" in advice
 
 
+def test_an_angle_that_falls() -> None:
+    blocks = stream(HEALTHY_S, 52)
+    samples = samples_of(blocks)
+    samples[:, -1] = -samples[:, -1] % (2 * np.pi)
+    made = made_of(with_samples(blocks, samples))
+    assert refused(made)
+    _, text, advice = verdict_of(made, "stationary")
+    assert text.endswith("the shaft angle falls, expected to grow from 0 to 2π in every turn")
+    assert advice.startswith("send 2π minus the angle")
+
+
 def test_vibration_that_grows() -> None:
     made = made_of(stream(70.0, 54, Event(at_s=35.0, excitation_level=4.0)))
     assert refused(made)
