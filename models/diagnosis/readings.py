@@ -67,6 +67,7 @@ _SEEN = 3.0  # standard errors from which a vector has a direction
 # Standard errors, and part of the unbalance, by which the heavy spot must have moved to count as turned: angle sensors
 # and probes are not mounted better than to a few degrees.
 _TURNED, _LEAST_TURN = 6.0, 0.05
+_SAME_SIZE = 0.1  # a heavy spot seldom moves without a change of its size; a sensor does
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +148,8 @@ class UnbalanceVector:
         where = f"{self.change_angle_deg:z.0f}° from the heavy spot".replace("-", "−")
         size = f"size {100 * self.magnitude_change:+.0f} %".replace("-", "−")
         turned = "" if self.turned_deg is None else f", turned by {self.turned_deg:z.0f}°".replace("-", "−")
+        if self.turned and abs(self.magnitude_change) < _SAME_SIZE:
+            turned += ": the heavy spot has moved, or the zero of the shaft angle"
         return f"a vector of {100 * self.change:.0f} % of the nominal unbalance at {where} ({size}{turned})"
 
     def _error(self, x: float, y: float) -> float:

@@ -29,7 +29,7 @@ class UnbalanceVector(Record):
     )
     text: str = Field(
         description="the change in words",
-        examples=["a vector of 141 % of the nominal unbalance at 135° from the heavy spot (size −2 %, turned by 90°)"],
+        examples=["a vector of 61 % of the nominal unbalance at 35° from the heavy spot (size +54 %, turned by 13°)"],
     )
 
 

@@ -134,6 +134,7 @@ class AlarmBook:
                     named=reading.name in sure,
                     taken_back=verdict.settled and not hidden and (another or reading.name not in held),
                     low_confidence=verdict.outside_model,
+                    growth=None if reading.vector is None else reading.vector.magnitude_change,
                     evidence=evidence,
                     note="" if reading.vector is None else reading.vector.text,
                 )
@@ -177,6 +178,7 @@ class AlarmBook:
         named: bool,
         taken_back: bool = False,
         low_confidence: bool = False,
+        growth: float | None = None,
         evidence: Evidence | None = None,
         note: str = "",
     ) -> tuple[AlarmEvent, ...]:
@@ -190,6 +192,9 @@ class AlarmBook:
             Whether the parameter is among those found to have changed.
         taken_back : bool
             Whether a whole window after the change says that it is not.
+        growth : float, optional
+            How much of the change loads the machine more or less than before, where that is not all: an unbalance that
+            has only turned is not dangerous.
         note : str
             The change in words, where a number does not say all.
         """
@@ -207,7 +212,9 @@ class AlarmBook:
         )
         beyond, small = named and size > limits.raise_above, taken_back or size < limits.clear_below
         # With reserve the size is one of a parameter that need not be the one; levels say whether it is dangerous.
-        danger = beyond and size > limits.danger_above and not low_confidence
+        danger = (
+            beyond and min(size, size if growth is None else abs(growth)) > limits.danger_above and not low_confidence
+        )
         return self._judge(alarm, time_ns, beyond=beyond, small=small, danger=danger)
 
     def update_state(  # noqa: PLR0913  # what is known of a state

@@ -52,7 +52,8 @@ def test_where_the_file_does_not_say_where_the_heavy_spot_is_its_angle_is_no_unb
 
 def test_where_the_file_says_it_another_angle_is_a_change() -> None:
     windows, events = feed(MachineMonitor(Installed(with_heavy_spot(0.0))), stream(75.0, 2.5))
-    assert [event.alarm.name for event in events] == ["e"]
+    assert [(event.alarm.name, event.alarm.severity) for event in events] == [("e", "alert")]  # no more than it was
+    assert "turned by 143°: the heavy spot has moved, or the zero of the shaft angle" in events[0].text
     assert e_of(windows[-1].parameters) == pytest.approx(2 * math.sin(2.5 / 2), abs=0.1)
 
 
