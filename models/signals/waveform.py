@@ -14,6 +14,9 @@ from models.signals.block import FloatArray
 
 CountArray = npt.NDArray[np.int64]
 
+_DROPPED, _JUMPS = 4, 4.0
+"""Least samples of a run that a channel jumps into and out of, and least jump, in steps as they usually are."""
+
 
 @dataclass(frozen=True, slots=True)
 class Waveform:
@@ -30,6 +33,8 @@ class Waveform:
     at_minimum: CountArray
     at_maximum: CountArray
     longest_run: CountArray  # most samples in a row that are exactly equal; 1 if no neighbours are
+    # Samples in runs of equal ones that the channel jumps into and out of, as where its line is broken for a moment.
+    dropped: CountArray
     # Smallest difference between unequal neighbours: the quantisation step, if there is one. Nan where no neighbours
     # are equal (not quantised) or all are.
     step: FloatArray
@@ -44,7 +49,7 @@ class Waveform:
         return {
             "n_samples": np.array(self.n_samples, dtype=np.int64),
             "levels": np.stack([self.mean, self.rms, self.minimum, self.maximum, self.step]),
-            "counts": np.stack([self.at_minimum, self.at_maximum, self.longest_run]),
+            "counts": np.stack([self.at_minimum, self.at_maximum, self.longest_run, self.dropped]),
         }
 
     @classmethod
@@ -57,9 +62,9 @@ class Waveform:
             If an array is missing or of another form.
         """
         mean, rms, minimum, maximum, step = checked(arrays, "levels", np.float64, (5, None))
-        at_minimum, at_maximum, longest_run = checked(arrays, "counts", np.int64, (3, mean.size))
+        at_minimum, at_maximum, longest_run, dropped = checked(arrays, "counts", np.int64, (4, mean.size))
         n_samples = int(checked(arrays, "n_samples", np.int64, ()))
-        return cls(n_samples, mean, rms, minimum, maximum, at_minimum, at_maximum, longest_run, step)
+        return cls(n_samples, mean, rms, minimum, maximum, at_minimum, at_maximum, longest_run, dropped, step)
 
 
 def waveform_of(samples: FloatArray) -> tuple[Waveform, FloatArray]:
@@ -82,20 +87,25 @@ def waveform_of(samples: FloatArray) -> tuple[Waveform, FloatArray]:
     minimum, maximum = x.min(axis=1), x.max(axis=1)
     equal = x[:, 1:] == x[:, :-1]
     at_minimum, at_maximum = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
-    longest_run, step = np.ones(n, dtype=np.int64), np.full(n, np.nan)
+    longest_run, dropped, step = np.ones(n, dtype=np.int64), np.zeros(n, dtype=np.int64), np.full(n, np.nan)
     for row in np.flatnonzero(equal.any(axis=1)):
-        first = np.flatnonzero(equal[row])  # each is equal to its successor
-        runs = np.split(first, np.flatnonzero(np.diff(first) != 1) + 1) if first.size < n_samples - 1 else [first]
-        lengths = np.array([run.size + 1 for run in runs])
-        levels = x[row, [run[0] for run in runs]]
+        follows = np.flatnonzero(equal[row])  # each is equal to its successor
+        breaks = np.flatnonzero(np.diff(follows) != 1)
+        first, last = follows[np.append(0, breaks + 1)], follows[np.append(breaks, -1)] + 1
+        lengths, levels = last - first + 1, x[row, first]
         at_minimum[row] = lengths[levels == minimum[row]].sum()
         at_maximum[row] = lengths[levels == maximum[row]].sum()
         longest_run[row] = lengths.max()
-        if first.size < n_samples - 1:
-            step[row] = np.abs(np.diff(x[row])[~equal[row]]).min()
+        if follows.size < n_samples - 1:
+            moves = np.abs(np.diff(x[row]))
+            step[row] = moves[~equal[row]].min()
+            inside = (lengths >= _DROPPED) & (first > 0) & (last < n_samples - 1)
+            if inside.any() and 2 * follows.size < n_samples:  # or the channel may be one that is held between values
+                jumps = np.minimum(moves[first[inside] - 1], moves[last[inside]])
+                dropped[row] = lengths[inside][jumps > _JUMPS * np.median(moves[~equal[row]])].sum()
     x -= mean[:, None]
     rms = np.sqrt(np.einsum("ij,ij->i", x, x) / n_samples)
-    return Waveform(n_samples, mean, rms, minimum, maximum, at_minimum, at_maximum, longest_run, step), x
+    return Waveform(n_samples, mean, rms, minimum, maximum, at_minimum, at_maximum, longest_run, dropped, step), x
 
 
 def stacked_waveform(hops: Sequence[Waveform]) -> Waveform:

@@ -7,7 +7,7 @@ import numpy as np
 from models.diagnosis.motion import motion_pairs
 from models.diagnosis.sensors.disagreement import BROKEN, gain_and_delay, suspect_pairs, swapped
 from models.diagnosis.sensors.kinematics import PairReading, banded, read_pair
-from models.diagnosis.sensors.level import clipped, gain_jump, offset, spiked, stuck
+from models.diagnosis.sensors.level import clipped, dropped, gain_jump, offset, spiked, stuck
 from models.diagnosis.sensors.noise import noisy
 from models.diagnosis.sensors.phase import no_angle, phase_faults
 from models.diagnosis.sensors.reference import Naming, SensorReference, implicated
@@ -43,7 +43,9 @@ def sensor_findings(
     """
     window, naming = window.as_mounted, Naming(channels)
     stood = np.full(len(window.waveforms), True) if standing else runs_down(window)
-    findings = [*stuck(window, naming, stood), *clipped(window, naming)]
+    findings = [*stuck(window, naming, stood), *dropped(window, naming)]
+    lost = implicated(findings)  # where a channel falls to the end of its range it is not cut off there
+    findings += [found for found in clipped(window, naming) if not set(found.states) & lost]
     wrong_angle = no_angle(window, naming)
     if stood.any() or wrong_angle:
         return (*findings, *wrong_angle)

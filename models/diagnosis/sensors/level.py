@@ -36,6 +36,7 @@ STEP_PART = 0.3  # part of the channel's rms that it must exceed besides
 DRIFT_PART = 3.0
 # The mean may differ from the reference by this many rms of the channel: temperature and load move gap voltages.
 MOVED_PART = 3.0
+_FEWEST_DROPPED = 3  # hops of a window in which a channel drops out; rarer ones do not matter to what is read
 _TOGETHER = 0.3  # where another displacement moves by at least this part of a displacement's step, the shaft has moved
 
 
@@ -80,6 +81,22 @@ def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]
                 f"expected to move within {STILL_S:g} s: the sensor or its line is stuck"
             )
             findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=longest_s))
+    return findings
+
+
+def dropped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
+    """Channels that jump to a constant and back again and again: a coarse converter steps into what it holds."""
+    hops, findings = window.hop_waveform, []
+    rate_hz = hops.n_samples * len(window.waveforms) / window.duration_s
+    for column, state in enumerate(window.sensors):
+        counts = hops.dropped[:, column]
+        if state != "theta" and np.count_nonzero(counts) >= _FEWEST_DROPPED:
+            lost_s = float(counts.sum()) / rate_hz
+            text = (
+                f"{naming.name(state)}: jumps to a constant and back, for {lost_s:.2g} s of {window.duration_s:.3g} s, "
+                "expected to move without a break: a loose connector or a broken cable"
+            )
+            findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=lost_s))
     return findings
 
 

@@ -159,6 +159,36 @@ def test_peaks_that_are_no_motion_are_named(also: tuple[str, ...], every: int) -
     assert "of which y2_dot shows nothing" in finding.text
 
 
+@pytest.mark.parametrize(("state", "gap"), [("y1", 0.0), ("z2", 40.0), ("y2_dot", 0.0)])
+def test_a_channel_that_drops_out_again_and_again_has_a_loose_connector(state: str, gap: float) -> None:
+    samples = recorded("lab", 1).copy()
+    own = samples[:, column(state)]
+    own += gap * own.std()  # a probe's distance from the shaft
+    for first in range(3_000, len(own), 4_000):
+        own[first : first + 40] = 0.0
+    finding = only(found_in(samples))
+    assert (finding.kind, finding.states) == ("stuck", (state,))
+    assert f"{state}: jumps to a constant and back, for 0." in finding.text
+    few = recorded("lab", 1).copy()
+    few[60_000:60_040, column(state)] = 0.0  # once in a window matters to nothing
+    assert found_in(few) == ()
+
+
+@pytest.mark.parametrize("kind", ["few digits", "8 bits", "held", "impulses on a coarse converter"])
+def test_runs_of_equal_samples_that_are_no_break(kind: str) -> None:
+    samples = recorded("lab", 1).copy()
+    rng, own = np.random.default_rng(1611), samples[:, 0]
+    spread = own.std()
+    if kind == "held":  # sent at a quarter of the rate
+        own[:] = np.repeat(own[::4], 4)[: len(own)]
+    else:
+        if kind.startswith("impulses"):
+            own += np.where(rng.random(len(own)) < 0.002, 12 * spread * rng.standard_normal(len(own)), 0.0)
+        step = {"few digits": 0.01, "8 bits": 0.08}.get(kind, 0.5) * spread
+        own[:] = np.round(own / step) * step
+    assert not any("jumps to a constant" in finding.text for finding in found_in(samples))
+
+
 @pytest.mark.parametrize(
     ("bounds", "angle"),
     [
