@@ -264,6 +264,10 @@ class KnownMachineEvaluator(WindowEvaluator):
         short = {} if newest is None else self._newest(window, *newest, deciding)
         if not deciding.unexplained:
             self._explained_ns = window.end_ns
+        elif self._explained_ns is None and not self._commissioned:
+            deciding = replace(
+                deciding, unexplained=f"{deciding.unexplained}; if it is healthy like that, commission it"
+            )
         equations: tuple[Equation, ...] = ()
         opinions = []
         for other in self._others:

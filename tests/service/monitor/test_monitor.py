@@ -233,6 +233,7 @@ def test_mains_hum_hides_no_rotor_and_another_line_is_told_with_its_frequency() 
     assert not [each for one in windows[-1].opinions for each in one.agreement if each.verdict == "disagree"]
     (last,) = feed(monitor(), with_lines(healthy(63.0), {37.3: 0.3}))[0][-1:]
     assert "most of it at 37" in sure(last.parameters[0].reason)
+    assert last.reason.endswith("if it is healthy like that, commission it")
 
 
 def test_a_machine_that_runs_down_raises_nothing() -> None:
