@@ -19,7 +19,7 @@ from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.machine import MachineSnapshots
 from service.api.routes.recordings import found_recording
 from service.api.views import ServiceView
-from service.monitor.evaluation import evaluator_for
+from service.monitor.evaluators import evaluator_for
 from service.monitor.reports import identity_of
 from service.recordings.replay.source import RecordingSource
 from service.stream.monitored import Monitored

@@ -42,7 +42,7 @@ from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
 from service.monitor.alarms.operation import OperatorAction
-from service.monitor.evaluation import evaluator_for
+from service.monitor.evaluators import evaluator_for
 from service.monitor.levels import LevelWatch
 from service.monitor.parts import divided, joined
 from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, counted, identity_of

@@ -8,7 +8,8 @@ from models.commissioning.commission import Commissioning
 from models.commissioning.commissioned import Installed
 from models.commissioning.healthy import HealthyRecording
 from rotorwatch.records.windows import Parameter
-from service.monitor.evaluation import Evaluation, evaluator_for
+from service.monitor.evaluation import Evaluation
+from service.monitor.evaluators import evaluator_for
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, stream, windows_of
 from tests.sure import sure

@@ -26,7 +26,7 @@ from models.diagnosis.sensors.reference import Naming
 from models.errors import BundleError
 from models.machine import MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETERS
-from service.monitor.evaluation import evaluator_for
+from service.monitor.evaluators import evaluator_for
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import (
     LAB,

@@ -16,7 +16,7 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError, UnexplainedError
 from models.machine import load_machine
 from models.physics.rotor import impossible
-from service.monitor.evaluation import KnownMachineEvaluator
+from service.monitor.known_machine import KnownMachineEvaluator
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 from tests.sure import sure
 

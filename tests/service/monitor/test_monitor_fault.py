@@ -16,7 +16,7 @@ from rotorwatch.records.alarms import EventKind, Evidence
 from rotorwatch.records.health import HealthState
 from service.history.records import Checkpoint, Step, StoreError
 from service.monitor.alarms.alarm import AlarmEvent
-from service.monitor.evaluation import KnownMachineEvaluator
+from service.monitor.known_machine import KnownMachineEvaluator
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import identity_of
 from service.runtime.runtime import running

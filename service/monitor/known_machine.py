@@ -1,0 +1,253 @@
+"""Evaluation of a machine whose parameters are known, given or identified: its windows are compared with theory."""
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from models.checkpoint import checked, prefixed, unprefixed
+from models.commissioning.commissioned import Commissioned, in_sense
+from models.diagnosis.likelihood.lengths import LengthFits
+from models.diagnosis.networks.amortised import NetworkDiagnostician
+from models.diagnosis.networks.bundle import Bundle
+from models.diagnosis.networks.relation import RelationDiagnostician
+from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading
+from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.verdict.calibration import beside
+from models.diagnosis.verdict.sequential import SequentialTest
+from models.diagnosis.verdict.stretch import determined, with_shared_error
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError, UnexplainedError
+from models.machine import Machine
+from models.physics.rotor import PARAMETERS
+from rotorwatch.records.windows import Equation, Opinion
+from service.monitor.evaluation import Evaluation, Newest, WindowEvaluator, opinion_of
+
+_LIKELIHOOD, _EXPLAINED, _SENSE, _DIRECTED = "likelihood", "explained_ns", "sense", "directed"
+_STEADY = 0.15
+"""Range of speed within a window, relative, up to which the rotation taken out hop by hop leaves nothing behind: on the
+rotor kit readings stay unbiased at ramps of 5, 10 and 15 % (16 seeds each, ``tests/diagnosis/test_window.py``)."""
+
+_INSIDE, _BETTER, _SURELY_OUTSIDE = 2.0, 3.0, 8.0
+"""Standard deviations of the misfit with which a window is explained beyond doubt, by which one explanation is better
+than another, and of what is outside the model by something else than its spectra."""
+_HEAVIEST, _SURELY = 20.0, 3.0
+"""Times the unbalance of the machine file, in standard errors: a lost blade makes ten of it, millimetres in place of
+micrometres a thousand."""
+_OUTSIDE = 4.0
+"""Standard deviations of the misfit from which the short stretches of a window are tested for themselves."""
+
+
+class KnownMachineEvaluator(WindowEvaluator):
+    """Compares the windows of one machine with theory.
+
+    Parameters
+    ----------
+    bundle : Bundle or None
+        Without it the equations are reported as not evaluable.
+    commissioned : Commissioned, optional
+        Uncertainty of parameters that were identified, part of every reading; and the healthy windows' misfit, which
+        later ones are compared with.
+    """
+
+    by = "likelihood"
+    takes_short = True
+
+    def __init__(self, machine: Machine, bundle: Bundle | None, commissioned: Commissioned | None = None) -> None:
+        identified = None if commissioned is None else commissioned.identified
+        self._shared = None if identified is None else identified.matrix()
+        self._commissioned = commissioned is not None
+        self._healthy_misfit = None if commissioned is None else commissioned.misfit
+        self.needs_lags = bundle is not None  # only the networks look at lags
+        self._explained_ns: int | None = None
+        self._given, self._bundle = machine, bundle
+        # The sense of the gyroscopic moments is open until a window has been explained.
+        self._open, self._opposite = commissioned is None, False
+        # Where the file does not say where the heavy spot is, it is looked for in the first window that shows it.
+        given = "unbalance_phase_rad" in machine.operation.model_fields_set
+        self._sought = commissioned is None and not given
+        self._tried_ns, self._tried_in_vain = 0, False  # end of the window that the other one was tried on
+        self._compare_with(machine)
+
+    def _compare_with(self, machine: Machine) -> None:
+        self._machine, bundle = machine, self._bundle
+        self._likelihood = LengthFits(machine)
+        others: list[Diagnostician] = []
+        if bundle is not None and bundle.amortised is not None:
+            others.append(NetworkDiagnostician(machine, bundle.amortised))
+        others.append(RelationDiagnostician(machine, () if bundle is None else bundle.networks))
+        self._others = tuple(others)
+
+    def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
+        """Evaluate one window, see `WindowEvaluator`."""
+        speed = self._speed(window)
+        window = window if self.directed else replace(window, directed=False)
+        deciding = self._explained(window)
+        if self._open:
+            deciding = self._by_sense(window, deciding)
+        if self._elsewhere(deciding):
+            self.directed, window = False, replace(window, directed=False)
+            deciding = self._explained(window)
+        deciding = self._within(deciding)
+        short = {} if newest is None else self._newest(window, *newest, deciding)
+        if not deciding.unexplained:
+            self._explained_ns = window.end_ns
+        elif self._explained_ns is None and not self._commissioned:
+            deciding = replace(
+                deciding, unexplained=f"{deciding.unexplained}; if it is healthy like that, commission it"
+            )
+        equations: tuple[Equation, ...] = ()
+        opinions = []
+        for other in self._others:
+            try:
+                diagnosis = other.diagnose(window)
+            except (EstimationError, np.linalg.LinAlgError) as error:
+                opinions.append(Opinion(by=other.by, reason=str(error)))
+                continue
+            equations = diagnosis.equations or equations
+            opinions.append(opinion_of(deciding, beside(deciding, diagnosis)))
+        return Evaluation(deciding, short, equations, tuple(opinions), speed)
+
+    def _elsewhere(self, deciding: Diagnosis) -> bool:
+        """Whether the first window that shows the heavy spot shows it where it was only supposed not to be.
+
+        Where the file does not say where it is, no turn of it can be told then: the unbalance is judged by its size.
+        """
+        vector = deciding.unbalance
+        if not self._sought or self._open or deciding.unexplained or vector is None or vector.foreign:
+            return False
+        self._sought = vector.turned_error_deg is None
+        return self.directed and vector.turned
+
+    def _explained(self, window: WindowStatistics) -> Diagnosis:
+        try:
+            return self._decide(window, self._likelihood.window)
+        except UnexplainedError as error:
+            reason = str(error)
+            nothing = tuple(no_reading(name, self.by, reason) for name in PARAMETERS)
+            return Diagnosis(self.by, nothing, covariance=np.zeros((0, 0)), unexplained=reason)
+
+    def _by_sense(self, window: WindowStatistics, given: Diagnosis) -> Diagnosis:
+        """The diagnosis with gyroscopic moments of that sense which explains the window, if either does.
+
+        The other sense is a search from nothing: it is tried once in a window's length.
+        """
+        misfit_z = _misfit_z(given)
+        tried = window.start_ns < self._tried_ns <= window.end_ns and (self._tried_in_vain or np.isinf(misfit_z))
+        if misfit_z <= _INSIDE or tried:
+            self._open = misfit_z > _INSIDE
+            return given
+        # What neither sense explains, a disturbance for instance, says nothing of it: the next that is read does.
+        self._tried_ns, self._tried_in_vain = window.end_ns, bool(np.isfinite(misfit_z))
+        before = self._machine, self._likelihood, self._others
+        self._compare_with(in_sense(self._given, "opposite"))
+        try:
+            other = self._explained(window)
+            self._opposite = _misfit_z(other) <= min(_OUTSIDE, misfit_z - _BETTER)
+        except EstimationError:
+            other = given
+        finally:
+            if not self._opposite:
+                self._machine, self._likelihood, self._others = before
+        self._open = not self._opposite
+        return other if self._opposite else given
+
+    def _within(self, decided: Diagnosis) -> Diagnosis:
+        """The diagnosis, unexplained where it takes an unbalance that means wrong units, or a wrong e_m."""
+        vector = decided.unbalance
+        if vector is None or decided.unexplained or vector.foreign:
+            return decided
+        times = 1 + vector.magnitude_change
+        if times - _SURELY * vector.magnitude_error < _HEAVIEST:
+            return decided
+        why = (
+            f"{self._machine.title}: it would take {times:.1f} times the unbalance of the machine file, evaluated is at"
+        )
+        return replace(decided, unexplained=f"{why} most {_HEAVIEST:g} times: check the units of the channels and e_m")
+
+    def _newest(
+        self, window: WindowStatistics, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis
+    ) -> dict[int, Diagnosis]:
+        """What the latest hops say for themselves, by how many."""
+        wanted, evaluated = test.wanted(), {}
+        # Where the window is outside the model it may be astride a change: then its newest hops are inside.
+        closely = deciding.misfit_z is not None and deciding.misfit_z > _OUTSIDE
+        if deciding.unexplained:
+            # One machine or two in this window? If some of its data were explained, the shortest stretch says.
+            straddles = self._explained_ns is not None and window.start_ns < self._explained_ns
+            wanted = tuple(sorted(wanted)[: int(straddles)])
+        elif test.unchanged and not closely and not self._likelihood.has_news(sliding, window, wanted):
+            return {}
+        for hops in wanted:
+            with suppress(EstimationError):  # too little data for itself; the window has said what there is to say
+                if (statistics := sliding.statistics(hops)) is not None:
+                    statistics = replace(statistics, directed=self.directed, lines=window.lines)
+                    decided = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
+                    evaluated[hops] = self._within(decided)
+        return evaluated
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Where the likelihood's maximum is followed from, and what is known; networks remember nothing."""
+        explained = np.array([] if self._explained_ns is None else [self._explained_ns], dtype=np.int64)
+        sense = [self._open, self._opposite, self._tried_in_vain, self._tried_ns, self._sought]
+        known = {_EXPLAINED: explained, _SENSE: np.array(sense, dtype=np.int64), _DIRECTED: np.array(self.directed)}
+        return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | known
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called, see `WindowEvaluator`."""
+        explained = checked(arrays, _EXPLAINED, np.int64, (None,)).tolist()
+        still_open, opposite, in_vain, tried_ns, sought = checked(arrays, _SENSE, np.int64, (5,)).tolist()
+        directed = bool(checked(arrays, _DIRECTED, np.bool_, ()))
+        machine = in_sense(self._given, "opposite" if opposite else "Eq. 27")
+        likelihood = LengthFits(machine)
+        likelihood.restore(unprefixed(_LIKELIHOOD, arrays))
+        self._compare_with(machine)
+        self._likelihood, self._explained_ns = likelihood, next(iter(explained), None)
+        self._open, self._opposite, self._sought = bool(still_open), bool(opposite), bool(sought)
+        self._tried_ns, self._tried_in_vain, self.directed = tried_ns, bool(in_vain), directed
+
+    def _speed(self, window: WindowStatistics) -> float | None:
+        """Mean speed, if it is one that is evaluated."""
+        if not np.isfinite(window.speed_rad_s):
+            return None
+        operation, speed = self._machine.operation, float(window.speed_rad_s)
+        off = abs(speed / operation.speed_rad_s - 1)
+        if off > operation.speed_tolerance:
+            text, limit = beyond(100 * off, 100 * operation.speed_tolerance)
+            raise EstimationError(
+                f"{self._machine.title}: speed is {speed * 30 / np.pi:.0f} rpm, off {operation.speed_rpm:g} rpm by "
+                f"{text} %, evaluated is at most {limit} %"
+            )
+        slowest, fastest = window.speed_range
+        varied = (fastest - slowest) / operation.speed_rad_s
+        if varied > _STEADY:
+            text, limit = beyond(100 * varied, 100 * _STEADY)
+            raise EstimationError(
+                f"{self._machine.title}: speed went from {slowest * 30 / np.pi:.0f} to {fastest * 30 / np.pi:.0f} rpm "
+                f"within the window, by {text} % of nominal, evaluated is at most {limit} %"
+            )
+        return speed
+
+    def _decide(self, window: WindowStatistics, diagnose: Callable[[WindowStatistics], Diagnosis]) -> Diagnosis:
+        """The likelihood's diagnosis with what these sensors do not determine taken out."""
+        try:
+            diagnosis = diagnose(window)
+        except np.linalg.LinAlgError as error:
+            raise EstimationError(f"{self._machine.title}: {error} in this window") from error
+        stated = determined(diagnosis, window, self._machine.window_data_s)
+        if self._healthy_misfit is not None and stated.goodness is not None:
+            left = self._healthy_misfit.beyond(stated.goodness, window.duration_s / self._machine.window_data_s)
+            stated = replace(stated, misfit_z=left.misfit_z, suspect=left.suspect)
+        vector = stated.unbalance
+        seen = any(state.endswith("_dot") for state in window.states)  # displacements alone may have run-out
+        if vector is not None and vector.foreign and seen and not self._commissioned and stated.misfit_z is not None:
+            # Of a commissioned machine levels know what its 1x was.
+            misfit_z = max(stated.misfit_z, _SURELY_OUTSIDE)
+            stated = replace(stated, misfit_z=misfit_z, suspect=stated.suspect or vector.foreign)
+        return stated if self._shared is None else with_shared_error(stated, self._shared)
+
+
+def _misfit_z(diagnosis: Diagnosis) -> float:
+    return np.inf if diagnosis.unexplained or diagnosis.misfit_z is None else diagnosis.misfit_z
