@@ -23,6 +23,8 @@ _FEWEST_SEGMENTS = 6
 _ORDERS = range(2, 13)
 _MAINS_HZ, _MAINS_VARY = (50.0, 60.0), 0.004  # frequencies of electric supplies, and how far these are off, relative
 _SAME = 0.02  # relative distance of a line from itself
+_HUM = 0.05  # part of the random power up to which a line is no more than hum; above it is told as any other
+_HALVES = (0.5, 1.5, 2.5)  # multiples of the speed that a rub or looseness makes
 
 KnownLine = tuple[float, float]
 """A line of the healthy machine: its frequency, Hz, and the same over the running speed."""
@@ -70,8 +72,10 @@ def excluded_lines(
         peaks = np.zeros(frequencies_hz.size)
         peaks[at] = strength
         highest = scipy.ndimage.maximum_filter1d(peaks, 2 * _LOBE + 1)[at]
+        healthy = _near_known(frequencies_hz, speed_hz, known)
         for n in np.flatnonzero((strength > _STANDS_OUT) & (strength == highest)):
-            if _keeps_course(segments[at[n]] @ motions[n]):
+            own = segments[at[n]] @ motions[n]
+            if _keeps_course(own) and (healthy[at[n]] or _share(segments, int(at[n]), own) <= _HUM):
                 found.append(ExcludedLine(float(frequencies_hz[at[n]]), step_hz * _skirt(strength[n])))
         if turning is None:
             return tuple(found)
@@ -97,7 +101,7 @@ def _wanted(
     """Bins that are looked at: where a known line may be, or hum that is no multiple of the speed; not the rotation."""
     near_hz = _LOBE * (frequencies_hz[1] - frequencies_hz[0])
 
-    def away_hz(order: int) -> FloatArray:
+    def away_hz(order: float) -> FloatArray:
         return np.abs(frequencies_hz - np.clip(frequencies_hz, order * slowest_hz, order * fastest_hz))
 
     if known is None:
@@ -106,11 +110,31 @@ def _wanted(
         mains = np.array(_MAINS_HZ)[:, np.newaxis]
         off = np.abs(frequencies_hz - mains * np.maximum(np.round(frequencies_hz / mains), 1.0)).min(axis=0)
         wanted = off <= _MAINS_VARY * frequencies_hz + near_hz / (2 * _LOBE)
-        wanted &= np.minimum.reduce([away_hz(order) for order in _ORDERS]) > near_hz
-        for line_hz, order in known:
-            for then in (line_hz, order * (slowest_hz + fastest_hz) / 2):
-                wanted |= np.abs(frequencies_hz - then) <= _SAME * then
+        wanted &= np.minimum.reduce([away_hz(order) for order in (*_HALVES, *_ORDERS)]) > near_hz
+        wanted |= _near_known(frequencies_hz, (slowest_hz + fastest_hz) / 2, known)
     return np.asarray(wanted & (away_hz(1) > near_hz))
+
+
+def _near_known(
+    frequencies_hz: FloatArray, speed_hz: float, known: Sequence[KnownLine] | None
+) -> npt.NDArray[np.bool_]:
+    """Bins where a line of the healthy machine may be; all where it is this window that says which it has."""
+    near = np.full(frequencies_hz.size, known is None)
+    for line_hz, order in known or ():
+        for then in (line_hz, order * speed_hz):
+            near |= np.abs(frequencies_hz - then) <= _SAME * then
+    return near
+
+
+def _share(segments: ComplexArray, at: int, own: ComplexArray) -> float:
+    """Part of the power of all channels in the band that goes with the line, as one motion of all of them does.
+
+    Of a single channel it says little: where hardly anything but the rotation moves one, faint hum is most of the rest.
+    """
+    lobe = slice(max(0, at - _LOBE), at + _LOBE + 1)
+    line = np.abs(_unit(own).conj() @ segments[lobe] / own.size) ** 2
+    noise = (np.abs(segments[lobe]) ** 2).mean(axis=1) / own.size
+    return float((line - noise).sum() / (np.abs(segments) ** 2).mean(axis=1).sum())
 
 
 def _outstanding(

@@ -56,9 +56,32 @@ def test_a_multiple_of_the_speed_is_no_hum_but_may_be_known() -> None:
     assert not lines_of(found, np.nan)
 
 
+def test_what_shakes_the_machine_at_the_mains_is_no_more_hum() -> None:
+    """A stator at fault, a neighbour at 3000 rpm: where the healthy machine had none, it is told as any other line."""
+    for size, hum in ((0.2, [50.0]), (1.5, [50.0]), (3.0, []), (30.0, [])):
+        assert lines_of(with_line(50.0, size)) == hum
+        assert lines_of(with_line(50.0, size), known=[(49.7, 2.26)]) == [50.0]
+
+
+def test_hum_is_hum_where_it_is_most_of_what_one_channel_shows() -> None:
+    found = with_line(50.0)
+    found[:, :, 3] -= segments(np.ones(SEGMENTS), sources=1)[:, :, 3] * 0.99
+    alone = np.abs(found[:, :, 3]) ** 2
+    assert alone[234:237].sum() > 0.3 * alone.sum()
+    assert lines_of(found) == [50.0]
+
+
+@pytest.mark.parametrize("order", [0.5, 1.5, 2.5])
+def test_half_a_multiple_of_the_speed_is_that_of_a_rub(order: float) -> None:
+    found = with_line(50.0)
+    assert not lines_of(found, 50 / order)
+    assert lines_of(found, 50 / order + 2) == [50.0]
+
+
 def test_the_louder_a_line_the_further_it_reaches() -> None:
-    faint, loud = (with_line(50.1, size) for size in (0.3, 30.0))
-    (near,), (far,) = (excluded_lines(found, summed(found), FREQUENCIES_HZ, (138.0, 138.0)) for found in (faint, loud))
+    faint, loud, known = with_line(50.1, 0.3), with_line(50.1, 30.0), [(50.0, 2.27)]
+    (near,) = excluded_lines(faint, summed(faint), FREQUENCIES_HZ, (138.0, 138.0), known)
+    (far,) = excluded_lines(loud, summed(loud), FREQUENCIES_HZ, (138.0, 138.0), known)
     assert near.reach_hz < far.reach_hz < 3.0
 
 
