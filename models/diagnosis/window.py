@@ -100,11 +100,16 @@ class WindowStatistics:
 
     @property
     def spectrum_without_lines(self) -> ComplexArray:
-        """Spectra that go straight over the bins of `lines`, for what needs a value in every bin."""
-        found = self.spectrum
+        """Spectra that go straight over the bins of `lines`, for what needs a value in every bin.
+
+        Those of the window where lines are in all of them.
+        """
+        found, clear = self.spectrum, ~self.line_bins
+        if not clear.any():
+            return found
         edges = np.flatnonzero(np.diff(self.line_bins, prepend=False, append=False)).reshape(-1, 2).tolist()
         for first, end in edges:
-            before, after = found[max(0, first - _BESIDE) : first], found[end : end + _BESIDE]
+            before, after = found[:first][clear[:first]][-_BESIDE:], found[end:][clear[end:]][:_BESIDE]
             ends = [part.mean(axis=0) for part in (before, after) if part.size]
             way = (np.arange(1, end - first + 1) / (end - first + 1))[:, np.newaxis, np.newaxis]
             found = found.copy() if found is self.spectrum else found

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from models.diagnosis.excluded import ExcludedLine
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import Plan, hop_moments, plan_for
 from models.diagnosis.sliding_window import SlidingWindow
@@ -364,3 +365,15 @@ def test_hop_by_hop_any_splitting_gives_identical_statistics(cuts: list[int], an
     assert all(one.removed_by_hop for one in whole)
     for a, b in zip(split, whole, strict=True):
         assert_identical(a, b)
+
+
+def test_spectra_go_straight_over_lines_and_never_through_one_beside() -> None:
+    window = feed(SlidingWindow(small_plan()), signal(500, 5))[-1]
+    spectrum = window.spectrum.copy()
+    spectrum[[10, 11, 12, 15, 16, 17]] *= 1e6
+    loud = replace(window, spectrum=spectrum, lines=(ExcludedLine(26.0, 2.0), ExcludedLine(36.0, 2.0)))
+    np.testing.assert_array_equal(window.frequencies_hz[[11, 16]], [26, 36])
+    np.testing.assert_array_equal(loud.spectrum_without_lines[[13, 14]], spectrum[[13, 14]])
+    assert np.abs(loud.spectrum_without_lines).max() <= np.abs(window.spectrum).max()
+    everywhere = replace(window, lines=(ExcludedLine(20.0, 1000.0),))
+    np.testing.assert_array_equal(everywhere.spectrum_without_lines, window.spectrum)
