@@ -25,6 +25,7 @@ from models.diagnosis.baseline.unbalance import (
     ForeignRotationError,
     SynchronousState,
     SynchronousVectors,
+    combination,
     relative_force,
     rotation_of,
     slopes,
@@ -319,12 +320,11 @@ class BaselineDiagnostician:
         observed = relative_force(rows, state, now, healthy)
         if not (np.all(np.isfinite(observed)) and np.all(np.isfinite(spread))):
             raise EstimationError("no unbalance in the healthy recording")
-        design = np.kron(np.eye(2), np.ones((len(rows), 1)))
+        design = np.kron(np.eye(2), np.ones((len(rows), 1))).astype(np.float64)
         # weighted as if the bearing were known: sharpest where the verdict is that nothing else changed
         total = positive(bearing.noise + bearing.common)
         known = with_bearing.T @ np.linalg.pinv(total, hermitian=True) @ with_bearing
-        weight = np.linalg.inv(positive(spread - known))
-        combine = np.linalg.solve(design.T @ weight @ design, design.T @ weight)
+        combine = combination(design, positive(spread - known))
         vector = combine @ observed
         usual = design @ [1.0, 0.0]
         if foreign := foreign_rotation(usual + observed, usual + design @ vector, spread):

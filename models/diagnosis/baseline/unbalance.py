@@ -201,3 +201,24 @@ def slopes(
             columns.append((ends[0] - ends[1]) / (2 * step))
         derivatives.append(np.stack(columns, axis=1))
     return derivatives[0], derivatives[1], derivatives[2], derivatives[3]
+
+
+def combination(design: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Weights with which the rows' forces make the vector of the unbalance, shape (2, n_rows).
+
+    Parameters
+    ----------
+    design : ndarray, shape (n_rows, 2)
+    covariance : ndarray, shape (n_rows, n_rows)
+        Of the rows' errors.
+
+    Raises
+    ------
+    EstimationError
+        If it has no inverse: of what is no rotor, errors may be all that there is.
+    """
+    try:
+        weight = np.linalg.inv(covariance)
+        return np.asarray(np.linalg.solve(design.T @ weight @ design, design.T @ weight), dtype=np.float64)
+    except np.linalg.LinAlgError as error:
+        raise EstimationError("unbalance not seen well enough: nothing is left beside its errors") from error

@@ -9,8 +9,9 @@ import pytest
 from benchmarks.finite_elements.observed import windows_of
 from benchmarks.finite_elements.rotor import BeamRotor, changed_rotor
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.learned import learn_baseline
+from models.diagnosis.baseline.learned import learn_baseline, positive
 from models.diagnosis.baseline.rows import parameters_of
+from models.diagnosis.baseline.unbalance import combination
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.verdict.isolation import isolate_window
 from models.errors import EstimationError
@@ -107,3 +108,11 @@ def test_a_rotation_that_no_unbalance_makes_names_nothing(plane: str) -> None:
     for turned in (2.0, 0.5j, -1.0):  # another unbalance is one, wherever its heavy spot is
         more = reading.diagnose(replace(window, synchronous=sure(window.synchronous) * turned))
         assert not more.unexplained
+
+
+def test_errors_with_nothing_beside_them_make_no_unbalance() -> None:
+    """As two sines in all channels left of a rotor: a hop of that was a defect in the monitor."""
+    lost = positive(np.array([[-8.0, 0.0], [-12.0, -2.0]]) * 2.0**40)  # what cancels in such a hop
+    with pytest.raises(EstimationError, match="not seen well enough: nothing is left beside its errors"):
+        combination(np.eye(2), lost)
+    np.testing.assert_allclose(combination(np.eye(2), np.diag([1.0, 4.0])), np.eye(2))
