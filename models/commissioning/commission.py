@@ -321,12 +321,7 @@ def commission(
 
 def _excluded(windows: Sequence[WindowStatistics]) -> tuple[KnownLine, ...]:
     """Lines that the likelihood has left out, which it leaves out from now on."""
-    found = {
-        (round(line.frequency_hz, 1), round(line.frequency_hz * 2 * np.pi / abs(window.speed_rad_s), 2))
-        for window in windows
-        for line in window.lines
-    }
-    return tuple(sorted(found))
+    return tuple(sorted({line.known(window.speed_rad_s) for window in windows for line in window.lines}))
 
 
 def _only_levels(machine: MachineFile, text: str) -> Check:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import scipy  # its sub-packages are loaded when they are first used
 
 from models.diagnosis.moments import ComplexArray
 from models.signals.block import FloatArray
@@ -36,6 +35,11 @@ class ExcludedLine(NamedTuple):
     frequency_hz: float
     reach_hz: float
 
+    def known(self, speed_rad_s: float) -> KnownLine:
+        """What is kept of it, to three digits: of a line that is found in every window one is kept, or few."""
+        order = self.frequency_hz * 2 * np.pi / abs(speed_rad_s)
+        return float(f"{self.frequency_hz:.3g}"), float(f"{order:.3g}")
+
 
 def excluded_lines(
     segments: ComplexArray,
@@ -54,7 +58,7 @@ def excluded_lines(
     spectrum : ndarray, shape (n_bins, n, n)
         Their cross-spectra, in any unit.
     speeds_rad_s : tuple of float
-        Slowest and fastest hop. Where they are nan no line can be told from the rotation.
+        Slowest and fastest hop. Where they are nan, or the shaft stands, no line can be told from the rotation.
     known : sequence of KnownLine, optional
         Those of the healthy machine. None: all lines are taken for such, multiples of the speed too.
     turning : ndarray, shape (n_segments, n_bins), optional
@@ -62,16 +66,16 @@ def excluded_lines(
     """
     slowest_hz, fastest_hz = sorted(abs(speed) / (2 * np.pi) for speed in speeds_rad_s)
     enough = segments.shape[1] >= _FEWEST_SEGMENTS and segments.shape[2] and frequencies_hz.size > 2 * _BESIDE.stop
-    if not np.isfinite(slowest_hz) or not enough:
+    if not (slowest_hz > 0 and enough):
         return ()
     step_hz, speed_hz = frequencies_hz[1] - frequencies_hz[0], (slowest_hz + fastest_hz) / 2
     found = []
     try:
         at = np.flatnonzero(_wanted(frequencies_hz, slowest_hz, fastest_hz, known))
         strength, motions = _outstanding(spectrum, at, (at, at))
-        peaks = np.zeros(frequencies_hz.size)
-        peaks[at] = strength
-        highest = scipy.ndimage.maximum_filter1d(peaks, 2 * _LOBE + 1)[at]
+        peaks = np.zeros(frequencies_hz.size + 2 * _LOBE)
+        peaks[at + _LOBE] = strength
+        highest = peaks[at + np.arange(2 * _LOBE + 1)[:, np.newaxis]].max(axis=0)
         healthy = _near_known(frequencies_hz, speed_hz, known)
         for n in np.flatnonzero((strength > _STANDS_OUT) & (strength == highest)):
             own = segments[at[n]] @ motions[n]

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from models.diagnosis.excluded import KnownLine, excluded_lines
+from models.diagnosis.excluded import ExcludedLine, KnownLine, excluded_lines
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.stationarity import summed
 from models.signals.block import FloatArray
@@ -54,6 +54,7 @@ def test_a_multiple_of_the_speed_is_no_hum_but_may_be_known() -> None:
     assert lines_of(found, 25.0, [(50.0, 2.0)]) == lines_of(found, 25.0, None) == [50.0]
     assert not lines_of(found, 50.0, None)  # the rotation itself has regressors of its own
     assert not lines_of(found, np.nan)
+    assert not lines_of(found, 0.0, None)
 
 
 def test_what_shakes_the_machine_at_the_mains_is_no_more_hum() -> None:
@@ -116,3 +117,9 @@ def test_a_multiple_of_a_speed_that_wanders_is_told_by_going_with_the_shaft() ->
     known = [(110.0, 5.0)]  # what the healthy machine had is left out whether it stands out or not
     (kept,) = excluded_lines(without, summed(without), FREQUENCIES_HZ, (slowest, fastest), known, line(1).T)
     assert kept.frequency_hz == pytest.approx(110)
+
+
+def test_what_is_kept_of_a_line_is_near_enough_on_a_slow_machine_too() -> None:
+    for line_hz, speed_hz in ((0.5349, 1.5), (1.534, 0.75), (119.98, 22.0)):
+        kept = ExcludedLine(line_hz, 1.0).known(-2 * np.pi * speed_hz)
+        assert kept == pytest.approx((line_hz, line_hz / speed_hz), rel=0.005)
