@@ -146,7 +146,7 @@ class UnbalanceVector:
         if self.change_angle_deg is None:
             return "no change of its vector"
         where = f"{self.change_angle_deg:z.0f}° from the heavy spot".replace("-", "−")
-        size = f"size {100 * self.magnitude_change:+.0f} %".replace("-", "−")
+        size = f"size {100 * self.magnitude_change:+z.0f} %".replace("-", "−")
         turned = "" if self.turned_deg is None else f", turned by {self.turned_deg:z.0f}°".replace("-", "−")
         if self.turned and abs(self.magnitude_change) < _SAME_SIZE:
             turned += ": the heavy spot has moved, or the zero of the shaft angle"

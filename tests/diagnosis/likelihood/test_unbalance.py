@@ -85,6 +85,7 @@ def test_an_angle_that_is_rounded_to_nothing_has_no_sign() -> None:
         vector.sentence
         == "a vector of 50 % of the nominal unbalance at 0° from the heavy spot (size +50 %, turned by 0°)"
     )
+    assert "(size +0 %, turned by −57°: the heavy spot" in UnbalanceVector(0.54, -0.84, 1e-8, 0.0, 1e-8).sentence
 
 
 def test_vectors_that_no_unbalance_makes_are_not_read_as_one() -> None:
