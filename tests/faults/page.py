@@ -10,43 +10,45 @@ PAGE = ROOT / "docs" / "reliability.md"
 
 _HEAD = """# Reliability
 
-What breaks around a monitor, what that costs, what the monitor says of it, and how long it takes until everything
-is as before. Each fault was brought about with the programs as users start them: `rotorwatch run` with its history
-in SQLite, `rotorsim publish` in real time, five blocks a second, both on one computer with two cores. Meanwhile an
-operator shelved an alarm and ended that again, several times a second, and noted what was answered as done; a
-listener on the network noted every alarm event.
+This page lists what can fail around a monitor, what each failure costs, what the monitor says about it, and how long
+recovery takes. Guarantees are at [the end](#what-can-be-relied-on).
 
-This page is written by the run: `python -m tests.faults --write` ({rows} faults, seeds {seeds}, {runs} runs; the
-moments differ from seed to seed). The figures are of that run, the least and the most. Times include the start of
-programs, each of which computes for a few seconds. During this run {least:.0f} to {most:.0f} programs at a
-time wanted to compute on the two cores (load average).
+Each fault was produced with the programs as users start them: `rotorwatch run` with its history in SQLite and
+`rotorsim publish` in real time (five blocks a second), both on one computer with two cores. In the meantime an operator
+shelved and unshelved an alarm several times a second and noted which requests were answered as done, and a listener on
+the network noted every alarm event.
+
+`python -m tests.faults --write` runs the faults and writes this page: {rows} faults, seeds {seeds}, {runs} runs, with
+faults at other moments for each seed. Figures are the smallest and largest of that run. Times include program starts,
+each of which computes for a few seconds. During this run {least:.0f} to {most:.0f} programs at a time competed for the
+two cores (load average).
 
 """
 
 _WORDS = """
-- **Data missing**: what was not evaluated, in seconds of data, as the monitor states it (`missing_s`). Where one
-  publisher and one monitor ran from beginning to end, what the publisher says it has sent was compared with what
-  was evaluated and what is stated as missing: {compared} runs, {unaccounted} blocks unaccounted for.
-- **Orders lost**: what operators were told is done and is not in the log of alarms afterwards, of so many orders.
+- **Data missing**: seconds of data that were not evaluated, as the monitor states it (`missing_s`). Where one publisher
+  and one monitor ran from beginning to end, the blocks that the publisher reports as sent were compared with those
+  evaluated and stated as missing: {compared} runs, {unaccounted} blocks unaccounted for.
+- **Actions lost**: operator actions that were answered as done but are not in the alarm log afterwards, out of all
+  such actions.
 - **Events doubled**: alarm events that are in the log twice: {doubled} in all runs.
-- **Stated after**: from the fault until the monitor says so; the longest and shortest of all runs.
-- **Over after**: from when the cause was gone (a program was started again, a lock let go of) until it was over.
+- **Stated after**: time from the fault until the monitor reports it; shortest and longest of all runs.
+- **Over after**: time from when the cause was removed (a program was restarted, a lock released) until recovery.
 {wrong}
 ## What can be relied on
 
-- What was confirmed is in the history: no kill, no failing write and no full disk takes it away again, or puts it
-  there twice.
-- An alarm is published also while the history cannot be written. What operators do meanwhile is done, and waits in
-  memory like everything else: a monitor that is killed before the history is back has lost it. `/readyz` says for
-  how long that is so; look at it before you end a monitor.
-- Blocks that were sent while the monitor was away come out of the publisher's cache. `rotorsim` keeps 1200;
-  publishers of your own should keep as many as they send in the longest time in which a monitor may be away
-  ([wire format](wire.md)). On a busy computer a new block may overtake those of the cache, which are then not
-  fetched: the gap is stated, and the data are missing.
-- A silent stream, a gap, a clock that was set and a second publisher are stated ([Alarms](alarms.md)).
+- Confirmed data are in the history: no kill, failing write or full disk removes or duplicates them.
+- Alarms are published even while the history cannot be written. Operator actions take effect and wait in memory like
+  everything else, so they are lost if the monitor is killed before the history is back. `/readyz` says whether this is
+  the case; check it before you end a monitor.
+- Blocks sent while the monitor was away are taken from the publisher's cache. `rotorsim` keeps 1200; your own
+  publishers should keep as many as they send in the longest time that a monitor may be away ([wire format](wire.md)).
+  On a busy computer a new block may overtake those of the cache, which are then not fetched: the gap is stated, and the
+  data are missing.
+- A silent stream, a gap, a clock that was set and a second publisher are reported ([Alarms](alarms.md)).
 
-What becomes of a damaged history, and how it is recovered, is said in [History](history.md); how receivers of
-webhooks are told, in [Webhooks](webhooks.md).
+[History](history.md) says what happens to a damaged history and how to recover it; [Webhooks](webhooks.md) says how
+delivery to receivers works.
 """
 
 
@@ -87,12 +89,12 @@ def written(found: Mapping[str, Sequence[Outcome]], seeds: Sequence[int], loads:
     )
     seeds_text = ", ".join(map(str, seeds))
     text = _HEAD.format(rows=len(ROWS), seeds=seeds_text, runs=len(outcomes), least=min(loads), most=max(loads))
-    text += "| what happens | how it was done | what may be lost | what the monitor says | over when |\n"
+    text += "| what happens | how it was produced | what may be lost | what the monitor says | over when |\n"
     text += "|---|---|---|---|---|\n"
     text += "".join(f"| {row.name} | {row.done} | {row.lost} | {row.stated} | {row.recovery} |\n" for row in ROWS)
     text += "\nWhat was measured:\n\n"
     text += (
-        "| what happens | data missing, s | orders lost | stated after, s | over after, s |\n|---|---|---|---|---|\n"
+        "| what happens | data missing, s | actions lost | stated after, s | over after, s |\n|---|---|---|---|---|\n"
     )
     text += "".join(_row(row, found[row.name]) for row in ROWS)
     return text + _WORDS.format(
