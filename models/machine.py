@@ -24,9 +24,13 @@ from models.mistakes import changed, checked, did_you_mean, read_toml
 from models.physics.rotor import PARAMETERS, KnownRotor, RotorParameters
 from models.signals.channels import Channel, ChannelDescriptor, Quantity, Sensor
 from models.signals.keys import MachineKeys
-from models.whole_samples import usual_window, whole
+from models.stream_settings import IngestSettings, Schedule, WindowSettings, default_window, time_scale, whole
 
 _SHIPPED = Path(__file__).parent / "machines"
+
+
+_BINS = 20
+_LONGEST_HOP_S = 600.0
 
 
 class Operation(BaseModel, extra="forbid", frozen=True):
@@ -62,121 +66,6 @@ class ConditionRange(BaseModel, extra="forbid", frozen=True):
             low, high = getattr(self, field)
             if not 0 <= low <= high:
                 raise ValueError(f"{field} is ({low}, {high}), expected 0 ≤ from ≤ to")
-        return self
-
-
-class Schedule(BaseModel, extra="forbid", frozen=True):
-    """Snapshots: so many seconds of samples, again and again, and silence between them."""
-
-    on_s: float = Field(gt=0, le=600, description="length of a snapshot")
-    every_s: float = Field(gt=0, le=86400, description="from the start of a snapshot to that of the next one")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.on_s >= self.every_s:
-            raise ValueError(f"on_s {self.on_s:g} must be below every_s {self.every_s:g}: there is silence between")
-        return self
-
-    @property
-    def silence_s(self) -> float:
-        """Silence after a snapshot."""
-        return self.every_s - self.on_s
-
-    def is_silence(self, silence_s: float) -> bool:
-        """Whether nothing is missing where nothing came for so long: snapshots may come half a period late."""
-        return self.silence_s / 2 <= silence_s <= self.silence_s + self.every_s / 2
-
-    def window(self, rate_hz: float) -> dict[str, float]:
-        """Settings of the window where the machine file says nothing.
-
-        A hop is a snapshot, a window twelve of them. Seven half-overlapping segments or more go into a snapshot, and
-        the longest lag is a quarter of it.
-        """
-        segment_s = min(_SEGMENT_S, 2 * math.floor(self.on_s * rate_hz / 8) / rate_hz)
-        lag_to_s = min(_LAG_TO_S, math.floor(self.on_s * rate_hz / 4) / rate_hz)
-        return {
-            "length_s": 12 * self.every_s,
-            "hop_s": self.every_s,
-            "max_span_s": 18 * self.every_s,
-            "segment_s": max(segment_s, 2 / rate_hz),
-            "lag_to_s": max(lag_to_s, 2 / rate_hz),
-            "lag_from_s": min(_LAG_FROM_S, math.floor(lag_to_s * rate_hz / 8) / rate_hz),
-        }
-
-    def ingest(self) -> dict[str, float]:
-        """Settings of ingest where the machine file says nothing: a block may be a snapshot, two may fail to come."""
-        defaults = IngestSettings()
-        return {
-            "block_to_s": max(defaults.block_to_s, 1.05 * self.on_s),
-            "no_data_after_s": max(defaults.no_data_after_s, 2.5 * self.every_s),
-            "max_jump_s": max(defaults.max_jump_s, 10 * self.every_s),
-        }
-
-
-_SEGMENT_S, _LAG_FROM_S, _LAG_TO_S = 2.0, 0.01, 0.125
-_BINS = 20
-_LONGEST_HOP_S = 600.0
-
-
-class WindowSettings(BaseModel, extra="forbid", frozen=True):
-    """The sliding window: its length, how often it is evaluated, and what is computed in it."""
-
-    length_s: float = Field(default=60.0, gt=0, le=30 * 86400, description="window length")
-    hop_s: float = Field(
-        default=5.0, gt=0, le=86400, description="one report per hop; also the sub-block of the errors"
-    )
-    max_span_s: float = Field(
-        default=90.0, gt=0, le=60 * 86400, description="oldest sample a window may hold, across gaps"
-    )
-    lag_from_s: float = Field(default=_LAG_FROM_S, ge=0, le=10, description="shortest lag of the relation networks")
-    lag_to_s: float = Field(default=_LAG_TO_S, gt=0, le=10, description="longest lag of the correlation functions")
-    lag_step_s: float = Field(default=0.001, gt=0, le=1, description="lag spacing of the relation networks")
-    segment_s: float = Field(
-        default=_SEGMENT_S, gt=0, le=120, description="segment of the cross-spectra, half overlapped"
-    )
-    band_hz: tuple[float, float] = Field(default=(3.0, 150.0), description="band of the likelihood, from and to")
-
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if not whole(self.length_s / self.hop_s) or self.length_s < 4 * self.hop_s:
-            raise ValueError(f"length_s {self.length_s} must be a multiple of hop_s {self.hop_s}, at least four hops")
-        if self.lag_to_s >= self.hop_s:
-            raise ValueError(f"lag_to_s {self.lag_to_s} must be below hop_s {self.hop_s}")
-        if self.lag_from_s >= self.lag_to_s:
-            raise ValueError(f"lag_from_s {self.lag_from_s} must be below lag_to_s {self.lag_to_s}")
-        if not 0 < self.band_hz[0] < self.band_hz[1]:
-            raise ValueError(f"band_hz {self.band_hz} must be 0 < from < to")
-        if self.max_span_s < self.length_s:
-            raise ValueError(f"max_span_s {self.max_span_s} must not be below length_s {self.length_s}")
-        return self
-
-    @property
-    def hops(self) -> int:
-        """Hops in a full window."""
-        return round(self.length_s / self.hop_s)
-
-
-class IngestSettings(BaseModel, extra="forbid", frozen=True):
-    """When a block is refused, and when silence is called missing data."""
-
-    block_from_s: float = Field(default=0.001, gt=0, le=1, description="shortest accepted block")
-    block_to_s: float = Field(default=2.0, gt=0, le=630, description="longest accepted block")
-    time_tolerance_s: float = Field(default=0.0002, gt=0, le=1, description="jitter of block times that is no gap")
-    rate_tolerance: float = Field(default=1e-4, ge=0, lt=0.1, description="relative deviation of the sampling rate")
-    max_jump_s: float = Field(default=3600.0, gt=0, description="a block further ahead than this is refused as future")
-    resync_blocks: int = Field(default=10, ge=2, le=1000, description="blocks in a row that establish a stepped clock")
-    reorder_blocks: int = Field(
-        default=20, ge=0, le=1000, description="blocks that may wait for a missing one; 0 takes them as they arrive"
-    )
-    no_data_after_s: float = Field(default=5.0, gt=0, le=30 * 86400, description="silence that is called no data")
-
-    @model_validator(mode="after")
-    def _blocks_are_no_silence(self) -> Self:
-        if self.no_data_after_s <= self.block_to_s:
-            raise ValueError(
-                f"no_data_after_s is {self.no_data_after_s:g}, expected more than block_to_s, {self.block_to_s:g}: "
-                "between two blocks of that length nothing comes for as long"
-            )
         return self
 
 
@@ -315,23 +204,24 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
     @model_validator(mode="before")
     @classmethod
     def _defaults_that_depend_on_others(cls, fields: object) -> object:
-        """What is not given: what goes with the rate, and what follows from a schedule."""
+        """What is not given: what goes with rate and natural frequencies or speed, and what follows from a schedule."""
         if not isinstance(fields, dict) or not isinstance(fields.get("window", {}), dict):
             return fields
-        window, rate_hz = fields.get("window", {}), fields.get("rate_hz")
+        given, rate_hz = fields.get("window", {}), fields.get("rate_hz")
         if not isinstance(rate_hz, int | float) or not 0 < rate_hz <= 1e6:
             return fields
-        if isinstance(fields.get("schedule"), dict) and isinstance(fields.get("ingest", {}), dict):
-            with suppress(ValidationError):  # told when the table itself is looked at
-                schedule = Schedule.model_validate(fields["schedule"])
-                window = schedule.window(rate_hz) | window
-                fields = fields | {"window": window, "ingest": schedule.ingest() | fields.get("ingest", {})}
-        usual = WindowSettings()
-        lengths = usual.model_dump(include={"lag_step_s", "segment_s", "hop_s", "length_s", "max_span_s"})
-        fitting = usual_window(rate_hz, lengths, usual.band_hz)
-        if window.keys() & {"segment_s", "hop_s", "length_s"}:  # multiples of each other
-            fitting = {name: one for name, one in fitting.items() if name in {"lag_step_s", "band_hz"}}
-        return fields | {"window": fitting | window} if fitting else fields
+        modes_hz: tuple[float, ...] = ()
+        schedule, speed_hz = None, None
+        with suppress(KeyError, ValidationError):  # told when the table itself is looked at
+            schedule = Schedule.model_validate(fields["schedule"])
+        with suppress(KeyError, ValidationError):
+            speed_hz = Operation.model_validate(fields["operation"]).speed_rpm / 60
+        with suppress(KeyError, ValidationError):
+            modes_hz = KnownRotor.model_validate(fields["rotor"], from_attributes=True).modes_hz
+        if schedule is not None and isinstance(fields.get("ingest", {}), dict):
+            fields = fields | {"ingest": schedule.ingest() | fields.get("ingest", {})}
+        window = default_window(rate_hz, given, schedule, modes_hz, speed_hz) | given
+        return fields | {"window": window} if window else fields
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -420,6 +310,12 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
     def holds_band(self) -> bool:
         """Whether segments are long enough for spectra in the band; without them there are levels alone."""
         return (self.window.band_hz[1] - self.window.band_hz[0]) * self.window.segment_s >= _BINS
+
+    @property
+    def time_scale(self) -> float:
+        """How much slower it moves than machines that the usual window suits, see `models.stream_settings`."""
+        speed_hz = None if self.operation is None else self.operation.speed_rpm / 60
+        return time_scale(() if self.rotor is None else self.rotor.modes_hz, speed_hz)
 
     @property
     def title(self) -> str:

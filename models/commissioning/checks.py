@@ -30,6 +30,7 @@ _STEADY_LEVEL = 2.0  # ratio of the rms between the halves of a recording; chanc
 SAME_SPEED = 0.03  # relative difference within which speeds count as one
 _MOST_OUTSIDE = 0.8  # share of healthy windows outside a theory beyond which it is not the machine's
 _RATE = 1e-3  # probability that a healthy machine fails a comparison of its own windows
+_NEGLIGIBLE = 0.01  # relative difference, a tenth of an alarm's usual limit, that no alarm comes of, however certain
 _LOUD_LINE, _DOMINANT_LINE = 0.05, 0.5  # share of a foreign line in the power of a channel's random part
 
 
@@ -324,7 +325,8 @@ def _compared(name: str, diagnoses: Sequence[Diagnosis], between: str, *, theory
         return Check(name=name, verdict="limited", text=text, advice="record at least two full windows")
     rate = _RATE / len(readable)
     isolations = [isolate_window(each, rate) for each in readable]
-    named: Counter[str] = Counter(changed for one in isolations for changed in one.changed)
+    certain = [(each, name) for each, one in zip(readable, isolations, strict=True) for name in one.changed]
+    named: Counter[str] = Counter(name for each, name in certain if _difference(each, name) >= _NEGLIGIBLE)
     outside = sum(one.outside for one in isolations)
     if named:
         worst = named.most_common(1)[0][0]
@@ -350,5 +352,13 @@ def _compared(name: str, diagnoses: Sequence[Diagnosis], between: str, *, theory
             advice="give fewer parameters in [rotor], so that more is learned from the recordings",
         )
     worst_z = max(abs(r.z or 0.0) for each in readable for r in each.evaluable)
-    text = f"no difference {between}: at most {worst_z:.1f} standard errors in {len(readable)} windows"
+    size = f"no difference of {_NEGLIGIBLE:.0%} or more" if certain else "no difference"
+    text = f"{size} {between}: at most {worst_z:.1f} standard errors in {len(readable)} windows"
     return Check(name=name, verdict="passed", text=text)
+
+
+def _difference(diagnosis: Diagnosis, name: str) -> float:
+    """Relative size of a difference; of the unbalance, which may only have turned, that of its vector's."""
+    if name == "e" and diagnosis.unbalance is not None:
+        return diagnosis.unbalance.change
+    return max(abs(one.relative_change or 0.0) for one in diagnosis.evaluable if one.name == name)

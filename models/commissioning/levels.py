@@ -178,7 +178,8 @@ def _learn_partial(
 
 def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
     windows = [piece.window for piece in pieces]
-    wrong, too_slow = unsuitable(windows[0]), machine.rate_hz * LONGEST_LAG_STEP_S < 1
+    longest_s = LONGEST_LAG_STEP_S * machine.time_scale
+    wrong, too_slow = unsuitable(windows[0]), machine.rate_hz * longest_s < 1
     if wrong and not too_slow:
         advice = "change lag_step_s, lag_to_s or length_s in [window] of the machine file; the recordings can stay"
         return Learned((Check(name="window settings", verdict="refused", text=wrong, advice=advice),))
@@ -194,7 +195,7 @@ def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
     ]
     if too_slow:
         why = f"a sampling rate of {machine.rate_hz:g} Hz allows no equation"
-        least_hz = math.ceil(1 / LONGEST_LAG_STEP_S)
+        least_hz = math.ceil(1 / longest_s)
         return _without_equations(machine, shape, no_shape, why, f"sample at {least_hz} Hz or faster")
     if not evaluable:
         return _without_equations(machine, shape, no_shape)
@@ -242,7 +243,7 @@ def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progre
     sources = check_sources(
         {name: [piece.window for piece in pieces if piece.recording == name] for name in _speeds(pieces)}
     )
-    band = _differentiated(baselines[0], machine.window.band_hz[1])
+    band = _differentiated(baselines[0], machine)
     checks = (determined_, sources, halves) if agreement is None else (determined_, sources, agreement, halves)
     return Learned(
         checks,
@@ -287,14 +288,14 @@ def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[s
     return replace(baseline, relations=relations, reasons=reasons)
 
 
-def _differentiated(baseline: Baseline, band_to_hz: float) -> str:
+def _differentiated(baseline: Baseline, machine: MachineFile) -> str:
     """Up to which frequency the derivatives of what is measured hold, in a sentence."""
     deepest = max(
         formation_of([term.motions for term in row.terms], relation.states).deepest
         for row, relation in zip(learned_rows(baseline.rows), baseline.relations, strict=True)
         if relation is not None
     )
-    edge = passband_hz(deepest, band_to_hz)
+    edge = passband_hz(deepest, machine.window.band_hz[1], machine.time_scale)
     return (
         f"What is not measured is derived: up to {deepest} derivatives are taken of the correlation functions under "
         f"smooth kernels, valid from 0 to {edge:.0f} Hz; what lies above hardly counts."

@@ -64,6 +64,7 @@ class Plan:
     stride: int
     hops: int  # hops in a full window
     max_span_ns: int  # oldest data a window may hold
+    time_scale: float = 1.0  # of the machine, see `models.stream_settings.time_scale`
     # Speed to look for where there is no shaft angle; None: the rotation is not looked for.
     speed_rad_s: float | None = None
     speed_tolerance: float = 0.0  # how far the speed may be off, relative
@@ -160,13 +161,12 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False,
     rows = [[parts_seen(one).get(name, 0.0) for name in states] for one in channels[: len(states)]]
     seen = np.array(rows).reshape(len(states), len(states))
     runout = np.array([one.runout for one in channels], dtype=np.complex128)
-    speed_rpm = None if machine.operation is None else machine.operation.speed_rpm
+    band_hz = machine.levels.band(None if machine.operation is None else machine.operation.speed_rpm)
     segment = round(window.segment_s * rate_hz)
     lag_step = round(window.lag_step_s * rate_hz)
     lags = np.arange(0, round(window.lag_to_s * rate_hz) + 1, lag_step)
-    longest = int(lags[-1])
     first, last = (round(edge * window.segment_s) for edge in window.band_hz)
-    preamble = max(longest, segment // 2)
+    preamble = max(int(lags[-1]), segment // 2)
     # A snapshot has no history but its own beginning.
     hop = math.floor(machine.hop_data_s * rate_hz + 1e-6) - (0 if machine.schedule is None else preamble)
     return Plan(
@@ -183,12 +183,11 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False,
         stride=round(window.hop_s * rate_hz),
         hops=window.hops,
         max_span_ns=round(window.max_span_s * 1e9),
+        time_scale=machine.time_scale,
         speed_rad_s=None if machine.operation is None else machine.operation.speed_rad_s,
         speed_tolerance=0.0 if machine.operation is None else machine.operation.speed_tolerance,
         others=others,
-        levels=level_plan(channels, rate_hz, machine.levels.band(speed_rpm), runout, lines=thorough)
-        if levels
-        else None,
+        levels=level_plan(channels, rate_hz, band_hz, runout, lines=thorough) if levels else None,
         thorough=thorough,
         angled=tuple(state_name(one) for one in channels[: len(states)]),
         turn=None if np.array_equal(seen, np.eye(len(states))) else np.linalg.inv(seen),

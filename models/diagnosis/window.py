@@ -80,6 +80,7 @@ class WindowStatistics:
     # slow-roll vector. `waveforms` and `pair_powers` are those of mounted sensors in either.
     mounted: "WindowStatistics | None" = None
     lines: tuple[ExcludedLine, ...] = ()  # that say nothing of the machine
+    time_scale: float = 1.0  # how much slower the machine moves than usual (`models.stream_settings.time_scale`)
     directed: bool = True  # whether vectors keep their directions: the shaft angle has not jumped since it was set up
 
     @property
@@ -202,6 +203,7 @@ def window_statistics(
         hop_jump_rad=angle_jumps(hops),
         removed_by_hop=rotation.by_hop,
         phase_kept=phase_kept,
+        time_scale=plan.time_scale,
         duration_s=len(hops) * plan.hop / plan.rate_hz,
         waveforms=tuple(hop.waveform for hop in hops),
         sensors=plan.sensors,

@@ -32,6 +32,23 @@ class KnownRotor(BaseModel, extra="forbid", frozen=True):
         """Fields that are not given."""
         return tuple(name for name in type(self).model_fields if getattr(self, name) is None)
 
+    @property
+    def modes_hz(self) -> tuple[float, ...]:
+        """Natural frequencies at rest and without damping, ascending, Hz; none where parameters are missing.
+
+        Examples
+        --------
+        >>> from models.machine import load_machine
+        >>> [round(one) for one in load_machine("lab").rotor.modes_hz]
+        [28, 30, 92, 94, 489, 489]
+        """
+        if self.unknown:
+            return ()
+        rotor = RotorParameters.model_validate(self, from_attributes=True)
+        root = 1 / np.sqrt(np.diag(M_matrix(rotor)))
+        squares = np.linalg.eigvalsh(Q_matrix(rotor) * np.outer(root, root))
+        return tuple(float(one) for one in np.sqrt(np.maximum(squares, 0)) / (2 * np.pi))
+
 
 class RotorParameters(KnownRotor):
     """Bearing mass on springs and dampers, flexible shaft, overhung disc (paper §2.1, Fig. 2).

@@ -10,6 +10,7 @@ from models.errors import MachineFileError
 from models.machine import Machine, load_machine, load_machine_file
 from models.physics.response import synchronous_response
 from models.physics.rotor import PARAMETERS, changed, system_A
+from models.stream_settings import WindowSettings
 
 LAB = (Path(__file__).parents[2] / "models" / "machines" / "lab.toml").read_text(encoding="utf-8")
 
@@ -100,3 +101,73 @@ def test_a_machine_file_with_nothing_but_sensors_goes_with_any_rate(tmp_path: Pa
 
 def test_the_mark_that_windows_editors_begin_a_file_with_is_no_mistake(tmp_path: Path) -> None:
     assert load_machine_file(write(tmp_path, "\ufeff" + SENSORS_ALONE)).name == "fan"
+
+
+def in_time(times: float, rate_hz: float, *more: str) -> str:
+    """The rotor kit as a machine that moves so many times as fast, its file without a window of its own."""
+    text = LAB[: LAB.index("[window]")] + LAB[LAB.index("[alarms]") :]
+    factors = {"k_by_N_per_m": times**2, "k_bz_N_per_m": times**2, "c_by_N_s_per_m": times, "c_bz_N_s_per_m": times}
+    for name, factor in (factors | {"shaft_diameter_m": times**0.5, "speed_rpm": times}).items():
+        line = next(one for one in text.splitlines() if one.startswith(f"{name} ="))
+        text = text.replace(line, f"{name} = {factor * float(line.split()[2])}")
+    text = text.replace("rate_hz = 2000.0", f"rate_hz = {rate_hz}").replace(
+        "[25.0, 200.0]", str([25 * times, 200 * times])
+    )
+    return "\n".join([text, *more])
+
+
+def test_a_window_that_is_not_given_goes_with_the_natural_frequencies(tmp_path: Path) -> None:
+    usual = load_machine(write(tmp_path, in_time(1, 2000.0)))
+    assert usual.window == WindowSettings()
+    assert usual.time_scale == 1
+
+    fast = load_machine(write(tmp_path, in_time(15, 20000.0)))
+    low_hz, high_hz = fast.window.band_hz
+    assert low_hz < 0.1 * fast.rotor.modes_hz[0] < 1.2 * fast.rotor.modes_hz[3] < high_hz < 8000
+    assert (fast.window.length_s, fast.window.hop_s, fast.window.segment_s) == (60, 5, 2)
+    assert fast.window.lag_to_s == pytest.approx(0.125 * fast.time_scale)
+    assert fast.window.lag_step_s * fast.rate_hz == 2
+
+    slow = load_machine(write(tmp_path, in_time(0.05, 200.0)))
+    assert slow.time_scale == pytest.approx(6 / slow.rotor.modes_hz[0], rel=0.05)
+    low_hz, high_hz = slow.window.band_hz
+    assert low_hz <= slow.rotor.modes_hz[0] / 2
+    assert 1.25 * slow.rotor.modes_hz[3] <= high_hz < 50
+    assert slow.window.hop_s == pytest.approx(5 * slow.time_scale)
+    assert slow.window.length_s == 12 * slow.window.hop_s
+    assert slow.window.hop_s % (slow.window.segment_s / 2) == pytest.approx(0)
+
+
+def test_a_window_that_is_given_is_taken(tmp_path: Path) -> None:
+    given = load_machine(
+        write(
+            tmp_path,
+            in_time(
+                15, 20000.0, "[window]", "hop_s = 10.0", "length_s = 120.0", "max_span_s = 200.0", "lag_to_s = 0.05"
+            ),
+        )
+    )
+    assert (given.window.hop_s, given.window.length_s, given.window.segment_s) == (10, 120, 2)
+    assert (given.window.lag_from_s, given.window.lag_to_s) == (0.01, 0.05)
+    assert given.window.band_hz[1] > 1000
+
+
+def test_where_the_rotor_is_not_known_a_fast_speed_says_so_and_a_slow_one_nothing(tmp_path: Path) -> None:
+    windows = {
+        rpm: load_machine_file(
+            write(tmp_path, f"{SENSORS_ALONE.replace('2000', '25600')}[operation]\nspeed_rpm = {rpm}\n")
+        )
+        for rpm in (60, 1500, 3000, 15000)
+    }
+    assert [one.time_scale for one in windows.values()] == [1, 1, 1, 0.2]
+    assert windows[60].window == windows[3000].window
+    assert windows[15000].window.band_hz == (15, 750)
+    assert windows[15000].window.lag_to_s == pytest.approx(0.025)
+
+
+def test_snapshots_of_a_fast_machine_have_its_band_and_lags(tmp_path: Path) -> None:
+    text = SENSORS_ALONE.replace("2000", "25600") + "[operation]\nspeed_rpm = 15000\n"
+    window = load_machine_file(write(tmp_path, f"{text}[schedule]\non_s = 4.0\nevery_s = 60.0\n")).window
+    assert (window.hop_s, window.length_s, window.segment_s) == (60, 720, 1)
+    assert window.band_hz == (15, 750)
+    assert (window.lag_from_s, window.lag_to_s) == pytest.approx((0.002, 0.025))

@@ -34,7 +34,7 @@ def force_spectrum(windows: Sequence[RowWindow], combinations: Sequence[FloatArr
     forces = np.stack([one.terms @ combination for one, combination in zip(windows, combinations, strict=True)], axis=1)
     spectra = forces @ window.spectrum @ forces.conj().transpose(0, 2, 1)
     f = window.frequencies_hz
-    bands = np.array_split(spectra, max(1, int((f[-1] - f[0]) // _BAND_HZ)))
+    bands = np.array_split(spectra, max(1, int((f[-1] - f[0]) * window.time_scale // _BAND_HZ)))
     mean = np.stack([band.mean(axis=0) for band in bands])
     return np.asarray(np.triu(mean.real) + np.tril(mean.imag, -1), dtype=np.float64)
 

@@ -24,6 +24,7 @@ from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
+# Times of a machine that the usual window suits; of another one each is multiplied by its time scale.
 LONGEST_LAG_STEP_S = 0.00126  # spacing of the lags beyond which a kernel has too few points
 _SPACING_S = 0.004
 _FALLEN_TO = 0.1
@@ -39,6 +40,7 @@ class Shape:
     width_s: float
     # From the shortest lag to the first kernel's centre; what lies before it weighs less than a thousandth.
     lead_s: float
+    spacing_s: float  # of neighbours, as near as the lags allow
 
     @property
     def cosines(self) -> FloatArray:
@@ -49,7 +51,7 @@ class Shape:
         return np.asarray(row, dtype=np.float64)
 
 
-def shape_for(deepest: int, band_to_hz: float) -> Shape:
+def shape_for(deepest: int, band_to_hz: float, time_scale: float) -> Shape:
     """Shape of the kernels that bear some derivatives.
 
     One derivative is borne by a narrow kernel. Every further one lifts the sensors' noise by another power of the
@@ -62,11 +64,14 @@ def shape_for(deepest: int, band_to_hz: float) -> Shape:
         Most derivatives on a kernel (`Formation.deepest`), at most 4.
     band_to_hz : float
         Highest frequency of the window's spectra.
+    time_scale : float
+        `models.stream_settings.time_scale` of the machine.
     """
+    spacing_s = _SPACING_S * time_scale
     if deepest <= 1:
-        return Shape(4, 0.010, 0.005)
+        return Shape(4, 0.010 * time_scale, 0.005 * time_scale, spacing_s)
     width_s = _FALLEN_AT / band_to_hz
-    return Shape(8, width_s, _LEAD * width_s)
+    return Shape(8, width_s, _LEAD * width_s, spacing_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +107,7 @@ def kernels(lags_s: FloatArray, lag_from_s: float, shape: Shape, deepest: int) -
 def _kernels(lags: bytes, lag_from_s: float, shape: Shape, deepest: int) -> Kernels:
     lags_s = np.frombuffer(lags)
     step_s = float(lags_s[1] - lags_s[0])
-    spacing_s = max(1, round(_SPACING_S / step_s)) * step_s
+    spacing_s = max(1, round(shape.spacing_s / step_s)) * step_s
     width_s = shape.width_s
     centres = np.arange(lag_from_s + shape.lead_s, lags_s[-1] - width_s / 2 + 1e-9, spacing_s)
     u = (lags_s[None, :] - centres[:, None]) / width_s
@@ -126,10 +131,10 @@ def gain(frequencies_hz: FloatArray, shape: Shape) -> FloatArray:
     return total
 
 
-def passband_hz(deepest: int, band_to_hz: float) -> float:
+def passband_hz(deepest: int, band_to_hz: float, time_scale: float) -> float:
     """Frequency, Hz, up to which kernels let through at least a tenth: the end of the differentiator's valid band."""
-    f = np.linspace(0.0, 2000.0, 8001)
-    through = gain(f, shape_for(deepest, band_to_hz))
+    f = np.linspace(0.0, 2000.0, 8001) / time_scale
+    through = gain(f, shape_for(deepest, band_to_hz, time_scale))
     return float(min(band_to_hz, f[np.argmax(through < _FALLEN_TO * through[0])]))
 
 
@@ -199,7 +204,8 @@ class RowWindow:
     @property
     def shape(self) -> Shape:
         """Of the kernels."""
-        return shape_for(self.formation.deepest, float(self.window.frequencies_hz[-1]))
+        window = self.window
+        return shape_for(self.formation.deepest, float(window.frequencies_hz[-1]), window.time_scale)
 
     def beyond(self, lag_from_s: float) -> LagMoments:
         """Moments beyond a shortest lag."""
@@ -252,9 +258,9 @@ def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], refe
     columns = [index[name] for name in references]
     pairs = np.array(np.triu_indices(n_terms))
     own = spectra[:, pairs[0], pairs[1]].real
-    shape = shape_for(formation.deepest, float(f[-1]))
+    shape = shape_for(formation.deepest, float(f[-1]), window.time_scale)
     between = _reference_spectra(window, columns, shape)
-    nearest = kernels(window.lags_s, SHORTEST_LAG_FROM_S, shape, formation.deepest)
+    nearest = kernels(window.lags_s, SHORTEST_LAG_FROM_S * window.time_scale, shape, formation.deepest)
     cosine, sine = _waves(f.tobytes(), nearest.spacing_s, nearest.centres_s.size)
     flat = between.reshape(f.size, -1)
     # one product for each reference pair: what the distance does to it, weighted by the pairs of terms

@@ -323,11 +323,12 @@ def _covariance(
 
 def unsuitable(window: WindowStatistics) -> str:
     """Why a window cannot be used at all; empty if it can."""
-    if window.lags_s[-1] < _SHORTEST_LAG_RANGE_S:
-        return f"correlations reach {window.lags_s[-1]:g} s, {_SHORTEST_LAG_RANGE_S:g} s are needed"
+    wanted_s, most_s = _SHORTEST_LAG_RANGE_S * window.time_scale, LONGEST_LAG_STEP_S * window.time_scale
+    if window.lags_s[-1] < wanted_s:
+        return f"correlations reach {window.lags_s[-1]:g} s, {wanted_s:g} s are needed"
     step_s = float(window.lags_s[1] - window.lags_s[0])
-    if step_s > LONGEST_LAG_STEP_S:
-        return f"lags are {1e3 * step_s:g} ms apart, at most {1e3 * LONGEST_LAG_STEP_S:g} ms are needed"
+    if step_s > most_s:
+        return f"lags are {1e3 * step_s:g} ms apart, at most {1e3 * most_s:g} ms are needed"
     if window.hop_correlation.shape[0] < _FEWEST_HOPS:
         return f"it has one hop, {_FEWEST_HOPS} are needed"
     if not np.all(np.isfinite(window.correlation)):

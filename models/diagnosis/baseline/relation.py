@@ -96,14 +96,15 @@ def lag_beyond_memory(row: RowWindow, combination: FloatArray) -> float:
     Where the row was differentiated, that is undone first; the sensors' noise at the lowest frequencies is left out.
     """
     raised = row.formation.raised
-    f = row.window.frequencies_hz
+    scale = row.window.time_scale
+    f = row.window.frequencies_hz * scale  # as if the machine were one that the usual window suits
     used = f >= _LOWEST_RAISED_HZ if raised else np.ones(f.size, dtype=bool)
     f = f[used]
     density = row.residual_spectrum(combination)[used] / f ** (2 * raised)
     logarithm, inverse_model = _models(f.tobytes())
     cost = logarithm + np.log(inverse_model @ density / f.size)
     cutoff_hz = _CUTOFFS_HZ[int(np.argmin(cost)) // _NOISES.size]
-    return float(np.clip(_MEMORY / cutoff_hz, SHORTEST_LAG_FROM_S, LONGEST_LAG_FROM_S))
+    return scale * float(np.clip(_MEMORY / cutoff_hz, SHORTEST_LAG_FROM_S, LONGEST_LAG_FROM_S))
 
 
 def one_source(window: WindowStatistics) -> bool:
@@ -265,7 +266,7 @@ def beyond_memory(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMomen
     parts, fits, lags = _beyond_force(row, windows)
     if any(fit.fits for fit in fits):
         return parts, fits, 0.0
-    for longer in _LONGER_LAGS_S:
+    for longer in np.multiply(windows[0].window.time_scale, _LONGER_LAGS_S).tolist():
         beyond = [window.beyond(max(lag, longer)) for window, lag in zip(windows, lags, strict=True)]
         again = fit_row(row, beyond)
         if any(fit.fits for fit in again):
@@ -275,9 +276,9 @@ def beyond_memory(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMomen
 
 def _beyond_force(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMoments], tuple[Fit, Fit], list[float]]:
     parts, lags, used = (
-        [window.beyond(LAG_FROM_S) for window in windows],
+        [window.beyond(LAG_FROM_S * window.window.time_scale) for window in windows],
         [0.0] * len(windows),
-        [LAG_FROM_S] * len(windows),
+        [LAG_FROM_S * window.window.time_scale for window in windows],
     )
     fits = fit_row(row, parts)
     for _ in range(_LAG_ROUNDS):
@@ -411,10 +412,11 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
     EstimationError
         If the window does not determine them: it is explained as it is, and by nearly any change as well.
     """
-    first = change_of(row, relation, window.beyond(max(LAG_FROM_S, relation.lag_from_s)))
+    usual_s = LAG_FROM_S * window.window.time_scale
+    first = change_of(row, relation, window.beyond(max(usual_s, relation.lag_from_s)))
     lag_s = max(relation.lag_from_s, lag_beyond_memory(window, first.combination))
     change = change_of(row, relation, window.beyond(lag_s))
-    longest = first if lag_s < LAG_FROM_S else change
+    longest = first if lag_s < usual_s else change
     # An estimate that the window does not determine wanders, to where the misfit is anything: no change counts as well.
     believed = longest if (longest.fits or longest.unchanged) and not change.fits else change
     errors = zip(row.own, believed.error(relation), strict=True)

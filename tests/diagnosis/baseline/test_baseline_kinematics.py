@@ -101,9 +101,9 @@ def test_what_is_missing_is_said_as_a_place() -> None:
 @pytest.mark.parametrize("deepest", [1, 2, 3, 4])
 def test_kernels_differentiate_within_their_passband(deepest: int) -> None:
     lags = np.arange(0, 0.1255, 0.001)
-    shape = shape_for(deepest, 150.0)
+    shape = shape_for(deepest, 150.0, 1.0)
     over = kernels(lags, 0.03, shape, deepest)
-    edge = passband_hz(deepest, 150.0)
+    edge = passband_hz(deepest, 150.0, 1.0)
     assert 100 < edge <= 150
     for f in (5.0, 30.0, 0.9 * edge):
         wave = np.exp(2j * np.pi * f * lags)

@@ -13,10 +13,11 @@ from models.checkpoint import from_bytes, to_bytes
 from models.commissioning.commissioned import Installed, install
 from models.errors import CheckpointError
 from models.ingest import Reason
-from models.machine import AlarmSettings, IngestSettings, Machine
+from models.machine import AlarmSettings, Machine
 from models.signals.block import SampleBlock
 from models.signals.keys import Topic
 from models.signals.wire import encode_block
+from models.stream_settings import IngestSettings
 from rotorwatch.records.alarms import AlarmState
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Report

@@ -12,8 +12,9 @@ import httpx_sse
 import pytest
 
 from models.errors import BundleError, MachineFileError
-from models.machine import IngestSettings, load_machine
+from models.machine import load_machine
 from models.signals.link import LinkSettings
+from models.stream_settings import IngestSettings
 from rotorwatch.records.alarms import AlarmStates
 from rotorwatch.records.health import Health, HealthState
 from rotorwatch.records.monitor import Readiness

@@ -1,0 +1,199 @@
+"""How a machine's samples come and what windows are made of them: settings, and what they are where a file is silent.
+
+Windows, lags and band suit machines whose motion lies between some 6 and 120 Hz. Of a faster or slower one the natural
+frequencies say how far off that is, or where they are not known the speed; all times are multiplied by one factor then.
+"""
+
+import math
+from collections.abc import Collection, Sequence
+from typing import Self
+
+from pydantic import BaseModel, Field, model_validator
+
+_USABLE = 0.4
+"""Part of the sampling rate up to which an anti-aliasing filter lets through."""
+_SLOW_HZ, _FAST_HZ = 6.0, 120.0
+"""Lowest and fourth natural frequency, those of bearing and disc across, between which the usual window suits."""
+_FAST_SPEED_HZ = 50.0
+_SLOWEST = 60.0
+_LENGTHS = ("segment_s", "hop_s", "length_s", "max_span_s")
+
+
+def whole(value: float) -> bool:
+    """Whether a number is a whole one, but for rounding."""
+    return abs(value - round(value)) < 1e-9 * max(1.0, abs(value))
+
+
+class IngestSettings(BaseModel, extra="forbid", frozen=True):
+    """When a block is refused, and when silence is called missing data."""
+
+    block_from_s: float = Field(default=0.001, gt=0, le=1, description="shortest accepted block")
+    block_to_s: float = Field(default=2.0, gt=0, le=630, description="longest accepted block")
+    time_tolerance_s: float = Field(default=0.0002, gt=0, le=1, description="jitter of block times that is no gap")
+    rate_tolerance: float = Field(default=1e-4, ge=0, lt=0.1, description="relative deviation of the sampling rate")
+    max_jump_s: float = Field(default=3600.0, gt=0, description="a block further ahead than this is refused as future")
+    resync_blocks: int = Field(default=10, ge=2, le=1000, description="blocks in a row that establish a stepped clock")
+    reorder_blocks: int = Field(
+        default=20, ge=0, le=1000, description="blocks that may wait for a missing one; 0 takes them as they arrive"
+    )
+    no_data_after_s: float = Field(default=5.0, gt=0, le=30 * 86400, description="silence that is called no data")
+
+    @model_validator(mode="after")
+    def _blocks_are_no_silence(self) -> Self:
+        if self.no_data_after_s <= self.block_to_s:
+            raise ValueError(
+                f"no_data_after_s is {self.no_data_after_s:g}, expected more than block_to_s, {self.block_to_s:g}: "
+                "between two blocks of that length nothing comes for as long"
+            )
+        return self
+
+
+class WindowSettings(BaseModel, extra="forbid", frozen=True):
+    """The sliding window: its length, how often it is evaluated, and what is computed in it."""
+
+    length_s: float = Field(default=60.0, gt=0, le=30 * 86400, description="window length")
+    hop_s: float = Field(
+        default=5.0, gt=0, le=86400, description="one report per hop; also the sub-block of the errors"
+    )
+    max_span_s: float = Field(
+        default=90.0, gt=0, le=60 * 86400, description="oldest sample a window may hold, across gaps"
+    )
+    lag_from_s: float = Field(default=0.01, ge=0, le=10, description="shortest lag of the relation networks")
+    lag_to_s: float = Field(default=0.125, gt=0, le=10, description="longest lag of the correlation functions")
+    lag_step_s: float = Field(default=0.001, gt=0, le=1, description="lag spacing of the relation networks")
+    segment_s: float = Field(default=2.0, gt=0, le=120, description="segment of the cross-spectra, half overlapped")
+    band_hz: tuple[float, float] = Field(default=(3.0, 150.0), description="band of the likelihood, from and to")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if not whole(self.length_s / self.hop_s) or self.length_s < 4 * self.hop_s:
+            raise ValueError(f"length_s {self.length_s} must be a multiple of hop_s {self.hop_s}, at least four hops")
+        if self.lag_to_s >= self.hop_s:
+            raise ValueError(f"lag_to_s {self.lag_to_s} must be below hop_s {self.hop_s}")
+        if self.lag_from_s >= self.lag_to_s:
+            raise ValueError(f"lag_from_s {self.lag_from_s} must be below lag_to_s {self.lag_to_s}")
+        if not 0 < self.band_hz[0] < self.band_hz[1]:
+            raise ValueError(f"band_hz {self.band_hz} must be 0 < from < to")
+        if self.max_span_s < self.length_s:
+            raise ValueError(f"max_span_s {self.max_span_s} must not be below length_s {self.length_s}")
+        return self
+
+    @property
+    def hops(self) -> int:
+        """Hops in a full window."""
+        return round(self.length_s / self.hop_s)
+
+
+class Schedule(BaseModel, extra="forbid", frozen=True):
+    """Snapshots: so many seconds of samples, again and again, and silence between them."""
+
+    on_s: float = Field(gt=0, le=600, description="length of a snapshot")
+    every_s: float = Field(gt=0, le=86400, description="from the start of a snapshot to that of the next one")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.on_s >= self.every_s:
+            raise ValueError(f"on_s {self.on_s:g} must be below every_s {self.every_s:g}: there is silence between")
+        return self
+
+    @property
+    def silence_s(self) -> float:
+        """Silence after a snapshot."""
+        return self.every_s - self.on_s
+
+    def is_silence(self, silence_s: float) -> bool:
+        """Whether nothing is missing where nothing came for so long: snapshots may come half a period late."""
+        return self.silence_s / 2 <= silence_s <= self.silence_s + self.every_s / 2
+
+    def window(self, rate_hz: float, usual: WindowSettings) -> dict[str, float]:
+        """Settings of the window where the machine file says nothing, from what they would be of an unbroken stream.
+
+        A hop is a snapshot, a window twelve of them. Seven half-overlapping segments or more go into a snapshot, and
+        the longest lag is a quarter of it.
+        """
+        segment_s = min(usual.segment_s, 2 * math.floor(self.on_s * rate_hz / 8) / rate_hz)
+        lag_to_s = min(usual.lag_to_s, math.floor(self.on_s * rate_hz / 4) / rate_hz)
+        return {
+            "length_s": 12 * self.every_s,
+            "hop_s": self.every_s,
+            "max_span_s": 18 * self.every_s,
+            "segment_s": max(segment_s, 2 / rate_hz),
+            "lag_to_s": max(lag_to_s, 2 / rate_hz),
+            "lag_from_s": min(usual.lag_from_s, math.floor(lag_to_s * rate_hz / 8) / rate_hz),
+        }
+
+    def ingest(self) -> dict[str, float]:
+        """Settings of ingest where the machine file says nothing: a block may be a snapshot, two may fail to come."""
+        defaults = IngestSettings()
+        return {
+            "block_to_s": max(defaults.block_to_s, 1.05 * self.on_s),
+            "no_data_after_s": max(defaults.no_data_after_s, 2.5 * self.every_s),
+            "max_jump_s": max(defaults.max_jump_s, 10 * self.every_s),
+        }
+
+
+def time_scale(modes_hz: Sequence[float], speed_hz: float | None) -> float:
+    """How much slower a machine moves than those that the usual window suits: one of those is 1, below 1 is faster.
+
+    Parameters
+    ----------
+    modes_hz : sequence of float
+        Natural frequencies, ascending; empty where they are not known. A machine with slow and fast ones is usual.
+    speed_hz : float, optional
+        Nominal speed, for where they are not. A slow shaft says nothing of how fast the machine vibrates.
+
+    Examples
+    --------
+    >>> time_scale((28.1, 30.2, 91.6, 93.5, 489.0, 489.0), 22.0), time_scale((), 330.0)
+    (1.0, 0.15)
+    """
+    scale = 1.0
+    if not modes_hz:
+        scale = min(1.0, _FAST_SPEED_HZ / speed_hz) if speed_hz else 1.0
+    elif modes_hz[3] > _FAST_HZ and modes_hz[0] >= _SLOW_HZ:
+        scale = _FAST_HZ / modes_hz[3]
+    elif modes_hz[0] < _SLOW_HZ and modes_hz[3] <= _FAST_HZ:
+        scale = min(_SLOWEST, _SLOW_HZ / modes_hz[0])
+    return float(f"{scale:.2g}")
+
+
+def default_window(
+    rate_hz: float, given: Collection[str], schedule: Schedule | None, modes_hz: Sequence[float], speed_hz: float | None
+) -> dict[str, object]:
+    """Settings of the window that are not given and are not the usual ones.
+
+    Data acquisition often divides a clock by whole numbers (51 200 / 3 Hz), and slow machines are sampled slowly: the
+    nearest settings that are whole numbers of samples are taken, and the band ends within what the rate allows. Fast
+    and slow machines have their own, see `time_scale`. A fast one tells more in the same time, so that what leaks from
+    one frequency into the next has to be smaller too: segments are not shortened.
+
+    Examples
+    --------
+    >>> default_window(200.0, (), None, (), None)
+    {'band_hz': (3.0, 80.0), 'lag_step_s': 0.005}
+    >>> round(default_window(51200 / 3, (), None, (), None)["hop_s"] * 51200 / 3, 6)
+    85335.0
+    >>> default_window(20000.0, (), None, (), 330.0)["band_hz"]
+    (20.0, 1000.0)
+    """
+    usual, scale = WindowSettings(), time_scale(modes_hz, speed_hz)
+    low_hz, high_hz = (float(f"{edge / scale:.3g}") for edge in usual.band_hz)
+    if modes_hz:
+        low_hz, high_hz = min(low_hz, modes_hz[0] / 2), max(high_hz, 1.25 * modes_hz[3])
+    if high_hz >= rate_hz / 2 and _USABLE * rate_hz > low_hz:
+        high_hz = _USABLE * rate_hz
+    found: dict[str, object] = {} if (low_hz, high_hz) == usual.band_hz else {"band_hz": (low_hz, high_hz)}
+    step_s, longer = usual.lag_step_s * scale, max(scale, 1.0)
+    lengths = {name: getattr(usual, name) * longer for name in _LENGTHS}
+    if scale != 1 and not {"lag_from_s", "lag_to_s"} & {*given}:
+        found |= {name: getattr(usual, name) * scale for name in ("lag_from_s", "lag_to_s")}
+    if scale != 1 or not whole(step_s * rate_hz):
+        found["lag_step_s"] = max(1, round(step_s * rate_hz)) / rate_hz
+    if schedule is not None:
+        found |= schedule.window(rate_hz, usual.model_copy(update={"segment_s": lengths["segment_s"]} | found))
+    elif {"segment_s", "hop_s", "length_s"} & {*given}:  # multiples of each other
+        return found
+    elif longer != 1 or not all(whole(length * rate_hz) for length in lengths.values()):
+        half = max(1, round(lengths["segment_s"] / 2 * rate_hz))
+        found |= {name: round(2 * each / lengths["segment_s"]) * half / rate_hz for name, each in lengths.items()}
+    return found
