@@ -118,6 +118,7 @@ class Gate:
         self._candidate: Course | None = None
         self._earlier: deque[Course] = deque(maxlen=EARLIER_COURSES)
         self._refused: deque[Course] = deque(maxlen=EARLIER_COURSES)
+        self._had: tuple[Course, ...] = ()
 
     @property
     def courses(self) -> tuple[Course, ...]:
@@ -127,6 +128,14 @@ class Gate:
     def knows(self, block: SampleBlock) -> bool:
         """Whether a block's place is among those that were received or passed over."""
         return any(course.covers(block) for course in self.courses)
+
+    def begin(self) -> None:
+        """Take note that whatever comes is heard from now on; what is known so far is from before a restart."""
+        self._had = self.courses
+
+    def had(self, block: SampleBlock) -> bool:
+        """Whether a block's place is from before a restart: a publisher's cache sends it again when it is asked."""
+        return any(course.covers(block) for course in self._had)
 
     def is_newest(self, block: SampleBlock) -> bool:
         """Whether it is the latest block that was received."""

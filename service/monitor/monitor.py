@@ -105,7 +105,7 @@ class MachineMonitor:
         self.window: WindowStatistics | None = None  # that of the latest report, if it was full
         self._newest = NewestBlocks(20_000)
         self._used: SampleBlock | None = None
-        self.used, self.could_use = False, self._gate.could_use
+        self.used, self.could_use, self.begin = False, self._gate.could_use, self._gate.begin
 
     def step_payload(
         self, payload: bytes, attachment: bytes, encoding: str, dropped_before: int = 0
@@ -133,7 +133,7 @@ class MachineMonitor:
             return (MonitorReport(self._count(Admission(Reason.MALFORMED, f"{self.machine.title}: {error}"))),)
         if (misshapen := self._gate.form(block, schema_hash)) is not None:  # before its run and number are used
             return (MonitorReport(self._count(misshapen)),)
-        if self._window.lacks:
+        if self._window.lacks or self._gate.had(block):  # the latter is no news, and no fault of the publisher
             if self._gate.knows(block):
                 self._recall(block)
             else:  # one that is known may have been overtaken

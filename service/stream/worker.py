@@ -342,6 +342,7 @@ class MachineWorker:
                 self._catch_up(self._recorded_since_ns)
         except Exception as error:  # what it brought to light must not end the monitoring of the machine
             self._failed(error)
+        self._monitor.begin()
         self._shedding = LoadShedding() if self._sheds else None  # what was recorded has been evaluated
         while (item := self.inbox.get(self._monitor.blocks_to_hop)) is not None:
             try:

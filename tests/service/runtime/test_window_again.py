@@ -205,8 +205,9 @@ def test_killed_where_nobody_has_the_window_it_fills_anew_and_alarms_are_held(tm
 
 
 @pytest.mark.slow
-def test_stopped_in_order_the_window_is_kept(tmp_path: Path) -> None:
-    with plant(tmp_path, recording=False, kept=0) as here:
+@pytest.mark.parametrize("kept", [0, 20])
+def test_stopped_in_order_the_window_is_kept(tmp_path: Path, kept: int) -> None:
+    with plant(tmp_path, recording=False, kept=kept) as here:
         with here.monitor() as first:
             put_first(here, first)
             assert first.stop() == 0
@@ -215,5 +216,6 @@ def test_stopped_in_order_the_window_is_kept(tmp_path: Path) -> None:
             assert (health.filled, health.restart) == (1.0, "went on where it stood at 2026-01-01T00:00:39.000000Z")
             here.put(stream()[FIRST:])
             until_evaluated(second)
+            assert second.health().quality.refused_blocks == {}  # the cache was asked for what it sends again
             assert second.stop() == 0
         assert here.said() == offline()
