@@ -5,6 +5,7 @@ the name that was probably meant. The checks themselves are fields and validator
 """
 
 import difflib
+import os
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
@@ -52,7 +53,8 @@ def read_toml(path: Path) -> dict[str, object]:
         If it cannot be read or is not TOML; the message names the file and, where known, the line.
     """
     try:
-        data = path.read_bytes()
+        with open(path, "rb", opener=_at_once) as file:
+            data = file.read()
     except FileNotFoundError as error:
         beside = [entry.name for entry in path.parent.glob("*.toml")]
         raise MachineFileError(f"{path}: no such file{did_you_mean(path.name, beside)}") from error
@@ -66,6 +68,13 @@ def read_toml(path: Path) -> dict[str, object]:
         line = data[: error.start].count(b"\n") + 1
         raise MachineFileError(f"{path}: line {line}: expected UTF-8, save the file in that encoding") from error
     return parse_toml(text, path)
+
+
+def _at_once(path: str, flags: int) -> int:
+    """Open a file; a named pipe, too, without waiting for somebody who writes into it."""
+    descriptor = os.open(path, flags | os.O_NONBLOCK)
+    os.set_blocking(descriptor, True)  # a pipe into which somebody writes is read to its end
+    return descriptor
 
 
 def parse_toml(text: str, place: object) -> dict[str, object]:
@@ -133,12 +142,46 @@ def checked(model: type[_Model], fields: object, place: object) -> _Model:
         With one line for each mistake.
     """
     try:
+        refuse_truths(fields, model, place)
         return model.model_validate(fields)
     except ValidationError as error:
         told = [text for _, text in mistakes(error, model, fields)]
         more = error.error_count() - _MOST_TOLD
         told += [f"and {more} more mistakes"] if more > 0 else []
         raise MachineFileError("\n".join(f"{place}: {text}" for text in told)) from error
+
+
+def refuse_truths(fields: object, model: type[BaseModel], place: object) -> None:
+    """Refuse true and false in the place of a number, for which pydantic takes them: 1 and 0.
+
+    Parameters
+    ----------
+    place : object
+        What the messages begin with.
+
+    Raises
+    ------
+    MachineFileError
+        With one line for each of them.
+    """
+    told = []
+    for at, value in _truths(fields):
+        info = _field(at, model)[1]
+        kinds = {"bool"} if info is None else set(re.findall(r"\w+", str(info.annotation)))
+        kind = next((one for one in ("int", "float") if one in kinds and "bool" not in kinds), None)
+        if kind is not None:
+            fault = ErrorDetails(type=f"{kind}_type", loc=at, msg="", input=value)
+            told.append(f"{place}: {_named(at, fields)}{expectation(fault, info)}")
+    if told:
+        raise MachineFileError("\n".join(told))
+
+
+def _truths(fields: object, at: _Place = ()) -> Iterator[tuple[_Place, bool]]:
+    if isinstance(fields, bool):
+        yield at, fields
+    elif isinstance(fields, Mapping | list | tuple):
+        for name, value in fields.items() if isinstance(fields, Mapping) else enumerate(fields):
+            yield from _truths(value, (*at, name))
 
 
 def in_folder(model: _Model, folder: Path) -> _Model:

@@ -4,6 +4,7 @@ A message names the file or argument, the field, the value and what was expected
 libraries inside is in it. To read all of them: ``pytest tests/test_mistakes.py -rA``.
 """
 
+import os
 import re
 import shlex
 import socket
@@ -19,6 +20,7 @@ from typer.testing import CliRunner
 from models.errors import MachineFileError
 from models.machine import load_machine, load_machine_file
 from service.rotorwatch import app as rotorwatch
+from service.settings.service import load_settings
 from simulator.rotorsim import app as rotorsim
 from simulator.rotortrain import app as rotortrain
 from tests.service.rig.live import ROOT, endpoint
@@ -129,3 +131,9 @@ def test_a_number_of_thousands_of_digits_is_refused(number: str, told: str, tmp_
     (tmp_path / "machine.toml").write_text(f"rate_hz = {number}\n", encoding="utf-8")
     with pytest.raises(MachineFileError, match=told):
         load_machine_file(tmp_path / "machine.toml")
+
+
+def test_a_named_pipe_into_which_nobody_writes_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "service.toml")
+    with pytest.raises(MachineFileError, match="nothing is in it"):
+        load_settings(tmp_path / "service.toml")

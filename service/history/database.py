@@ -11,7 +11,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,6 +42,7 @@ _POSTGRESQL = {"application_name": "rotorwatch", "client_encoding": "UTF8", "tcp
 _SERVER_KEEPALIVES = {
     "tcp_keepalives_idle": 5, "tcp_keepalives_interval": 3, "tcp_keepalives_count": 3, "tcp_user_timeout": 15_000
 }  # fmt: skip
+_HIGHEST_PORT = 65535
 _FORMS = "expected sqlite:////folder/file, sqlite:///:memory: or postgresql://user:password@host/database"
 
 
@@ -318,6 +319,10 @@ class Database:
                 self.to_write(connection)
                 with connection.begin():
                     self._bring_up_to_date(connection)
+            if self.is_sqlite:  # kept in the file, so not before that is known to be ours
+                with closing(engine.raw_connection()) as raw, closing(raw.cursor()) as cursor:
+                    cursor.execute("PRAGMA journal_mode = WAL")
+                    cursor.execute("PRAGMA schema_version")  # the log is made by whoever reads
             if self.file is not None:
                 self.file.opened()
         except BaseException:
@@ -421,6 +426,10 @@ def checked_url(url: str) -> URL:
     if not made.database or (made.drivername == "sqlite" and made.host):
         wanted = "file" if made.drivername == "sqlite" else "database"
         raise StoreError(f"the URL {made.render_as_string(hide_password=True)} names no {wanted}; {_FORMS}")
+    if made.drivername == "sqlite" and made.query:
+        raise StoreError(f"the URL has options ({', '.join(made.query)}), of which a file has none; {_FORMS}")
+    if not 0 < (made.port or 1) <= _HIGHEST_PORT:
+        raise StoreError(f"the port in the URL is {made.port}, expected 1 to {_HIGHEST_PORT}")
     return made
 
 
@@ -430,7 +439,7 @@ def _prepare_sqlite(connection: Any, record: object) -> None:
     # Every page that a step touches is written whole, and few pages hold more than one thing that a step changes. Those
     # that every step touches go from the log into the file only every few hundred steps.
     small = ("page_size = 512", "wal_autocheckpoint = 32000")
-    for setting in (*small, "journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
+    for setting in (*small, "synchronous = FULL", "foreign_keys = ON"):
         connection.execute(f"PRAGMA {setting}")
 
 

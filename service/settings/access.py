@@ -1,12 +1,13 @@
 """Settings of access to the HTTP API: who may, from where, how much, and under which certificate."""
 
 import ipaddress
+import re
 from pathlib import Path
 
 from pydantic import BaseModel, Field, field_validator
 
 from models.errors import MachineFileError
-from models.signals.link import is_loopback
+from models.signals.link import is_address, is_loopback
 
 
 class HttpTlsSettings(BaseModel, extra="forbid", frozen=True):
@@ -62,6 +63,9 @@ class AccessSettings(BaseModel, extra="forbid", frozen=True):
     @field_validator("hosts")
     @classmethod
     def _lower_case(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
+        for host in hosts:
+            if not re.fullmatch(r"[\w.-]+(:\d+)?", host) and not is_address(host.strip("[]")):
+                raise ValueError(f"{host!r} is no name of a host, expected one as in monitor.plant.example")
         return tuple(host.lower() for host in hosts)
 
 

@@ -92,8 +92,11 @@ def test_a_database_of_others_is_left_alone(url: str, change: str, message: str)
 
 def test_nothing_is_put_into_the_database_of_another_program(url: str) -> None:
     executed(url, "CREATE TABLE orders (number INTEGER)")
+    file = Path(url.removeprefix("sqlite:///"))
+    before = file.read_bytes() if file.is_file() else b""
     with pytest.raises(StoreError, match="a table 'orders' that is not ours"):
         opened_and_closed(url)
+    assert before == (file.read_bytes() if file.is_file() else b"")
     assert executed(url, "SELECT * FROM orders") == []
 
 
