@@ -25,6 +25,10 @@ class RecordingError(RotorwatchError):
     """A recording cannot be read or written."""
 
 
+class PictureError(RotorwatchError):
+    """A picture cannot be written."""
+
+
 class EstimationError(RotorwatchError):
     """A window's statistics do not allow an estimate."""
 

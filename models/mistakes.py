@@ -35,6 +35,7 @@ _TYPES = {
     "path": "the name of a file in quotes",
     "datetime": "a date and time such as 2026-01-31T12:00:00Z",
 }
+_FORMS: dict[str, str] = {}
 _UNREADABLE = (
     (r"Invalid value", "expected a value here; text needs quotes"),
     (r"Cannot overwrite a value", "this name is there twice"),
@@ -262,7 +263,7 @@ def expectation(fault: ErrorDetails, info: FieldInfo | None = None) -> str:
         wanted = f"one of {', '.join(names)}" if len(names) > 1 else wanted
         hint = did_you_mean(str(value), names)
     elif kind == "string_pattern_mismatch":
-        wanted = (info.description if info is not None else None) or f"text of the form {context['pattern']}"
+        wanted = (info.description if info is not None else None) or _FORMS.get(context["pattern"], "another text")
     elif kind in {"too_short", "too_long", "string_too_short", "string_too_long"}:
         one = "character" if isinstance(value, str) else "entry"
         count = context.get("min_length", context.get("max_length"))
@@ -277,6 +278,12 @@ def expectation(fault: ErrorDetails, info: FieldInfo | None = None) -> str:
         described = "" if info is None or info.description is None else f": {info.description}"
         wanted += described if kind.startswith(("tuple", "list")) else ""
     return f"expected {wanted}{_shown(fault)}{hint}"
+
+
+def form(pattern: str, words: str) -> str:
+    """Return a pattern of text, for which `expectation` has words from now on."""
+    _FORMS[pattern] = words
+    return pattern
 
 
 def plainly(fault: Mapping[str, Any]) -> str:

@@ -11,19 +11,20 @@ OperationKind = Literal["acknowledge", "reset", "shelve", "unshelve", "remove-fr
 
 _LONGEST_REASON = 500
 
-_PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
+PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
+NOT_BLANK = r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$"
 
 _Reason = Annotated[
     str,
     Field(
         max_length=_LONGEST_REASON,
-        pattern=_PRINTABLE,
+        pattern=PRINTABLE,
         description="why; it goes into the log of alarms and the audit log",
         examples=["sensor cable is being replaced"],
     ),
 ]
 
-_GivenReason = Annotated[_Reason, Field(pattern=r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$")]
+_GivenReason = Annotated[_Reason, Field(pattern=NOT_BLANK)]
 
 _ExpectedState = Annotated[
     AlarmState | None,

@@ -8,6 +8,8 @@ from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.fields import REQUEST, Record
 from rotorwatch.records.health import Report
 
+TOML_NAME = r"^[A-Za-z0-9][A-Za-z0-9_. -]{0,94}\.toml$"
+
 
 class ReplayProgress(Record):
     """How far a replay is."""
@@ -102,7 +104,7 @@ class ReplayRequest(BaseModel):
     )
     machine_file_name: str = Field(
         default="sent.toml",
-        pattern=r"^[A-Za-z0-9][A-Za-z0-9_. -]{0,94}\.toml$",
+        pattern=TOML_NAME,
         description="what the replay calls that file",
         examples=["stricter.toml"],
     )

@@ -12,6 +12,7 @@ from typing import Annotated
 from fastapi import Depends, HTTPException, Query
 
 from models.errors import RotorwatchError
+from models.mistakes import form
 from rotorwatch.records.replays import ReplayJob
 from service.analysis.recorded import Held, Recorded, Sampled
 from service.analysis.recorded_window import recorded_window
@@ -33,8 +34,9 @@ _NO_SAMPLES = "no samples have come in"
 _NONE: list[str] = []
 _Files = tuple[tuple[Path, int], ...]
 
+_NAME = form(r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,199}\.mcap$", "a file name that ends in .mcap")
 Recordings = Annotated[
-    list[Annotated[str, Query(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,199}\.mcap$")]],
+    list[Annotated[str, Query(pattern=_NAME)]],
     Query(
         alias="recording",
         max_length=12,
@@ -44,7 +46,7 @@ Recordings = Annotated[
 _Replay = Annotated[
     str | None,
     Query(
-        pattern="^[0-9a-f]{12}$",
+        pattern=form("^[0-9a-f]{12}$", "the id of a replay, such as 4dedec2483d3"),
         description="id of a replay of this machine, for its recordings, machine file and what it read",
     ),
 ]

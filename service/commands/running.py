@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from models.errors import BundleError, MachineFileError, RecordingError, RotorwatchError
+from models.errors import BundleError, MachineFileError, PictureError, RecordingError, RotorwatchError
 from service.terminal.memory import prepare_memory
 
 ENDPOINT = "tcp/127.0.0.1:7447"
@@ -132,7 +132,7 @@ def _too_small(limit: int) -> str:
 def exit_code(error: RotorwatchError) -> int:
     """2 for a file or argument that cannot be used, such as a recording that is not there; 1 for everything else."""
     kinds = FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError
-    unusable = isinstance(error, RecordingError) and isinstance(error.__cause__, kinds)
+    unusable = isinstance(error, RecordingError | PictureError) and isinstance(error.__cause__, kinds)
     return 2 if unusable or isinstance(error, MachineFileError | BundleError) else 1
 
 

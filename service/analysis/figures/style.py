@@ -15,7 +15,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from models.errors import RecordingError
+from models.errors import PictureError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from rotorwatch.records.alarms import AlarmEventData
@@ -85,7 +85,7 @@ def draw(path: Path, look: Look, paint: Paint) -> None:
 
     Raises
     ------
-    RecordingError
+    PictureError
         If the file cannot be written.
     """
     with style.context(["default", _STYLE]):
@@ -109,7 +109,7 @@ def _write(figure: Figure, path: Path, dpi: float) -> None:
         else:
             figure.savefig(path, format="png", dpi=dpi, metadata={"Software": None}, pil_kwargs={"optimize": True})
     except OSError as error:
-        raise RecordingError(f"{path}: cannot be written ({error.strerror or error})") from error
+        raise PictureError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def heading(figure: Figure, look: Look, title: str, span_ns: tuple[int, int], *details: str) -> None:

@@ -11,6 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from models.alarm_names import ALARMS
 from models.diagnosis.networks.equations import EQUATIONS
+from models.mistakes import form
 from models.physics.rotor import PARAMETERS
 from rotorwatch.records.alarms import EventKind, Severity
 from rotorwatch.records.health import MEASURES
@@ -26,6 +27,7 @@ from rotorwatch.records.history import (
 )
 from rotorwatch.records.levels import LEVEL_MEASURES
 from rotorwatch.records.monitor import HistoryStatus
+from rotorwatch.records.operations import PRINTABLE
 from service.access.guard import Guard
 from service.access.problems import responses, written
 from service.api.views import (
@@ -65,7 +67,7 @@ _Quantity = Annotated[
     AfterValidator(_known_quantity),
     Query(description="what the windows are read for", json_schema_extra={"enum": list(_QUANTITIES)}),
 ]
-_ReadingName = Annotated[str, Query(pattern="^[A-Za-z0-9_.:-]{1,80}$")]
+_ReadingName = Annotated[str, Query(pattern=form("^[A-Za-z0-9_.:-]{1,80}$", "letters, digits and _ . : -, at most 80"))]
 _Names = Annotated[
     list[_ReadingName],
     Query(
@@ -78,8 +80,12 @@ _Points = Annotated[
     int | None,
     Query(ge=1, le=5000, description="reduce each to at most so many buckets of equal length, instead of one by one"),
 ]
-_Of = Annotated[str, Query(pattern=rf"^{_PLACE}/{_PLACE}/({'|'.join(_QUANTITIES)})/[A-Za-z0-9_.:-]{{1,80}}$")]
-_Plain = Annotated[str | None, Query(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+_OF = form(
+    rf"^{_PLACE}/{_PLACE}/({'|'.join(_QUANTITIES)})/[A-Za-z0-9_.:-]{{1,80}}$",
+    f"site/machine/quantity/name, where the quantity is one of {', '.join(_QUANTITIES)}",
+)
+_Of = Annotated[str, Query(pattern=_OF)]
+_Plain = Annotated[str | None, Query(max_length=200, pattern=PRINTABLE)]
 
 
 def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:

@@ -6,9 +6,18 @@ from typing import Annotated, Any
 from fastapi import Body, FastAPI, Header, HTTPException, Path, Query, Request, Response
 
 from models.errors import RotorwatchError
+from models.mistakes import form
 from rotorwatch.records.alarms import Alarm, AlarmState, AlarmStates
 from rotorwatch.records.example import example
-from rotorwatch.records.operations import OperationDone, OperationKind, OperationOrder, ReasonedOrder, ShelveOrder
+from rotorwatch.records.operations import (
+    NOT_BLANK,
+    PRINTABLE,
+    OperationDone,
+    OperationKind,
+    OperationOrder,
+    ReasonedOrder,
+    ShelveOrder,
+)
 from service.access.audit import AuditNote
 from service.access.guard import Guard
 from service.access.problems import responses
@@ -25,7 +34,9 @@ from service.monitor.alarms.operation import (
 )
 from service.stream.monitored import Monitored
 
-_IF_MATCH = r'^(\*|(W/)?"-?[0-9]{1,18}")$'
+_IF_MATCH = form(r'^(\*|(W/)?"-?[0-9]{1,18}")$', 'an ETag such as "17", or *')
+form(PRINTABLE, "one line of text")
+form(NOT_BLANK, "one line of text that says something")
 _ETAG = {
     "ETag": {
         "description": "version of the alarm in quotation marks, for If-Match",

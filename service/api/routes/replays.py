@@ -18,7 +18,7 @@ from models.commissioning.commissioned import FILE as COMMISSIONED
 from models.commissioning.commissioned import Installed
 from models.errors import MachineFileError, RotorwatchError
 from models.machine import load_machine_file
-from models.mistakes import changed
+from models.mistakes import changed, form
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings, is_loopback
 from rotorwatch.records.alarms import AlarmCloudEvent
@@ -26,6 +26,7 @@ from rotorwatch.records.example import example
 from rotorwatch.records.fields import Record
 from rotorwatch.records.health import Report
 from rotorwatch.records.replays import (
+    TOML_NAME,
     ReplayAlarmList,
     ReplayJob,
     ReplayList,
@@ -42,6 +43,7 @@ from service.recordings.replay.machine import check_sent, choose_machine, is_shi
 from service.settings.service import MachineEntry, ServiceSettings
 
 _PLACE = "/api/v1/replays"
+form(TOML_NAME, "a file name that ends in .toml")
 _JOB = f"{_PLACE}/{{replay_id}}"
 _END = re.compile(r'"end_ns":(\d+)')
 _SAME_NS = 1000

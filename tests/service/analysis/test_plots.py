@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from models.commissioning.commissioned import install
 from models.diagnosis.networks.bundle import load_bundle
-from models.errors import MachineFileError, RotorwatchError
+from models.errors import MachineFileError, PictureError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent
@@ -16,7 +17,7 @@ from rotorwatch.records.example import example
 from rotorwatch.records.health import MEASURES, Report
 from service.analysis.correlation import correlations_of, latest_window
 from service.analysis.figures.spectrum import Lines, paint_spectrum, paint_waterfall
-from service.analysis.figures.style import Look
+from service.analysis.figures.style import Look, draw
 from service.analysis.orbit import phase_lag_deg, read_orbits
 from service.analysis.recorded import Recorded
 from service.analysis.spectrum import read_spectrum, read_waterfall, shown_as
@@ -323,3 +324,8 @@ def test_a_trend_of_nothing_says_what_was_looked_for(faulty: Path) -> None:
     bare = [Report.model_validate(example(Report) | {"levels": [], "parameters": [], "verdict": None, "reason": ""})]
     with pytest.raises(RotorwatchError, match=r"neither parameter nor level was read .*: 1 reports, while the window"):
         trend_of(bare, (), None, "as recorded")
+
+
+def test_a_picture_that_cannot_be_written_is_no_recording(tmp_path: Path) -> None:
+    with pytest.raises(PictureError, match="cannot be written"):
+        draw(tmp_path / "nowhere" / "empty.png", Look(), lambda _: Figure())

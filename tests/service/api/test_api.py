@@ -176,6 +176,10 @@ def test_readings_are_reduced_to_a_plot(http: httpx.Client) -> None:
         ("alarms?name=k_by&name=level:y9", "demo/lab: no alarm level:y9; there are: k_by"),
         ("alarms/events?name=level:y9", "demo/lab: no alarm level:y9; there are: k_by"),
         ("../../../trends?of=demo/lab/level/y9:overall", "demo/lab: of is 'y9:overall', which is no level of it"),
+        (
+            "../../../trends?of=k_by",
+            "of: expected site/machine/quantity/name, where the quantity is one of parameter, ",
+        ),
     ],
 )
 def test_arguments_that_do_not_fit_together_are_explained(http: httpx.Client, query: str, text: str) -> None:
