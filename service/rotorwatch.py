@@ -285,7 +285,7 @@ def _checked(file: Path) -> str:
     from models.commissioning.commissioned import install  # noqa: PLC0415  # keeps --help quick
     from models.machine import load_machine_file  # noqa: PLC0415
     from models.mistakes import read_toml  # noqa: PLC0415
-    from service.access.tls import tls_context  # noqa: PLC0415
+    from service.access.tls import lapses, tls_context  # noqa: PLC0415
     from service.delivery.webhooks.webhooks import Webhooks  # noqa: PLC0415
     from service.settings.service import load_settings  # noqa: PLC0415
 
@@ -304,7 +304,7 @@ def _checked(file: Path) -> str:
     Webhooks(settings.webhooks)
     if settings.access.tls is not None:
         tls_context(settings.access.tls)
-    return f"settings for {', '.join(names)}"
+    return "; ".join((f"settings for {', '.join(names)}", *lapses(settings)))
 
 
 # After the commands of this module, which are the first in the list.

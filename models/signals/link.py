@@ -7,6 +7,7 @@ import ipaddress
 import json
 import os
 import re
+import ssl
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -147,6 +148,20 @@ def check_key(field: str, path: Path) -> None:
         )
     if "PRIVATE KEY-----" not in text:
         raise MachineFileError(f"link.{field}: {path}: expected a private key in PEM (-----BEGIN PRIVATE KEY-----)")
+
+
+def check_pair(field: str, certificate: Path, key: Path) -> None:
+    """Check that a private key is that of a certificate.
+
+    Raises
+    ------
+    MachineFileError
+        If it is another's, or one of them cannot be used.
+    """
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)
+    except ssl.SSLError as error:
+        raise MachineFileError(f"link.{field}: {key} is not the key of {certificate}, or one is damaged") from error
 
 
 def _secret(field: str, path: Path) -> str:
@@ -336,7 +351,7 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
                 "another name than the endpoint's"
             )
             if self.tls.mutual:
-                reasons.append(f"{self.tls.certificate} is not issued by the authority that is trusted there")
+                reasons.append(f"{self.tls.certificate} is not issued by the authority trusted there, or has expired")
             else:
                 reasons.append("a certificate is wanted from whoever connects, and link.tls.mutual is false")
         elif self.connect:
@@ -392,6 +407,7 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         if tls.certificate is not None and tls.key is not None:
             check_certificate("tls.certificate", tls.certificate)
             check_key("tls.key", tls.key)
+            check_pair("tls.key", tls.certificate, tls.key)
             for role, ends in (("listen", self.listen), ("connect", self.connect)):
                 if self._encrypted(ends) and (role == "listen" or tls.mutual):
                     items[f"{place}/{role}_certificate"] = json.dumps(str(tls.certificate))

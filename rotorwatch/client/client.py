@@ -350,7 +350,12 @@ class Client:
         try:
             answer = self._http.request(method, path, params=given, json=body, headers=headers)
         except httpx.TransportError as error:
-            raise NoAnswer(f"{self._http.base_url}: {str(error) or type(error).__name__}") from error
+            # Of TLS, 1.3 at least, nothing comes back that would say so.
+            dropped = isinstance(error, httpx.RemoteProtocolError | httpx.ReadError | httpx.WriteError)
+            secure = self._http.base_url.scheme == "https"
+            why = "it wants a certificate of an authority it trusts" if secure else "the address begins with https"
+            hint = f"; perhaps {why}" if dropped else ""
+            raise NoAnswer(f"{self._http.base_url}: {str(error) or type(error).__name__}{hint}") from error
         except ValueError as error:  # NaN and infinity are no JSON
             raise ClientError(f"{path}: expected finite numbers (found {body})") from error
         if answer.status_code != httpx.codes.OK:

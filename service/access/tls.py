@@ -1,13 +1,16 @@
 """Certificate and key of the HTTP server, checked before anything listens."""
 
 import ssl
+import time
 from pathlib import Path
 from typing import Any
 
 from models.errors import MachineFileError
 from service.settings.access import AccessSettings, HttpTlsSettings
+from service.settings.service import ServiceSettings
 
 _READABLE_BY_OTHERS = 0o004
+_SOON_S = 30 * 86_400.0
 
 
 def server_arguments(access: AccessSettings) -> dict[str, Any]:
@@ -60,6 +63,24 @@ def tls_context(tls: HttpTlsSettings) -> ssl.SSLContext:
             raise MachineFileError(f"{tls.client_ca}: tls.client_ca holds no certificate (PEM)") from error
         context.verify_mode = ssl.CERT_REQUIRED
     return context
+
+
+def lapses(settings: ServiceSettings) -> list[str]:
+    """Certificates of a monitor that have expired, or do so within a month: whoever connects refuses them then."""
+    given = (settings.access.tls, settings.link.tls, None if settings.fleet is None else settings.fleet.tls)
+    return [
+        *filter(None, (_lapse(one.certificate) for one in given if one is not None and one.certificate is not None))
+    ]
+
+
+def _lapse(certificate: Path) -> str:
+    try:
+        decoded = ssl._ssl._test_decode_cert(str(certificate))  # type: ignore[attr-defined]  # no other way
+        end_s = ssl.cert_time_to_seconds(decoded["notAfter"])
+    except (OSError, ValueError):
+        return ""
+    left_s, day = end_s - time.time(), time.strftime("%Y-%m-%d", time.gmtime(end_s))
+    return "" if left_s > _SOON_S else f"{certificate} {'expired' if left_s < 0 else 'expires'} on {day}"
 
 
 def _check_readable(name: str, path: Path) -> None:

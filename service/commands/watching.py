@@ -104,6 +104,10 @@ def status(
     ca: Annotated[
         Path | None, typer.Option("--ca", metavar="FILE", help="Authority (PEM) of the API's certificate.")
     ] = None,
+    certificate: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option("--certificate", metavar="FILE KEY", help="Own certificate and key (PEM), if the API wants one."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document, for another program.")] = False,
 ) -> None:
     """Table of all machines of a running monitor.
@@ -122,7 +126,7 @@ def status(
     """
     healths, code, why = [], _NO_ANSWER, ""
     try:
-        healths = _fetch_healths(url, token, ca)
+        healths = _fetch_healths(url, token, ca, certificate)
         code = max((_exit_code(health) for health in healths), key=(0, _NO_DATA, _ALARM).index, default=0)
     except MachineFileError:
         raise
@@ -214,14 +218,16 @@ def _show_json(message: "TopicMessage") -> None:
     sys.stdout.flush()
 
 
-def _fetch_healths(url: str, token: str | None, ca: Path | None) -> "list[Health]":
+def _fetch_healths(
+    url: str, token: str | None, ca: Path | None, certificate: tuple[Path, Path] | None
+) -> "list[Health]":
     # An HTTP client, for which --help must not wait.
     from rotorwatch import AccessRefused, Client, ClientError, NoAnswer, RequestRefused  # noqa: PLC0415
 
     try:
-        client = Client(url, token, ca=ca, timeout_s=5.0)
+        client = Client(url, token, ca=ca, certificate=certificate, timeout_s=5.0)
     except ClientError as error:
-        raise MachineFileError(f"--url, --token, --ca: {error}") from error
+        raise MachineFileError(f"--url, --token, --certificate, --ca: {error}") from error
     try:
         with client:
             return [client.health(f"{one.site}/{one.machine}") for one in client.machines()]
@@ -232,13 +238,13 @@ def _fetch_healths(url: str, token: str | None, ca: Path | None) -> "list[Health
     except RequestRefused as error:
         raise RotorwatchError(f"{url}: the monitor's HTTP API answers {error.status}: {error}") from error
     except NoAnswer as error:
-        why = str(error.__cause__)
+        why = str(error).partition(": ")[2]
         if "CERTIFICATE_VERIFY_FAILED" in why:
             raise RotorwatchError(
                 f"{url}: its certificate is not trusted under this name: {why}; --ca takes the authority (PEM) of a "
                 "certificate of your own, --url the name in it"
             ) from error
-        why = re.sub(r"\[Errno -?\d+\] ", "", why) or type(error.__cause__).__name__
+        why = re.sub(r"\[Errno -?\d+\] ", "", why)
         raise RotorwatchError(f"{url}: the monitor's HTTP API does not answer: {why}") from error
     except ClientError as error:
         raise RotorwatchError(f"{url}: this is not the HTTP API of a monitor: {error}") from error

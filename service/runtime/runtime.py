@@ -16,6 +16,7 @@ from pathlib import Path
 from rotorwatch.records.health import Health
 from rotorwatch.records.monitor import MachineReadiness, Readiness
 from service.access.guard import Guard
+from service.access.tls import lapses
 from service.api.app import create_app
 from service.api.routes.replays import ReplayRequests
 from service.api.server import HttpError, HttpServer
@@ -168,6 +169,8 @@ class Runtime:
             server.start(app)
             self._undo = undo.pop_all()
         _log.info("running", http=server.url, machines=len(self._monitored))
+        for said in lapses(self.settings):
+            _log.warning("a certificate has to be renewed, and the monitor restarted", which=said)
 
     def stop(self) -> None:
         """Stop in the reverse order of starting.

@@ -198,6 +198,13 @@ def test_certificates_that_cannot_be_used_are_named(tmp_path: Path, file: str, t
         link.zenoh_items()
 
 
+def test_a_key_of_another_certificate_is_refused(tmp_path: Path) -> None:
+    link = LinkSettings(listen=TLS_ENDPOINT, tls=certificate(tmp_path))
+    (tmp_path / "lab.key").write_bytes(trustme.CA().issue_cert("localhost").private_key_pem.bytes())
+    with pytest.raises(MachineFileError, match=r"lab\.key is not the key of .*lab\.pem"):
+        link.zenoh_items()
+
+
 def test_a_certificate_serves_the_role_of_the_endpoint(tmp_path: Path) -> None:
     tls = certificate(tmp_path)
     one_sided = tls.model_copy(update={"mutual": False})

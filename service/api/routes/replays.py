@@ -99,6 +99,13 @@ class ReplayRequests:
         if len(machines) != 1:
             raise HTTPException(422, f"recordings: of several machines ({', '.join(machines)}), expected one")
         offline = request.mode == "offline"
+        link = self._settings.link
+        if not offline and (link.grants or link.tls or link.user or link.passwords_file):  # it would not be let in
+            raise HTTPException(
+                409,
+                "mode: a paced replay needs a network without grants, passwords and certificates, expected offline, or "
+                "rotorwatch replay on a network of its own",
+            )
         sent = request.machine_file is not None
         machine = self._machine(request, machines[0]) if offline and not sent else None
         bundle = self._beside_sent(request, machines[0])
@@ -129,7 +136,7 @@ class ReplayRequests:
             arguments += [f"--set={line}" for line in request.changes]
         else:
             arguments += ["--pace", f"{request.pace:g}", "--prefix", job.prefix]
-            arguments += [part for end in _endpoints(self._settings.link) for part in ("--connect", end)]
+            arguments += [part for end in _endpoints(link) for part in ("--connect", end)]
         try:
             return self.jobs.start(JobPlan(job, tuple(arguments), request.machine_file or "", bundle))
         except TooManyReplaysError as error:

@@ -1,6 +1,7 @@
 """Tokens: made, taken apart, checked, hidden; rates and settings beside them; and the certificates of TLS."""
 
 import ssl
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import httpx
@@ -8,16 +9,19 @@ import pytest
 import trustme
 from hypothesis import given
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
 from models.errors import MachineFileError
 from models.mistakes import in_folder
 from service.access.credentials import network_of
 from service.access.rates import MovingWindow
 from service.access.scopes import Scope
-from service.access.tls import server_arguments, tls_context
+from service.access.tls import lapses, server_arguments, tls_context
 from service.access.tokens import masked, new_token, parse_token, token_is_valid
 from service.history.records import TokenRecord
+from service.rotorwatch import app
 from service.settings.access import AccessSettings, HttpTlsSettings, check_access
+from service.settings.service import ServiceSettings
 from tests.service.rig.guarded import guarded
 from tests.sure import sure
 
@@ -220,9 +224,28 @@ def test_a_client_without_a_certificate_is_refused_where_one_is_asked_for(
         trustme.CA().issue_cert("operator@plant.example").configure_cert(stranger)
         with monitor.client(token, verify=known) as client:
             assert client.get("/health").status_code == 200
+        own, ca = authority.issue_cert("operator@plant.example"), tmp_path / "ca.pem"
+        file, key = tmp_path / "own.pem", tmp_path / "own.key"
+        file.write_bytes(own.cert_chain_pems[0].bytes())
+        key.write_bytes(own.private_key_pem.bytes())
+        status = ("status", "--url", monitor.url, "--token", token, "--ca", str(ca))
+        found = CliRunner().invoke(app, [*status, "--certificate", str(file), str(key)])
+        assert "answers 404" in found.stderr  # of an application that has no machines
+        found = CliRunner().invoke(app, status)
+        assert (found.exit_code, "perhaps it wants a certificate" in found.stderr) == (4, True)
         for context in (stranger, trusting(authority)):
             with monitor.client(token, verify=context) as client, pytest.raises(httpx.TransportError):
                 client.get("/health")
+
+
+@pytest.mark.parametrize(("days", "said"), [(-1.0, ".pem expired on "), (20.0, "pem expires on "), (40.0, "")])
+def test_a_certificate_that_has_to_be_renewed_is_told(
+    tmp_path: Path, authority: trustme.CA, days: float, said: str
+) -> None:
+    tls = files(tmp_path, authority)
+    issued = authority.issue_cert("localhost", not_after=datetime.now(UTC) + timedelta(days=days))
+    tls.certificate.write_bytes(issued.cert_chain_pems[0].bytes())
+    assert [said in one for one in lapses(ServiceSettings(access=AccessSettings(tls=tls)))] == [True] * bool(said)
 
 
 def refused(tls: HttpTlsSettings) -> str:

@@ -8,12 +8,15 @@ from typing import Any, TypeVar
 
 import httpx
 import pytest
+from fastapi import HTTPException
 from pydantic import BaseModel
 
 import models.machine
+from models.signals.keys import Grant
 from rotorwatch.records.recordings import RecordingDetail, RecordingList
-from rotorwatch.records.replays import ReplayAlarmList, ReplayJob, ReplayList, ReplayReportList
+from rotorwatch.records.replays import ReplayAlarmList, ReplayJob, ReplayList, ReplayReportList, ReplayRequest
 from service.api.routes.replays import ReplayRequests
+from service.recordings.catalogue import Catalogue
 from service.runtime.runtime import Runtime, running
 from service.settings.service import HttpSettings, RecordingSettings, ReplaySettings, ServiceSettings
 from simulator.scenario import parse_fault
@@ -285,6 +288,14 @@ def test_switched_off_nothing_can_be_started(directory: Path) -> None:
         found = problem(client.post(REPLAYS, json={"recordings": [ID]}), 403)
         assert "[replay] enabled" in found.detail
         assert len(get(client, RECORDINGS, RecordingList, until_ns=START_NS + DAY_NS).recordings) == 3
+
+
+def test_a_paced_replay_that_nobody_would_let_in_is_refused(directory: Path) -> None:
+    guarded = plan(directory)
+    grant = Grant(who=("logger",), publishes=("demo/lab",))
+    guarded = guarded.model_copy(update={"link": guarded.link.model_copy(update={"grants": (grant,)})})
+    with pytest.raises(HTTPException, match="without grants, passwords and certificates"):
+        ReplayRequests(guarded, Catalogue(directory)).start(ReplayRequest(recordings=(ID,), mode="paced"))
 
 
 @pytest.mark.parametrize(
