@@ -31,7 +31,19 @@ from models.signals.wire import ARROW_ENCODING, decode_block, may_be_block
 EARLIER_COURSES = 64  # courses that are remembered, so that repetitions of their blocks are known as such
 # The year 2200: a clock that says more is broken, and times beyond 2262 fit nowhere.
 _LATEST_NS = 7_258_118_400_000_000_000
+_MANY_S = 999_999.0
 _SURELY_S = 1.0  # a block that is next in sequence but later than this has a wrong time rather than a gap before it
+
+
+def lasting(seconds: float) -> str:
+    """A time in words: in days where seconds would have an exponent.
+
+    Examples
+    --------
+    >>> lasting(12.5), lasting(2846490.0)
+    ('12.5 s', '32.9 days')
+    """
+    return f"{seconds:.6g} s" if abs(seconds) < _MANY_S else f"{seconds / 86_400.0:.1f} days"
 
 
 class Reason(StrEnum):
@@ -273,20 +285,20 @@ class Gate:
             if same_run and block.sequence < expected.sequence:
                 return self._refuse(
                     Reason.OVERLAP,
-                    f"block {block.sequence} starts {-late_s:.6g} s before the end of block {expected.sequence - 1}: "
-                    "a repetition or out of order",
+                    f"block {block.sequence} starts {lasting(-late_s)} before the end of block "
+                    f"{expected.sequence - 1}: a repetition or out of order",
                 )
             return self._resynchronise(
                 block,
                 Reason.PAST,
-                f"start_ns {block.start_ns} of block {block.sequence} lies {-late_s:.6g} s before what was received "
+                f"start_ns {block.start_ns} of block {block.sequence} lies {lasting(-late_s)} before what was received "
                 "already; believed if the clock stays there",
             )
         if late_s > self._settings.max_jump_s:
             return self._resynchronise(
                 block,
                 Reason.FUTURE,
-                f"start_ns {block.start_ns} of block {block.sequence} lies {late_s:.6g} s ahead, expected at most "
+                f"start_ns {block.start_ns} of block {block.sequence} lies {lasting(late_s)} ahead, expected at most "
                 f"{self._settings.max_jump_s:g} s; believed if the clock stays there",
             )
         next_in_sequence = block.run == expected.run and block.sequence == expected.sequence
@@ -294,8 +306,8 @@ class Gate:
             return self._resynchronise(
                 block,
                 Reason.FUTURE,
-                f"start_ns {block.start_ns} lies {late_s:.6g} s ahead although block {block.sequence} is the next one; "
-                "believed if the clock stays there",
+                f"start_ns {block.start_ns} lies {lasting(late_s)} ahead although block {block.sequence} is the next "
+                "one; believed if the clock stays there",
             )
         what = "the publisher restarted and " if block.run != expected.run else ""
         missed = block.sequence - expected.sequence if block.run == expected.run else 0
@@ -305,9 +317,9 @@ class Gate:
             gap_s = late_s - schedule.silence_s
             count = max(1, round(gap_s / schedule.every_s))
             missing = "a snapshot is missing" if count == 1 else f"{count} snapshots are missing"
-            text = f"{self._name}: {what}{missing}, {gap_s:.6g} s{blocks}"
+            text = f"{self._name}: {what}{missing}, {lasting(gap_s)}{blocks}"
             return Admission(text=text, gap_s=gap_s, new_snapshot=True)
-        return Admission(text=f"{self._name}: {what}{late_s:.6g} s of data are missing{blocks}", gap_s=late_s)
+        return Admission(text=f"{self._name}: {what}{lasting(late_s)} of data are missing{blocks}", gap_s=late_s)
 
     def _resynchronise(self, block: SampleBlock, reason: Reason, text: str) -> Admission:
         """Refuse, unless enough consecutive blocks agree that this is where the stream is now."""
@@ -333,9 +345,11 @@ class Gate:
         self._candidate = None
         self._go_on(candidate)
         if new_run:
-            text = f"the publisher restarted, {abs(step_s):.6g} s {'earlier' if step_s < 0 else 'later'} in data time"
+            text = (
+                f"the publisher restarted, {lasting(abs(step_s))} {'earlier' if step_s < 0 else 'later'} in data time"
+            )
         else:
-            text = f"the stream's clock stepped by {step_s:.6g} s; following it"
+            text = f"the stream's clock stepped by {lasting(step_s)}; following it"
         return Admission(text=f"{self._name}: {text}", clock_step_s=step_s, new_run=new_run)
 
     def _follow(self, block: SampleBlock) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from models.ingest import lasting
 from models.machine import MachineFile
 from models.signals.block import FloatArray
 from models.signals.channels import time_unit_ns
@@ -167,7 +168,7 @@ def check_order(path: Path, column: Reference | None, times: FloatArray, first_r
     if wrong.size:
         at = int(wrong[0]) + 1
         back_ns = times[at - 1] - times[at]
-        what = "repeats the time of the row before" if back_ns == 0 else f"goes back by {back_ns / 1e9:.9g} s"
+        what = "repeats the time of the row before" if back_ns == 0 else f"goes back by {lasting(back_ns / 1e9)}"
         hint = (
             "; times written with too few decimals? Leave the column out and give time.rate_hz" if back_ns == 0 else ""
         )

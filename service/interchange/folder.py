@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from models.ingest import lasting
 from models.machine import MachineFile
 from models.signals.block import FloatArray
 from service.interchange.angle import pulse_times
@@ -161,8 +162,8 @@ def joined(
             offset_ns = float(clock.origin_ns - first.origin_ns)
             if offset_ns < end_ns - step_ns / 2:
                 raise SourceError(
-                    f"{file.path}: begins {(end_ns - offset_ns) / 1e9:.6g} s before the end of {before.name}, expected "
-                    "the files of a folder one after the other"
+                    f"{file.path}: begins {lasting((end_ns - offset_ns) / 1e9)} before the end of {before.name}, "
+                    "expected the files of a folder one after the other"
                 )
             if offset_ns > end_ns + step_ns / 2:
                 read.gaps.append(Gap(end_ns, offset_ns, 0, file.path.name))

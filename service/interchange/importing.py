@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from models.ingest import lasting
 from models.machine import MachineFile
 from models.signals.block import lowest_valid_hz, settling_s
 from models.signals.keyphasor import PulseTrain
@@ -162,10 +163,10 @@ def _gap_lines(done: Imported) -> list[str]:
     if schedule is not None:
         gaps = [gap for gap in gaps if not schedule.is_silence((gap.to_ns - gap.from_ns) / 1e9)]
     total_s = sum(gap.to_ns - gap.from_ns for gap in gaps) / 1e9
-    lines = [f"gaps: {len(gaps)}, {total_s:.6g} s in all, kept as gaps" if gaps else "gaps: none"]
+    lines = [f"gaps: {len(gaps)}, {lasting(total_s)} in all, kept as gaps" if gaps else "gaps: none"]
     lines += [
         f"  before row {gap.row + 1}{f' of {gap.file}' if done.read.files > 1 else ''}: "
-        f"{(gap.to_ns - gap.from_ns) / 1e9:.6g} s from {rfc3339(done.clock.origin_ns + round(gap.from_ns))}"
+        f"{lasting((gap.to_ns - gap.from_ns) / 1e9)} from {rfc3339(done.clock.origin_ns + round(gap.from_ns))}"
         for gap in gaps[:_LISTED]
     ]
     if len(gaps) > _LISTED:

@@ -32,7 +32,7 @@ from models.diagnosis.verdict.sequential_state import SequentialState
 from models.diagnosis.verdict.stretch import stretch_of
 from models.diagnosis.window import WindowStatistics
 from models.errors import CheckpointError, EstimationError, WireError
-from models.ingest import Admission, Gate, Reason
+from models.ingest import Admission, Gate, Reason, lasting
 from models.levels.judgement import growth_seen
 from models.signals.block import NewestBlocks, SampleBlock
 from models.signals.wire import decode_block
@@ -383,13 +383,13 @@ class MachineMonitor:
             name, ingest = self.machine.title, self.machine.ingest
             late_s = (block.start_ns - self.end_ns) / 1e9
             if abs(late_s) > ingest.max_jump_s:
-                text = f"{name}: the stream's clock is {late_s:.6g} s from where it was before the restart"
+                text = f"{name}: the stream's clock is {lasting(late_s)} from where it was before the restart"
                 verdict = Admission(text=text, clock_step_s=late_s, new_run=block.sequence == 0)
             elif late_s > ingest.time_tolerance_s:
-                text = f"{name}: {late_s:.6g} s of data are missing over the restart"
+                text = f"{name}: {lasting(late_s)} of data are missing over the restart"
                 verdict = Admission(text=text, gap_s=late_s)
         if dropped and verdict.gap_s > 0:
-            text = f"{dropped} blocks ({verdict.gap_s:.6g} s of data) were not evaluated: the monitor cannot keep up"
+            text = f"{dropped} blocks ({lasting(verdict.gap_s)} of data) were not evaluated: the monitor cannot keep up"
             verdict = replace(verdict, text=f"{self.machine.title}: {text}")
         return self._count(verdict)
 

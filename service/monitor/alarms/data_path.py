@@ -7,7 +7,7 @@ import numpy as np
 from models.alarm_names import CLOCK, CONFLICT, FAULT, GAP, OVERLOADED, PHASE_REFERENCE, STREAM_LOST, data_alarm
 from models.checkpoint import checked
 from models.diagnosis.window import WindowStatistics
-from models.ingest import Admission
+from models.ingest import Admission, lasting
 from models.machine import MachineFile
 from rotorwatch.records.alarms import Evidence
 from rotorwatch.records.sensor_faults import FaultKind
@@ -149,7 +149,7 @@ class DataPathAlarms:
         self._unseen_blocks += blocks
         self._unseen_s += gap_s
         skipped = f"; windows skipped: {self._unseen_windows}" if self._unseen_windows else ""
-        lost = f"; not evaluated: {self._unseen_blocks} blocks, {self._unseen_s:.6g} s of data"
+        lost = f"; not evaluated: {self._unseen_blocks} blocks, {lasting(self._unseen_s)} of data"
         return f"this computer cannot keep up{skipped}{lost if self._unseen_blocks else ''}"
 
     def _lost(self, end_ns: int) -> None:
