@@ -411,7 +411,16 @@ _UNITS: dict[str, dict[str, float]] = {
     Quantity.SHAFT_ANGLE: {"rad": 1.0, "deg": _DEGREE, "°": _DEGREE, "rev": _TURN},
 }
 
-_TIME_NS: dict[str, float] = {"s": 1e9, "ms": 1e6, "us": 1e3, "µs": 1e3, "ns": 1.0, "min": 60e9, "h": 3600e9}
+_TIME_NS: dict[str, float] = {
+    "s": 1e9,
+    "ms": 1e6,
+    "us": 1e3,
+    "µs": 1e3,
+    "ns": 1.0,
+    "min": 60e9,
+    "h": 3600e9,
+    "d": 86_400e9,
+}
 _DETECTED = re.compile(r"(?:[ _(-]|\b)(pp|p-p|pk-pk|pkpk|peak-peak|0-p|0-pk|pk|peak|rms|avg)\)?$", re.IGNORECASE)
 
 

@@ -48,7 +48,7 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
 
     column: _Name | None = Field(default=None, description="column with the time of each row")
     index: int | None = Field(default=None, ge=0, description="its column, in a table within an array file")
-    unit: str = Field(default="s", description="of that column: s, ms, us, ns, min, h; datetime for dates and times")
+    unit: str = Field(default="s", description="of that column: s, ms, us, ns, min, h, d; datetime for dates and times")
     start: datetime | Literal["unix"] | None = Field(
         default=None, description="time of the first row, or of 0 in the time column; unix if that counts from 1970"
     )

@@ -146,6 +146,8 @@ class CsvSource(_Table):
                                 what = "an ISO 8601 time" if self._is_datetime(name) else "a number"
                                 if name == self._time_column and not self._is_datetime(name):
                                     what += ', or ISO 8601 times with time.unit = "datetime" in the mapping'
+                                if self._form.decimal == "." and re.fullmatch(r"[-+]?\d+,\d+", cell.strip()):
+                                    what += ", or decimal commas with csv.decimal in the mapping"
                                 return (
                                     f"{self.path}: row {row + offset + 1}, column {name!r}: found {cell!r}, "
                                     f"expected {what}"

@@ -56,6 +56,13 @@ def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
     assert done.written.samples == 1000
 
 
+def test_days_of_a_spreadsheet_are_times(tmp_path: Path) -> None:
+    rows = [f"{46053.5 + number / 2000 / 86_400:.12f},{row.partition(',')[2]}" for number, row in enumerate(GOOD)]
+    days = '[time]\ncolumn = "t"\nunit = "d"\nstart = "1899-12-30T00:00:00Z"\n' + CHANNELS
+    done, _ = imported(tmp_path, table(tmp_path / "run.csv", rows), days)
+    assert (done.written.samples, done.clock.origin_ns) == (1000, 1_769_860_800 * 10**9)
+
+
 @pytest.mark.parametrize(
     ("rows", "mapping", "header", "said"),
     [
@@ -65,6 +72,9 @@ def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
         )),
         *((with_cell(cell), TEXT, HEADER, (f"row 737, column 'v': found {cell!r}, expected a number",))
           for cell in ("OVERLOAD", "1.2.3", "--")),
+        ([row.replace(",", ";").replace(".", ",") for row in GOOD], '[csv]\ndelimiter = ";"\n' + TEXT, "t;x;v;a", (
+            "row 1, column 't': found '0,0'", "or decimal commas with csv.decimal in the mapping",
+        )),
         ([*GOOD[:500], "0.25,1.0", *GOOD[501:]], TEXT, HEADER, (
             "run.csv: ", "row 501: Expected 4 columns, got 2",
         )),
@@ -104,7 +114,7 @@ def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
         )) for year in (1900, 2300, 9999)),
     ],
     ids=[
-        *("missing column", "unmapped channel", "text", "two dots", "no number", "short row", "other signs"),
+        *("missing column", "unmapped channel", "text", "two dots", "no number", "comma", "short row", "other signs"),
         *("time goes back", "no second time", "no time", "half the rate", "few decimals"),
         *("other rate", "rate contradicts times", "five decimals", "dates"),
         *("no row", "one row", "no start", "1900", "2300", "9999"),
