@@ -208,6 +208,7 @@ def restore(into: HistoryFile, backup: Path) -> Path | None:
             if descriptor is None:
                 raise StoreError(f"{file}: a monitor writes it ({path.name} is locked): stop it first")
             undo.callback(os.close, descriptor)
+        file.parent.mkdir(parents=True, exist_ok=True)  # on another computer there is none yet
         copy = file.with_name(f"{file.name}.restored")
         copy.unlink(missing_ok=True)
         back_up(backup, copy)

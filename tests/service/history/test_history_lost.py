@@ -195,6 +195,7 @@ def test_a_backup_is_taken_from_a_running_monitor_and_restored_without_one(tmp_p
     assert not list(tmp_path.glob("*.restored*"))
     with bench(tmp_path) as at:
         assert at.log()[: len(before)] == before
+    assert history(tmp_path / "another" / "computer", "restore", str(copy))[0] == 0
     history_of(tmp_path).write_bytes(data)
     for end in ("-wal", "-shm"):
         Path(f"{history_of(tmp_path)}{end}").unlink(missing_ok=True)
