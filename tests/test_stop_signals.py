@@ -1,9 +1,13 @@
 """Signals stop the programs wherever they find them, in the middle of a wait as well, or while they load."""
 
+import os
+import signal
 import subprocess
 import sys
 
 import pytest
+
+from service.terminal.stopping import stop_request
 
 # Every line that the main thread runs during the wait, inside the standard library too, is interrupted by the signal.
 _SCRIPT = """
@@ -29,6 +33,17 @@ def test_a_signal_in_the_middle_of_a_wait_stops(module: str, name: str) -> None:
     script = _SCRIPT.format(module=module, name=name)
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60.0, check=True)
     assert run.stdout == "True\n"
+
+
+@pytest.mark.parametrize(("ignored", "stopped"), [(False, True), (True, False)], ids=["terminal", "nohup"])
+def test_a_terminal_that_is_closed_stops_in_order(ignored: bool, stopped: bool) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN if ignored else signal.SIG_DFL)
+    try:
+        with stop_request() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert stop.wait(1.0) is stopped
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 _LOADING = """

@@ -10,7 +10,7 @@ _TICK_S = 0.25
 
 
 class StopRequest:
-    """Whether SIGINT or SIGTERM has come."""
+    """Whether SIGINT, SIGTERM or SIGHUP has come."""
 
     def __init__(self) -> None:
         # Not an event: the handler may interrupt the main thread where it holds the event's lock, and wait for ever.
@@ -39,9 +39,14 @@ class StopRequest:
 
 @contextmanager
 def stop_request() -> Iterator[StopRequest]:
-    """Turn SIGINT and SIGTERM into a request to stop; the signals' former handlers come back afterwards."""
+    """Turn SIGINT, SIGTERM and SIGHUP into a request to stop; the signals' former handlers come back afterwards.
+
+    SIGHUP comes when the terminal is closed; what was started with nohup goes on.
+    """
     stop = StopRequest()
-    before = {number: signal.signal(number, lambda *_: stop.ask()) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    numbers += [] if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else [signal.SIGHUP]
+    before = {number: signal.signal(number, lambda *_: stop.ask()) for number in numbers}
     try:
         yield stop
     finally:
