@@ -148,7 +148,8 @@ class ReplayRequests:
         """One replay; raises HTTPException 404 if there is none."""
         found = self.jobs.find(replay_id)
         if found is None:
-            raise HTTPException(404, f"no replay {replay_id}; they are forgotten when the service stops")
+            kept = self._settings.replay.kept
+            raise HTTPException(404, f"no replay {replay_id}; the latest {kept} are kept, until the service stops")
         return found
 
     def installed(self, job: ReplayJob) -> Installed:

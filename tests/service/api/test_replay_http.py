@@ -323,7 +323,8 @@ def test_the_service_ends_its_replays_and_old_results_make_room(directory: Path)
         assert (folder / first.id).is_dir()
         second = start(client, mode="paced", pace=0.1)
         assert not (folder / first.id).exists()
-        problem(client.get(f"{REPLAYS}/{first.id}"), 404)
+        found = problem(client.get(f"{REPLAYS}/{first.id}"), 404)
+        assert "the latest 1 are kept, until the service stops" in found.detail
         until(lambda: get(client, f"{REPLAYS}/{second.id}", ReplayJob).progress is not None, "first block")
         jobs = runtime.replays.jobs
     stopped = sure(jobs.find(second.id))
