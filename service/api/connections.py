@@ -93,6 +93,16 @@ class _Connection:
             self.taken_s = now_s
         self.unsent, self.taken = unsent, taken
 
+    @property
+    def idle(self) -> bool:
+        """Whether its latest request is answered and the next has not begun, which is no trouble.
+
+        Over TLS such a connection outlives uvicorn's own limit: it waits for a farewell of the other side.
+        """
+        protocol = self.protocol
+        answered = self.doing == "head" and self.request is not None
+        return answered and protocol is not None and not protocol.conn.trailing_data[0]
+
     def waited_for(self, now_s: float) -> float | None:
         """Since when the server waits for the other side; None if it does not, or for moments."""
         if self.doing != "answering":
@@ -221,7 +231,10 @@ class HttpConnections:
             one.taken_s = min(now_s, one.taken_s + late_s)
             one.look(now_s)
             if now_s - one.since_s > self._longest_s.get(one.doing, float("inf")):
-                self._say("ended", one.address, f"the {one.doing} took longer than {self._longest_s[one.doing]:g} s")
+                if not one.idle:
+                    self._say(
+                        "ended", one.address, f"the {one.doing} took longer than {self._longest_s[one.doing]:g} s"
+                    )
                 one.end()
             elif now_s - one.taken_s > self._send_s:
                 self._say("ended", one.address, f"nothing of the answer was taken for {self._send_s:g} s")

@@ -428,7 +428,7 @@ def checked_url(url: str) -> URL:
         raise StoreError(f"the URL {made.render_as_string(hide_password=True)} names no {wanted}; {_FORMS}")
     if made.drivername == "sqlite" and made.query:
         raise StoreError(f"the URL has options ({', '.join(made.query)}), of which a file has none; {_FORMS}")
-    if not 0 < (made.port or 1) <= _HIGHEST_PORT:
+    if made.port is not None and not 0 < made.port <= _HIGHEST_PORT:
         raise StoreError(f"the port in the URL is {made.port}, expected 1 to {_HIGHEST_PORT}")
     return made
 

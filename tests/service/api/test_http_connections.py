@@ -189,6 +189,22 @@ def test_handshakes_that_never_end_make_room_for_others(tmp_path: Path) -> None:
         until(lambda: all(map(over, waiting)), "end of the handshakes")
 
 
+def test_a_client_that_has_nothing_to_ask_is_no_trouble(tmp_path: Path) -> None:
+    authority = trustme.CA()
+    access = AccessSettings(tls=files(tmp_path, authority))
+    with monitor(access, head_timeout_s=0.5) as runtime, capture_logs() as logs:
+        with httpx.Client(verify=trusting(authority), trust_env=False, timeout=180.0) as client:
+            assert client.get(f"{runtime.http_url}/healthz").status_code == 200
+            pool = client._transport._pool  # type: ignore[attr-defined]  # a connection that nobody asks anything on
+            (idle,) = pool.connections
+            line = idle._connection._network_stream.get_extra_info("socket")
+            until(lambda: bool(select.select([line], [], [], 0)[0]), "end of the idle connection")
+        assert [one for one in logs if one["event"].startswith("connection ended")] == []
+        with connections(runtime.http_url, 1) as waiting:
+            until(lambda: all(map(over, waiting)), "end of the silent")
+        assert [one["why"] for one in logs if one["event"].startswith("connection ended")] != []
+
+
 def test_a_full_table_of_files_is_said_once_a_minute() -> None:
     app = FastAPI()
     app.get("/healthz")(lambda: True)
