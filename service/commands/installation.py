@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import ENDPOINT, ConnectOption, ListenOption, finite, prepare_numerics
+from service.commands.replay import link_of
+from service.commands.running import ENDPOINT, ConnectOption, LinkOption, ListenOption, finite, prepare_numerics
 
 if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from models.machine import MachineFile
@@ -171,6 +172,7 @@ def doctor(
     machine: Annotated[str, typer.Option("--machine", metavar="FILE", help="Machine file: shipped name or path.")],
     connect: ConnectOption = None,
     listen: ListenOption = None,
+    link: LinkOption = None,
     seconds: Annotated[
         float | None,
         typer.Option(
@@ -196,18 +198,15 @@ def doctor(
     """
     prepare_numerics()
     from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
-    from models.mistakes import checked  # noqa: PLC0415
-    from models.signals.link import LinkSettings  # noqa: PLC0415
     from models.signals.recording import RecordedMessage  # noqa: PLC0415
     from service.analysis.arrival import examined  # noqa: PLC0415
     from service.stream.transport import Link, tap  # noqa: PLC0415
 
     known = load_machine_file(machine)
-    ends = {"mode": "client", "connect": connect} if connect else {"listen": listen or [ENDPOINT]}
-    link = Link(checked(LinkSettings, ends, "command line"))
+    session = Link(link_of(connect, listen or (None if connect or link else [ENDPOINT]), link))
     heard: list[RecordedMessage] = []
     try:
-        close = tap(link, known.keys, heard.append)
+        close = tap(session, known.keys, heard.append)
         schedule = known.schedule
         seconds = seconds or (10.0 if schedule is None else 10.0 + schedule.every_s + schedule.on_s)
         typer.echo(f"listening for {seconds:g} s to {known.keys.root} ...")
@@ -215,7 +214,7 @@ def doctor(
         time.sleep(seconds)
         close()
     finally:
-        link.close()
+        session.close()
     found = examined(known, heard)
     for line in found.lines:
         typer.echo(line)

@@ -13,7 +13,7 @@ import typer
 
 from models.errors import MachineFileError, RecordingError
 from service.commands.replay import link_of
-from service.commands.running import ConnectOption, ListenOption, exit_code, prepare_numerics
+from service.commands.running import ConnectOption, LinkOption, ListenOption, exit_code, prepare_numerics
 
 if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from models.machine import MachineFile
@@ -43,6 +43,7 @@ def record(
     ] = None,
     connect: ConnectOption = None,
     listen: ListenOption = None,
+    link: LinkOption = None,
     rotate_s: Annotated[
         float | None, typer.Option("--rotate-s", metavar="SECONDS", help="Longest time in one file; 300 if left out.")
     ] = None,
@@ -90,13 +91,13 @@ def record(
         for recorder in recorders:
             recorder.prepare()  # a folder that cannot be written is a mistake to be told at once
         stop = undo.enter_context(stop_request())
-        link = Link(link_of(connect, listen))
-        undo.callback(link.close)
+        session = Link(link_of(connect, listen, link))
+        undo.callback(session.close)
         with ExitStack() as running:
             for recorder in recorders:
                 running.callback(recorder.stop)
                 recorder.start()
-                running.callback(tap(link, recorder.machine.keys, recorder.put))
+                running.callback(tap(session, recorder.machine.keys, recorder.put))
                 if not as_json:
                     typer.echo(f"recording {recorder.machine.keys.root} into {recorder.folder}/; Ctrl-C ends")
             told: dict[Path, str] = {}

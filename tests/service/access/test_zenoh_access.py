@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,13 +15,14 @@ import zenoh
 import zenoh.ext
 
 from models.signals.link import LinkSettings, TlsSettings, load_link
-from service.runtime.runtime import running
+from models.signals.recording import read_recording
+from service.runtime.runtime import Runtime, running
 from service.settings.service import HttpSettings, MachineEntry, ServiceSettings
 from service.stream.transport import Link, TopicMessage, follow
 from simulator.publisher import PublishError, PublishSettings, publish
 from tests.loopback import session_of
 from tests.service.access.plant import GRANTS, PUMP, Plant, at_once, kept, plant
-from tests.service.rig.live import LAB, ROOT, endpoint, program, scenario_blocks, until
+from tests.service.rig.live import LAB, ROOT, Program, endpoint, program, scenario_blocks, until
 from tests.sure import sure
 
 
@@ -377,6 +379,14 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@contextmanager
+def started(recorder: Program, plan: ServiceSettings) -> Iterator[Runtime]:
+    """A monitor, once a recorder is there."""
+    recorder.wait_for("recording rotorwatch/demo/lab")
+    with running(plan) as service:
+        yield service
+
+
 @pytest.mark.parametrize("level", sorted(path.name for path in SHIPPED.iterdir() if path.is_dir()))
 def test_the_shipped_examples_work_together(tmp_path: Path, level: str, request: pytest.FixtureRequest) -> None:
     port = endpoint().rpartition(":")[2]
@@ -401,7 +411,11 @@ def test_the_shipped_examples_work_together(tmp_path: Path, level: str, request:
     gate = Link(load_link(folder / "router.toml"))
     try:
         with (
-            running(plan) as service,
+            program(
+                tmp_path, "service.rotorwatch", "record", "--machine", "lab", "--out", str(tmp_path / "recorded"),
+                "--link", str(folder / "monitor.toml"),
+            ) as recorder,
+            started(recorder, plan) as service,
             follow(load_link(folder / "viewer.toml"), "demo/*", ("health", "alarm_event"), messages.append),
             program(
                 tmp_path, "simulator.rotorsim", "publish", "healthy", "--duration", "3", "--pace", "max",
@@ -411,6 +425,9 @@ def test_the_shipped_examples_work_together(tmp_path: Path, level: str, request:
             publisher.wait_for("published 30 blocks")
             until(lambda: service.machines()[0].health().stream.data_age_s is not None, "accepted blocks")
             until(lambda: any(message.key == LAB.keys.health for message in messages), "health at the viewer")
+            assert recorder.stop() == 0
+        (recording,) = (tmp_path / "recorded" / "demo" / "lab").glob("*.mcap")
+        assert len([*read_recording(recording, keys=[LAB.keys.stream])]) == 30
     finally:
         gate.close()
 
