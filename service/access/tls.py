@@ -68,9 +68,8 @@ def tls_context(tls: HttpTlsSettings) -> ssl.SSLContext:
 def lapses(settings: ServiceSettings) -> list[str]:
     """Certificates of a monitor that have expired, or do so within a month: whoever connects refuses them then."""
     given = (settings.access.tls, settings.link.tls, None if settings.fleet is None else settings.fleet.tls)
-    return [
-        *filter(None, (_lapse(one.certificate) for one in given if one is not None and one.certificate is not None))
-    ]
+    files = {one.certificate: None for one in given if one is not None and one.certificate is not None}
+    return [*filter(None, map(_lapse, files))]
 
 
 def _lapse(certificate: Path) -> str:

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from models.errors import MachineFileError
 from models.mistakes import in_folder
+from models.signals.link import LinkSettings, TlsSettings
 from service.access.credentials import network_of
 from service.access.rates import MovingWindow
 from service.access.scopes import Scope
@@ -245,7 +246,9 @@ def test_a_certificate_that_has_to_be_renewed_is_told(
     tls = files(tmp_path, authority)
     issued = authority.issue_cert("localhost", not_after=datetime.now(UTC) + timedelta(days=days))
     tls.certificate.write_bytes(issued.cert_chain_pems[0].bytes())
-    assert [said in one for one in lapses(ServiceSettings(access=AccessSettings(tls=tls)))] == [True] * bool(said)
+    link = LinkSettings(listen=("tls/127.0.0.1:7447",), tls=TlsSettings(certificate=tls.certificate, key=tls.key))
+    both = ServiceSettings(access=AccessSettings(tls=tls), link=link)
+    assert [said in one for one in lapses(both)] == [True] * bool(said)
 
 
 def refused(tls: HttpTlsSettings) -> str:
