@@ -130,7 +130,7 @@ class Gate:
         self._candidate: Course | None = None
         self._earlier: deque[Course] = deque(maxlen=EARLIER_COURSES)
         self._refused: deque[Course] = deque(maxlen=EARLIER_COURSES)
-        self._had: tuple[Course, ...] = ()
+        self._had: list[Course] = []
 
     @property
     def courses(self) -> tuple[Course, ...]:
@@ -143,11 +143,18 @@ class Gate:
 
     def begin(self) -> None:
         """Take note that whatever comes is heard from now on; what is known so far is from before a restart."""
-        self._had = self.courses
+        self._had = [*self.courses]
 
     def had(self, block: SampleBlock) -> bool:
-        """Whether a block's place is from before a restart: a publisher's cache sends it again when it is asked."""
-        return any(course.covers(block) for course in self._had)
+        """Whether a block is from before a restart, and comes again for the first time.
+
+        A publisher's cache sends each once more when it is asked. Whoever goes on repeating himself is refused.
+        """
+        for number, course in enumerate(self._had):
+            if course.covers(block):
+                self._had[number] = replace(course, first=block.sequence + 1, first_ns=block.end_ns)
+                return True
+        return False
 
     def is_newest(self, block: SampleBlock) -> bool:
         """Whether it is the latest block that was received."""

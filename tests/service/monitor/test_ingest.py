@@ -98,6 +98,17 @@ def test_scattered_wild_times_never_move_the_clock() -> None:
     assert all(verdict.reason is Reason.FUTURE for verdict in judge(block(0), *wild)[1:])
 
 
+def test_what_was_there_before_a_restart_is_no_news_once() -> None:
+    gate = Gate(MACHINE)
+    blocks = [block(number) for number in range(8)]
+    for one in blocks[:5]:
+        gate.judge(one)
+    gate.begin()
+    gate.judge(blocks[5])
+    assert [gate.had(one) for one in blocks] == [True] * 5 + [False] * 3
+    assert not any(gate.had(one) for one in blocks)  # whoever goes on repeating them is refused
+
+
 def test_repeated_history_of_the_same_run_never_moves_the_clock() -> None:
     blocks = [block(n) for n in range(30)]
     verdicts = judge(*blocks, *blocks, block(30))
