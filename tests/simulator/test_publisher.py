@@ -315,7 +315,7 @@ def test_samples_show_what_the_truth_says(scenario: Scenario, machine: Machine) 
 def test_sensors_never_change_how_the_machine_moves(scenario: Scenario, machine: Machine) -> None:
     plain = Scenario.model_validate({
         **scenario.model_dump(),
-        "sensors": Sensors(channels={"z1": ChannelSettings(noise_relative=1.0)}).model_dump(),
+        "sensors": Sensors(channels={"z1": ChannelSettings(noise_relative=1.0, gain=2.0)}).model_dump(),
         "events": [event.model_dump() for event in EVENTS if event.sensor is None],
     })  # fmt: skip
     noiseless = scenario.model_copy(update={"sensors": Sensors()})

@@ -62,6 +62,8 @@ def test_a_restored_baseline_of_coupled_planes_reads_the_same() -> None:
         each.diagnose(window) for each in (BaselineDiagnostician(baseline("fluid-film")), again.diagnostician())
     )
     assert one.parameters == other.parameters
+    assert np.array_equal(again.baseline().force, baseline("fluid-film").force)
+    assert baseline("fluid-film").force.size
 
 
 def test_each_condition_that_a_relation_holds_in_makes_it_surer_elsewhere() -> None:

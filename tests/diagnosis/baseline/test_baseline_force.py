@@ -89,16 +89,6 @@ def test_a_record_without_a_force_is_written_as_it_was_before_there_was_one() ->
     assert BaselineRecord.of(baseline(3)).model_dump(mode="json")["force"]
 
 
-def test_a_restored_baseline_knows_its_force() -> None:
-    again = BaselineRecord.model_validate_json(BaselineRecord.of(baseline(3)).model_dump_json())
-    assert np.array_equal(again.baseline().force, baseline(3).force)
-    (window,) = windows(condition(3), 1, 8)
-    assert (
-        again.diagnostician().diagnose(window).parameters
-        == BaselineDiagnostician(baseline(3)).diagnose(window).parameters
-    )
-
-
 @pytest.mark.slow
 def test_where_a_relation_does_not_fit_longer_lags_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
     healthy = windows(condition(4), 4, 1)

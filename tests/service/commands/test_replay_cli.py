@@ -127,6 +127,7 @@ def test_a_monitor_in_the_namespace_of_a_replay(faulty: Path, tmp_path: Path) ->
         found = run(faulty, *options)
         assert found.returncode == 0, found.stderr
         assert "801 messages replayed" in found.stderr
+        until(lambda: monitor.health().quality.accepted_blocks == 800, "all blocks")
         until(lambda: monitor.health().state == "danger", "alarm")
         assert [alarm.name for alarm in monitor.health().alarms if alarm.raised] == ["c_bz"]
         assert monitor.stop() == 0

@@ -76,8 +76,10 @@ def test_nothing_is_lost_while_the_database_is_away(parts: Parts) -> None:
         lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
         for number in range(3):
             written(lab, hop_step(number, events=(alarm_event(number),)))
-        assert store.trouble == ""
+        assert store.unreachable() == store.trouble == ""
         fail()
+        assert store.unreachable() != ""  # it shows before anything is written
+        assert store.trouble == ""
         for number in range(3, 40):
             assert not lab.commit(hop_step(number, events=(alarm_event(number),)))
             assert not pump.commit(hop_step(number, events=(alarm_event(number - 3),)))
@@ -85,7 +87,10 @@ def test_nothing_is_lost_while_the_database_is_away(parts: Parts) -> None:
         assert (lab.waiting, lab.last_sequence()) == (37, 39)
         mend()
         until(lambda: lab.waiting == pump.waiting == 0, "recovery")
+        until(lambda: store.unreachable() == "", "answer of the database")
         assert store.trouble == ""
+        with opened(url) as other, pytest.raises(StoreError, match="another monitor writes the history of demo/lab"):
+            other.machine("demo", "lab")  # its locks are taken again
         written(lab, hop_step(40, events=(alarm_event(40),)))
         assert [event.sequence for event in lab.events()] == list(range(41))
         assert [event.sequence for event in pump.events()] == list(range(37))
@@ -321,29 +326,6 @@ def test_nobody_waits_twice_for_a_disk_that_hangs(tmp_path: Path) -> None:
         assert store.trouble == ""
         assert [event.sequence for event in lab.events()] == [0, 1]
         written(lab, hop_step(2))
-
-
-def test_that_the_database_is_away_shows_while_nothing_is_written(parts: Parts) -> None:
-    url, fail, mend = parts
-    with opened(url) as store:
-        assert store.unreachable() == ""
-        fail()
-        assert store.unreachable() != ""
-        assert store.trouble == ""
-        mend()
-        until(lambda: store.unreachable() == "", "answer of the database")
-
-
-def test_locks_are_taken_again_after_the_database_was_away(parts: Parts) -> None:
-    url, fail, mend = parts
-    with opened(url) as store:
-        lab = store.machine("demo", "lab")
-        fail()
-        assert not lab.commit(Step(events=(alarm_event(0),)))
-        mend()
-        until(lambda: lab.waiting == 0, "recovery")
-        with opened(url) as other, pytest.raises(StoreError, match="another monitor writes the history of demo/lab"):
-            other.machine("demo", "lab")
 
 
 ONES = select(literal(1).label("n")).cte("ones", recursive=True)

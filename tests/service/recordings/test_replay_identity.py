@@ -52,9 +52,9 @@ def expected(faulty: Path) -> OfflineSummary:
 
 
 @contextmanager
-def monitor_in(namespace: str, link: LinkSettings, when_full: str = "drop") -> Iterator[MachineWorker]:
+def monitor_in(namespace: str, link: LinkSettings) -> Iterator[MachineWorker]:
     apart = link.model_copy(update={"namespace": namespace})
-    with running(settings(endpoint(), bundle="lab", when_full=when_full, bound=2000, link=apart)) as runtime:
+    with running(settings(endpoint(), bundle="lab", bound=2000, link=apart)) as runtime:
         yield worker_of(runtime)
 
 
@@ -92,20 +92,6 @@ def test_one_sample_more_or_less_is_another_answer(tmp_path: Path) -> None:
     assert touched.sha256 != summary.sha256
 
 
-def test_replayed_onto_the_network_is_the_same(faulty: Path, expected: OfflineSummary) -> None:
-    address, source = endpoint(), RecordingSource([faulty])
-    with monitor_in("replay/x", LinkSettings(listen=(address,)), when_full="wait") as worker:
-        going = plan(source, address, "replay/x", wait_for_subscriber_s=20.0)
-        count = replay_to_network(source, going, Control())
-        until(lambda: worker.health().quality.accepted_blocks == BLOCKS, "all blocks")
-        health = worker.health()
-        found = digest_of(worker)
-    assert count == BLOCKS + 1  # and the descriptor
-    assert health.quality.refused_blocks == {}
-    assert health.stream.descriptor_mismatch == ()
-    assert found == expected.sha256
-
-
 def test_a_replay_disturbs_nothing_that_is_live(faulty: Path, expected: OfflineSummary, tmp_path: Path) -> None:
     """A healthy machine, and on the same network the replay of its fault, with a monitor of its own."""
     healthy = scenario_blocks(BLOCKS / 10)
@@ -130,9 +116,10 @@ def test_a_replay_disturbs_nothing_that_is_live(faulty: Path, expected: OfflineS
         until(lambda: live.health().quality.accepted_blocks == BLOCKS, "live blocks")
         until(lambda: replayed.health().quality.accepted_blocks == BLOCKS, "replayed blocks")
         until(lambda: len(heard) >= undisturbed.windows, "live reports")
-        health = live.health()
+        health, elsewhere = live.health(), replayed.health()
         said, digests = lines_of(live), (digest_of(live), digest_of(replayed))
-    assert health.quality.refused_blocks == {}
+    assert health.quality.refused_blocks == elsewhere.quality.refused_blocks == {}
+    assert elsewhere.stream.descriptor_mismatch == ()
     assert health.quality.queue_dropped_blocks == health.quality.link_missed_blocks == 0
     # While the replay goes on, nothing comes from the live machine any more; that is all there is to tell of it.
     assert {alarm.name for alarm in health.alarms} <= {STREAM_LOST}
