@@ -40,18 +40,7 @@ from service.settings.access import AccessSettings
 from service.settings.service import HttpSettings, ServiceSettings
 from service.stream.worker import MachineWorker
 from tests.service.access.test_access_tokens import files
-from tests.service.rig.live import (
-    IN_ORDER,
-    OPEN,
-    ROOT,
-    Feed,
-    endpoint,
-    kept_in,
-    machine_file,
-    open_session,
-    settings,
-    until,
-)
+from tests.service.rig.live import IN_ORDER, OPEN, ROOT, endpoint, feeding, kept_in, machine_file, settings, until
 from tests.service.rig.monitored import GUARDED, client, faulty, fed, token
 
 PLACE = "demo/lab"
@@ -215,12 +204,10 @@ def test_nobody_there() -> None:
 @contextmanager
 def gapped(plan: ServiceSettings, *, feed_it: bool = True) -> Iterator[Runtime]:
     """A service with a gap in its stream, which is an alarm at once."""
-    with running(plan) as runtime:
+    with feeding(plan) as (runtime, feed):
         if feed_it:
-            with open_session(plan.link.listen[0]) as session:
-                feed = Feed(session)
-                feed.gap()
-                until(lambda: runtime.machines()[0].alarms().sequence >= 0, "alarm")
+            feed.gap()
+            until(lambda: runtime.machines()[0].alarms().sequence >= 0, "alarm")
         yield runtime
 
 

@@ -20,13 +20,12 @@ from service.commands.running import exit_codes
 from service.terminal.lines import alarm_event_line, alarm_state_lines, health_line, report_line
 from simulator.scenario import parse_fault
 from tests.service.rig.live import (
-    PATIENT,
+    IMPATIENT,
+    QUICK,
     ROOT,
-    SHORT,
-    Feed,
     endpoint,
+    fed_service,
     machine_file,
-    open_session,
     program,
     scenario_blocks,
     send,
@@ -117,10 +116,8 @@ def test_watch_and_status_without_a_monitor_say_so() -> None:
 
 
 def test_status_tells_data_that_have_stopped_from_an_alarm(tmp_path: Path) -> None:
-    silence = ("[operation]", "[ingest]\nblock_to_s = 0.2\nno_data_after_s = 0.5\n\n[operation]")
-    address = endpoint()
-    with service(address, machine_file(tmp_path, silence)) as (runtime, worker), open_session(address) as session:
-        Feed(session, worker.machine).put_good()
+    with fed_service(machine_file(tmp_path, IMPATIENT)) as (runtime, worker, feed):
+        feed.put_good()
         until(lambda: worker.health().quality.accepted_blocks == 1, "a block")
         until(lambda: "stream-lost" in {one.name for one in worker.alarms().alarms if one.raised}, "the silence")
         found = run("status", "--url", runtime.http_url, "--json")
@@ -140,7 +137,7 @@ def test_status_names_a_certificate_it_cannot_use(tmp_path: Path) -> None:
 
 def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
     address = endpoint()
-    file = machine_file(tmp_path, PATIENT, *SHORT)
+    file = machine_file(tmp_path, *QUICK)
     watching = ("service.rotorwatch", "watch", "--connect", address, "--windows")
     with (
         service(address, file, when_full="wait") as (runtime, worker),

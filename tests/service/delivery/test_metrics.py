@@ -18,7 +18,7 @@ from service.monitor.reports import Tally
 from service.runtime.runtime import Runtime, running
 from service.settings.service import RecordingSettings
 from tests.service.delivery.hooked import hook, settings_for
-from tests.service.rig.live import IN_ORDER, ROOT, Feed, endpoint, kept_in, machine_file, open_session, settings, until
+from tests.service.rig.live import IN_ORDER, ROOT, endpoint, feeding, kept_in, machine_file, settings, until
 from tests.service.rig.monitored import GUARDED, PLACE, client, token
 from tests.sure import sure
 
@@ -74,17 +74,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def served(folder: Path) -> Iterator[tuple[Runtime, str, Read]]:
     """12 good blocks, one with a nan, one of a number that was there, 3 s missing, 2 good blocks; recorded."""
-    address = endpoint()
     (folder / "recordings").mkdir()
     with hook() as receiver:
         plan = settings(
-            address, machine_file(folder, IN_ORDER), when_full="wait", access=GUARDED, history=kept_in(folder),
+            endpoint(), machine_file(folder, IN_ORDER), when_full="wait", access=GUARDED, history=kept_in(folder),
             recording=RecordingSettings(directory=str(folder / "recordings")),
             webhooks=(settings_for(receiver, folder),),
         )  # fmt: skip
-        with running(plan) as runtime, open_session(address) as session:
+        with feeding(plan) as (runtime, feed):
             worker = runtime.machines()[0]
-            feed = Feed(session)
             for _ in range(12):
                 feed.put_good()
             twice = feed.block(sequence=feed.sequence - 1, start_ns=feed.start_ns - 300_000_000)
@@ -238,10 +236,8 @@ def test_webhooks_over_http(served: tuple[Runtime, str, Read]) -> None:
 
 
 def test_after_a_restart(tmp_path: Path) -> None:
-    address = endpoint()
-    plan = settings(address, machine_file(tmp_path, IN_ORDER), when_full="wait", history=kept_in(tmp_path))
-    with running(plan) as runtime, open_session(address) as session:
-        feed = Feed(session)
+    plan = settings(endpoint(), machine_file(tmp_path, IN_ORDER), when_full="wait", history=kept_in(tmp_path))
+    with feeding(plan) as (runtime, feed):
         feed.gap()
         until(lambda: runtime.machines()[0].history.last_sequence() == 0, "the alarm on the gap")
         until(lambda: parsed(runtime.metrics.text().decode()).of_lab("alarm_events_total", kind="raised") == 1, "count")

@@ -16,17 +16,7 @@ from service.settings.service import ServiceSettings
 from service.stream.liveness import Pulse
 from tests.service.delivery.hooked import hook, settings_for
 from tests.service.delivery.test_metrics import parsed
-from tests.service.rig.live import (
-    IN_ORDER,
-    Feed,
-    endpoint,
-    kept_in,
-    machine_file,
-    open_session,
-    service,
-    settings,
-    until,
-)
+from tests.service.rig.live import IN_ORDER, endpoint, feeding, kept_in, machine_file, service, settings, until
 from tests.service.rig.monitored import client
 
 
@@ -40,14 +30,13 @@ def asked(runtime: Runtime) -> tuple[int, Readiness]:
 def test_a_history_that_cannot_be_written_is_a_reason_until_it_can(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    address, file = endpoint(), tmp_path / "history.sqlite"
+    file = tmp_path / "history.sqlite"
     # As the runtime makes it, but not as patient with its database.
     monkeypatch.setattr("service.runtime.runtime.Store", partial(Store, timeout_s=2.0, retry_s=0.05))
-    plan = settings(address, machine_file(tmp_path, IN_ORDER), when_full="wait", history=kept_in(tmp_path))
-    with running(plan) as runtime, open_session(address) as session:
+    plan = settings(endpoint(), machine_file(tmp_path, IN_ORDER), when_full="wait", history=kept_in(tmp_path))
+    with feeding(plan) as (runtime, feed):
         assert asked(runtime) == (200, runtime.readiness())  # nothing has come that could be on its way
         assert runtime.readiness().ready
-        feed = Feed(session)
         feed.put_good()
         until(lambda: runtime.machines()[0].health().quality.accepted_blocks == 1, "the first block")
         blocker = sqlite3.connect(file, isolation_level=None)  # another program that does not let go of the file
@@ -104,12 +93,10 @@ def void(_: object) -> None:
 
 def test_webhooks_and_recorders_are_stated_and_no_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.delivery.webhooks.dispatcher._QUIET_S", 1e6)  # they are woken, or they sleep on
-    address = endpoint()
     machine = machine_file(tmp_path, IN_ORDER)
     with hook(lambda _: (503, {})) as receiver:
-        plan = settings(address, machine, when_full="wait", webhooks=(settings_for(receiver, tmp_path),))
-        with running(plan) as runtime, open_session(address) as session:
-            feed = Feed(session)
+        plan = settings(endpoint(), machine, when_full="wait", webhooks=(settings_for(receiver, tmp_path),))
+        with feeding(plan) as (runtime, feed):
             feed.gap()
             until(lambda: runtime.readiness().failing_webhooks != (), "the webhook that fails")
             status, found = asked(runtime)

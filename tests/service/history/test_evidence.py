@@ -14,18 +14,7 @@ from service.history.records import StoreError
 from service.runtime.runtime import running
 from service.stream.evidence import EvidenceCollector
 from simulator.scenario import parse_fault
-from tests.service.rig.live import (
-    LAB,
-    SHORT,
-    Feed,
-    endpoint,
-    kept_in,
-    machine_file,
-    open_session,
-    scenario_blocks,
-    settings,
-    until,
-)
+from tests.service.rig.live import SHORT, endpoint, feeding, kept_in, machine_file, scenario_blocks, settings, until
 from tests.service.rig.monitored import PLACE, client, problem
 from tests.service.rig.postgres import opened
 from tests.sure import sure
@@ -37,12 +26,10 @@ HOP = 50
 
 
 def test_an_alarm_can_be_understood_long_after_its_window_is_gone(tmp_path: Path) -> None:
-    address = endpoint()
-    plan = settings(address, machine_file(tmp_path, *SHORT), when_full="wait", history=kept_in(tmp_path))
+    plan = settings(endpoint(), machine_file(tmp_path, *SHORT), when_full="wait", history=kept_in(tmp_path))
     blocks = scenario_blocks(100.0, parse_fault(f"k_by={CHANGED}@{FAULT_S:g}"))
-    with running(plan) as runtime, open_session(address) as session, client(runtime) as http:
-        worker = runtime.machines()[0]
-        feed, sent = Feed(session, LAB), 0
+    with feeding(plan) as (runtime, feed), client(runtime) as http:
+        worker, sent = runtime.machines()[0], 0
 
         def kept() -> AlarmEvidence | None:
             text = worker.history.evidence("k_by")

@@ -19,7 +19,6 @@ from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.known_machine import KnownMachineEvaluator
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import identity_of
-from service.runtime.runtime import running
 from service.stream.checkpoints import checkpoint_step, restored
 from tests.service.monitor.test_alarm_trouble import bench, block, named, order, watched
 from tests.service.rig.live import (
@@ -27,17 +26,14 @@ from tests.service.rig.live import (
     LAB,
     PATIENT,
     START_NS,
-    Feed,
     endpoint,
+    fed_service,
     machine_file,
-    open_session,
     scenario_blocks,
     send,
     service,
     until,
-    worker_of,
 )
-from tests.service.rig.live import settings as plan_for
 from tests.service.rig.monitored import client
 
 DEFECT = "a defect of the evaluation"
@@ -194,11 +190,7 @@ def test_overload_clears_when_the_monitor_keeps_up() -> None:
 
 
 def test_a_full_queue_says_so_to_operators(tmp_path: Path) -> None:
-    address = endpoint()
-    plan = plan_for(address, machine_file(tmp_path, IN_ORDER), bound=30)
-    with running(plan) as runtime, open_session(address) as session:
-        worker = worker_of(runtime)
-        feed = Feed(session, worker.machine)
+    with fed_service(machine_file(tmp_path, IN_ORDER), bound=30) as (_, worker, feed):
         feed.put_good()
         until(lambda: worker.health().quality.accepted_blocks == 1, "first block")
         held = np.zeros(1, dtype=bool)

@@ -22,10 +22,9 @@ from service.recordings.backlog import Backlog
 from service.recordings.catalogue import Catalogue
 from service.recordings.leftovers import is_locked
 from service.recordings.recorder import MachineRecorder
-from service.runtime.runtime import running
 from service.settings.service import RecordingSettings, ServiceSettings
 from tests.loopback import session_of
-from tests.service.rig.live import LAB, Feed, Program, endpoint, open_session, program, settings, until, worker_of
+from tests.service.rig.live import LAB, Program, endpoint, feeding, open_session, program, settings, until, worker_of
 from tests.sure import sure
 
 KEYS = LAB.keys
@@ -70,24 +69,21 @@ def recorded(recorder: MachineRecorder, key: str = KEYS.stream) -> list[Recorded
 
 
 def test_everything_under_the_keys_is_recorded_as_it_was(tmp_path: Path) -> None:
-    listen = endpoint()
-    with running(settings(listen, recording=into(tmp_path / "kept"))) as service:
-        with open_session(listen) as session:
-            feed = Feed(session)
-            sent = []
-            session.put(KEYS.descriptor, b'{"channels": []}', encoding="application/json")
-            for _ in range(120):
-                block = feed.block()
-                sent.append(encode_block(block, LAB.descriptor.schema_hash))
-                feed.put_raw(*sent[-1])
-                feed.sequence, feed.start_ns = feed.sequence + 1, block.end_ns
-            note_key, said = f"{KEYS.root}/operator/note", b"\x00\xff bearing changed"
-            session.put(note_key, said, attachment=b"\x01\x02", encoding="text/plain;µ")
-            session.put("rotorwatch/demo/other/stream", b"another machine")
-            until(lambda: service.machines()[0].health().quality.accepted_blocks == 120, "120 accepted blocks")
-            recorder = sure(worker_of(service).recorder)
-            # Descriptor, note, health, alarm states, and the reports of two hops.
-            until(lambda: recorder.status().received >= 126, "messages at the recorder")
+    with feeding(settings(endpoint(), recording=into(tmp_path / "kept"))) as (service, feed):
+        sent = []
+        feed.session.put(KEYS.descriptor, b'{"channels": []}', encoding="application/json")
+        for _ in range(120):
+            block = feed.block()
+            sent.append(encode_block(block, LAB.descriptor.schema_hash))
+            feed.put_raw(*sent[-1])
+            feed.sequence, feed.start_ns = feed.sequence + 1, block.end_ns
+        note_key, said = f"{KEYS.root}/operator/note", b"\x00\xff bearing changed"
+        feed.session.put(note_key, said, attachment=b"\x01\x02", encoding="text/plain;µ")
+        feed.session.put("rotorwatch/demo/other/stream", b"another machine")
+        until(lambda: service.machines()[0].health().quality.accepted_blocks == 120, "120 accepted blocks")
+        recorder = sure(worker_of(service).recorder)
+        # Descriptor, note, health, alarm states, and the reports of two hops.
+        until(lambda: recorder.status().received >= 126, "messages at the recorder")
         assert service.readiness().machines[0].recording == "recording"
         assert service.readiness().ready
     (path,) = files(recorder)
@@ -204,10 +200,9 @@ def test_a_recorder_that_stops_writes_what_waits(tmp_path: Path) -> None:
 
 def test_a_missing_folder_is_waited_for_without_losing_anything(tmp_path: Path) -> None:
     """What a mount that comes late looks like; the monitor does not care."""
-    listen, place = endpoint(), tmp_path / "disk"
+    place = tmp_path / "disk"
     place.write_text("not a folder")
-    with running(settings(listen, recording=into(place))) as service, open_session(listen) as session:
-        feed = Feed(session)
+    with feeding(settings(endpoint(), recording=into(place))) as (service, feed):
         for _ in range(30):
             feed.put_good()
         until(lambda: service.machines()[0].health().quality.accepted_blocks == 30, "30 accepted blocks")

@@ -28,7 +28,7 @@ from service.recordings.catalogue import (
 )
 from service.recordings.recorder import MachineRecorder
 from service.recordings.retention import AlarmMark, alarm_mark, decide
-from service.runtime.runtime import Runtime, running
+from service.runtime.runtime import Runtime
 from service.settings.service import RecordingSettings
 from tests.service.history.test_store import alarm_event
 from tests.service.rig.live import (
@@ -37,6 +37,7 @@ from tests.service.rig.live import (
     Feed,
     Program,
     endpoint,
+    feeding,
     machine_file,
     open_session,
     program,
@@ -161,14 +162,9 @@ FEW = {"rotate_mb": 0.1, "keep_gb": 0.0007, "alarm_keep_gb": 1.0, "alarm_before_
 
 
 def record_files(
-    directory: Path,
-    first: int,
-    last: int,
-    forged_at: int | None = None,
-    events: tuple[StoredEvent, ...] = (),
-    away: bool = False,
+    directory: Path, first: int, last: int, events: tuple[StoredEvent, ...] = (), away: bool = False
 ) -> Path:
-    """Record one file of 0.3 MB per five minutes, numbered from now on, with an alarm event off the wire in one."""
+    """Record one file of 0.3 MB per five minutes, numbered from now on."""
     settings = RecordingSettings.model_validate({"directory": str(directory), **FEW})
 
     def committed(since_ns: int) -> tuple[StoredEvent, ...]:
@@ -180,8 +176,6 @@ def record_files(
     rng = np.random.default_rng(first)
     for number in range(first, last):
         time_ns = NOW_NS + 300 * number * NS
-        if number == forged_at:
-            recorder.put(RecordedMessage(ALARM.key, ALARM.payload, b"", ALARM.encoding, time_ns, time_ns))
         recorder.put(RecordedMessage(LAB.keys.stream, rng.bytes(300_000), b"", "x", time_ns, time_ns))
     recorder.start()
     recorder.stop()
@@ -212,17 +206,12 @@ def test_the_recorder_keeps_what_lies_around_an_alarm_when_the_rest_is_thinned_o
         assert ("2026-11-21 14:35:30 UTC raised: ALERT" in one.kept_because) == kept
 
 
-def test_alarm_events_off_the_wire_keep_nothing(tmp_path: Path) -> None:
-    folder = record_files(tmp_path, 0, 12, forged_at=2)
-    assert numbers(folder) == [10, 11]
-    assert kept_reasons(folder) == {}
-
-
-def test_what_is_kept_stays_when_the_history_is_lost(tmp_path: Path) -> None:
+@pytest.mark.parametrize("away", [False, True], ids=["lost", "away"])
+def test_what_is_kept_stays_when_the_history_is_lost_or_cannot_be_read(tmp_path: Path, away: bool) -> None:
     folder = record_files(tmp_path, 0, 3, events=(at_file(1),))
     before = kept_reasons(folder)
     assert len(before) == 3
-    record_files(tmp_path, 20, 29)
+    record_files(tmp_path, 20, 29, away=away)
     assert kept_reasons(folder) == before
     assert numbers(folder)[:3] == [0, 1, 2]
 
@@ -237,21 +226,12 @@ def test_what_kept_json_says_is_found_anew_when_it_is_lost(tmp_path: Path) -> No
     assert kept_reasons(folder) == before
 
 
-def test_a_history_that_cannot_be_read_takes_nothing_back(tmp_path: Path) -> None:
-    folder = record_files(tmp_path, 0, 3, events=(at_file(1),))
-    before = kept_reasons(folder)
-    record_files(tmp_path, 20, 29, away=True)
-    assert kept_reasons(folder) == before
-
-
 @contextmanager
 def recorded(folder: Path) -> Iterator[tuple[Runtime, Feed]]:
     """A monitor that records, and closes a file after a second."""
-    address = endpoint()
     kept = RecordingSettings(directory=str(folder / "kept"), rotate_s=1.0)
-    plan = settings(address, machine_file(folder, PATIENT), recording=kept)
-    with running(plan) as runtime, open_session(address) as session:
-        yield runtime, Feed(session)
+    with feeding(settings(endpoint(), machine_file(folder, PATIENT), recording=kept)) as found:
+        yield found
 
 
 def test_a_monitor_keeps_recordings_for_its_own_alarms_alone(tmp_path: Path) -> None:

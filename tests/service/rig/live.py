@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import httpx
 import numpy as np
@@ -41,8 +41,12 @@ PATIENT = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]")
 """For `machine_file`: no silence is one."""
 IN_ORDER = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
 """The same, and a gap is one at once."""
+IMPATIENT = ("[operation]", "[ingest]\nblock_to_s = 0.2\nno_data_after_s = 0.5\n\n[operation]")
+"""The opposite: half a second is a silence."""
 SHORT = (("length_s = 60.0", "length_s = 20.0"), ("off_delay_s = 60.0", "off_delay_s = 20.0"))
 """For `machine_file`: windows are full, and alarms cleared, after a third of the time."""
+QUICK = (PATIENT, *SHORT)
+"""Both, for streams that come as fast as they are evaluated."""
 _ALONE = {
     "ROTORWATCH_HISTORY__URL": "sqlite:///:memory:",
     "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true",
@@ -212,6 +216,20 @@ class Feed:
         self.put_good()
         self.skip()
         self.put_good()
+
+
+@contextmanager
+def feeding(plan: ServiceSettings) -> Iterator[tuple[Runtime, Feed]]:
+    """A running service, and what puts blocks of its first machine."""
+    with running(plan) as runtime, open_session(plan.link.listen[0]) as session:
+        yield runtime, Feed(session, runtime.machines()[0].machine)
+
+
+@contextmanager
+def fed_service(machine: str = "lab", **how: Any) -> Iterator[tuple[Runtime, MachineWorker, Feed]]:
+    """A running service with one machine and settings as those of `settings`, its worker, and what feeds it."""
+    with feeding(settings(endpoint(), machine, **how)) as (runtime, feed):
+        yield runtime, worker_of(runtime), feed
 
 
 @dataclass(slots=True)

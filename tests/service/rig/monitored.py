@@ -24,8 +24,8 @@ from tests.service.rig.live import (
     PATIENT,
     Feed,
     endpoint,
+    feeding,
     machine_file,
-    open_session,
     scenario_blocks,
     send,
     settings,
@@ -58,11 +58,10 @@ def faulty(folder: Path, access: AccessSettings = OPEN) -> Iterator[tuple[Runtim
 @contextmanager
 def fed(folder: Path, access: AccessSettings = OPEN, *lines: tuple[str, str]) -> Iterator[tuple[Runtime, Feed]]:
     """The lab machine, which gets the blocks that a test puts; gaps of a second are an alarm at once."""
-    address = endpoint()
-    file = machine_file(folder, IN_ORDER, *lines)
-    plan = settings(address, file, when_full="wait", access=access)
-    with running(plan) as runtime, open_session(address) as session:
-        yield runtime, Feed(session)
+    with feeding(
+        settings(endpoint(), machine_file(folder, IN_ORDER, *lines), when_full="wait", access=access)
+    ) as found:
+        yield found
 
 
 def token(runtime: Runtime, *scopes: Scope, name: str = "anna") -> str:

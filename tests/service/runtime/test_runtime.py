@@ -31,9 +31,11 @@ from service.stream.transport import LinkError, TopicMessage, follow
 from service.terminal.logs import Limiter
 from simulator.scenario import parse_fault
 from tests.service.rig.live import (
+    IMPATIENT,
     ROOT,
     Feed,
     endpoint,
+    fed_service,
     machine_file,
     open_session,
     scenario_blocks,
@@ -42,8 +44,6 @@ from tests.service.rig.live import (
     settings,
     until,
 )
-
-SHORT_SILENCE = ("[operation]", "[ingest]\nblock_to_s = 0.2\nno_data_after_s = 0.5\n\n[operation]")
 
 
 class Topics:
@@ -57,7 +57,7 @@ class Topics:
 
 
 def test_live_says_exactly_what_the_monitor_says_offline_and_silence_clears_nothing(tmp_path: Path) -> None:
-    file = machine_file(tmp_path, SHORT_SILENCE)
+    file = machine_file(tmp_path, IMPATIENT)
     machine = load_machine(file)
     stream = scenario_blocks(70.0, parse_fault("c_bz=0.5@0"))
     offline = MachineMonitor(install(machine, "lab"))
@@ -121,14 +121,11 @@ def silence_aside(health: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_data_after_silence_end_it(tmp_path: Path) -> None:
-    file = machine_file(tmp_path, SHORT_SILENCE)
-    address = endpoint()
-    with service(address, file) as (_, worker), open_session(address) as session:
+    with fed_service(machine_file(tmp_path, IMPATIENT)) as (_, worker, feed):
         until(lambda: worker.health().state == "no-data", "silence from the start")
         assert worker.health().reason == "no data since the monitor started"
         assert worker.health().stream.silent_since_ns is None
         assert worker.health().stream.data_age_s is None
-        feed = Feed(session, load_machine(file))
         feed.put_good()
         until(lambda: worker.health().state == "warming", "end of the silence")
         until(lambda: worker.health().state == "no-data", "silence")
@@ -154,9 +151,7 @@ class _Poisoned(MachineMonitor):
 
 def test_defect_in_the_monitor_costs_one_block_and_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.stream.worker.MachineMonitor", _Poisoned)
-    address = endpoint()
-    with service(address) as (runtime, worker), open_session(address) as session:
-        feed = Feed(session)
+    with fed_service() as (runtime, worker, feed):
         feed.put_good()
         feed.put_raw(b"", b"", "poison")
         feed.put_good()
@@ -208,9 +203,7 @@ def test_nothing_is_left_behind_when_a_part_cannot_start() -> None:
 
 
 def test_stopped_service_has_no_thread_left() -> None:
-    address = endpoint()
-    with service(address, when_full="wait", bound=1) as (_, worker), open_session(address) as session:
-        feed = Feed(session)
+    with fed_service(when_full="wait", bound=1) as (_, worker, feed):
         for _ in range(50):
             feed.put_good()
         until(lambda: worker.health().quality.accepted_blocks > 0, "blocks")
@@ -228,10 +221,10 @@ def test_log_lines_of_one_kind_are_limited() -> None:
 
 
 def test_health_over_http_is_the_health_on_the_topic() -> None:
-    address, topics = endpoint(), Topics()
-    with service(address) as (runtime, worker), open_session(address) as session:
-        with follow(LinkSettings(mode="client", connect=(address,)), "*/*", ("health",), topics.messages.append):
-            feed = Feed(session)
+    topics = Topics()
+    with fed_service() as (runtime, worker, feed):
+        link = LinkSettings(mode="client", connect=runtime.settings.link.listen)
+        with follow(link, "*/*", ("health",), topics.messages.append):
             feed.put_raw(b"", b"", "rubbish")
             until(lambda: bool(worker.health().quality.refused_blocks), "refusal")
             until(lambda: any("rubbish" in text for text in topics.texts("/health")), "refusal on the topic")

@@ -27,10 +27,10 @@ from service.runtime.standing import latest_from_bytes, latest_to_bytes
 from service.settings.service import HistorySettings, MachineEntry, ServiceSettings, ShardSettings
 from service.stream.shard_link import relay_items
 from simulator.scenario import parse_fault
+from tests.service.analysis.snapshotting import latest
 from tests.service.commands.test_demo import children_of
 from tests.service.rig.live import (
-    PATIENT,
-    SHORT,
+    QUICK,
     Feed,
     endpoint,
     kept_in,
@@ -41,7 +41,6 @@ from tests.service.rig.live import (
     send,
     settings,
     until,
-    worker_of,
 )
 from tests.service.rig.monitored import answered, client, problem
 from tests.service.rig.preloaded import CONTEXT
@@ -67,7 +66,7 @@ def plan_for(folder: Path, count: int | None, address: str | None = None) -> Ser
     entries = []
     for name in NAMES:
         (folder / name).mkdir(exist_ok=True)
-        changes = (*SHORT, PATIENT, ('name = "lab"', f'name = "{name}"'), ("on_delay_s = 5.0", "on_delay_s = 10.0"))
+        changes = (*QUICK, ('name = "lab"', f'name = "{name}"'), ("on_delay_s = 5.0", "on_delay_s = 10.0"))
         entries.append(MachineEntry(file=machine_file(folder / name, *changes)))
     shards = ShardSettings(count=count)
     return settings(address, when_full="wait", machines=tuple(entries), shards=shards, history=kept_in(folder))
@@ -96,7 +95,28 @@ def comparable(http: httpx.Client, path: str) -> str:
     return repr(found)
 
 
-def test_the_same_answers_whatever_the_number_of_processes(tmp_path: Path) -> None:
+def operators_and_listeners_reach_a_machine_of_another_process(http: httpx.Client) -> None:
+    place = "/api/v1/machines/demo/lab/alarms"
+    with httpx_sse.connect_sse(http, "GET", "/api/v1/events") as source:
+        events = source.iter_sse()
+        assert next(events).event == "start"
+        seen = http.get(f"{place}/k_by")
+        done = http.post(f"{place}/k_by/acknowledge", json={}, headers={"If-Match": seen.headers["etag"]})
+        assert answered(done, OperationDone).alarm.state == "acknowledged"
+        told = next(event for event in events if event.event == "alarm")
+        assert '"acknowledged"' in told.data
+        assert '"acknowledged"' in http.get("/api/v1/machines/demo/lab/health").text  # who hears it finds it there
+        health = next(event for event in events if event.event == "health" and '"acknowledged"' in event.data)
+        assert Health.model_validate_json(health.data).machine == "lab"
+    again = http.post(f"{place}/k_by/acknowledge", json={}, headers={"If-Match": seen.headers["etag"]})
+    problem(again, 409)
+    nothing = http.post(f"{place}/nothing/acknowledge", json={}, headers={"If-Match": "*"})
+    assert "no alarm nothing" in problem(nothing, 404).detail
+    states = answered(http.get(place), AlarmStates)
+    assert [one.state for one in states.alarms if one.name == "k_by"] == ["acknowledged"]
+
+
+def test_the_same_answers_whatever_the_number_of_processes_and_orders_reach_all(tmp_path: Path) -> None:
     answers, reports = [], []
     for count in (1, 2):
         folder = tmp_path / str(count)
@@ -117,30 +137,10 @@ def test_the_same_answers_whatever_the_number_of_processes(tmp_path: Path) -> No
                 assert f'rotorwatch_windows_total{{machine="{name}",site="demo"}} {float(len(kept))}' in metrics
             own = {one.machine.name for one in runtime.machines() if hasattr(one, "inbox")}
             assert own == (set(NAMES) if count == 1 else set())
+            if count == 2:
+                operators_and_listeners_reach_a_machine_of_another_process(http)
     assert answers[0] == answers[1]
     assert reports[0] == reports[1]
-
-
-def test_operators_and_listeners_reach_a_machine_of_another_process(tmp_path: Path) -> None:
-    with fed(tmp_path, 2) as (_, http):
-        place = "/api/v1/machines/demo/lab/alarms"
-        with httpx_sse.connect_sse(http, "GET", "/api/v1/events") as source:
-            events = source.iter_sse()
-            assert next(events).event == "start"
-            seen = http.get(f"{place}/k_by")
-            done = http.post(f"{place}/k_by/acknowledge", json={}, headers={"If-Match": seen.headers["etag"]})
-            assert answered(done, OperationDone).alarm.state == "acknowledged"
-            told = next(event for event in events if event.event == "alarm")
-            assert '"acknowledged"' in told.data
-            assert '"acknowledged"' in http.get("/api/v1/machines/demo/lab/health").text  # who hears it finds it there
-            health = next(event for event in events if event.event == "health" and '"acknowledged"' in event.data)
-            assert Health.model_validate_json(health.data).machine == "lab"
-        again = http.post(f"{place}/k_by/acknowledge", json={}, headers={"If-Match": seen.headers["etag"]})
-        problem(again, 409)
-        nothing = http.post(f"{place}/nothing/acknowledge", json={}, headers={"If-Match": "*"})
-        assert "no alarm nothing" in problem(nothing, 404).detail
-        states = answered(http.get(place), AlarmStates)
-        assert [one.state for one in states.alarms if one.name == "k_by"] == ["acknowledged"]
 
 
 def children(of: int) -> list[int]:
@@ -229,28 +229,18 @@ def test_processes_end_with_the_monitor_that_started_them(tmp_path: Path) -> Non
 
 
 def test_what_a_monitor_holds_survives_the_way_to_another_process() -> None:
-    with fed_alone() as data:
-        again = latest_from_bytes(latest_to_bytes(data))
-        assert again.window is not None
-        assert data.window is not None
-        assert again.parameters == data.parameters
-        assert again.parameters
-        assert again.mark() == data.mark()
-        assert again.window.hop_correlation.tobytes() == data.window.hop_correlation.tobytes()
-        assert again.window.spectrum.tobytes() == data.window.spectrum.tobytes()
-        assert [one.start_ns for one in again.blocks] == [one.start_ns for one in data.blocks]
-        assert again.blocks[-1].samples.tobytes() == data.blocks[-1].samples.tobytes()
+    data = latest()
+    again = latest_from_bytes(latest_to_bytes(data))
+    assert again.window is not None
+    assert data.window is not None
+    assert again.parameters == data.parameters
+    assert again.parameters
+    assert again.mark() == data.mark()
+    assert again.window.hop_correlation.tobytes() == data.window.hop_correlation.tobytes()
+    assert again.window.spectrum.tobytes() == data.window.spectrum.tobytes()
+    assert [one.start_ns for one in again.blocks] == [one.start_ns for one in data.blocks]
+    assert again.blocks[-1].samples.tobytes() == data.blocks[-1].samples.tobytes()
     assert latest_from_bytes(latest_to_bytes(LatestData(lacking="nothing came"))) == LatestData(lacking="nothing came")
-
-
-@contextmanager
-def fed_alone() -> Iterator[LatestData]:
-    address = endpoint()
-    with running(settings(address, bundle="lab", when_full="wait")) as runtime:
-        worker = worker_of(runtime)
-        send(address, scenario_blocks(66.0))
-        until(lambda: worker.health().quality.accepted_blocks == 660, "all blocks")
-        yield worker.latest
 
 
 def test_how_many_processes(tmp_path: Path) -> None:

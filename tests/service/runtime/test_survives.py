@@ -8,17 +8,7 @@ import pytest
 
 from models.machine import Machine, load_machine
 from simulator.scenario import parse_fault
-from tests.service.rig.live import (
-    PATIENT,
-    SHORT,
-    Program,
-    endpoint,
-    machine_file,
-    program,
-    scenario_blocks,
-    send,
-    until,
-)
+from tests.service.rig.live import QUICK, Program, endpoint, machine_file, program, scenario_blocks, send, until
 
 ALARMS = "/api/v1/machines/demo/lab/alarms"
 FAULT = parse_fault("c_bz=0.5@0")
@@ -58,7 +48,7 @@ def states(at: Program) -> dict[str, str]:
 
 @pytest.mark.slow
 def test_alarms_and_what_operators_did_survive_kill_9(tmp_path: Path) -> None:
-    file, address = machine_file(tmp_path, PATIENT, *SHORT), endpoint()
+    file, address = machine_file(tmp_path, *QUICK), endpoint()
     machine: Machine = load_machine(file)
     stream = scenario_blocks(80.0, FAULT)
     with running(tmp_path, address, file) as first:
@@ -100,7 +90,7 @@ def test_alarms_and_what_operators_did_survive_kill_9(tmp_path: Path) -> None:
         assert second.stop() == 0
 
     # Another machine file: what was accumulated does not fit, the alarms do.
-    changed = machine_file(tmp_path, PATIENT, *SHORT, ("on_delay_s = 5.0", "on_delay_s = 6.0"))
+    changed = machine_file(tmp_path, *QUICK, ("on_delay_s = 5.0", "on_delay_s = 6.0"))
     with running(tmp_path, address, changed) as third:
         third.wait_for("HTTP API")
         health = third.health()

@@ -23,17 +23,7 @@ from service.stream.checkpoints import stored_event, stored_report
 from simulator.scenario import load_scenario, parse_fault
 from simulator.stream import blocks
 from tests.loopback import session_of
-from tests.service.rig.live import (
-    PATIENT,
-    SHORT,
-    START_NS,
-    Program,
-    endpoint,
-    machine_file,
-    program,
-    until,
-    until_subscribed,
-)
+from tests.service.rig.live import QUICK, START_NS, Program, endpoint, machine_file, program, until, until_subscribed
 from tests.service.rig.postgres import opened
 
 BLOCK_S = 0.5
@@ -54,7 +44,7 @@ class Plant:
 
     def __init__(self, folder: Path, session: zenoh.Session, address: str, recording: bool, kept: int) -> None:
         self.folder, self.session, self.address = folder, session, address
-        file = machine_file(folder, PATIENT, *SHORT)
+        file = machine_file(folder, *QUICK)
         self.machine: Machine = load_machine(file)
         self.url = f"sqlite:///{folder / 'history.sqlite'}"
         self._settings = folder / "monitor.toml"
@@ -96,7 +86,7 @@ class Plant:
 def offline() -> tuple[list[str], list[str]]:
     """What is said without a network, in one go."""
     with TemporaryDirectory() as folder:
-        installed = install(load_machine(machine_file(Path(folder), PATIENT, *SHORT)), None)
+        installed = install(load_machine(machine_file(Path(folder), *QUICK)), None)
     identity = identity_of(installed)
     monitor = MachineMonitor(installed)
     said = [one for block in stream() for one in monitor.step_payload(*encode_block(block, ""))]

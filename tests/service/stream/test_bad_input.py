@@ -29,7 +29,7 @@ from service.monitor.descriptor import descriptor_mismatch
 from service.recordings.replay.source import RecordingSource
 from service.runtime.runtime import Runtime
 from service.stream.worker import MachineWorker
-from tests.service.rig.live import LAB, Feed, endpoint, machine_file, open_session, service, until
+from tests.service.rig.live import LAB, Feed, fed_service, machine_file, until
 from tests.sure import sure
 
 HASH = LAB.descriptor.schema_hash
@@ -77,14 +77,9 @@ BAD: dict[str, tuple[Reason, Callable[[Feed], None], str]] = {
 
 @pytest.fixture(scope="module")
 def fed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Runtime, MachineWorker, Feed]]:
-    address = endpoint()
     # What is missing is waited for no longer than silence may last.
     quick = ("[operation]", "[ingest]\nno_data_after_s = 1.0\nblock_to_s = 0.5\n\n[operation]")
-    with (
-        service(address, machine_file(tmp_path_factory.mktemp("machine"), quick)) as (runtime, worker),
-        open_session(address) as session,
-    ):
-        feed = Feed(session)
+    with fed_service(machine_file(tmp_path_factory.mktemp("machine"), quick)) as (runtime, worker, feed):
         feed.put_good()
         until(lambda: worker.health().quality.accepted_blocks > 0, "first block")
         yield runtime, worker, feed

@@ -34,6 +34,7 @@ from tests.service.rig.live import (
     LAB,
     Feed,
     endpoint,
+    fed_service,
     machine_file,
     open_session,
     scenario_blocks,
@@ -69,15 +70,12 @@ def test_a_descriptor_is_answered_in_few_words(announced: bytes) -> None:
         assert said == (f"descriptor has {len(announced)} bytes, expected at most {MOST_BYTES}",)
 
 
-def test_a_flood_of_descriptors_is_logged_now_and_then(tmp_path: Path) -> None:
+def test_floods_of_descriptors_publishers_and_replays_are_logged_now_and_then(tmp_path: Path) -> None:
     with bench(tmp_path) as at, structlog.testing.capture_logs() as lines:
         for number in range(200):
             at.worker.descriptor(other_names(number + 1))
         assert len([line for line in lines if "differences" in line]) <= 2
-
-
-def test_publishers_that_come_and_go_are_logged_now_and_then(tmp_path: Path) -> None:
-    with bench(tmp_path) as at, structlog.testing.capture_logs() as lines:
+        lines.clear()
         for number in range(200):
             at.worker.publisher(number % 2 == 0)
             at.worker.replay(number % 2 == 0)
@@ -85,16 +83,15 @@ def test_publishers_that_come_and_go_are_logged_now_and_then(tmp_path: Path) -> 
 
 
 def test_health_stays_small_whatever_is_sent() -> None:
-    address = endpoint()
-    with service(address) as (_, worker), open_session(address) as session:
-        feed = Feed(session)
+    with fed_service() as (_, worker, feed):
         feed.put_good()
         feed.put_raw(b"", b"", "text/" + "x" * 200)
         feed.put_raw(b"", b"", f"{BLOCK_ENCODING};" + "y" * 200)
         payload, header = b"\0" * 7200, b"\0" * 32
         feed.put_raw(payload, header, f"{BLOCK_ENCODING};" + "z" * 200)
         feed.put(feed.block(), "h" * 200)
-        session.put(LAB.keys.descriptor, empty_channels(300_000), congestion_control=zenoh.CongestionControl.BLOCK)
+        descriptor, block = empty_channels(300_000), zenoh.CongestionControl.BLOCK
+        feed.session.put(LAB.keys.descriptor, descriptor, congestion_control=block)
         until(lambda: sum(worker.health().quality.refused_blocks.values()) == 4, "refusals")
         until(lambda: worker.health().stream.descriptor_mismatch != (), "the descriptor")
         assert len(worker.health().model_dump_json()) < 100 * KB
@@ -333,9 +330,7 @@ def test_a_replay_that_is_announced_silences_no_machine(first: str) -> None:
 
 
 def test_blocks_that_say_they_are_replayed_are_not_the_machines() -> None:
-    address = endpoint()
-    with service(address) as (_, worker), open_session(address) as session:
-        feed = Feed(session)
+    with fed_service() as (_, worker, feed):
         feed.put_good()
         for one in scenario_blocks(2.0, start_ns=feed.start_ns, run=2):
             payload, header, encoding = encode_block(one, "")

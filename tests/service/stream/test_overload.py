@@ -24,26 +24,13 @@ from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
 from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.source import RecordingSource
-from service.runtime.runtime import running
 from service.settings.service import RecordingSettings
 from service.stream import shedding
 from service.stream.inbox import Inbox, RawBlock
 from service.stream.shedding import LoadShedding
 from service.stream.worker import MachineWorker
 from simulator.scenario import parse_fault
-from tests.service.rig.live import (
-    PATIENT,
-    SHORT,
-    START_NS,
-    Feed,
-    endpoint,
-    machine_file,
-    open_session,
-    scenario_blocks,
-    until,
-    worker_of,
-)
-from tests.service.rig.live import settings as plan_for
+from tests.service.rig.live import QUICK, START_NS, Feed, fed_service, machine_file, scenario_blocks, until
 from tests.service.rig.monitored import client
 from tests.service.rig.replaying import lines_of
 
@@ -55,7 +42,7 @@ LIMIT = '\n[[levels.limits]]\nchannel = "y1"\nmeasure = "overall"\nalert = 220.0
 
 def short_machine(folder: Path) -> str:
     """The rotor kit with windows of 20 s and a limit for what the channel y1 shows."""
-    file = Path(machine_file(folder, PATIENT, *SHORT))
+    file = Path(machine_file(folder, *QUICK))
     file.write_text(file.read_text(encoding="utf-8") + LIMIT, encoding="utf-8")
     return str(file)
 
@@ -290,12 +277,9 @@ def test_an_overloaded_service_loses_no_sample_says_so_and_is_replayed_to_the_sa
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shedding, "_LASTING_S", 0.3)  # data come a hundred times as fast as from a machine
-    address, stream, file = endpoint(), loud_in_between(LENGTH_S), short_machine(tmp_path)
+    stream, file = loud_in_between(LENGTH_S), short_machine(tmp_path)
     recording = RecordingSettings(directory=str(tmp_path / "recordings"))
-    plan = plan_for(address, file, bound=1500, recording=recording)
-    with running(plan) as runtime, open_session(address) as session:
-        worker = worker_of(runtime)
-        feed = Feed(session, worker.machine)
+    with fed_service(file, bound=1500, recording=recording) as (runtime, worker, feed):
         hurry(feed, worker, stream, 10 * (LOUD_TO_S + 50), 200)
         # From now on a hop comes when the one before is done.
         for end in (*range(feed.sequence + 25, len(stream), 50), len(stream)):

@@ -15,11 +15,12 @@ from rotorwatch.records.alarms import AlarmLogPage, AlarmStates
 from rotorwatch.records.health import Health
 from service.history.records import StoreError
 from service.stream.inbox import Inbox, RawBlock
-from service.stream.transport import Link, LinkError, MachineCallbacks, MachineLink, TopicMessage, follow, route
+from service.stream.transport import Link, LinkError, MachineCallbacks, MachineLink, TopicMessage, follow
 from tests.service.rig.live import (
     LAB,
     Feed,
     endpoint,
+    fed_service,
     open_session,
     scenario_blocks,
     send,
@@ -240,14 +241,11 @@ def repeating(action: Callable[[], None], condition: Callable[[], bool]) -> Call
 
 
 def test_late_joiner_asks_for_health_and_alarm_state() -> None:
-    address = endpoint()
-    with service(address) as (_, worker):
-        with open_session(address) as session:
-            feed = Feed(session)
-            for _ in range(5):
-                feed.put_good()
-            until(lambda: worker.health().quality.accepted_blocks == 5, "blocks")
-        with open_session(address) as session:
+    with fed_service() as (runtime, worker, feed):
+        for _ in range(5):
+            feed.put_good()
+        until(lambda: worker.health().quality.accepted_blocks == 5, "blocks")
+        with open_session(runtime.settings.link.listen[0]) as session:
             health = Health.model_validate_json(query(session, KEYS.health))
             assert health.quality.accepted_blocks == 5
             assert health.machine_hash == worker.identity["machine_hash"]
@@ -353,19 +351,6 @@ def test_publisher_is_seen_to_come_and_go_and_its_descriptor_is_asked_for() -> N
         until(lambda: not worker.health().stream.publisher_alive, "publisher gone")
         assert worker.health().stream.descriptor_mismatch == ()
         answer.undeclare()  # type: ignore[no-untyped-call]
-
-
-def test_router_joins_what_cannot_reach_each_other() -> None:
-    address = endpoint()
-    messages: list[TopicMessage] = []
-    with (
-        route(LinkSettings(listen=(address,))),
-        machine_link(LinkSettings(connect=(address,)), ignore) as (_, declared),
-        follow(LinkSettings(mode="client", connect=(address,)), "demo/*", ("health",), messages.append),
-    ):
-        declared.publish("health", json.dumps({"number": 1}))
-        until(lambda: bool(messages), "message through the router")
-        assert messages[0] == TopicMessage(KEYS.health, '{"number": 1}')
 
 
 def test_unusable_endpoint_is_named() -> None:

@@ -14,17 +14,7 @@ from service.runtime.runtime import Runtime, running
 from service.settings.service import RecordingSettings
 from simulator.scenario import parse_fault
 from tests.service.api.page.browsing import kept, looking, unreached, violations
-from tests.service.rig.live import (
-    PATIENT,
-    SHORT,
-    START_NS,
-    endpoint,
-    machine_file,
-    scenario_blocks,
-    send,
-    settings,
-    until,
-)
+from tests.service.rig.live import QUICK, START_NS, endpoint, machine_file, scenario_blocks, send, settings, until
 from tests.service.rig.monitored import PLACE, answered, client
 from tests.service.rig.replaying import recording
 
@@ -51,7 +41,7 @@ def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
     """A machine that has had a fault, and the recording of it."""
     folder = tmp_path_factory.mktemp("recordings")
     blocks = scenario_blocks(SECONDS, parse_fault(f"k_by=-0.33@{FAULT_S:g}"))
-    file = machine_file(tmp_path_factory.mktemp("machine"), *SHORT, PATIENT)
+    file = machine_file(tmp_path_factory.mktemp("machine"), *QUICK)
     recording(folder / ID, blocks, load_machine(file))
     address = endpoint()
     kept_in = RecordingSettings(directory=str(folder), keep_days=36_500.0)
