@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -100,15 +101,19 @@ def test_without_a_shaft_angle_no_sensor_is_blamed_but_levels_have_fallen() -> N
     assert {name for _, name in events} == {f"level:{one.name}" for one in WITHOUT_ANGLE.sensors}
 
 
+@cache
+def made_healthy() -> Installed:
+    made = commissioned(COMMISSIONED, recording(COMMISSIONED, scenario_blocks(END_S)))
+    return Installed(COMMISSIONED, None, made.commissioned)
+
+
 @pytest.mark.parametrize("turns", [False, True])
 def test_a_level_has_fallen_while_the_first_window_fills_only_where_the_machine_turns(turns: bool) -> None:
-    stream = scenario_blocks(END_S)
-    made = commissioned(COMMISSIONED, recording(COMMISSIONED, stream))
     quiet = [NOISE] * (len(KIT.sensors) - 1) + [1.0]
-    first = [replace(block, samples=(block.samples * quiet).astype(np.float32)) for block in stream]
+    first = [replace(block, samples=(block.samples * quiet).astype(np.float32)) for block in scenario_blocks(18.0)]
     if not turns:
-        first = list(stopping(KIT, "machine"))[round(10 * STANDS_S) :]
-    reports, events = watched(MachineMonitor(Installed(COMMISSIONED, None, made.commissioned)), first[:180])
+        first = list(stopping(KIT, "machine"))[round(10 * STANDS_S) :][:180]
+    reports, events = watched(MachineMonitor(made_healthy()), first)
     assert {one.state for one in reports} <= {HealthState.WARMING, HealthState.ALERT}
     assert {name for _, name in events} == {f"level:{one.name}" for one in KIT.sensors[:-1] if turns}
 

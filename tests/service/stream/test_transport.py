@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -15,7 +16,9 @@ from rotorwatch.records.alarms import AlarmLogPage, AlarmStates
 from rotorwatch.records.health import Health
 from service.history.records import StoreError
 from service.stream.inbox import Inbox, RawBlock
+from service.stream.intake import Intake
 from service.stream.transport import Link, LinkError, MachineCallbacks, MachineLink, TopicMessage, follow
+from tests.loopback import session_of
 from tests.service.rig.live import (
     LAB,
     Feed,
@@ -359,3 +362,63 @@ def test_unusable_endpoint_is_named() -> None:
         Link(settings)
     assert named in str(caught.value)
     assert ".rs" not in str(caught.value)
+
+
+KEPT, LIVE = 300, 60
+SIZE = 30_000
+
+
+@pytest.mark.parametrize("wait", [True, False], ids=["batch run", "live machine"])
+def test_kept_and_live_blocks_arrive_each_once(wait: bool) -> None:
+    address = endpoint()
+    patience = {"transport/link/tx/queue/congestion_control/block/wait_before_close": json.dumps(60_000_000)}
+    seen: list[int] = []
+    begun = threading.Event()
+
+    def take(block: RawBlock) -> None:
+        begun.set()
+        seen.append(int.from_bytes(block.payload[:4], "little"))
+        time.sleep(0.001)  # slow enough for live blocks to arrive in between
+
+    with session_of(LinkSettings(connect=(address,)), **patience) as session:
+        publisher = zenoh.ext.declare_advanced_publisher(
+            session,
+            LAB.keys.stream,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.DATA_HIGH,
+            cache=zenoh.ext.CacheConfig(max_samples=KEPT),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.2, sporadic_heartbeat=None),
+            publisher_detection=True,
+        )
+        for number in range(KEPT):
+            publisher.put(number.to_bytes(4, "little") * (SIZE // 4))
+        with machine_link(address, take, wait=wait):
+            until(begun.is_set, "first block")
+            for number in range(KEPT, KEPT + LIVE):
+                publisher.put(number.to_bytes(4, "little") * (SIZE // 4))
+            until(lambda: len(set(seen)) == KEPT + LIVE, "all blocks")
+        publisher.undeclare()  # type: ignore[no-untyped-call]
+    assert sorted(seen) == list(range(KEPT + LIVE))
+
+
+def test_all_channels_are_emptied_until_that_is_ended() -> None:
+    intake, waiting, taken = Intake(), deque([1, 2]), list[int]()
+    other, seen = deque[int](), list[int]()
+
+    def empty() -> None:
+        taken.extend(waiting.popleft() for _ in range(len(waiting)))
+
+    end = intake.add(empty)
+    intake.add(lambda: seen.extend(other.popleft() for _ in range(len(other))))
+    try:
+        until(lambda: taken == [1, 2], "the first messages")
+        waiting.append(3)
+        until(lambda: taken == [1, 2, 3], "what came later")
+        end()
+        waiting.append(4)
+        other.append(5)
+        until(lambda: seen == [5], "the message of the other channel")
+        end()  # once more changes nothing
+    finally:
+        intake.close()
+    assert taken == [1, 2, 3]
