@@ -16,7 +16,7 @@ from models.signals.waveform import waveform_of
 
 RATE_HZ, HOP, HOPS, SPEED_HZ = 2000.0, 10_000, 12, 22.0
 CHANNELS = [
-    Channel.model_validate({"name": name, "quantity": "velocity", "location": "DE", "direction": way, "unit": "m/s"})
+    Channel(name=name, quantity="velocity", location="DE", direction=way, unit="m/s")
     for name, way in (("V", "y"), ("H", "z"))
 ]
 NAMES = [channel.name for channel in CHANNELS]

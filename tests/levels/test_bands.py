@@ -16,9 +16,7 @@ from tests.levels.test_measures import taken
 from tests.sure import sure
 
 RATE_HZ, HOP_S, HOPS = 2560.0, 5.0, 4
-DE = Channel.model_validate(
-    {"name": "DE", "quantity": "acceleration", "location": "DE", "direction": "axial", "unit": "m/s2"}
-)
+DE = Channel(name="DE", quantity="acceleration", location="DE", direction="axial", unit="m/s2")
 PLAN: LevelPlan = level_plan([DE], RATE_HZ, (10.0, 1000.0))
 T = np.arange(round(HOPS * HOP_S * RATE_HZ)) / RATE_HZ
 

@@ -18,9 +18,7 @@ RATE_HZ, HOP_S, HOPS = 1000.0, 5.0, 12
 PLACES = ("bearing y", "disc y", "disc z")
 RESONANCES_HZ = (40.0, 60.0, 90.0)
 CHANNELS = [
-    Channel.model_validate(
-        {"name": name, "quantity": "displacement", "location": place, "direction": way, "unit": "um"}
-    )
+    Channel(name=name, quantity="displacement", location=place, direction=way, unit="um")
     for name, place, way in (("y1", "bearing", "y"), ("y2", "disc", "y"), ("z2", "disc", "z"))
 ]
 PLAN = level_plan(CHANNELS, RATE_HZ, (10.0, 400.0))

@@ -16,7 +16,7 @@ from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels
 from tests.sure import sure
 
 CHANNELS = [
-    Channel.model_validate({"name": name, "quantity": quantity, "location": "DE", "direction": "V", "unit": unit})
+    Channel(name=name, quantity=quantity, location="DE", direction="V", unit=unit)
     for name, quantity, unit in (("A", "acceleration", "g"), ("V", "velocity", "mm/s"), ("D", "displacement", "um"))
 ]
 PLAN = level_plan(CHANNELS, 10_000.0, (10.0, 1000.0))

@@ -15,13 +15,9 @@ from models.levels.zones import ZONES, zone_of
 from models.signals.channels import Channel
 from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelLimits
 
-CASING = Channel.model_validate(
-    {"name": "DE-H", "quantity": "velocity", "location": "DE", "direction": "horizontal", "unit": "mm/s"}
-)
+CASING = Channel(name="DE-H", quantity="velocity", location="DE", direction="horizontal", unit="mm/s")
 CASING_G = Channel.model_validate(CASING.model_dump() | {"name": "DE-A", "quantity": "acceleration", "unit": "g"})
-SHAFT = Channel.model_validate(
-    {"name": "XE-1", "quantity": "displacement", "location": "bearing", "direction": "y", "unit": "um"}
-)
+SHAFT = Channel(name="XE-1", quantity="displacement", location="bearing", direction="y", unit="um")
 SPEED = 2 * np.pi * 25
 
 

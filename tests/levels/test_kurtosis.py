@@ -17,9 +17,7 @@ from tests.levels.test_measures import taken
 from tests.sure import sure
 
 RATE_HZ, HOP_S, HOPS = 1000.0, 5.0, 12
-Y = Channel.model_validate(
-    {"name": "y2", "quantity": "displacement", "location": "disc", "direction": "y", "unit": "um"}
-)
+Y = Channel(name="y2", quantity="displacement", location="disc", direction="y", unit="um")
 PLAN: LevelPlan = level_plan([Y], RATE_HZ, (10.0, 400.0))
 T = np.arange(round(HOPS * HOP_S * RATE_HZ)) / RATE_HZ
 THETA = 2 * np.pi * 23.0 * T

@@ -16,16 +16,8 @@ RATE_HZ = 25_600.0
 
 def channel(quantity: str, direction: str = "y", location: str = "bearing", angle_deg: float | None = None) -> Channel:
     unit = {"displacement": "um", "velocity": "mm/s", "acceleration": "m/s2"}[quantity]
-    return Channel.model_validate(
-        {
-            "name": f"{quantity}-{direction}",
-            "quantity": quantity,
-            "location": location,
-            "direction": direction,
-            "unit": unit,
-            "angle_deg": angle_deg,
-        }
-    )
+    name = f"{quantity}-{direction}"
+    return Channel(name=name, quantity=quantity, location=location, direction=direction, unit=unit, angle_deg=angle_deg)
 
 
 def plan(*quantities: str, rate_hz: float = RATE_HZ, band_hz: tuple[float, float] = (10.0, 1000.0)) -> LevelPlan:

@@ -14,9 +14,7 @@ from simulator.sensors import SensorBank, SimulatedSensor
 from simulator.timeline import SensorFaults
 
 RATE_HZ = 2000.0
-DISPLACEMENT = Channel.model_validate(
-    {"name": "XE", "quantity": "displacement", "location": "bearing", "direction": "y", "unit": "um"}
-)
+DISPLACEMENT = Channel(name="XE", quantity="displacement", location="bearing", direction="y", unit="um")
 
 
 def _sensor(settings: SensorSettings, seed: int = 0, rms_SI: float = 1e-5) -> SimulatedSensor:

@@ -89,19 +89,9 @@ def test_an_overhang_bends_as_statics_says() -> None:
 
 def test_a_spinning_disc_splits_its_tilting_modes_as_the_rigid_rotor_says() -> None:
     k, L, disc, speed = 1e5, 0.4, Disc(2, 5.0, 0.1), 300.0
-    rotor = BeamRotor(
-        name="rigid",
-        description="",
-        length_m=L,
-        diameter_m=0.1,
-        elements=4,
-        bearings=(Bearing(0, k, k, 0, 0), Bearing(4, k, k, 0, 0)),
-        discs=(disc,),
-        speed_rad_s=speed,
-        shaft_damping_s=0.0,
-        E_Pa=1e13,
-        density_kg_m3=1e-3,
-    )
+    bearings = (Bearing(0, k, k, 0, 0), Bearing(4, k, k, 0, 0))
+    rigid = replace(BEAM, length_m=L, diameter_m=0.1, elements=4, E_Pa=1e13, density_kg_m3=1e-3)
+    rotor = replace(rigid, bearings=bearings, discs=(disc,), speed_rad_s=speed)
     I_d, I_p, turning = 5 * 0.01 / 4, 5 * 0.01 / 2, k * L**2 / 2
     roots = np.roots([I_d, -I_p * speed, -turning])
     expected = sorted(np.abs(roots) / (2 * np.pi))

@@ -6,6 +6,7 @@ import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -22,7 +23,17 @@ from service.stream.transport import Link, TopicMessage, follow
 from simulator.publisher import PublishError, PublishSettings, publish
 from tests.loopback import session_of
 from tests.service.access.plant import GRANTS, PUMP, Plant, at_once, kept, plant
-from tests.service.rig.live import LAB, ROOT, Program, endpoint, program, scenario_blocks, until
+from tests.service.rig.live import (
+    LAB,
+    ROOT,
+    Program,
+    advanced_publisher,
+    endpoint,
+    program,
+    scenario_blocks,
+    until,
+    until_subscribed,
+)
 from tests.sure import sure
 
 
@@ -251,16 +262,8 @@ def test_a_viewer_reads_no_more_than_its_grant(router: Plant) -> None:
         token.undeclare()  # type: ignore[no-untyped-call]
 
 
-def advanced(session: zenoh.Session, key: str, cache: int = 100) -> zenoh.ext.AdvancedPublisher:
-    """As the monitor and the simulator publish."""
-    return zenoh.ext.declare_advanced_publisher(
-        session,
-        key,
-        congestion_control=zenoh.CongestionControl.BLOCK,
-        cache=zenoh.ext.CacheConfig(max_samples=cache),
-        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.1, sporadic_heartbeat=None),
-        publisher_detection=True,
-    )
+advanced = partial(advanced_publisher, kept=100, heartbeat_s=0.1)
+"""As the monitor and the simulator publish."""
 
 
 def collected(
@@ -319,20 +322,13 @@ def test_a_granted_viewer_fetches_what_was_lost_on_the_way(router: Plant) -> Non
         plain: list[str] = []
         one.declare_subscriber(LAB.keys.alarm_event, lambda sample: plain.append(sample.payload.to_string()))
         texts, _ = collected(one, LAB.keys.alarm_event, history=False, recovery=True)
-        until(lambda: bool(events.key_expr) and matched(monitor, LAB.keys.alarm_event), "a subscriber")
+        until_subscribed(monitor, LAB.keys.alarm_event)
         for number in numbers:
             events.put(number)
         # Each subscriber has a thread of its own: what came by itself may be told last.
         until(lambda: len(texts) >= 10 and bool(plain), "events that were lost")
         assert texts == numbers
         assert plain == ["0"]
-
-
-def matched(session: zenoh.Session, key: str) -> bool:
-    probe = session.declare_publisher(key)
-    found = bool(probe.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
-    probe.undeclare()  # type: ignore[no-untyped-call]
-    return found
 
 
 def test_a_real_stream_reaches_only_whom_it_is_granted(router: Plant) -> None:

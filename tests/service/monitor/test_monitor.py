@@ -20,6 +20,7 @@ from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition
+from tests.commissioning import rotor_kit
 from tests.commissioning.rotor_kit import with_lines
 from tests.sure import sure
 
@@ -42,14 +43,11 @@ def feed(target: MachineMonitor, stream: Sequence[SampleBlock]) -> tuple[list[Re
     return windows, events
 
 
-@cache
-def stream(duration_s: float, *events: Event) -> list[SampleBlock]:
-    loaded, machine = load_scenario("healthy")
-    made = loaded.overridden(duration_s=duration_s, seed=SEED, faults=events)
-    return [block for block, _ in blocks(made, machine)]
+def stream(duration_s: float, *events: Event) -> Sequence[SampleBlock]:
+    return rotor_kit.stream(duration_s, SEED, *events)
 
 
-def healthy(duration_s: float) -> list[SampleBlock]:
+def healthy(duration_s: float) -> Sequence[SampleBlock]:
     """The first blocks of one stream, which no test may write to."""
     return stream(180.0)[: round(10 * duration_s)]
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from models.commissioning.commission import commission
-from models.commissioning.commissioned import FILE, HealthyEntry, Installed, install
+from models.commissioning.commissioned import FILE, Installed, install
 from models.commissioning.healthy import healthy_from_blocks
 from models.diagnosis.moments import plan_for
 from models.machine import AlarmSettings, MachineFile, Operation
@@ -181,11 +180,8 @@ def test_first_windows_outlast_whatever_they_do_not_depend_on(changes: dict[str,
 
 
 def test_commissioned_levels_are_the_reference_and_say_what_is_unchanged(tmp_path: Path) -> None:
-    healthy = healthy_from_blocks("healthy.mcap", FAN, [(block, "") for block in blocks(6, 150)])
-    entry = HealthyEntry(
-        name="healthy.mcap", sha256="0" * 64, start_ns=START_NS, end_ns=START_NS + 150 * 10**9, used_s=145.0, gaps=0
-    )
-    made = commission(FAN, [healthy], [entry])
+    found = healthy_from_blocks("healthy.mcap", FAN, [(block, "") for block in blocks(6, 150)])
+    made = commissioned(FAN, found)
     assert made.commissioned is not None, made.report.summary
     assert made.report.verdict == "limited"
     (tmp_path / FILE).write_text(made.commissioned.model_dump_json())
@@ -264,9 +260,7 @@ def test_a_dead_sensor_at_whatever_place_is_a_fault_of_that_sensor_and_no_quiet_
 
 
 def test_a_dead_sensor_elsewhere_is_told_and_the_rotor_is_diagnosed_as_before() -> None:
-    casing = Channel.model_validate(
-        {"name": "DE-H", "quantity": "acceleration", "location": "DE", "direction": "horizontal", "unit": "m/s2"}
-    )
+    casing = Channel(name="DE-H", quantity="acceleration", location="DE", direction="horizontal", unit="m/s2")
     rig = LAB.model_copy(update={"sensors": (*LAB.sensors, casing)})
     monitor, alone = MachineMonitor(install(rig, None)), MachineMonitor(install(LAB, None))
     for block in scenario_blocks(72.0):

@@ -15,6 +15,7 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 import zenoh
+import zenoh.ext
 
 from models.machine import MachineFile, load_machine
 from models.signals.block import SampleBlock
@@ -79,6 +80,21 @@ def open_session(connect: str, mode: Literal["peer", "client"] = "peer") -> Iter
     with loopback.session_of(LinkSettings(mode=mode, connect=(connect,))) as session:
         until_subscribed(session, LAB.keys.stream)
         yield session
+
+
+def advanced_publisher(
+    session: zenoh.Session, key: str, kept: int = 0, *, heartbeat_s: float = 0.2, detected: bool = True, **more: Any
+) -> zenoh.ext.AdvancedPublisher:
+    """As the simulator's: what is lost is noticed, and as much is kept for who comes late."""
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        key,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        cache=zenoh.ext.CacheConfig(max_samples=kept) if kept else None,
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=heartbeat_s, sporadic_heartbeat=None),
+        publisher_detection=detected,
+        **more,
+    )
 
 
 def settings(

@@ -23,7 +23,17 @@ from service.stream.checkpoints import stored_event, stored_report
 from simulator.scenario import load_scenario, parse_fault
 from simulator.stream import blocks
 from tests.loopback import session_of
-from tests.service.rig.live import QUICK, START_NS, Program, endpoint, machine_file, program, until, until_subscribed
+from tests.service.rig.live import (
+    QUICK,
+    START_NS,
+    Program,
+    advanced_publisher,
+    endpoint,
+    machine_file,
+    program,
+    until,
+    until_subscribed,
+)
 from tests.service.rig.postgres import opened
 
 BLOCK_S = 0.5
@@ -52,15 +62,7 @@ class Plant:
         if recording:
             text += f'[recording]\ndirectory = "{folder / "recordings"}"\n'
         self._settings.write_text(text, encoding="utf-8")
-        cache = zenoh.ext.CacheConfig(max_samples=kept) if kept else None
-        self._publisher = zenoh.ext.declare_advanced_publisher(
-            session,
-            self.machine.keys.stream,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            cache=cache,
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.2, sporadic_heartbeat=None),
-            publisher_detection=True,
-        )
+        self._publisher = advanced_publisher(session, self.machine.keys.stream, kept)
 
     @contextmanager
     def monitor(self) -> Iterator[Program]:

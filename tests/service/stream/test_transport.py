@@ -22,6 +22,7 @@ from tests.loopback import session_of
 from tests.service.rig.live import (
     LAB,
     Feed,
+    advanced_publisher,
     endpoint,
     fed_service,
     open_session,
@@ -129,14 +130,7 @@ def test_blocks_of_two_sessions_are_told_apart() -> None:
     taken: list[RawBlock] = []
     address = endpoint()
     with machine_link(address, taken.append), open_session(address) as session, open_session(address) as other:
-        publishers = [
-            zenoh.ext.declare_advanced_publisher(
-                one,
-                KEYS.stream,
-                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.2, sporadic_heartbeat=None),
-            )
-            for one in (session, other)
-        ]
+        publishers = [advanced_publisher(one, KEYS.stream, detected=False) for one in (session, other)]
         for number in range(6):
             publishers[number % 2].put(bytes([number % 2]))
         until(lambda: len(taken) == 6, "all blocks")
@@ -171,13 +165,7 @@ def test_waiting_survives_a_long_stall() -> None:
     worker = threading.Thread(target=work)
     worker.start()
     with machine_link(address, inbox.put, wait=True), open_session(address) as session:
-        publisher = zenoh.ext.declare_advanced_publisher(
-            session,
-            KEYS.stream,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            cache=zenoh.ext.CacheConfig(max_samples=300),
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.2, sporadic_heartbeat=None),
-        )
+        publisher = advanced_publisher(session, KEYS.stream, 300, detected=False)
         sender = threading.Thread(target=lambda: [publisher.put(bytes(7200)) for _ in range(10_000)])
         sender.start()
         # Longer than several heartbeats; a publisher blocked in a put shows nothing else to wait for.
@@ -381,15 +369,7 @@ def test_kept_and_live_blocks_arrive_each_once(wait: bool) -> None:
         time.sleep(0.001)  # slow enough for live blocks to arrive in between
 
     with session_of(LinkSettings(connect=(address,)), **patience) as session:
-        publisher = zenoh.ext.declare_advanced_publisher(
-            session,
-            LAB.keys.stream,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.DATA_HIGH,
-            cache=zenoh.ext.CacheConfig(max_samples=KEPT),
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.2, sporadic_heartbeat=None),
-            publisher_detection=True,
-        )
+        publisher = advanced_publisher(session, LAB.keys.stream, KEPT, priority=zenoh.Priority.DATA_HIGH)
         for number in range(KEPT):
             publisher.put(number.to_bytes(4, "little") * (SIZE // 4))
         with machine_link(address, take, wait=wait):
