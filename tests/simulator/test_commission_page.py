@@ -100,10 +100,6 @@ class Page(HTMLParser):
         return " ".join(" ".join(self.texts).split())
 
 
-def disturbed() -> HealthyRecording:
-    return recording(NOTHING, humming(stream(70.0, 61), 41.4), RUDE)
-
-
 def without_reference(operation: Operation | None) -> tuple[MachineFile, HealthyRecording]:
     """Displacements alone, no shaft angle, and a block is missing."""
     keep = [n for n, state in enumerate(LAB.descriptor.states) if state in ("y1", "z1", "y2", "z2")]
@@ -135,7 +131,7 @@ def case(name: str) -> Case:
     elif name == "no hop":
         machine, recordings = NOTHING, (healthy(NOTHING, 3.0, 70),)
     elif name == "second excitation":
-        machine, recordings = NOTHING, (disturbed(),)
+        machine, recordings = NOTHING, (recording(NOTHING, humming(stream(70.0, 61), 41.4), RUDE),)
     else:
         machine, one = without_reference(None if name == "no speed" else Operation(speed_rpm=1320.0))
         recordings = (one,)

@@ -14,7 +14,7 @@ from models.diagnosis.sensors.reference import SensorReference, implicated, lear
 from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
-from models.machine import Machine, load_machine
+from models.machine import load_machine
 from models.signals.block import FloatArray
 from models.signals.channels import unit_in_text
 from rotorwatch.records.windows import SensorFault
@@ -25,13 +25,9 @@ from tests.sure import sure
 WINDOW_S, MORE_S = 60.0, 3.0
 
 
-def machine_of(name: str) -> Machine:
-    return load_machine(name)
-
-
 @cache
 def plan_of(name: str) -> Plan:
-    return plan_for(machine_of(name), lagged=False)
+    return plan_for(load_machine(name), lagged=False)
 
 
 def sources_along(directions: FloatArray, cutoff_hz: float, force_N: float) -> tuple[NamedSource, ...]:
@@ -47,7 +43,7 @@ def sources_along(directions: FloatArray, cutoff_hz: float, force_N: float) -> t
 @cache
 def recorded(name: str, seed: int, windows: int = 1, *, one_source: bool = False) -> FloatArray:
     """SI samples of a healthy machine, with a level, a cutoff and a noise drawn from the seed."""
-    rng, machine = np.random.default_rng([seed, 5]), machine_of(name)
+    rng, machine = np.random.default_rng([seed, 5]), load_machine(name)
     force_N = machine.rotor.m2_kg * machine.rotor.e_m * machine.operation.speed_rad_s**2 * rng.uniform(0.5, 3)
     cutoff_hz, directions = rng.uniform(*machine.condition.cutoff_hz), np.eye(6)[[0, 1, 3, 4]]
     if one_source:
@@ -80,7 +76,7 @@ def column(state: str) -> int:
 
 def found_in(samples: FloatArray, reference: SensorReference | None = None) -> tuple[SensorFault, ...]:
     (window,) = windows_of(plan_of("lab"), samples)
-    return sensor_findings(window, reference, machine_of("lab").sensors)
+    return sensor_findings(window, reference, load_machine("lab").sensors)
 
 
 def only(findings: tuple[SensorFault, ...]) -> SensorFault:
@@ -112,7 +108,7 @@ def test_a_stuck_sensor_is_named_with_its_value_and_for_how_long(state: str) -> 
     finding = only(found_in(samples))
     assert (finding.kind, finding.states) == ("stuck", (state,))
     assert finding.value == pytest.approx(30.0, abs=5.0)
-    channel = next(one for one in machine_of("lab").sensors if one.name == state)
+    channel = next(one for one in load_machine("lab").sensors if one.name == state)
     assert f"{samples[50_000, column(state)] / channel.to_si:.3g} {unit_in_text(channel.unit)}" in finding.text
 
 

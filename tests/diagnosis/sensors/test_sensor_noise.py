@@ -12,11 +12,12 @@ from models.diagnosis.moments import Plan, plan_for
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import SensorReference, learn_sensor_reference
 from models.diagnosis.window import WindowStatistics
+from models.machine import load_machine
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import SensorFault
 from simulator.scenario import Event, Scenario, Sensors
 from simulator.stream import blocks
-from tests.diagnosis.sensors.test_sensor_checks import MORE_S, WINDOW_S, column, machine_of, only, sources_along
+from tests.diagnosis.sensors.test_sensor_checks import MORE_S, WINDOW_S, column, only, sources_along
 from tests.diagnosis.sensors.test_sensor_checks import windows_of as windows_in
 from tests.sure import sure
 
@@ -25,7 +26,7 @@ DISPLACEMENTS = ("y1", "z1", "y2", "z2")
 
 @cache
 def plan_of(name: str, *, displacements: bool = False) -> Plan:
-    plan = plan_for(machine_of(name), lagged=False)
+    plan = plan_for(load_machine(name), lagged=False)
     if not displacements:
         return plan
     keep = [plan.states.index(state) for state in DISPLACEMENTS]
@@ -37,7 +38,7 @@ def recorded(
     name: str, seed: int, windows: int = 1, *, directions: int = 4, noise: float = 0.02, events: tuple[Event, ...] = ()
 ) -> FloatArray:
     """SI samples of all channels and, last, the shaft angle; level and cutoff are drawn from the seed."""
-    rng, machine = np.random.default_rng([seed, 6]), machine_of(name)
+    rng, machine = np.random.default_rng([seed, 6]), load_machine(name)
     force_N = machine.rotor.m2_kg * machine.rotor.e_m * machine.operation.speed_rad_s**2 * rng.uniform(0.5, 2)
     cutoff_hz = rng.uniform(*machine.condition.cutoff_hz)
     rows = np.eye(6)[[0, 1, 3, 4]] if directions == 4 else rng.standard_normal((1, 6)) * [1, 1, 0.05, 1, 1, 0.05]
@@ -71,7 +72,7 @@ def found_in(
 ) -> tuple[SensorFault, ...]:
     (window,) = windows_of("lab", samples, displacements=displacements)
     reference = reference_of("lab", displacements=displacements) if reference is None else reference
-    return sensor_findings(window, reference, machine_of("lab").sensors)
+    return sensor_findings(window, reference, load_machine("lab").sensors)
 
 
 def with_noise(samples: FloatArray, state: str, part: float, seed: int = 0) -> FloatArray:
@@ -84,15 +85,15 @@ def with_noise(samples: FloatArray, state: str, part: float, seed: int = 0) -> F
 def with_hum(samples: FloatArray, state: str, part: float, line_hz: float = 50.0) -> FloatArray:
     """A line, its rms a part of the channel's."""
     humming, at = samples.copy(), column(state)
-    t_s = np.arange(len(samples)) / machine_of("lab").rate_hz
+    t_s = np.arange(len(samples)) / load_machine("lab").rate_hz
     humming[:, at] += part * samples[:, at].std() * np.sqrt(2) * np.sin(2 * np.pi * line_hz * t_s)
     return humming
 
 
 def in_band(part: float) -> float:
     """Of white noise of this size, what lies in the band, over the rms of channel and noise."""
-    low, high = machine_of("lab").window.band_hz
-    return float(part * np.sqrt((high - low) / (machine_of("lab").rate_hz / 2)) / np.hypot(1, part))
+    low, high = load_machine("lab").window.band_hz
+    return float(part * np.sqrt((high - low) / (load_machine("lab").rate_hz / 2)) / np.hypot(1, part))
 
 
 @pytest.mark.parametrize("name", ["lab", pytest.param("heavy", marks=pytest.mark.long)])
@@ -136,7 +137,7 @@ def test_a_line_that_one_sensor_sees_is_the_mains_or_the_machines(line_hz: float
 
 def test_a_line_that_the_machine_shows_in_all_channels_is_none_of_a_sensors() -> None:
     samples = recorded("lab", 920).copy()
-    t_s = np.arange(len(samples)) / machine_of("lab").rate_hz
+    t_s = np.arange(len(samples)) / load_machine("lab").rate_hz
     for place, size in zip(DISPLACEMENTS, (0.05, 0.1, 0.15, 0.1), strict=True):
         samples[:, column(place)] += size * samples[:, column(place)].std() * np.sin(2 * np.pi * 50 * t_s)
     assert found_in(samples, displacements=True) == ()
@@ -251,7 +252,7 @@ def test_a_heavy_spot_that_turns_is_no_fault_of_the_angle() -> None:
 
 
 def test_a_small_jump_in_loud_vibration_is_found_where_the_angle_shows_it() -> None:
-    samples, machine = recorded("lab", 922).copy(), machine_of("lab")
+    samples, machine = recorded("lab", 922).copy(), load_machine("lab")
     shaking = np.fft.rfft(np.random.default_rng(923).standard_normal(samples[:, :-1].shape), axis=0)
     f = np.fft.rfftfreq(len(samples), 1 / machine.rate_hz)
     shaking[np.abs(f - machine.operation.speed_rpm / 60) > 1] = 0
@@ -264,7 +265,7 @@ def test_a_small_jump_in_loud_vibration_is_found_where_the_angle_shows_it() -> N
 
 
 def test_a_shaft_that_changes_its_speed_has_a_sound_angle() -> None:
-    speed_rpm = machine_of("lab").operation.speed_rpm
+    speed_rpm = load_machine("lab").operation.speed_rpm
     event = Event(at_s=25.0, ramp_s=10.0, speed_rpm=1.03 * speed_rpm)
     assert found_in(recorded("lab", 927, events=(event,))) == ()
 
@@ -276,7 +277,7 @@ def test_a_lightly_damped_shaft_near_its_resonance_has_a_sound_angle(
 ) -> None:
     rng, plan = np.random.default_rng([60120, round(1e4 * damping), round(100 * resonance)]), plan_of("lab")
     plan = replace(plan, states=("y1",), columns=plan.columns[:1], scales=plan.scales[:1])
-    machine = machine_of("lab")
+    machine = load_machine("lab")
     t_s = np.arange(round((WINDOW_S + MORE_S) * machine.rate_hz)) / machine.rate_hz
     speed_hz = machine.operation.speed_rpm / 60
     knots_s = np.arange(0.0, t_s[-1] + 8.0, 4.0)

@@ -1,6 +1,5 @@
 """Connections that keep the HTTP server waiting are ended and keep nobody away: a real monitor, real sockets."""
 
-import json
 import os
 import resource
 import select
@@ -241,13 +240,8 @@ def test_the_monitor_may_open_as_many_files_as_the_system_allows(tmp_path: Path)
     with ExitStack() as undo:
         undo.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
         resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
-        started = undo.enter_context(
-            program(tmp_path, "service.rotorwatch", "run", ROTORWATCH_HTTP__PORT="0", ROTORWATCH_LINK=listening())
-        )
+        plan = ("--http-port", "0", "--listen", endpoint())
+        started = undo.enter_context(program(tmp_path, "service.rotorwatch", "run", *plan))
         text = httpx.get(f"{started.url()}/metrics", trust_env=False, timeout=180.0).text
     found = next(line for line in text.splitlines() if line.startswith("process_max_fds "))
     assert float(found.split()[1]) == min(hard, 65_536)
-
-
-def listening() -> str:
-    return json.dumps({"listen": [endpoint()]})

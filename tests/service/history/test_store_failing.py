@@ -32,7 +32,7 @@ from tests.sure import sure
 QUICK_S = 1.0
 
 
-Parts = tuple[str, Callable[[], None], Callable[[], None]]
+Parts = tuple[str, Callable[[], object], Callable[[], object]]
 
 
 @pytest.fixture(scope="module")
@@ -52,13 +52,9 @@ def parts(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Parts]:
     file = tmp_path / "history.sqlite"
     blocker = sqlite3.connect(file, isolation_level=None)  # another program that does not let go of the file
     try:
-        yield f"sqlite:///{file}", lambda: void(blocker, "BEGIN IMMEDIATE"), lambda: void(blocker, "ROLLBACK")
+        yield f"sqlite:///{file}", lambda: blocker.execute("BEGIN IMMEDIATE"), lambda: blocker.execute("ROLLBACK")
     finally:
         blocker.close()
-
-
-def void(connection: sqlite3.Connection, statement: str) -> None:
-    connection.execute(statement)
 
 
 opened = partial(history_opened, timeout_s=QUICK_S, retry_s=0.05)

@@ -143,11 +143,6 @@ def test_the_same_answers_whatever_the_number_of_processes_and_orders_reach_all(
     assert reports[0] == reports[1]
 
 
-def children(of: int) -> list[int]:
-    """Processes that a program has started to share its machines, and that run."""
-    return [one for one in children_of(of) if b"spawn_main" in Path(f"/proc/{one}/cmdline").read_bytes()]
-
-
 def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -> None:
     plan = plan_for(tmp_path, 2)
     blocks = scenario_blocks(SECONDS, parse_fault("k_by=-0.33@10"))
@@ -220,7 +215,8 @@ def test_processes_end_with_the_monitor_that_started_them(tmp_path: Path) -> Non
         ROTORWATCH_HISTORY__URL=plan.history.database,
     ) as monitor:
         monitor.wait_for("HTTP API")
-        started = children(monitor.process.pid)
+        own = {one: Path(f"/proc/{one}/cmdline").read_bytes() for one in children_of(monitor.process.pid)}
+        started = [one for one, command in own.items() if b"spawn_main" in command]  # to share its machines
         assert len(started) == 2
         monitor.kill()
     until(lambda: not any(Path(f"/proc/{one}").exists() for one in started), "end of all processes")
