@@ -20,6 +20,7 @@ from models.diagnosis.window import WindowStatistics
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETER_TEXT
 from models.signals.channels import with_channel_names
+from models.stream_settings import time_scale
 from rotorwatch.records.windows import SensorFault
 
 _FEWEST_HOPS = 8
@@ -30,6 +31,7 @@ _STEADY_LEVEL = 2.0  # ratio of the rms between the halves of a recording; chanc
 SAME_SPEED = 0.03  # relative difference within which speeds count as one
 _MOST_OUTSIDE = 0.8  # share of healthy windows outside a theory beyond which it is not the machine's
 _RATE = 1e-3  # probability that a healthy machine fails a comparison of its own windows
+_SUITED = 0.8  # of the time scale that a machine's speed asks for: within this its windows are near enough
 _NEGLIGIBLE = 0.01  # relative difference, a tenth of an alarm's usual limit, that no alarm comes of, however certain
 _LOUD_LINE, _DOMINANT_LINE = 0.05, 0.5  # share of a foreign line in the power of a channel's random part
 
@@ -103,6 +105,22 @@ def check_sensors_of(
             for (recording, _, _), texts in faults.items()
         ),
         advice="repair, re-range or rewire what is named, and record again: a fault must not become the healthy state",
+    )
+
+
+def check_speed_given(machine: MachineFile, windows: Sequence[WindowStatistics]) -> Check | None:
+    """Refusal of a machine that turns so fast that other windows suit it, where its file does not say so."""
+    speeds = [window.speed_rad_s / (2 * np.pi) for window in windows if np.isfinite(window.speed_rad_s)]
+    fastest_hz = max(speeds, default=0.0)
+    modes_hz = () if machine.rotor is None else machine.rotor.modes_hz
+    if time_scale(modes_hz, fastest_hz) > _SUITED * machine.time_scale:
+        return None
+    return Check(
+        name="window settings",
+        verdict="refused",
+        text=f"the shaft turns at {60 * fastest_hz:.0f} rpm, and the windows are those of a slower machine",
+        advice=f"give speed_rpm = {60 * fastest_hz:.0f} in [operation] of the machine file: what [window] leaves out "
+        "follows from it; the recordings can stay",
     )
 
 

@@ -9,7 +9,14 @@ import numpy as np
 from pydantic import BaseModel, Field
 from scipy.special import ndtri
 
-from models.commissioning.checks import Check, check_data, check_lines, check_sensors_of, check_steady
+from models.commissioning.checks import (
+    Check,
+    check_data,
+    check_lines,
+    check_sensors_of,
+    check_speed_given,
+    check_steady,
+)
 from models.commissioning.commissioned import (
     Commissioned,
     HealthyEntry,
@@ -261,6 +268,8 @@ def commission(
     knowledge = knowledge_of(machine)
     checks = [check_data(machine, recordings)]
     pieces = [] if checks[0].verdict == "refused" else pieces_of(recordings)
+    if (unsuited := check_speed_given(machine, [piece.window for piece in pieces])) is not None:
+        checks, pieces = [*checks, unsuited], []
     learned, states = Learned(()), states_of(machine)
     if pieces:
         by_recording = {

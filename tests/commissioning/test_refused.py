@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.commissioning.checks import check_lines, check_shapes
+from models.commissioning.checks import check_agreement, check_lines, check_shapes, check_speed_given
 from models.commissioning.commission import Commissioning
+from models.diagnosis.readings import Diagnosis, parameter_reading
 from models.diagnosis.shape import HealthyShape, ShapeSpread
-from models.machine import MachineFile
+from models.machine import MachineFile, Operation
+from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import (
@@ -23,6 +25,7 @@ from tests.commissioning.rotor_kit import (
     recording,
     samples_of,
     stream,
+    windows_of,
     with_samples,
 )
 from tests.sure import sure
@@ -261,3 +264,31 @@ def test_a_machine_that_is_no_such_rotor_is_told_the_cure() -> None:
     made = commissioned(wrong, healthy(wrong, 45.0, 41))
     assert refused(made)
     assert "leave [rotor] out of the machine file" in verdict_of(made, "agrees with the identified rotor")[2]
+
+
+@pytest.mark.parametrize(("rpm", "given", "refused"), [(3300, False, False), (6600, False, True), (6600, True, False)])
+def test_a_fast_machine_has_to_say_so(rpm: float, given: bool, refused: bool) -> None:
+    machine = NOTHING.model_copy(update={"operation": Operation(speed_rpm=rpm) if given else None})
+    windows = [replace(window, speed_rad_s=rpm * np.pi / 30) for window in windows_of(healthy(NOTHING, HEALTHY_S, 55))]
+    found = check_speed_given(machine, windows)
+    assert (found is not None) == refused
+    if found is not None:
+        assert found.verdict == "refused"
+        assert found.text == "the shaft turns at 6600 rpm, and the windows are those of a slower machine"
+        assert "give speed_rpm = 6600 in [operation]" in found.advice
+    assert check_speed_given(LAB, windows) is None  # its natural frequencies are known
+
+
+def test_a_difference_that_no_alarm_comes_of_refuses_nothing() -> None:
+    def read(change: float) -> Diagnosis:
+        found = [parameter_reading(name, "likelihood", change if name == "c_bz" else 0.0, 2e-4) for name in PARAMETERS]
+        return Diagnosis("likelihood", tuple(found), covariance=4e-8 * np.eye(len(found)))
+
+    small = check_agreement([read(0.003), read(0.0)], "the identified rotor")
+    assert (small.verdict, small.text) == (
+        "passed",
+        "no difference of 1% or more between the healthy data and the identified rotor: at most 15.0 standard errors "
+        "in 2 windows",
+    )
+    assert check_agreement([read(0.012), read(0.0)], "the identified rotor").verdict == "refused"
+    assert check_agreement([read(0.0), read(0.0)], "the identified rotor").text.startswith("no difference between")
