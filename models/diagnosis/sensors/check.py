@@ -66,11 +66,12 @@ def sensor_findings(
     findings += exchanged
     readings: list[PairReading] = []
     for pair, own in bands.items():
-        reading = None if pair in explained else read_pair(window, pair, own)
-        if reading is None:
-            continue
         first, second = window.states[pair.first], window.states[pair.second]
         known = None if reference is None else reference.pair(first, second)
+        lead_rad_s = None if known is None else known.lead_rad_s
+        reading = None if pair in explained else read_pair(window, pair, own, lead_rad_s)
+        if reading is None:
+            continue
         if reading.shared >= BROKEN * (1.0 if known is None else known.shared):
             readings.append(reading)
             continue

@@ -3,6 +3,9 @@
 Sensor noise makes |S_xv| / S_xx too small and S_vv / |S_xv| too large. What the other places of the machine have in
 common with the motion is free of both noises, so it serves as the instrument: h = S_wv / S_wx. Where there is no other
 place, the two biased ratios bracket the gain. The rotation-synchronous vectors add a line with little noise on it.
+
+A sensor or amplifier that is AC-coupled, as all that measure a rate on a casing are, runs ahead: well above the corner
+of its high-pass by a phase that falls as one over the frequency, where a delay's grows with it.
 """
 
 import math
@@ -18,9 +21,11 @@ from models.signals.block import FloatArray
 LONGEST_DELAY_S = 0.02  # longest delay that is looked for
 _DELAY_STEP_S = 2.5e-4
 _AS_GOOD = 0.98  # a shorter delay that fits this well is preferred: a narrow band repeats itself after a period
-# Standard errors within which the rotation must agree with the rest of the motion, or it is not counted (runout).
+# Standard errors within which the rotation must agree with the rest of the motion, in size and in time, or it is not
+# counted: run-out, and what a sensor sees of the other plane, which turns a quarter turn later.
 _LINE_FITS = 5.0
 _RUNOUT = 0.03  # logarithm of the gain by which the rotation must differ besides
+_TOLD_APART = 2 * math.log(1e3)  # of squares in standard errors: phases are a thousand times likelier so than otherwise
 _HANN_LOSS = 0.95  # part of the data's information that is left in half-overlapping Hann segments
 _FLOOR = 1e-10
 
@@ -37,7 +42,15 @@ class PairReading:
     # By how much the second comes later.
     delay_s: float
     delay_error_s: float
+    # Phase by which the second runs ahead besides, times the angular frequency; 0 unless that explains the phases and
+    # a delay does not. Behind a high-pass of first order that is its corner.
+    lead_rad_s: float
     shared: float  # how much of the motion they share after gain and delay, 0 to 1, over the whole band
+
+    def transfer(self, w: FloatArray) -> ComplexArray:
+        """What turns z into v at angular frequencies."""
+        phase = self.lead_rad_s / w - w * self.delay_s
+        return np.asarray(self.polarity * np.exp(self.log_gain + 1j * phase), dtype=np.complex128)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,13 +137,17 @@ def _turned(w: FloatArray, cross: ComplexArray) -> tuple[float, float]:
     return float(delays[best]), float(sums[best])
 
 
-def read_pair(window: WindowStatistics, pair: MotionPair, bands: Banded | None = None) -> PairReading | None:
+def read_pair(
+    window: WindowStatistics, pair: MotionPair, bands: Banded | None = None, lead_rad_s: float | None = None
+) -> PairReading | None:
     """Compare two sensors of one motion; None if one of them shows no fluctuation.
 
     Parameters
     ----------
     bands : Banded, optional
         What `banded` has made of them.
+    lead_rad_s : float, optional
+        That of the healthy pair; without it, what these data say of it.
     """
     bands = banded(window, pair) if bands is None else bands
     z, v = bands.spectra[:, 0, 0].real, bands.spectra[:, 1, 1].real
@@ -143,18 +160,24 @@ def read_pair(window: WindowStatistics, pair: MotionPair, bands: Banded | None =
     start = _Start(1 if total >= 0 else -1, float(np.log(max(abs(total) / level, _FLOOR))), delay_s)
     shared = min(1.0, abs(total) / (math.sqrt(level) * math.sqrt(other)))
     alone = _fitted(pair, start, bands.w, h, variance, bias)
+    lead_rad_s = _lead(alone, bands.w, h, variance) if lead_rad_s is None else lead_rad_s
+    if lead_rad_s:
+        h = h * np.exp(-1j * lead_rad_s / bands.w)
+        alone = _fitted(pair, start, bands.w, h, variance, bias)
     rotation = _rotation(window, pair)
     line = None if rotation is None else _line(rotation, window, bands, incoherent)
     if line is None:
-        return replace(alone, shared=shared)
+        return replace(alone, lead_rad_s=lead_rad_s, shared=shared)
     speed, ratio, spread = line
+    ratio *= complex(np.exp(-1j * lead_rad_s / speed))
     found = _fitted(
         pair, start, np.append(bands.w, speed), np.append(h, ratio), np.append(variance, spread), np.append(bias, 0.0)
     )
-    runout = abs(found.log_gain - alone.log_gain) > max(_LINE_FITS * alone.log_gain_error, _RUNOUT)
-    if runout and alone.log_gain_error < _RUNOUT:
+    foreign = abs(found.log_gain - alone.log_gain) > max(_LINE_FITS * alone.log_gain_error, _RUNOUT)
+    foreign |= abs(found.delay_s - alone.delay_s) > _LINE_FITS * alone.delay_error_s
+    if foreign and alone.log_gain_error < _RUNOUT:
         found = alone
-    return replace(found, shared=shared)
+    return replace(found, lead_rad_s=lead_rad_s, shared=shared)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,9 +202,18 @@ def _fitted(
     scatter_gain = max(1.0, float(weight @ y.real**2) * 2 / freedom)
     scatter_delay = max(1.0, float(weight @ y.imag**2) * 2 / freedom)
     gain_error = float(np.sqrt(scatter_gain / (2 * weight.sum())) + weight @ bias / weight.sum())
-    return PairReading(
-        pair, log_gain, gain_error, start.polarity, delay_s, float(np.sqrt(scatter_delay / (2 * moment))), 0.0
-    )
+    delay_error_s = float(np.sqrt(scatter_delay / (2 * moment)))
+    return PairReading(pair, log_gain, gain_error, start.polarity, delay_s, delay_error_s, 0.0, 0.0)
+
+
+def _lead(alone: PairReading, w: FloatArray, h: ComplexArray, variance: FloatArray) -> float:
+    """Phase by which the second runs ahead, times w, where that explains the phases of all bands and no delay does."""
+    weight, ahead = 2 / variance, np.angle(alone.polarity * h)
+    lead_rad_s = float(weight @ (ahead / w) / (weight @ w**-2.0))
+    late = np.angle(h / alone.transfer(w))
+    as_delay, as_lead = (float(weight @ left**2) for left in (late, ahead - lead_rad_s / w))
+    scatter = max(1.0, as_lead / max(1, w.size - 1))
+    return lead_rad_s if as_delay - as_lead > _TOLD_APART * scatter else 0.0
 
 
 def _line(
@@ -226,7 +258,7 @@ def gain_course(window: WindowStatistics, reading: PairReading, bands: Banded) -
     z, v = bands.total[:, 0, 0].real, bands.total[:, 1, 1].real
     incoherent = np.maximum(1 - np.abs(bands.total[:, 1, 0]) ** 2 / (z * v), _FLOOR)
     variance = incoherent / np.maximum(1 - incoherent, 1e-6) / (bands.averages / len(window.pair_powers))
-    aligned = reading.polarity * np.exp(1j * bands.w * reading.delay_s)
+    aligned = reading.transfer(bands.w).conj() / np.exp(reading.log_gain)
     powers = np.stack([hop[number] for hop in window.pair_powers])
     ratio = np.real(aligned * powers[:, :, 1]) / np.maximum(powers[:, :, 0].real, np.finfo(float).tiny)
     # Each band about its own mean: what noise takes from the ratio is the same in all hops.

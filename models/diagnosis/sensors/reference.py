@@ -116,7 +116,7 @@ def single(states: tuple[str, ...]) -> list[int]:
 
 def matched(bands: Banded, reading: PairReading) -> ComplexArray:
     """Spectra in bands with the first sensor brought to gain, sense and time of the second."""
-    h = reading.polarity * np.exp(reading.log_gain - 1j * bands.w * reading.delay_s)
+    h = reading.transfer(bands.w)
     spectra = bands.spectra.copy()
     spectra[:, 0] *= h[:, None]
     spectra[:, :, 0] *= h.conj()[:, None]
@@ -125,7 +125,7 @@ def matched(bands: Banded, reading: PairReading) -> ComplexArray:
 
 def pair_noise(window: WindowStatistics, bands: Banded, reading: PairReading) -> PairNoise:
     """Power of the difference of two sensors of one motion."""
-    h = reading.polarity * np.exp(reading.log_gain - 1j * bands.w * reading.delay_s)
+    h = reading.transfer(bands.w)
     z, v, cross = bands.spectra[:, 0, 0].real, bands.spectra[:, 1, 1].real, bands.spectra[:, 1, 0]
     power = np.abs(h) ** 2 * z + v
     density = np.maximum(power - 2 * (cross * h.conj()).real, 1e-12 * power)
@@ -250,6 +250,11 @@ class PairReference(_WithNoise):
     polarity: int = Field(ge=-1, le=1)
     delay_s: float = Field(description="by how much the second comes later")
     delay_spread_s: float = Field(ge=0)
+    lead_rad_s: float = Field(
+        default=0.0,
+        exclude_if=lambda lead: not lead,
+        description="phase by which the second runs ahead besides, as behind a high-pass, times the angular frequency",
+    )
     shared: float = Field(ge=0, le=1, description="how much of the motion they share at the best delay")
     same: float = Field(ge=-1, le=1, description="how much of it they show alike, at the same time and size")
 
@@ -306,6 +311,10 @@ def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReferen
         there = [reading for reading in readings if reading is not None]
         if len(there) < len(readings):
             raise EstimationError(f"no fluctuation in {states[pair.first]} or {states[pair.second]}")
+        lead_rad_s = float(np.median([one.lead_rad_s for one in there]))
+        if any(one.lead_rad_s for one in there):
+            again = [read_pair(window, pair, own, lead_rad_s) for window, own in zip(windows, bands, strict=True)]
+            there = [one for one in again if one is not None]
         noises = [pair_noise(window, own, one) for window, own, one in zip(windows, bands, there, strict=True)]
         pairs.append(_pair(states, there, min(same(own) for own in bands), _noise(noises)))
     alone = [channel_noise(window, single(states)) for window in windows]
@@ -371,6 +380,7 @@ def _pair(
         polarity=1 if sum(reading.polarity for reading in readings) >= 0 else -1,
         delay_s=float(delays.mean()),
         delay_spread_s=_spread(delays, delay_errors),
+        lead_rad_s=readings[0].lead_rad_s,
         shared=min(reading.shared for reading in readings),
         same=least_same,
         noise=noise,

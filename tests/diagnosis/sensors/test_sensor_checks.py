@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from scipy.signal import butter, lfilter
 
 from models.diagnosis.moments import Plan, plan_for
 from models.diagnosis.sensors.check import sensor_findings
@@ -278,6 +279,51 @@ def test_a_delayed_sensor_is_named_with_its_delay(state: str, late: int) -> None
     finding = only(found_in(samples))
     assert (finding.kind, finding.states) == ("delay", (state,))
     assert finding.value == pytest.approx(late / 2000.0, abs=3e-5)
+
+
+def coupled(samples: FloatArray, states: tuple[str, ...], corner_hz: float) -> FloatArray:
+    """Samples of which some channels come from behind a high-pass of first order."""
+    numerator, denominator = butter(1, corner_hz, "highpass", fs=2000.0)
+    found, columns = samples.copy(), [column(state) for state in states]
+    found[:, columns] = lfilter(numerator, denominator, samples[:, columns], axis=0)
+    return found
+
+
+RATES, DISPLACEMENTS = ("y1_dot", "z1_dot", "y2_dot", "z2_dot"), ("y1", "z1", "y2", "z2")
+
+
+@pytest.mark.parametrize("states", [RATES, DISPLACEMENTS])
+def test_a_sensor_that_is_ac_coupled_is_not_late(states: tuple[str, ...]) -> None:
+    assert found_in(coupled(recorded("lab", 1), states, 1.0)) == ()
+
+
+def test_beside_ac_coupling_a_delay_is_found_with_its_size() -> None:
+    healthy = coupled(recorded("lab", 900, 2), RATES, 1.0)
+    reference = learn_sensor_reference(windows_of(plan_of("lab"), healthy))
+    assert [pair.lead_rad_s for pair in reference.pairs] == pytest.approx([2 * np.pi] * 4, rel=0.05)
+    assert SensorReference.model_validate_json(reference.model_dump_json()) == reference
+    samples = coupled(recorded("lab", 1), RATES, 1.0)
+    assert found_in(samples, reference) == ()
+    samples[1:, column("z2_dot")] = samples[:-1, column("z2_dot")]
+    finding = only(found_in(samples, reference))
+    assert (finding.kind, finding.states) == ("delay", ("z2_dot",))
+    assert finding.value == pytest.approx(1 / 2000.0, abs=3e-5)
+
+
+@pytest.mark.parametrize("state", ["y2_dot", "z1"])
+def test_a_corner_that_is_too_high_is_told_as_one(state: str) -> None:
+    finding = only(found_in(coupled(recorded("lab", 1), (state,), 2.0)))
+    assert (finding.kind, finding.states) == ("delay", (state,))
+    assert f"{state}: runs ahead of" in finding.text
+    assert "as behind a high-pass at 2 Hz (AC coupling), expected at most 1.1 Hz" in finding.text
+
+
+def test_run_out_a_quarter_turn_off_is_no_delay() -> None:
+    samples = recorded("lab", 3).copy()
+    turning = np.exp(1j * samples[:, -1])
+    synchronous = 2 * (samples[:, column("y2")] * turning.conj()).mean()
+    samples[:, column("y2")] += (0.05j * synchronous * turning).real
+    assert found_in(samples) == ()
 
 
 @pytest.mark.parametrize(("one", "other"), [("y1", "y2"), ("y2_dot", "z2_dot")])
