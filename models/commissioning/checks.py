@@ -32,7 +32,9 @@ SAME_SPEED = 0.03  # relative difference within which speeds count as one
 _MOST_OUTSIDE = 0.8  # share of healthy windows outside a theory beyond which it is not the machine's
 _RATE = 1e-3  # probability that a healthy machine fails a comparison of its own windows
 _SUITED = 0.8  # of the time scale that a machine's speed asks for: within this its windows are near enough
-_NEGLIGIBLE = 0.01  # relative difference, a tenth of an alarm's usual limit, that no alarm comes of, however certain
+# Part of the limit from which a parameter's alarm is raised, within which a difference is none that matters. Sensors
+# are calibrated to some per cent, and where one force moves everything, standard errors are less than a thousandth.
+_MATTERS = 1 / 3
 _LOUD_LINE, _DOMINANT_LINE = 0.05, 0.5  # share of a foreign line in the power of a channel's random part
 
 
@@ -313,7 +315,7 @@ def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows
     )
 
 
-def check_halves(first_on_second: Sequence[Diagnosis]) -> Check:
+def check_halves(machine: MachineFile, first_on_second: Sequence[Diagnosis]) -> Check:
     """Whether either half of the data, taken for healthy, finds the other half healthy.
 
     Parameters
@@ -321,10 +323,10 @@ def check_halves(first_on_second: Sequence[Diagnosis]) -> Check:
     first_on_second : sequence of Diagnosis
         Windows read against what was learned on the other half.
     """
-    return _compared("halves agree", first_on_second, "between the halves of the healthy data")
+    return _compared(machine, "halves agree", first_on_second, "between the halves of the healthy data")
 
 
-def check_agreement(diagnoses: Sequence[Diagnosis], what: str) -> Check:
+def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: str) -> Check:
     """Whether healthy windows agree with what they are compared with.
 
     Parameters
@@ -332,10 +334,12 @@ def check_agreement(diagnoses: Sequence[Diagnosis], what: str) -> Check:
     what : str
         In words: "the parameters in the machine file".
     """
-    return _compared(f"agrees with {what}", diagnoses, f"between the healthy data and {what}", theory=True)
+    return _compared(machine, f"agrees with {what}", diagnoses, f"between the healthy data and {what}", theory=True)
 
 
-def _compared(name: str, diagnoses: Sequence[Diagnosis], between: str, *, theory: bool = False) -> Check:
+def _compared(
+    machine: MachineFile, name: str, diagnoses: Sequence[Diagnosis], between: str, *, theory: bool = False
+) -> Check:
     readable = [each for each in diagnoses if each.evaluable]
     if not readable:
         reasons = dict.fromkeys(reading.reason for each in diagnoses for reading in each.parameters if reading.reason)
@@ -343,8 +347,10 @@ def _compared(name: str, diagnoses: Sequence[Diagnosis], between: str, *, theory
         return Check(name=name, verdict="limited", text=text, advice="record at least two full windows")
     rate = _RATE / len(readable)
     isolations = [isolate_window(each, rate) for each in readable]
-    certain = [(each, name) for each, one in zip(readable, isolations, strict=True) for name in one.changed]
-    named: Counter[str] = Counter(name for each, name in certain if _difference(each, name) >= _NEGLIGIBLE)
+    differ = [
+        (name, _difference(each, name)) for each, one in zip(readable, isolations, strict=True) for name in one.changed
+    ]
+    named = Counter(name for name, by in differ if abs(by) > _MATTERS * machine.alarms.for_parameter(name).raise_above)
     outside = sum(one.outside for one in isolations)
     if named:
         worst = named.most_common(1)[0][0]
@@ -369,14 +375,17 @@ def _compared(name: str, diagnoses: Sequence[Diagnosis], between: str, *, theory
             text=f"{outside} of {len(readable)} windows lie further apart than chance explains, {between}",
             advice="give fewer parameters in [rotor], so that more is learned from the recordings",
         )
+    if differ:
+        worst, by = max(differ, key=lambda one: abs(one[1]))
+        text = f"no difference that matters {between}: {PARAMETER_TEXT[worst]} by {by:+.1%} at most"
+        return Check(name=name, verdict="passed", text=text)
     worst_z = max(abs(r.z or 0.0) for each in readable for r in each.evaluable)
-    size = f"no difference of {_NEGLIGIBLE:.0%} or more" if certain else "no difference"
-    text = f"{size} {between}: at most {worst_z:.1f} standard errors in {len(readable)} windows"
+    text = f"no difference {between}: at most {worst_z:.1f} standard errors in {len(readable)} windows"
     return Check(name=name, verdict="passed", text=text)
 
 
 def _difference(diagnosis: Diagnosis, name: str) -> float:
-    """Relative size of a difference; of the unbalance, which may only have turned, that of its vector's."""
+    """Relative difference; of the unbalance, which may only have turned, the size of its vector's."""
     if name == "e" and diagnosis.unbalance is not None:
         return diagnosis.unbalance.change
-    return max(abs(one.relative_change or 0.0) for one in diagnosis.evaluable if one.name == name)
+    return next(one.relative_change or 0.0 for one in diagnosis.evaluable if one.name == name)

@@ -122,7 +122,7 @@ def _read_known(machine: Machine, pieces: Sequence[HealthyPiece], progress: Prog
 def _learn_full(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress, sense: Gyroscopic) -> Learned:
     assert isinstance(machine, Machine)  # noqa: S101  # the level says so
     read = _read_known(in_sense(machine, sense), pieces, progress)
-    check = check_agreement([each for _, _, each in read], "the parameters in the machine file")
+    check = check_agreement(machine, [each for _, _, each in read], "the parameters in the machine file")
     if check.verdict == "refused":
         check = check.model_copy(
             update={
@@ -169,7 +169,7 @@ def _learn_partial(
     record = IdentifiedRecord(
         machine=filled, names=identified.names, covariance=tuple(tuple(row) for row in identified.covariance.tolist())
     )
-    check = check_agreement([each for _, _, each in read], "the identified rotor")
+    check = check_agreement(machine, [each for _, _, each in read], "the identified rotor")
     if check.verdict == "refused":
         check = check.model_copy(update={"advice": f"{check.advice}; {NO_SUCH_ROTOR}"})
     notes = _integrated(pieces, identified.machine)
@@ -238,7 +238,7 @@ def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progre
             read.append((piece.recording, piece.window.end_ns, stated))
             progress("learning the relations", len(read), len(pieces))
         compared += _halves(group, baseline.rows)
-    halves = check_halves([each for _, _, each in compared])
+    halves = check_halves(machine, [each for _, _, each in compared])
     determined_ = check_determined([reason for baseline in baselines for reason in baseline.reasons if reason])
     sources = check_sources(
         {name: [piece.window for piece in pieces if piece.recording == name] for name in _speeds(pieces)}

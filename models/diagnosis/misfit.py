@@ -11,13 +11,15 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, Field
-from scipy.special import log_ndtr, ndtri
+from scipy.special import chdtri, log_ndtr, ndtri
 
 from models.physics.rotor import impossible
+from models.signals.block import FloatArray
 
 UNEQUAL = "shaft stiffer in y than in z"
 _LEAST_SUSPECT_Z = 5.0
 _LEAST_SUSPECT = 5e-3  # no sensor and no machine file is truer than that, and with one source a tenth of it stands out
+_SCATTER = 1e-4  # probability that a score scatters so much among healthy windows by chance
 _LINEAR = 0.5  # largest one-step estimate that is worth telling: farther out it only says that the thing is not small
 
 
@@ -91,13 +93,22 @@ class HealthyMisfit(BaseModel, extra="forbid", frozen=True):
     error: _Error = Field(description="standard error of the mean scores")
     excess: _Finite = Field(description="mean total excess, standard deviations")
     excess_error: _Error = Field(description="its standard error")
+    spreads: dict[str, _Error] = Field(
+        default={},
+        exclude_if=lambda spreads: not spreads,
+        description="by how much scores differ from window to window besides, where that is no chance",
+    )
+    excess_spread: _Error = Field(
+        default=0.0, exclude_if=lambda spread: not spread, description="the same of the total excess"
+    )
 
     @classmethod
     def of(cls, windows: Sequence[Goodness], parts: Sequence[float]) -> "HealthyMisfit | None":
         """Average over healthy windows; None without any.
 
         A deviation of one size stands out by the root of the data's length in a score, and by the length in the total
-        excess.
+        excess. How much it stands out depends on what shakes the machine, too: where one force does, a wrong gain of a
+        hundredth is many standard errors, where several do it is hardly one.
 
         Parameters
         ----------
@@ -112,12 +123,17 @@ class HealthyMisfit(BaseModel, extra="forbid", frozen=True):
         for one, by in zip(windows, root.tolist(), strict=True):
             for each in one.alternatives:
                 scores.setdefault(each.tried, []).append(by * each.z)
+        kept = {name: np.array(values) for name, values in scores.items() if len(values) == count}
+        excess = length * [one.excess_z for one in windows]
+        spreads = {name: _spread(values, length) for name, values in kept.items()}
         return cls(
             mean=float(np.mean([by * one.misfit_z for one, by in zip(windows, root, strict=True)])),
-            scores={name: float(np.mean(found)) for name, found in scores.items() if len(found) == count},
+            scores={name: float(np.mean(values)) for name, values in kept.items()},
             error=float(np.sqrt(length.sum())) / count,
-            excess=float(np.mean([by * one.excess_z for one, by in zip(windows, length, strict=True)])),
+            excess=float(np.mean(excess)),
             excess_error=float(np.sqrt(np.sum(length**2))) / count,
+            spreads={name: spread for name, spread in spreads.items() if spread},
+            excess_spread=_spread(excess, length**2),
         )
 
     def beyond(self, window: Goodness, part: float) -> Goodness:
@@ -133,8 +149,19 @@ class HealthyMisfit(BaseModel, extra="forbid", frozen=True):
         for one in window.alternatives:
             left = one.z - root * self.scores.get(one.tried, 0.0)
             change = one.change * left / one.z if one.z else 0.0
-            alternatives.append(replace(one, z=left / math.hypot(1.0, root * self.error), change=change))
+            error = root * math.hypot(self.error, self.spreads.get(one.tried, 0.0))
+            alternatives.append(replace(one, z=left / math.hypot(1.0, error), change=change))
         excess = window.excess_z - part * max(0.0, self.excess)
         return replace(
-            window, excess_z=excess / math.hypot(1.0, part * self.excess_error), alternatives=tuple(alternatives)
+            window,
+            excess_z=excess / math.hypot(1.0, part * self.excess_error, part * self.excess_spread),
+            alternatives=tuple(alternatives),
         )
+
+
+def _spread(values: FloatArray, variances: FloatArray) -> float:
+    """Standard deviation of one more value about the mean beyond its own variance; 0 where chance may have made it."""
+    count = len(values)
+    if count < 2 or np.sum((values - values.mean()) ** 2 / variances) < chdtri(count - 1, _SCATTER):
+        return 0.0
+    return math.sqrt(max(0.0, float(values.var(ddof=1) - variances.mean())) * (1 + 1 / count))

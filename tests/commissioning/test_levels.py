@@ -149,6 +149,23 @@ def test_a_later_window_is_judged_by_how_the_healthy_ones_were_off() -> None:
     assert HealthyMisfit.of([], []) is None
 
 
+def test_a_misfit_that_differs_with_what_shakes_the_machine_is_none_of_a_later_window() -> None:
+    """A gain that is a little off stands out where one force moves everything, and hardly where several do."""
+    rng, names = np.random.default_rng(4_502), ("gain of y1", "gain of z1")
+
+    def window(gain: float, other: float = 0.0) -> Goodness:
+        tests = (AlternativeTest(name, rng.normal(z), z / 100) for name, z in zip(names, (gain, other), strict=True))
+        return Goodness(rng.normal(gain / 2), tuple(tests), 3)
+
+    healthy = sure(HealthyMisfit.of([window(gain) for gain in (20.0, 2.0, 20.0) * 4], [1.0] * 12))
+    assert set(healthy.spreads) == {"gain of y1"}
+    assert HealthyMisfit.model_validate_json(healthy.model_dump_json()) == healthy
+    assert max(healthy.beyond(window(gain), 1.0).misfit_z for gain in (20.0, 2.0) * 100) < 4.0
+    assert min(healthy.beyond(window(gain, 12.0), 1.0).misfit_z for gain in (20.0, 2.0) * 100) > 4.5
+    alike = sure(HealthyMisfit.of([window(20.0) for _ in range(12)], [1.0] * 12))
+    assert not {"spreads", "excess_spread"} & set(json.loads(alike.model_dump_json()))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("level", ["partial", pytest.param("full", marks=pytest.mark.long)])
 def test_a_misfit_that_was_there_when_the_machine_was_healthy_is_none_of_a_later_window(level: str) -> None:
