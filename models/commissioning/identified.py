@@ -146,10 +146,11 @@ def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics]) -> M
     for axis in "yz":
         k = fields[f"k_b{axis}_N_per_m"]
         fields.setdefault(f"c_b{axis}_N_s_per_m", 2 * _START_DAMPING * math.sqrt(k * (known.m1_kg + known.m2_kg)))
+    low_hz, high_hz = (edge / machine.time_scale for edge in _CUTOFF_HZ)
     described = machine.model_dump() | {
         "rotor": RotorParameters.model_validate(fields),
         "operation": operation,
-        "condition": machine.condition or ConditionRange(cutoff_hz=_CUTOFF_HZ),
+        "condition": machine.condition or ConditionRange(cutoff_hz=(low_hz, high_hz)),
     }
     return Machine.model_validate(described)
 
