@@ -48,31 +48,31 @@ ALARMS: Mapping[str, AlarmKind] = MappingProxyType(
         CHANGED: AlarmKind(
             "changed, not certain what",
             "machine",
-            "what has changed has a name, or nothing has changed any more",
-            "what has changed is not certain yet",
+            "the change has been identified, or is no longer present",
+            "it is not yet certain what has changed",
         ),
         SHAPE: AlarmKind(
             "vibration changed",
             "machine",
-            "the vibration is as it was",
-            "a channel's vibration is no longer as on the healthy machine",
+            "the vibration is back to what it was",
+            "a channel's vibration differs from that of the healthy machine",
         ),
-        STREAM_LOST: AlarmKind("stream lost", "data", "data come again"),
-        FAULT: AlarmKind("fault in the monitor", "monitor", "the monitor works again"),
-        OVERLOADED: AlarmKind("monitor overloaded", "monitor", "the monitor keeps up again"),
-        GAP: AlarmKind("data health, gap", "data", "the data are without gaps again"),
-        CLOCK: AlarmKind("data health, clock", "data", "the clock of the data runs steadily again"),
+        STREAM_LOST: AlarmKind("stream lost", "data", "data are arriving again"),
+        FAULT: AlarmKind("fault in the monitor", "monitor", "the monitor is working again"),
+        OVERLOADED: AlarmKind("monitor overloaded", "monitor", "the monitor is keeping up again"),
+        GAP: AlarmKind("data health, gap", "data", "the data are free of gaps again"),
+        CLOCK: AlarmKind("data health, clock", "data", "the clock of the data is steady again"),
         CONFLICT: AlarmKind(
-            "data health, conflict of publishers", "data", "one publisher sends, and does not contradict itself"
+            "data health, conflict of publishers", "data", "only one publisher sends, and its data are consistent"
         ),
         PHASE_REFERENCE: AlarmKind(
             "data health, phase reference",
             "data",
-            "the phase reference is steady again; after a jump, phases are still off",
+            "the phase reference is steady again; after a jump, phases remain shifted",
         ),
         **{
             data_alarm(kind): AlarmKind(
-                f"data health, {kind.text}", "data", f"data health, {kind.text}: nothing of it is seen any more"
+                f"data health, {kind.text}", "data", f"data health, {kind.text}: no longer detected"
             )
             for kind in FaultKind
         },
@@ -91,4 +91,4 @@ def alarm_kind(name: str) -> AlarmKind:
     if name.startswith(LEVEL):
         channel = name.removeprefix(LEVEL)
         return AlarmKind(f"vibration level, {channel}", "machine", f"the levels of {channel} are within their limits")
-    return ALARMS.get(name) or AlarmKind(name, "machine", f"{name}: nothing of it is seen any more")
+    return ALARMS.get(name) or AlarmKind(name, "machine", f"{name}: no longer detected")

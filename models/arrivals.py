@@ -266,7 +266,7 @@ class Senders:
         if self._disputed:
             run, sequence = next(iter(self._disputed))
             count = len(self._disputed)
-            said.append(f"{count} blocks came in two versions, block {sequence} of run {run} first; neither is used")
+            said.append(f"{count} blocks arrived in two versions, block {sequence} of run {run} first; neither is used")
         return "; ".join(said)
 
     def _follow(self, block: SampleBlock) -> None:

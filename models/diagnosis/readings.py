@@ -60,7 +60,7 @@ def foreign_rotation(observed: FloatArray, explained: FloatArray, spread: FloatA
     if chi2 <= most:
         return ""
     text, limit = beyond(chi2, round(most, 1))
-    return f"its misfit χ² is {text} with {2 * n - 2} degrees of freedom, evaluated is at most {limit}"
+    return f"its misfit χ² is {text} with {2 * n - 2} degrees of freedom, evaluation limit {limit}"
 
 
 _SEEN = 3.0  # standard errors from which a vector has a direction

@@ -149,8 +149,8 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
         figures = f"{z:.1f} standard deviations, limit {limit:.1f}"
         if p < rate:
             text = (
-                f"{one.channel}: its correlation function has changed shape ({figures}); whether the machine or its "
-                "excitation did, this comparison cannot tell"
+                f"{one.channel}: its correlation function has changed shape ({figures}); this comparison cannot "
+                "tell whether the machine or its excitation has"
             )
             return Shape(state=one.channel, verdict="changed", z=z, limit=limit, text=text)
         text = f"{one.channel}: its correlation function has its healthy shape ({figures})"

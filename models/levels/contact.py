@@ -31,7 +31,7 @@ _FITTED = 4
 """One of so many samples is enough to fit what predicts the next one."""
 _STEPS = 20.0
 """Steps of a converter in the rms: of fewer what is rounded goes with where the shaft is. On the rotor kit *heavy*
-steps of a twelfth to a seventh made 4.3 standard errors in a mean hop, of half of that nothing."""
+steps of a twelfth to a seventh made 4.3 standard errors in an average hop, of half of that nothing."""
 _NOTHING = 1e-6
 """Of the largest distance: less is what numbers are rounded to."""
 _Hop = npt.NDArray[np.float32]  # written with every hop

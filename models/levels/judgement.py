@@ -156,7 +156,7 @@ class LevelJudge:
             wrong = wrong_gain(levels.bands, [place_of(one) for one in self._channels], reference.gains)
             if wrong is not None:
                 own = " and ".join(one.name for one in self._channels if place_of(one) == wrong[0])
-                more = f"{wrong[1]:.2f} times as much at all frequencies, compared with the other places"
+                more = f"{wrong[1]:.2f} times its healthy value at all frequencies, compared with the other places"
                 return Foreign(f"gain of {own}: {more}", hides=True)
         if found or not seen:  # at another speed much is otherwise
             return Foreign(found)
@@ -174,7 +174,7 @@ class LevelJudge:
         if channel is None or not most:
             return Foreign()
         healthy = state.kurtosis[channel.name].mean
-        how = "clipped, as by a rub" if most < 0 else "with impacts, as of a rub, a loose part or a damaged bearing"
+        how = "clipped, as by a rub" if most < 0 else "with impacts, as from a rub, a loose part or a damaged bearing"
         return Foreign(
             f"a vibration at {channel.name} ({channel.location} {channel.direction}) that is {how}: kurtosis of its "
             f"random part {healthy + most:.2f}, {healthy:.2f} on the healthy machine"
@@ -202,8 +202,8 @@ class LevelJudge:
             return ""
         y, z = (self._channels[column] for column in pair)
         return (
-            f"a shaft at {y.name} and {z.name} ({y.location}) that is pushed back where it is far out, as by a rub or "
-            f"a stop: {mean + most:.1f} standard errors in a mean hop, {mean:.1f} on the healthy machine"
+            f"a shaft at {y.name} and {z.name} ({y.location}) that is pushed back at large displacements, as by a "
+            f"rub or a stop: {mean + most:.1f} standard errors in an average hop, {mean:.1f} on the healthy machine"
         )
 
     def _departure(self, levels: WindowLevels, column: int, state: OperatingState, n_errors: float) -> float:
@@ -248,7 +248,7 @@ class LevelJudge:
                     math.degrees(-math.copysign(1.0, levels.speed_rad_s or 0.0) * cmath.phase(region.centre)) % 360
                 )
                 out = (
-                    f"phase lag {values[_ROW['x1_phase_lag_deg']]:.0f}°: out of its acceptance region about "
+                    f"phase lag {values[_ROW['x1_phase_lag_deg']]:.0f}°: outside its acceptance region around "
                     f"{shown_level(channel, 'x1', region.mean):.3g} {unit_in_text(channel.unit)} at {was_deg:.0f}°"
                 )
         key, words = (column, alike, standard, zone, edge), _WORDS
@@ -340,9 +340,9 @@ class LevelJudge:
         """
         danger, alert, fall = nearest.danger, nearest.alert, nearest.fall
         if danger is not None and value >= (danger.danger or math.inf):
-            state, decided, what = "danger", danger, f"danger from {danger.danger:.3g} ({danger.source})"
+            state, decided, what = "danger", danger, f"danger limit {danger.danger:.3g} ({danger.source})"
         elif alert is not None and value >= (alert.alert or math.inf):
-            state, decided, what = "alert", alert, f"alert from {alert.alert:.3g} ({alert.source})"
+            state, decided, what = "alert", alert, f"alert limit {alert.alert:.3g} ({alert.source})"
             if alert.source == _TURNED_OUT:
                 what = out
         elif fall is not None and value < (fall.fall or 0.0):
@@ -459,8 +459,8 @@ def growth_seen(levels: Sequence[ChannelLevels]) -> LevelGrowth:
     if measure == "growth":
         word = "strongest band"
     text = (
-        f"every channel that had grown by {growth:.0%} would have raised an alert; {one.channel} last, whose {word} is "
-        f"{value:.3g} {unit_in_text(unit)} and its alert from {limit:.3g}"
+        f"growth of {growth:.0%} in any channel would have raised an alert; last in {one.channel}, whose {word} is "
+        f"{value:.3g} {unit_in_text(unit)} with an alert limit of {limit:.3g}"
     ).replace("%", " %")
     return LevelGrowth(growth=rounded(growth), channel=one.channel, measure=measure, text=text)
 

@@ -59,8 +59,8 @@ class LevelGrowth(Record):
     text: str = Field(
         description="the same in words",
         examples=[
-            "every channel that had grown by 60 % would have raised an alert; DE-H last, whose overall is 1.93 m/s2 "
-            "rms and its alert from 3.09"
+            "growth of 60 % in any channel would have raised an alert; last in DE-H, whose overall is 1.93 "
+            "m/s2 rms with an alert limit of 3.09"
         ],
     )
 

@@ -24,7 +24,7 @@ from service.monitor.evaluation import Evaluation, Newest, WindowEvaluator
 from service.monitor.known_machine import KnownMachineEvaluator
 
 _SHAPE = "shape"
-_NO_EQUATION = "no equation can be evaluated on this machine; see what is said of each channel"
+_NO_EQUATION = "no equation can be evaluated on this machine; see the result for each channel"
 
 
 def evaluator_for(installed: Installed) -> WindowEvaluator:
@@ -76,7 +76,7 @@ class BaselineEvaluator(WindowEvaluator):
         _ = newest
         outside = self._conditions.outside(window, self._naming)
         if outside:
-            here = "not evaluable here" if self._diagnosed else "levels are judged by the nearest commissioned speed"
+            here = "not evaluable here" if self._diagnosed else "levels are judged as at the nearest commissioned speed"
             raise EstimationError(f"{self._place}: {here}: {outside}")
         speed = float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else None
         if self._baselines:

@@ -96,7 +96,7 @@ class KnownMachineEvaluator(WindowEvaluator):
             self._explained_ns = window.end_ns
         elif self._explained_ns is None and not self._commissioned:
             deciding = replace(
-                deciding, unexplained=f"{deciding.unexplained}; if it is healthy like that, commission it"
+                deciding, unexplained=f"{deciding.unexplained}; if this is its healthy state, commission it"
             )
         equations: tuple[Equation, ...] = ()
         opinions = []
@@ -162,10 +162,8 @@ class KnownMachineEvaluator(WindowEvaluator):
         times = 1 + vector.magnitude_change
         if times - _SURELY * vector.magnitude_error < _HEAVIEST:
             return decided
-        why = (
-            f"{self._machine.title}: it would take {times:.1f} times the unbalance of the machine file, evaluated is at"
-        )
-        return replace(decided, unexplained=f"{why} most {_HEAVIEST:g} times: check the units of the channels and e_m")
+        why = f"{self._machine.title}: it would take {times:.1f} times the unbalance of the machine file, the limit is"
+        return replace(decided, unexplained=f"{why} {_HEAVIEST:g} times: check the units of the channels and e_m")
 
     def _newest(
         self, window: WindowStatistics, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis
@@ -217,8 +215,8 @@ class KnownMachineEvaluator(WindowEvaluator):
         if off > operation.speed_tolerance:
             text, limit = beyond(100 * off, 100 * operation.speed_tolerance)
             raise EstimationError(
-                f"{self._machine.title}: speed is {speed * 30 / np.pi:.0f} rpm, off {operation.speed_rpm:g} rpm by "
-                f"{text} %, evaluated is at most {limit} %"
+                f"{self._machine.title}: speed is {speed * 30 / np.pi:.0f} rpm, off {operation.speed_rpm:g} rpm "
+                f"by {text} %, evaluation limit {limit} %"
             )
         slowest, fastest = window.speed_range
         varied = (fastest - slowest) / operation.speed_rad_s
@@ -226,7 +224,7 @@ class KnownMachineEvaluator(WindowEvaluator):
             text, limit = beyond(100 * varied, 100 * _STEADY)
             raise EstimationError(
                 f"{self._machine.title}: speed went from {slowest * 30 / np.pi:.0f} to {fastest * 30 / np.pi:.0f} rpm "
-                f"within the window, by {text} % of nominal, evaluated is at most {limit} %"
+                f"within the window, by {text} % of nominal, evaluation limit {limit} %"
             )
         return speed
 

@@ -140,7 +140,7 @@ class MachineMonitor:
                 self._held.append((payload, attachment, encoding))
             return self._released()
         if self._disputed(block):
-            text = f"block {block.sequence} of run {block.run} came in two versions; neither is used"
+            text = f"block {block.sequence} of run {block.run} arrived in two versions; neither is used"
             verdict = Admission(Reason.CONFLICT, f"{self.machine.title}: {text}")
             return (MonitorReport(self._count(verdict), events=self._alarms.take()),)
         if self._dropped:
@@ -170,9 +170,9 @@ class MachineMonitor:
     def recalled(self) -> str:
         """What became of a window that was to be recalled, in words; empty if nothing of it is missing."""
         if self._window.lacks:
-            return "the window is not there until its samples come again"
+            return "there is no window until its samples are received again"
         lost = self._not_recalled
-        return f"{lost} hops of the window did not come again, it fills anew" if lost else ""
+        return f"{lost} hops of the window were not received again, and it is filling anew" if lost else ""
 
     def _released(self) -> tuple[MonitorReport, ...]:
         """New blocks that came while the window was recalled, once it is there or not waited for any longer."""
@@ -386,7 +386,7 @@ class MachineMonitor:
                 text = f"{name}: the stream's clock is {lasting(late_s)} from where it was before the restart"
                 verdict = Admission(text=text, clock_step_s=late_s, new_run=block.sequence == 0)
             elif late_s > ingest.time_tolerance_s:
-                text = f"{name}: {lasting(late_s)} of data are missing over the restart"
+                text = f"{name}: {lasting(late_s)} of data are missing across the restart"
                 verdict = Admission(text=text, gap_s=late_s)
         if dropped and verdict.gap_s > 0:
             text = f"{dropped} blocks ({lasting(verdict.gap_s)} of data) were not evaluated: the monitor cannot keep up"

@@ -93,7 +93,7 @@ def test_a_channel_that_reaches_the_end_of_its_range_is_told(bits: int, limit: f
     samples[:, 0] = np.clip(np.round(samples[:, 0] / step) * step, -end, end)
     found, text, _ = verdict_of(made_of(with_samples(blocks, samples)), "sensors")
     assert found == verdict
-    assert ("y1 stands at exactly" in text) == (verdict == "limited")
+    assert ("y1 is at exactly" in text) == (verdict == "limited")
 
 
 def test_a_stuck_channel() -> None:
@@ -270,7 +270,7 @@ def test_shapes_without_power_are_no_commissioning(count: int, varies: float, ve
         then = _shaped(int(wanted), varies).powers(3e-6)
         assert all(then[name].growth <= 8 for name, one in powers.items() if one.windows is not None)
     if verdict == "limited" and varies > 1:
-        assert "own limits of the levels" in check.advice
+        assert "limits for the levels yourself" in check.advice
 
 
 @pytest.mark.slow

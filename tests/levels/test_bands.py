@@ -72,7 +72,7 @@ def test_a_line_that_doubles_or_comes_is_found_at_whatever_frequency(hz: float) 
     assert state == "alert"
     low, high = (float(part) for part in text.split(" Hz")[0].split(") ")[1].split(" to "))
     assert low * 0.99 <= hz <= high * 1.01
-    assert "times the reference, alert from" in text
+    assert "times the reference, alert limit" in text
     assert "(commissioned)" in text
 
 

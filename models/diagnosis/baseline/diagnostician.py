@@ -329,8 +329,8 @@ class BaselineDiagnostician:
         usual = design @ [1.0, 0.0]
         if foreign := foreign_rotation(usual + observed, usual + design @ vector, spread):
             raise ForeignRotationError(
-                "what turns with the shaft is not what an unbalance makes, as with sensors of one plane that are "
-                f"swapped or reversed: {foreign}"
+                "the 1× vibration is not what an unbalance causes, as if sensors of one "
+                f"plane were swapped or reversed: {foreign}"
             )
         size = math.hypot(1 + vector[0], vector[1])
         along = np.array([1 + vector[0], vector[1]]) / max(size, 1e-9) @ combine
@@ -339,7 +339,7 @@ class BaselineDiagnostician:
         if error > most:
             text, limit = beyond(100 * error, round(100 * most, 1))
             raise EstimationError(
-                f"unbalance not seen well enough: standard error {text} %, at most {limit} % is a reading"
+                f"unbalance not determined well enough: standard error {text} %, limit for a reading {limit} %"
             )
         common_variance = float(along @ shared @ along)
         return _Unbalance(size - 1, with_bearing @ along, variance, shared_with @ along, common_variance, along @ to_d)
@@ -353,8 +353,8 @@ class BaselineDiagnostician:
         slowest, fastest = (speed * _RPM for speed in window.speed_range)
         if now is None and fastest > slowest * (1 + SPEED_TOLERANCE):
             raise EstimationError(
-                f"the speed varies from {slowest:.0f} to {fastest:.0f} rpm within the window, at most "
-                f"{SPEED_TOLERANCE:.0%} is compared"
+                f"the speed varies from {slowest:.0f} to {fastest:.0f} rpm within the window, "
+                f"compared up to {SPEED_TOLERANCE:.0%}"
             )
         if now is None:
             raise EstimationError("no phase reference, and no speed found in the vibration")
@@ -374,9 +374,9 @@ def _unexplained(misfit_z: float | None) -> str:
         return ""
     text, limit = beyond(misfit_z, _SURELY_OUTSIDE)
     return (
-        f"the relations that were learned do not hold here: what they leave over is {text} standard errors more than "
-        f"chance leaves, read is at most {limit}; either another force moves the machine than when it was commissioned "
-        "(record a healthy condition like this one then), or something has changed that no parameter describes"
+        f"the learned relations do not hold here: their remainder is {text} standard errors more than "
+        f"chance leaves, limit for a reading {limit}; either another force drives the machine than in commissioning "
+        "(then record a healthy condition like this one), or something has changed that no parameter describes"
     )
 
 
@@ -393,7 +393,7 @@ def _impossible(diagnosis: Diagnosis, variances: Mapping[str, float]) -> str:
             continue
         gone = reading.relative_change + 2 * reading.standard_error < _GONE
         if gone or (reading.name.startswith("k") and variances[reading.name] > LOST**2):
-            return f"{reading.name} makes no sense, as with a sensor of this plane that is swapped, reversed or late"
+            return f"{reading.name} is impossible, as if a sensor of this plane were swapped, reversed or delayed"
     return ""
 
 
@@ -419,7 +419,7 @@ def _read(row: Row, relation: Relation | None, window: WindowStatistics, why: st
     except EstimationError as error:
         return None, str(error)
     except np.linalg.LinAlgError:
-        return None, f"{row.title}: a channel hardly moves in this window"
+        return None, f"{row.title}: a channel hardly vibrates in this window"
 
 
 def _misfit(changes: list[RowChange | None]) -> float | None:

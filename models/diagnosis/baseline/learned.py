@@ -261,7 +261,7 @@ def _learn(
     except EstimationError as error:
         return None, [], str(error)
     except np.linalg.LinAlgError:
-        return None, [], f"{row.title}: the healthy recording does not determine it; a channel may hardly move"
+        return None, [], f"{row.title}: the healthy recording does not determine it; a channel may hardly vibrate"
     return relation, contributions, ""
 
 
@@ -376,7 +376,7 @@ def undetermined(baseline: Baseline) -> tuple[str, ...]:
 
 def _reason(row: Row, relation: Relation, *, alone: bool) -> str:
     if alone and relation.misfit > _LEFT_OVER:
-        return f"what is left over is {relation.misfit:.1f} times what chance leaves, so no such relation holds"
+        return f"the remainder is {relation.misfit:.1f} times what chance leaves, so no such relation holds"
     b, spread = relation.coefficients, np.sqrt(np.diag(relation.covariance))
     for own in row.own:
         for at in own.terms:
@@ -416,7 +416,7 @@ def disagreements(baseline: Baseline) -> tuple[str, ...]:
                 change = float(np.mean([each.change for each in readings]))
                 where = condition or "part of the recording"
                 found.append(
-                    f"{where}: {PARAMETER_TEXT.get(name, name)} reads {change:+.0%} against what the others teach "
-                    f"({abs(z):.0f} standard errors)"
+                    f"{where}: {PARAMETER_TEXT.get(name, name)} reads {change:+.0%} against what was learned "
+                    f"from the others ({abs(z):.0f} standard errors)"
                 )
     return tuple(found)

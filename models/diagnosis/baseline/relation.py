@@ -342,8 +342,8 @@ def learn_row(
             known = abs(b[number - 1]) > 2 * spread[number - 1] and (b[number - 1] < 0 or not own.resists)
             if not (np.all(np.isfinite(b)) and known):
                 raise EstimationError(
-                    f"{row.title}: the healthy recording does not determine {own.parameter}; record longer, or while "
-                    "more than the unbalance moves the machine"
+                    f"{row.title}: the healthy recording does not determine {own.parameter}; record longer, or "
+                    "while something besides the unbalance excites the machine"
                 )
     misfit = chosen.chi2 / chosen.degrees_of_freedom
     stretch = np.sqrt(max(1.0, misfit)) * np.eye(b.size)
@@ -421,9 +421,7 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
     believed = longest if (longest.fits or longest.unchanged) and not change.fits else change
     errors = zip(row.own, believed.error(relation), strict=True)
     if (change.unchanged or longest.unchanged) and any(error > LOST for own, error in errors if 0 in own.terms):
-        raise EstimationError(
-            f"{row.title}: what this window holds beyond the memory of its force does not determine it"
-        )
+        raise EstimationError(f"{row.title}: what this window holds beside its force's past does not determine it")
     return believed
 
 

@@ -221,4 +221,4 @@ def combination(design: FloatArray, covariance: FloatArray) -> FloatArray:
         weight = np.linalg.inv(covariance)
         return np.asarray(np.linalg.solve(design.T @ weight @ design, design.T @ weight), dtype=np.float64)
     except np.linalg.LinAlgError as error:
-        raise EstimationError("unbalance not seen well enough: nothing is left beside its errors") from error
+        raise EstimationError("unbalance not determined well enough: it is smaller than its errors") from error

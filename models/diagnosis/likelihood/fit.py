@@ -413,7 +413,7 @@ class LikelihoodFit:
             return ""
         return (
             f"{self._machine.name}: it would take a shaft {100 * change:.0f} % stiffer than that of the machine file, "
-            "which no fault makes: masses or lengths there are not those of this machine, or its shaft is another one"
+            "which no fault causes: the file's masses or lengths are not those of this machine, or its shaft is not"
         )
 
 

@@ -152,14 +152,14 @@ def unexplained_at(
             if 2 * squared[there].sum() > squared.sum()
             else ""
         )
-        why = f"its spectra deviate from it by {text} % (rms, sampling aside){line}, evaluated is at most {limit} %"
+        why = f"its spectra deviate from it by {text} % (rms, without sampling error){line}, evaluation limit {limit} %"
         return why, far or impossible
     # Noise is a sensor's own: what both sensors of a motion show is motion, and this one the theory does not explain.
     shared = np.maximum(model.noise(point.theta) - _UNSHARED * model.motions.rest(states, model.centre), 0)
     share = float(np.mean(bins @ shared / (bins @ np.einsum("fii->fi", point.S).real)))
     if share > times * _MOST_NOISE:
         text, limit = beyond(100 * share, 100 * _MOST_NOISE)
-        why = f"{text} % of what pairs of sensors show alike would be noise of each, evaluated is at most {limit} %"
+        why = f"{text} % of what pairs of sensors have in common would be noise of each, evaluation limit {limit} %"
         return why, impossible
     if not impossible:
         return "", False
@@ -191,6 +191,6 @@ def unseen(model: SpectralModel, weights: Weights, found: Maximum, misfit_z: flo
     text, limit = beyond(misfit_z, MOST_MISFIT)
     names = ", ".join(PARAMETER_TEXT[name] for name, missing in zip(STRUCTURAL, lost, strict=True) if missing)
     return (
-        f"it hardly shows the rotor's {names}, and it deviates from the theory by {text} standard errors, evaluated is "
-        f"then at most {limit}"
+        f"it hardly shows the rotor's {names}, and it deviates from the theory by {text} standard errors, the limit "
+        f"for evaluation is then {limit}"
     )

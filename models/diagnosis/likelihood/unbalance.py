@@ -125,7 +125,7 @@ def estimate_unbalance(
         between = float(spread[0, -1])
     foreign = foreign_rotation(q2, design @ values[1:], total)
     if foreign:
-        foreign = f"{machine.name}: what turns with the shaft is not what an unbalance makes on this rotor: {foreign}"
+        foreign = f"{machine.name}: the 1× vibration is not what an unbalance causes on this rotor: {foreign}"
     weights = np.asarray(weighted.conj() @ combined[0] / total_weight, dtype=np.complex128)
     return UnbalanceRatios(values, variances, between, with_structural, foreign, weights)
 

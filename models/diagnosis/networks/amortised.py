@@ -198,7 +198,7 @@ class NetworkDiagnostician:
         if not novelty <= amortised.novelty_limit:
             text, limit = beyond(novelty, float(f"{amortised.novelty_limit:.3g}"))
             return self._refused(
-                f"the window is unlike what the networks were trained on ({text} apart, evaluated is at most {limit})"
+                f"the window is unlike what the networks were trained on ({text} apart, evaluation limit {limit})"
             )
         readings: list[Parameter] = []
         blocks: list[FloatArray] = []
@@ -248,7 +248,7 @@ class NetworkDiagnostician:
                 readings.append(no_reading(name, self.by, reason))
             elif not error < _VAGUE:
                 text, limit = beyond(100 * error, 100 * _VAGUE)
-                reason = f"not determined in this window (standard error {text} %, at most {limit} % is a reading)"
+                reason = f"not determined in this window (standard error {text} %, limit for a reading {limit} %)"
                 readings.append(no_reading(name, self.by, reason))
             else:
                 readings.append(parameter_reading(name, self.by, ratio - 1, error))

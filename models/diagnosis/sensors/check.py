@@ -76,8 +76,8 @@ def sensor_findings(
             readings.append(reading)
             continue
         text = (
-            f"{naming.name(second)} and {naming.name(first)} measure one motion but share only {reading.shared:.2f} of "
-            "it, expected nearly 1: noise, a loose sensor, or a wrong channel"
+            f"{naming.name(second)} and {naming.name(first)} measure the same motion but share only "
+            f"{reading.shared:.2f} of it, expected nearly 1: noise, a loose sensor, or a wrong channel"
         )
         findings.append(SensorFault(states=(first, second), kind=FaultKind.INCOHERENT, text=text, value=reading.shared))
     bad = implicated(findings)

@@ -125,7 +125,7 @@ def _gain(
     error = abs(size) / z if z > 0 else 0.0
     expected = "as they were on the healthy machine" if departure.known else "the same motion, 0 % apart"
     if departure.reversed:
-        text = f"{naming.name(second)} moves against {naming.name(first)}: one of them is reversed"
+        text = f"{naming.name(second)} moves opposite to {naming.name(first)}: one of them is reversed"
         return SensorFault(states=(first, second), kind=FaultKind.GAIN, text=text, value=-2.0, z=z)
     if guilty is not None:
         state = window.states[guilty]
@@ -136,10 +136,10 @@ def _gain(
             f"{naming.name(state)}: its gain {change} (± {error:.1%}) against {naming.name(other)}, expected {expected}"
         )
         return SensorFault(states=(state,), kind=FaultKind.GAIN, text=text, value=own, z=z)
-    change = f"came apart by {size:+.1%} within the window" if moving else f"are {size:+.1%} apart"
+    change = f"drifted apart by {size:+.1%} within the window" if moving else f"are {size:+.1%} apart"
     text = (
         f"{naming.name(second)} and {naming.name(first)} {change} (± {error:.1%}) in gain, expected {expected}; "
-        "which of them is wrong does not show"
+        "which of them is wrong cannot be told"
     )
     return SensorFault(states=(first, second), kind=FaultKind.GAIN, text=text, value=size, z=z)
 

@@ -61,14 +61,14 @@ def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]
         if state == "theta":
             if runs.max() >= limit:
                 text = (
-                    f"{name}: the shaft angle stood still for {longest_s:.3g} s: the phase reference is lost, or the "
-                    "machine has not run since the monitor began"
+                    f"{name}: the shaft angle stood still for {longest_s:.3g} s: the phase reference is lost, or "
+                    "the machine has not run since the monitor started"
                 )
                 findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=longest_s))
         elif np.any(coarse):
             quiet_s = float(coarse.sum()) * hops.n_samples / rate_hz
             text = (
-                f"{name}: shows nothing but its own steps of {naming.value(state, float(step[coarse].max()))} for "
+                f"{name}: shows nothing but quantisation steps of {naming.value(state, float(step[coarse].max()))} for "
                 f"{quiet_s:.3g} s, expected a vibration of several steps: the sensor is dead or its range far too wide"
             )
             findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=quiet_s))
@@ -78,7 +78,7 @@ def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]
             what = f"the value {naming.value(state, float(hops.mean[still, column]))}" if known else "one value"
             text = (
                 f"{name}: repeated {what} for {longest_s:.3g} s, "
-                f"expected to move within {STILL_S:g} s: the sensor or its line is stuck"
+                f"expected to change within {STILL_S:g} s: the sensor or its line is stuck"
             )
             findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=longest_s))
     return findings
@@ -94,7 +94,7 @@ def dropped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
             lost_s = float(counts.sum()) / rate_hz
             text = (
                 f"{naming.name(state)}: jumps to a constant and back, for {lost_s:.2g} s of {window.duration_s:.3g} s, "
-                "expected to move without a break: a loose connector or a broken cable"
+                "expected an unbroken signal: a loose connector or a broken cable"
             )
             findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=lost_s))
     return findings
@@ -123,7 +123,7 @@ def clipped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
             flat = sum(share for share, _ in sides.values())
             where = " and ".join(f"{naming.value(state, level)} ({side})" for side, (_, level) in sides.items())
             text = (
-                f"{naming.name(state)}: cut off at {where}, {flat:.1%} of the samples stand exactly there, "
+                f"{naming.name(state)}: cut off at {where}, {flat:.1%} of the samples lie exactly there, "
                 f"expected less than {float(allowed[:, column].max()):.1%}: the measuring range is too small"
             )
             findings.append(SensorFault(states=(state,), kind=FaultKind.CLIPPED, text=text, value=flat))
@@ -143,7 +143,7 @@ def at_range_end(windows: Sequence[WindowStatistics], naming: Naming) -> list[st
             hit = np.count_nonzero((values[:, column] == furthest) & (flat[:, column] > 1))
             if hit >= least and abs(furthest - mean) > _BEYOND_SINE * rms:
                 name, value = naming.name(state), naming.value(state, float(furthest))
-                found.append(f"{name} stands at exactly {value} in {hit} of {len(hops.rms)} hops")
+                found.append(f"{name} is at exactly {value} in {hit} of {len(hops.rms)} hops")
                 break
     return found
 
@@ -160,7 +160,7 @@ def spiked(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
             continue
         text = (
             f"{naming.name(first)}: peaks of up to {crest[alone, pair.first].max():.3g} times its rms in "
-            f"{np.count_nonzero(alone)} of {len(alone)} hops, of which {naming.name(second)} shows nothing: a loose "
+            f"{np.count_nonzero(alone)} of {len(alone)} hops, which {naming.name(second)} does not show: a loose "
             "connector, or a bad cable"
         )
         found.append(SensorFault(states=(first,), kind=FaultKind.INCOHERENT, text=text, value=None))
@@ -198,7 +198,7 @@ def offset(window: WindowStatistics, naming: Naming, reference: SensorReference 
         ):
             value = float(drifts[column])
             text = (
-                f"{name}: the mean drifted by {naming.value(state, value)} within the window, allowed are "
+                f"{name}: the mean drifted by {naming.value(state, value)} within the window, the limit is "
                 f"{DRIFT_PART:g} times the channel's rms ({naming.value(state, DRIFT_PART * own)})"
             )
             findings.append(
@@ -288,7 +288,7 @@ def gain_jump(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
             text = (
                 f"{naming.name(state)}: everything it measures changed by {value:+.0%} at once (± "
                 f"{abs(value) / z:.1%}) while {naming.names(window.states[i] for i in others)} stayed as they were, "
-                "expected a machine to show in more than one channel: its gain jumped"
+                "expected a change of the machine to show in more than one channel: its gain jumped"
             )
             findings.append(SensorFault(states=(state,), kind=FaultKind.GAIN, text=text, value=value, z=z))
     return findings

@@ -141,7 +141,7 @@ def _of_pairs(
             f"{np.exp(limit / 2):.2g} times: cable, earthing or amplifier"
         )
         if guilty is None:
-            text += "; which of the two it is does not show"
+            text += "; which of the two it is cannot be told"
         z = float(rise[row].max()) / float(np.hypot(_PAIR_SCATTER, np.sqrt(1 / own.averages.min())))
         value = sizes[column] / float(rms[column])
         findings.append(SensorFault(states=states, kind=FaultKind.NOISE, text=text, value=value, z=z))

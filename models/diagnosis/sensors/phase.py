@@ -176,9 +176,9 @@ def _elsewhere(
     if not 1 / _THERE < float(np.median(seen)) < _THERE:
         return None
     rpm, own_rpm = 60 * window.frequencies_hz[at], window.speed_rad_s * 30 / np.pi
-    pulses = "there are pulses too many throughout" if abs(own_rpm) > rpm else "pulses are missing throughout"
+    pulses = "there are too many pulses throughout" if abs(own_rpm) > rpm else "pulses are missing throughout"
     text = (
-        f"{name}: turns at {own_rpm:.5g} rpm, but the rotation stands in the vibration at {rpm:.5g} rpm and not there: "
+        f"{name}: turns at {own_rpm:.5g} rpm, but the vibration shows the rotation at {rpm:.5g} rpm and not there: "
         f"the angle is not this shaft's, or {pulses}"
     )
     return _theta(FaultKind.INCOHERENT, text, float(own_rpm / rpm))
@@ -246,7 +246,7 @@ def _jump(window: WindowStatistics, common: _Common, name: str) -> SensorFault |
         return None
     text = (
         f"{name}: jumped by {np.degrees(-value):+.0f}° (± {np.degrees(float(error[0])):.1f}°) within the window: every "
-        "channel's rotation turned by as much and kept its length, expected a machine to change each in its own way"
+        "channel's 1× vector turned by as much and kept its length, expected a machine to change each differently"
     )
     return _theta(FaultKind.OFFSET, text, -value, best)
 
@@ -298,6 +298,6 @@ def _jitter(window: WindowStatistics, columns: Sequence[int], vectors: ComplexAr
     jitter_rad = float(np.sqrt(2 * np.arcsinh(np.sqrt(share) / 2)))
     text = (
         f"{name}: jitters by about {np.degrees(jitter_rad):.0f}° rms: {share:.0%} of the rotation's power is still in "
-        f"every channel after what is steady with the angle was taken out, expected next to nothing"
+        f"every channel after the part synchronous with the angle was removed, expected next to nothing"
     )
     return _theta(FaultKind.NOISE, text, jitter_rad, z)

@@ -76,9 +76,9 @@ class Standstill:
         if not stood_s:
             return ""
         return (
-            f"the machine stands, or all its sensors have lost their supply: for {stood_s:.3g} s of the window no "
-            f"rotation, and in every channel less than {QUIET:.0%} of the vibration of the running machine; parameters "
-            "are not judged, nor channels by one another"
+            f"the machine is at a standstill, or all its sensors have lost their supply: for {stood_s:.3g} s of the "
+            f"window no rotation, and in every channel less than {QUIET:.0%} of the vibration of the running machine; "
+            "parameters are not judged, and channels are not compared"
         )
 
     def _running_rms(self, window: WindowStatistics) -> FloatArray:

@@ -255,6 +255,6 @@ def _stated(
     if not error < vague:
         text, limit = beyond(100 * error, 100 * vague)
         return no_reading(
-            name, by, f"not determined in this window (standard error {text} %, at most {limit} % is a reading)"
+            name, by, f"not determined in this window (standard error {text} %, limit for a reading {limit} %)"
         )
     return possible_reading(name, by, reading.relative_change, error, _vector(diagnosis, name))

@@ -93,6 +93,6 @@ class AlarmEvent:
             case EventKind.ESCALATED:
                 return f"{alarm.severity.upper()}: {what} changed further, now {size}{reserve}"
             case _ if alarm.taken_back:
-                return f"cleared: {what} is named no longer; it reads {size}"
+                return f"cleared: {what} is no longer named as changed; it reads {size}"
             case _:
                 return f"cleared: {what} is back {alarm_kind(alarm.name).cleared} at {size}"

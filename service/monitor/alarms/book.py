@@ -161,7 +161,7 @@ class AlarmBook:
                 danger=any(change > limits.danger_above for change, limits in changes),
             )
         if verdict.current or unexplained or verdict.outside_model:
-            at_once = f"{', '.join(named)} seem to have changed at once, so none is named" if another else ""
+            at_once = f"{', '.join(named)} seem to have changed at the same time, so none is named" if another else ""
             within_s = astride_s + self._settings.on_delay_s
             just = f"if a parameter has just changed, it can be named in {within_s:.0f} s" if astride_s else ""
             note = "; ".join(filter(None, (unexplained, suspect and f"best explained by: {suspect}", at_once, just)))
@@ -281,7 +281,7 @@ class AlarmBook:
         events: list[AlarmEvent] = []
         for alarm in self.alarms:
             if alarm.shelf is not None and time_ns >= alarm.shelf.until_ns:
-                events += self._unshelve(alarm, alarm.shelf.until_ns, "its time is over")
+                events += self._unshelve(alarm, alarm.shelf.until_ns, "the shelf time has expired")
         return tuple(events)
 
     def clock_stepped(self, time_ns: int, step_ns: int) -> None:
@@ -321,7 +321,7 @@ class AlarmBook:
             hint = " (acknowledge needs an alarm that has been raised)" if kind is EventKind.ACKNOWLEDGED else ""
             raise OperationRefused(f"{alarm.name} is {alarm.state.value}: {operation.kind} is not possible{hint}")
         if kind in {EventKind.SHELVED, EventKind.REMOVED_FROM_SERVICE} and not operation.reason.strip():
-            raise OperationRefused(f"{operation.kind} of {alarm.name}: reason is empty, expected why")
+            raise OperationRefused(f"{operation.kind} of {alarm.name}: reason is empty, expected an explanation")
         if kind is EventKind.SHELVED:
             alarm = replace(alarm, shelf=self._shelf(operation, time_ns))
         elif kind is EventKind.UNSHELVED:

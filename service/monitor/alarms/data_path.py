@@ -90,7 +90,7 @@ class DataPathAlarms:
             return ""
         return (
             f"no {self._hop_ns / 1e9:g} s without a gap for {without_ns / 1e9:.3g} s, so nothing is evaluated: blocks "
-            f"are lost, or their times are not counted in samples; the latest: {verdict.text}"
+            f"are lost, or their times do not come from counting samples; the latest: {verdict.text}"
         )
 
     def passed(self, time_ns: int, end_ns: int | None) -> None:
@@ -154,7 +154,7 @@ class DataPathAlarms:
 
     def _lost(self, end_ns: int) -> None:
         """Raise the alarm on silence, at the time at which it was due: then live and replay say the same."""
-        note = f"no usable data for {self._silence_s:g} s; what was raised stays raised"
+        note = f"no usable data for {self._silence_s:g} s; alarms already raised stay raised"
         due_ns = end_ns + self._silence_ns
         self._book.update_state(
             STREAM_LOST, True, due_ns, note, evidence=Evidence(start_ns=end_ns, end_ns=due_ns), at_once=True

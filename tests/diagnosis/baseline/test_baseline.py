@@ -102,7 +102,7 @@ def test_a_rotation_that_no_unbalance_makes_names_nothing(plane: str) -> None:
     assert not reading.diagnose(window).unexplained
     q[[number for number, name in enumerate(window.states) if name.startswith(plane)]] *= -1
     diagnosis = reading.diagnose(replace(window, synchronous=q))
-    assert "what turns with the shaft is not what an unbalance makes" in diagnosis.unexplained
+    assert "the 1× vibration is not what an unbalance causes" in diagnosis.unexplained
     reasons = {one.name: one.reason for one in diagnosis.parameters}
     assert reasons["e"] == diagnosis.unexplained
     for turned in (2.0, 0.5j, -1.0):  # another unbalance is one, wherever its heavy spot is
@@ -113,6 +113,6 @@ def test_a_rotation_that_no_unbalance_makes_names_nothing(plane: str) -> None:
 def test_errors_with_nothing_beside_them_make_no_unbalance() -> None:
     """As two sines in all channels left of a rotor: a hop of that was a defect in the monitor."""
     lost = positive(np.array([[-8.0, 0.0], [-12.0, -2.0]]) * 2.0**40)  # what cancels in such a hop
-    with pytest.raises(EstimationError, match="not seen well enough: nothing is left beside its errors"):
+    with pytest.raises(EstimationError, match="not determined well enough: it is smaller than its errors"):
         combination(np.eye(2), lost)
     np.testing.assert_allclose(combination(np.eye(2), np.diag([1.0, 4.0])), np.eye(2))

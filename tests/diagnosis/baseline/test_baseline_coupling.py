@@ -84,7 +84,7 @@ def test_a_relation_that_leaves_over_too_much_in_its_own_recording_is_none() -> 
     first, second = baseline("overhung").relations
     foreign = replace(baseline("overhung"), relations=(replace(sure(first), misfit=5.5), second))
     reason, none = undetermined(foreign)
-    assert "what is left over is 5.5 times what chance leaves" in reason
+    assert "the remainder is 5.5 times what chance leaves" in reason
     assert none == ""
 
 

@@ -70,7 +70,7 @@ def test_a_window_of_another_force_that_the_relations_do_not_hold_in_names_nothi
     monitor = BaselineDiagnostician(baseline("fluid-film", 4))
     diagnosis = monitor.diagnose(later("fluid-film", 4, 3))
     assert sure(diagnosis.misfit_z) > 8
-    assert "(record a healthy condition like this one then)" in diagnosis.unexplained
+    assert "(then record a healthy condition like this one)" in diagnosis.unexplained
     verdict = isolate_window(diagnosis, 0.01)
     assert verdict.outside
     assert verdict.changed == ()
@@ -126,4 +126,4 @@ def test_a_reversed_sensor_is_suspected_although_the_force_that_it_leaves_hides_
     samples = sampled(rotor, run, 30.0 + planned.preamble / planned.rate_hz + 0.1, 99)
     samples[:, 0] *= -1
     diagnosis = BaselineDiagnostician(learned).diagnose(windows_of(samples, planned)[0])
-    assert "swapped, reversed or late" in diagnosis.unexplained
+    assert "swapped, reversed or delayed" in diagnosis.unexplained

@@ -93,7 +93,7 @@ def test_vectors_that_no_unbalance_makes_are_not_read_as_one() -> None:
     foreign = np.abs(sure(window.synchronous)) * np.exp(1j * np.random.default_rng(5).uniform(0, 6, len(window.states)))
     diagnosis = LikelihoodFit(MACHINE).diagnose(replace(window, synchronous=foreign))
     vector = sure(diagnosis.unbalance)
-    assert "not what an unbalance makes" in vector.foreign
+    assert "not what an unbalance causes" in vector.foreign
     verdict = isolate_window(diagnosis, 0.001)
     assert "e" not in verdict.changed
     assert not verdict.outside

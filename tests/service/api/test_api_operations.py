@@ -142,7 +142,7 @@ def test_latched_alarms_are_reset_and_out_of_service_is_for_who_configures(
     plant: tuple[Runtime, Feed, httpx.Client],
 ) -> None:
     runtime, feed, http = plant
-    for _ in range(130):  # until a hop is complete: then the data are without gaps again
+    for _ in range(130):  # until a hop is complete: then the data are free of gaps again
         feed.put_good()
     until(lambda: state(http) == "latched-unacknowledged", "end of the gap")
     answered(http.post(f"{GAP}/acknowledge", json={"expected_state": "latched-unacknowledged"}), OperationDone)

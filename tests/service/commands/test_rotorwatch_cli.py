@@ -239,9 +239,9 @@ def test_lines_for_terminals() -> None:
     assert report_line(early.model_copy(update={"reason": "too fast"})).endswith("too fast")
     event = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
     assert alarm_event_line(event).startswith("00:03:25  demo/lab  ALERT: bearing stiffness, horizontal (k_by)")
-    back = event.data.model_copy(update={"name": "stream-lost", "text": "cleared: data come again"})
+    back = event.data.model_copy(update={"name": "stream-lost", "text": "cleared: data are arriving again"})
     assert alarm_event_line(event.model_copy(update={"data": back})) == (
-        "00:03:25  demo/lab  cleared: data come again (stream-lost)"
+        "00:03:25  demo/lab  cleared: data are arriving again (stream-lost)"
     )
     states = AlarmStates.model_validate(example(AlarmStates))
     assert alarm_state_lines(states) == (

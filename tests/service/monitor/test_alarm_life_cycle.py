@@ -131,7 +131,7 @@ def test_shelving_ends_by_itself_and_what_is_there_then_is_unacknowledged() -> N
     assert book.severity is None
     assert book.passed((now_s + 599) * S) == ()
     (event,) = book.passed((now_s + 1000) * S)
-    assert (event.kind, event.time_ns, event.reason) == ("unshelved", (now_s + 600) * S, "its time is over")
+    assert (event.kind, event.time_ns, event.reason) == ("unshelved", (now_s + 600) * S, "the shelf time has expired")
     assert state_of(book) is AlarmState.UNACKNOWLEDGED
 
 

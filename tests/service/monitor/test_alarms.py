@@ -130,7 +130,7 @@ def test_missing_data_and_data_health_are_alarms_of_their_own_and_not_of_the_mac
     assert book.present("k_by")
     assert not book.update_state(STREAM_LOST, True, 2 * 10**11, at_once=True)
     (event,) = book.update_state(STREAM_LOST, False, 3 * 10**11, at_once=True)
-    assert event.text == "cleared: data come again"
+    assert event.text == "cleared: data are arriving again"
     empty = AlarmBook(SETTINGS)
     empty.update_state("data-stuck", True, 0, "y1 stands still", at_once=True)
     assert empty.severity is None
@@ -247,5 +247,5 @@ def test_a_name_that_is_taken_back_is_cleared_however_large_its_reading() -> Non
     assert judged([SURE] * 3 + [nothing] * 3) == ["raised c_bz"]
     assert judged([SURE] * 3 + [nothing] * 4) == ["raised c_bz", "cleared c_bz"]
     text = happened([SURE] * 3 + [nothing] * 4)[-1].text
-    assert text == "cleared: bearing damping, vertical (c_bz) is named no longer; it reads +20.0% ± 5.9%"
+    assert text == "cleared: bearing damping, vertical (c_bz) is no longer named as changed; it reads +20.0% ± 5.9%"
     assert judged([SURE] * 3 + [nothing] * 9, settled=False) == ["raised c_bz"]  # too little data to take it back

@@ -101,7 +101,7 @@ def test_a_rub_is_told_and_what_it_is_taken_for_is_named_with_reserve(
         update={"rub": Rub(clearance_m=clearance_m), "events": (Event(at_s=0.0, anomaly="rub", size=size),)}
     ).overridden(duration_s=66.0, seed=SEED + 7)
     windows, events = feed(MachineMonitor(of()), [block for block, _ in blocks(rubbing, machine)])
-    assert "(disc) that is pushed back where it is far out, as by a rub" in full(windows)[-1].suspect
+    assert "(disc) that is pushed back at large displacements, as by a rub" in full(windows)[-1].suspect
     raised = {event.alarm.name: event.alarm for event in events}
     assert "as by a rub" in raised[MODEL].note
     named = [alarm for name, alarm in raised.items() if name in PARAMETERS]

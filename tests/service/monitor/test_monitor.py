@@ -231,7 +231,7 @@ def test_mains_hum_hides_no_rotor_and_another_line_is_told_with_its_frequency() 
     assert not [each for one in windows[-1].opinions for each in one.agreement if each.verdict == "disagree"]
     (last,) = feed(monitor(), with_lines(healthy(63.0), {37.3: 0.3}))[0][-1:]
     assert "most of it at 37" in sure(last.parameters[0].reason)
-    assert last.reason.endswith("if it is healthy like that, commission it")
+    assert last.reason.endswith("if this is its healthy state, commission it")
 
 
 def test_a_machine_that_runs_down_raises_nothing() -> None:
@@ -250,7 +250,7 @@ def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
     _, machine = load_scenario("healthy")
     windows, events = feed(MachineMonitor(install(machine, None)), stream(75.0, Event(at_s=0.0, speed_rpm=2000.0)))
     assert windows[-1].state is HealthState.NOT_EVALUABLE
-    assert "speed is 2000 rpm, off 1320 rpm by 51.5 %, evaluated is at most 20 %" in windows[-1].reason
+    assert "speed is 2000 rpm, off 1320 rpm by 51.5 %, evaluation limit 20 %" in windows[-1].reason
     assert windows[-1].parameters == ()
     assert not events
 
@@ -360,5 +360,5 @@ def test_a_1x_that_no_unbalance_makes_is_outside_the_model() -> None:
     cuts = np.cumsum([len(block.samples) for block in blocks_])[:-1]
     parts = zip(blocks_, np.split(samples.astype(np.float32), cuts), strict=True)
     windows, events = feed(MachineMonitor(install(machine, None)), [replace(a, samples=b) for a, b in parts])
-    assert "what turns with the shaft is not what an unbalance makes" in windows[-1].suspect
+    assert "the 1× vibration is not what an unbalance causes" in windows[-1].suspect
     assert [event.alarm.name for event in events if event.alarm.name in {MODEL, *PARAMETERS}] == [MODEL]

@@ -109,7 +109,7 @@ def test_a_machine_that_doubles_after_its_first_windows_raises_the_alarm_of_its_
     assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
     assert 90 < events[0][2] <= 90 + 2 * FAN.window.length_s
     alarm = next(one for one in monitor.health().alarms if one.name == "level:DE-H")
-    assert "alert from" in alarm.note
+    assert "alert limit" in alarm.note
     assert "the first windows" in alarm.note
     assert monitor.health().state is HealthState.ALERT
 
@@ -204,7 +204,7 @@ def test_levels_are_judged_at_a_speed_that_was_not_commissioned() -> None:
             monitor.step(block, machine.descriptor.schema_hash)
         now = monitor.health()
         assert now.state is state
-        assert "levels are judged by the nearest commissioned speed: speed is 1399 rpm" in now.reason
+        assert "levels are judged as at the nearest commissioned speed: speed is 1399 rpm" in now.reason
 
 
 def test_a_machine_that_is_watched_says_what_would_have_been_seen() -> None:

@@ -83,7 +83,7 @@ def test_a_machine_that_stops_and_starts_raises_nothing_and_is_healthy_again_aft
     assert events + rest[1] == []
     states = {round((one.end_ns - stream[0].start_ns) / 1e9): one.state for one in reports}
     assert states[38] is states[168] is HealthState.HEALTHY
-    standing = [one for one in reports if "the machine stands" in one.reason]
+    standing = [one for one in reports if "the machine is at a standstill" in one.reason]
     assert {one.state for one in standing} == {HealthState.NOT_EVALUABLE}
     assert standing[-1].end_ns - standing[0].end_ns >= (STARTS_S - STANDS_S) * 1e9
     assert not any(one.sensors for one in standing)

@@ -73,7 +73,7 @@ def test_alarms_and_what_operators_did_survive_kill_9(tmp_path: Path) -> None:
         assert states(second) == {"c_bz": "acknowledged", "model": "shelved", "data-stuck": "out-of-service"}
         health = second.health()
         assert health.restart.startswith(
-            "went on where it stood at 2026-01-01T00:00:45.000000Z; the window is not there"
+            "went on where it stood at 2026-01-01T00:00:45.000000Z; there is no window until"
         )
         assert health.filled == 0.0
         assert health.state in {"alert", "danger"}

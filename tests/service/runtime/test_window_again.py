@@ -188,7 +188,7 @@ def test_killed_where_nobody_has_the_window_it_fills_anew_and_alarms_are_held(tm
             here.put(stream()[FIRST:])
             until_evaluated(second)
             told = second.health().restart
-            assert "hops of the window did not come again, it fills anew" in told
+            assert "hops of the window were not received again, and it is filling anew" in told
             assert second.stop() == 0
         events, reports = here.said()
         assert raised(events)[0] == "c_bz"
