@@ -65,7 +65,7 @@ def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> 
         lost += f", {sum(refused.values())} blocks refused (the latest: {last})"
     stopped_s = sum(one.stopped_s for one in recordings)
     if stopped_s:
-        lost += f"; {stopped_s:.4g} s left out in which the machine stood, ran up or ran down"
+        lost += f"; {stopped_s:.4g} s left out in which the machine stood still, ran up or coasted down"
     files = "one recording" if len(recordings) == 1 else f"{len(recordings)} recordings"
     found = f"{used_s:.4g} s of usable data in {files}; {lost}"
     wanted_s = _FEW_WINDOWS * machine.window_data_s
@@ -96,7 +96,7 @@ def check_sensors_of(
     naming = Naming(machine.sensors)
     ends = [f"{name}: {end}" for name, found in windows.items() for end in at_range_end(found, naming)]
     if not faults and ends:
-        text = f"{'; '.join(ends)}: the range ends there, and a machine that vibrates more is cut off (data-clipped)"
+        text = f"{'; '.join(ends)}: the range ends there, and stronger vibration would be clipped (data-clipped)"
         return told(verdict="limited", text=text, advice="choose a wider measuring range, and record again")
     if not faults:
         return told(verdict="passed", text="no sensor stuck, clipped, swapped, delayed or in contradiction")
@@ -106,7 +106,7 @@ def check_sensors_of(
             f"{recording}: {texts[0]}" + (f" (in {len(texts)} windows)" if len(texts) > 1 else "")
             for (recording, _, _), texts in faults.items()
         ),
-        advice="repair, re-range or rewire what is named, and record again: a fault must not become the healthy state",
+        advice="repair, re-range or rewire these sensors, and record again: a fault must not become the healthy state",
     )
 
 
@@ -163,11 +163,11 @@ def check_steady(
                     f"{round(ratio[worst], 6):.2g} times that of the first"
                 )
     if not moved:
-        return told(verdict="passed", text="speed and level hold still within every recording")
+        return told(verdict="passed", text="speed and level are steady within every recording")
     return told(
         verdict="refused",
         text="; ".join(moved),
-        advice="record in steady operation; one file for each speed or load, each of at least two windows",
+        advice="record in steady operation: one file for each speed or load, each of at least two windows",
     )
 
 
@@ -177,15 +177,15 @@ def check_lines(machine: MachineFile, recordings: Sequence[HealthyRecording]) ->
     found = [(one.name, line) for one in recordings for line in foreign_lines(one)]
     loud = [(recording, line) for recording, line in found if line.share > _LOUD_LINE]
     if not loud:
-        return told(verdict="passed", text="no line but those of the rotation stands out")
+        return told(verdict="passed", text="no line stands out except those of the rotation")
     text = "; ".join(
         f"{recording}: a steady line at {line.frequency_hz:.2f} Hz makes {100 * line.share:.3g} % of the random "
         f"vibration of {with_channel_names(line.state, machine.sensors)}"
         for recording, line in loud
     )
     advice = (
-        "a neighbouring machine, a gear or a supply line drives the rotor besides: the relations are for noise and "
-        "unbalance; record while the other machine stands, or let the line fall outside the band"
+        "a neighbouring machine, a gear or the mains also excites the rotor: the relations hold for noise "
+        "and unbalance; record while the other machine is stopped, or exclude the line from the band"
     )
     unknown_speed = all(one.plan.angle_column is None and one.plan.speed_rad_s is None for one in recordings)
     if unknown_speed:
@@ -207,19 +207,19 @@ def check_recordings(differences: Sequence[str], speeds_rad_s: Mapping[str, floa
     if len(speeds_rad_s) < 2:
         return None
     if not differences:
-        return told(verdict="passed", text=f"one relation holds in all {len(speeds_rad_s)} recordings")
+        return told(verdict="passed", text=f"the same relation holds in all {len(speeds_rad_s)} recordings")
     text = "; ".join(differences)
     speeds = sorted(speeds_rad_s.values())
     if speeds[-1] <= speeds[0] * (1 + SAME_SPEED) or not np.all(np.isfinite(speeds)):
         return told(
             verdict="refused",
             text=f"{text}, at one speed",
-            advice="the machine was not the same in all of them, or the load changes its bearing: commission on "
+            advice="the machine was not the same in all of them, or the load alters its bearing: commission on "
             "recordings of one load, or find out what changed",
         )
     return told(
         verdict="limited",
-        text=f"{text}; a baseline is kept for each speed, and nothing is said between the speeds",
+        text=f"{text}; a baseline is kept for each speed, and nothing is evaluated between the speeds",
         advice="record at more speeds between these if the machine runs there",
     )
 
@@ -233,17 +233,17 @@ def check_sources(windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
     told = partial(Check, name="ways of excitation")
     alone = [recording for recording, own in windows.items() if own and all(one_source(window) for window in own)]
     if len(alone) < len(windows):
-        return told(verdict="passed", text="several independent forces move the machine")
+        return told(verdict="passed", text="several independent forces excite the machine")
     if not _alike([windows[name] for name in alone]):
-        text = f"one source moves everything in each of {len(alone)} recordings; together they can tell more"
+        text = f"a single source excites everything in each of {len(alone)} recordings; together they can tell more"
         return told(verdict="passed", text=text)
     where = "in the only recording" if len(alone) == 1 else f"in the same way in all {len(alone)} recordings"
     return told(
         verdict="limited",
-        text=f"one source moves everything, {where}: what else holds the shaft cannot be told "
-        "for certain, and some later readings may be off by more than their intervals say",
-        advice="add a recording of another condition: another speed or load, or a day on which something else shakes "
-        "the machine",
+        text=f"a single source excites everything, {where}: what else holds the shaft cannot "
+        "be told for certain, and some later readings may be off by more than their intervals",
+        advice="add a recording of another condition: another speed or load, or a time when something else "
+        "shakes the machine",
     )
 
 
@@ -274,7 +274,7 @@ def check_determined(reasons: Sequence[str], *, only_shapes: bool = False) -> Ch
     text = "; ".join(dict.fromkeys(reasons))
     if only_shapes:
         text += "; each channel will only be called changed or not changed, and no part of the machine will be named"
-        advice += "; a machine that is more than one bearing and one disc may stay beyond these relations"
+        advice += "; a machine with more than one bearing and one disc may never satisfy these relations"
     return told(verdict="limited", text=text, advice=advice)
 
 
@@ -290,28 +290,28 @@ def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows
     names = {state: with_channel_names(state, machine.sensors) for state in powers}
     seen = {names[state]: one.growth for state, one in powers.items() if one.growth <= SEEN_GROWTH}
     blind = {names[state]: one for state, one in powers.items() if one.growth > SEEN_GROWTH}
-    text = "no channel's change of shape would be called one"
+    text = "no channel's change of shape would be reported"
     if seen:
         least = max(seen, key=seen.__getitem__)
-        text = f"noise that makes a channel {seen[least]:.2g} times as loud ({least}) is called a change of its shape"
+        text = f"noise that makes a channel {seen[least]:.2g} times as loud ({least}) is reported as a changed shape"
     if not blind:
         return told(verdict="passed", text=text)
     text += (
-        f"; with {windows} healthy windows not even noise that makes {', '.join(blind)} {SEEN_GROWTH:g} times as loud "
-        "is called one"
+        f"; with {windows} healthy windows not even noise that makes {', '.join(blind)} {SEEN_GROWTH:g} times as "
+        "loud is reported"
     )
     wanted = max((one.windows or 0 for one in blind.values()), default=0)
     if wanted <= windows:
         return told(
             verdict="limited",
             text=text,
-            advice="set own limits of the levels: these channels sound like noise as it is",
+            advice="set limits for the levels yourself: the healthy signal of these channels is noise-like",
         )
     return told(
         verdict="limited" if seen else "refused",
         text=text,
-        advice=f"record about {wanted} windows, {wanted * machine.window.length_s:g} s: the fewer there are, the "
-        "further a window must lie from them to be beyond chance",
+        advice=f"record about {wanted} windows, {wanted * machine.window.length_s:g} s: with fewer, a window "
+        "must differ more from them to be beyond chance",
     )
 
 
@@ -372,7 +372,7 @@ def _compared(
         return Check(
             name=name,
             verdict="refused" if theory and outside > _MOST_OUTSIDE * len(readable) else "limited",
-            text=f"{outside} of {len(readable)} windows lie further apart than chance explains, {between}",
+            text=f"{outside} of {len(readable)} windows differ by more than chance explains, {between}",
             advice="give fewer parameters in [rotor], so that more is learned from the recordings",
         )
     if differ:

@@ -334,14 +334,14 @@ def _excluded(windows: Sequence[WindowStatistics]) -> tuple[KnownLine, ...]:
 
 
 def _only_levels(machine: MachineFile, text: str) -> Check:
-    advice = "name location and direction of the sensors as the model does, where they are at such places"
+    advice = "give location and direction of the sensors as the model names them, where they are at such places"
     if not machine.holds_band:
-        advice = "record longer snapshots, where band_hz shall hold 20 frequencies of segment_s"
+        advice = "record longer snapshots, so that band_hz holds 20 frequencies of segment_s"
     return Check(name="can be learned", verdict="limited", text=text, advice=advice)
 
 
 def _not_learned(level: KnowledgeLevel, text: str) -> Check:
-    advice = "record longer, at more than one speed or load, and while more than the unbalance moves the machine"
+    advice = "record longer, at more than one speed or load, while something besides the unbalance excites the machine"
     if level is KnowledgeLevel.PARTIAL:
         advice += f"; {NO_SUCH_ROTOR}"
     return Check(name="can be learned", verdict="refused", text=f"at level {level}: {text}", advice=advice)
@@ -418,8 +418,8 @@ def _misfit_notes(commissioned: Commissioned | None) -> tuple[str, ...]:
         return ()
     return (
         f"the healthy windows lie {misfit.mean:.1f} ± {misfit.error:.1f} standard deviations from the theory: masses "
-        "and shaft in the machine file are not quite the machine's; later windows are outside the model where they "
-        "deviate otherwise, or more",
+        "and shaft in the machine file are not quite those of the machine; later windows are outside the model if "
+        "they deviate more, or differently",
     )
 
 
@@ -447,14 +447,14 @@ def _growths(machine: MachineFile, commissioned: Commissioned | None) -> tuple[G
 def _told(machine: MachineFile, evaluable: Sequence[str]) -> str:
     if evaluable:
         return f"changes of {', '.join(evaluable)} can be read"
-    return "only changed or not changed can be said" if states_of(machine) else "only levels are compared"
+    return "it can only be told whether a channel has changed" if states_of(machine) else "only levels are compared"
 
 
 def _summary(verdict: str, checks: Sequence[Check], read: str) -> str:
     told = {each: [check for check in checks if check.verdict == each] for each in ("refused", "limited")}
     if verdict == "refused":
         reasons = told["refused"] or told["limited"]
-        return "; ".join(f"{check.text}; instead: {check.advice}" for check in reasons) or "nothing could be learned"
+        return "; ".join(f"{check.text}; advice: {check.advice}" for check in reasons) or "nothing could be learned"
     if verdict == "limited":
         return f"{read}; limited by: {'; '.join(check.text for check in told['limited'])}"
     return read
@@ -478,6 +478,6 @@ def _equations(machine: MachineFile, learned: Learned, pieces: Sequence[HealthyP
             reason = "; ".join(filter(None, [reason, "needs the rotor's masses and shaft"]))
         add(equation, equation.parameters, reason)
     for row, reason in evaluable_rows(states, has_speed):
-        why = "the rotor is known: theory says more" if known and not reason else reason
+        why = "the rotor is known: theory gives more" if known and not reason else reason
         add(row, tuple(own.parameter for own in row.own), why)
     return tuple(found)

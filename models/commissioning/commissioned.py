@@ -81,8 +81,8 @@ def knowledge_of(machine: MachineFile) -> Knowledge:
     if lacking:
         return Knowledge(
             KnowledgeLevel.NONE,
-            f"[rotor] lacks {', '.join(lacking)}: without masses and shaft nothing of it can be used, everything is "
-            "learned from the recordings",
+            f"[rotor] lacks {', '.join(lacking)}: without masses and shaft it cannot be used at all, and "
+            "everything is learned from the recordings",
         )
     tables = [f"[{name}]" for name in ("operation", "condition") if getattr(machine, name) is None]
     if rotor.unknown:
@@ -142,7 +142,7 @@ class OperatingRange(BaseModel, extra="forbid", frozen=True):
             rpm = window.speed_rad_s * _RPM
             if not low * (1 - SPEED_MARGIN) <= rpm <= high * (1 + SPEED_MARGIN):
                 seen = f"{low:.0f} rpm" if f"{low:.0f}" == f"{high:.0f}" else f"{low:.0f} to {high:.0f} rpm"
-                return f"speed is {rpm:.0f} rpm, commissioned is {seen} ± {SPEED_MARGIN:.0%}"
+                return f"speed is {rpm:.0f} rpm, commissioned at {seen} ± {SPEED_MARGIN:.0%}"
         for name, value in zip(window.states, _rms(window).tolist(), strict=True):
             if name not in self.rms:
                 continue
@@ -150,7 +150,7 @@ class OperatingRange(BaseModel, extra="forbid", frozen=True):
             if not low / LEVEL_MARGIN <= value <= high * LEVEL_MARGIN:
                 found, least, most = (naming.value(name, each) for each in (value, low, high))
                 return (
-                    f"random vibration of {naming.name(name)} is {found} rms, commissioned is {least} to {most}, and "
+                    f"random vibration of {naming.name(name)} is {found} rms, commissioned at {least} to {most}, and "
                     f"up to {LEVEL_MARGIN:g} times less or more"
                 )
         return ""

@@ -127,8 +127,8 @@ def _learn_full(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
         check = check.model_copy(
             update={
                 "advice": _elsewhere(machine, [each for _, _, each in read])
-                or "the file describes another machine than was recorded: correct it, or leave out of [rotor] "
-                "what is not known for certain, so that it is identified"
+                or "the file does not describe the machine that was recorded: correct it, or leave "
+                "out of [rotor] what is not known for certain, so that it is identified"
             }
         )
     return Learned((check,), read, read, machine, gyroscopic=sense, notes=_integrated(pieces, machine))
@@ -144,13 +144,13 @@ def _elsewhere(machine: Machine, read: Sequence[Diagnosis]) -> str:
     found_rad = math.remainder(phase_rad + cmath.phase(sum(turned)), 2 * math.pi)
     return (
         f"the unbalance is as large as in the file, but its heavy spot is {math.degrees(found_rad):z.0f}° from the "
-        f"phase reference, where the file has it at {math.degrees(phase_rad):z.0f}°: if nothing else differs, give "
+        f"phase reference, whereas the file has it at {math.degrees(phase_rad):z.0f}°: if nothing else differs, give "
         f"unbalance_phase_rad = {found_rad:z.2f} in [operation]"
     )
 
 
 NO_SUCH_ROTOR = (
-    "where the machine is not one bearing and an overhung disc, leave [rotor] out of the machine file: it is then "
+    "if the machine is not one bearing and an overhung disc, leave [rotor] out of the machine file: it is then "
     "compared with its own healthy windows"
 )
 
@@ -211,7 +211,7 @@ def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
 
 _LINEAR = (
     "The relations are linear. A bearing that stiffens with its displacement reads up to 5 % too stiff or too soft "
-    "under a force of another direction or level: smaller changes of its stiffness are not claimed."
+    "under a force of another direction or level: smaller changes of its stiffness are not reported."
 )
 
 
@@ -298,7 +298,7 @@ def _differentiated(baseline: Baseline, machine: MachineFile) -> str:
     edge = passband_hz(deepest, machine.window.band_hz[1], machine.time_scale)
     return (
         f"What is not measured is derived: up to {deepest} derivatives are taken of the correlation functions under "
-        f"smooth kernels, valid from 0 to {edge:.0f} Hz; what lies above hardly counts."
+        f"smooth kernels, valid from 0 to {edge:.0f} Hz; higher frequencies hardly count."
     )
 
 

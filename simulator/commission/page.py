@@ -24,9 +24,9 @@ from simulator.commission.recording_plots import Portrait, draw_levels, draw_spe
 _COMPARED = {
     KnowledgeLevel.FULL: "Each healthy window against the parameters in the machine file.",
     KnowledgeLevel.PARTIAL: "Each healthy window against the rotor that was identified from all of them. They scatter "
-    "about zero by construction; what counts is that none stands apart.",
-    KnowledgeLevel.NONE: "Each healthy window against what the other halves of the recordings teach, so that no window "
-    "is compared with itself. With half of the data the intervals are wider than those of the monitor will be.",
+    "about zero by construction; what matters is that none is far from the others.",
+    KnowledgeLevel.NONE: "Each healthy window against what was learned from the other halves of the recordings, so "
+    "that no window is compared with itself. With half of the data the intervals are wider than the monitor's will be.",
 }
 
 
@@ -104,7 +104,7 @@ def _levels_caption(portraits: Sequence[Portrait]) -> str:
     if any(one.broken.any() for one in portraits):
         text += " A line is broken where data are missing."
     if len(portraits) > 1:
-        text += " The number on top is that of the recording."
+        text += " The number at the top is that of the recording."
     return text
 
 

@@ -219,12 +219,12 @@ def budget_sentences(report: CommissioningReport) -> tuple[str, ...]:
     else:
         told.append(
             f"The {duration(report.healthy_s)} of healthy data leave an error of the commissioning. It is part of "
-            "every later interval: longer windows do not remove it, more healthy data do."
+            "every later interval: longer windows do not remove it, but more healthy data do."
         )
         for which, text in (
             ("commissioning", "The commissioning dominates the error of {}: record more healthy data."),
-            ("window", "One window dominates the error of {}: a longer window helps, more healthy data little."),
-            ("both", "Window and commissioning both count for {}: longer windows help, and so do more healthy data."),
+            ("window", "One window dominates the error of {}: a longer window helps, more healthy data help little."),
+            ("both", "Window and commissioning both contribute to {}: longer windows and more healthy data help."),
         ):
             names = [one.name for one in read if dominant(one) == which]
             if names:
@@ -233,7 +233,7 @@ def budget_sentences(report: CommissioningReport) -> tuple[str, ...]:
     if found:
         sizes = {one.name: one.wished for one in found}
         wished = listed(percent(size) for size in sorted({size for size in sizes.values() if size}))
-        told.append(f"The wished change of {wished} of {listed(sizes)} is found as things are.")
+        told.append(f"The wished change of {wished} of {listed(sizes)} is found with the present settings.")
     never = [one.name for one in read if one.wished is not None and one.window_s_for_wished is None]
     if never:
         told.append(

@@ -87,7 +87,7 @@ def test_a_heavy_spot_at_another_angle_than_in_the_file_is_refused_with_its_angl
     elsewhere_now = LAB.model_copy(update={"operation": operation})
     report = commissioned(elsewhere_now, healthy(LAB, 75.0, 4_910_011)).report
     assert report.verdict == "refused"
-    assert "is 0° from the phase reference, where the file has it at 86°" in report.summary
+    assert "is 0° from the phase reference, whereas the file has it at 86°" in report.summary
     assert "unbalance_phase_rad = " in report.summary
 
 
@@ -246,10 +246,10 @@ def test_outside_the_commissioned_conditions_is_said_so() -> None:
     assert all(conditions.outside(window, naming) == "" for window in windows)
     faster = Event(at_s=0.0, speed_rpm=1.12 * LAB.operation.speed_rpm)
     (window,) = windows_of(recording(NOTHING, stream(66.0, 44, faster)))
-    assert conditions.outside(window, naming).startswith("speed is 1478 rpm, commissioned is 1320 rpm")
+    assert conditions.outside(window, naming).startswith("speed is 1478 rpm, commissioned at 1320 rpm")
     quiet = Event(at_s=0.0, excitation_level=0.01)
     (window,) = windows_of(recording(NOTHING, stream(66.0, 45, quiet)))
-    assert re.match(r"random vibration of y1 is \S+ µm rms, commissioned is", conditions.outside(window, naming))
+    assert re.match(r"random vibration of y1 is \S+ µm rms, commissioned at", conditions.outside(window, naming))
 
 
 @pytest.mark.slow

@@ -257,7 +257,7 @@ def test_what_a_reader_is_told_at_each_level(folder: Path) -> None:
     assert "taken as exact" in full
     assert "identified" not in full
     for told in (partial, none):
-        assert "It is part of every later interval: longer windows do not remove it, more healthy data do." in told
+        assert "It is part of every later interval: longer windows do not remove it, but more healthy data do." in told
     report = written(folder, "partial")[1]
     k_by = next(one for one in report.parameters if one.name == "k_by")
     assert k_by.identified == pytest.approx(5e4, rel=0.02)
@@ -342,7 +342,7 @@ def test_pictures(folder: Path) -> None:
     }
     assert "broken where data are missing" in levels["no phase reference"]
     assert "broken" not in levels["full"]
-    assert "number on top" in levels["none"]
+    assert "number at the top" in levels["none"]
 
 
 def test_pictures_take_the_colours_of_the_page(folder: Path) -> None:
@@ -416,10 +416,10 @@ def test_changes_that_cannot_be_found_are_said_to_be_so() -> None:
     report = case("partial")[0].report.model_copy(update={"parameters": (poor,)})
     told = " ".join(budget_sentences(report))
     assert "For c_by the wished change would take a window of more than 60 min, the longest there is" in told
-    assert "as things are" not in told
+    assert "with the present settings" not in told
     sharp = one.model_copy(update={"detectable_loss": -0.05, "detectable_gain": 0.052, "wished": 0.1})
     told = " ".join(budget_sentences(report.model_copy(update={"parameters": (sharp,)})))
-    assert "The wished change of 10% of c_by is found as things are." in told
+    assert "The wished change of 10% of c_by is found with the present settings." in told
 
 
 def printed(report: CommissioningReport, width: int = 80) -> str:
