@@ -63,7 +63,7 @@ def look(one: Monitor, folder: Path) -> None:
             page.locator(there).first.wait_for()
             if name == "replay":
                 page.get_by_role("button", name=re.compile("Choose ten minutes before and after .*k_by")).click()
-                page.get_by_label("Alarm when that has lasted, s").fill("20")
+                page.get_by_label("On-delay, s").fill("20")
                 page.get_by_role("button", name="Start replay").click()
                 page.locator("replay-parameters canvas").first.wait_for()
                 page.get_by_role("slider", name="Window").focus()

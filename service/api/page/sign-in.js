@@ -12,7 +12,7 @@ class SignIn extends HTMLElement {
       html("h1", {}, "Sign in"),
       html("form", { submit: (event) => this.#submit(event) }, html("label", {}, "Access token", this.#token), html("button", { type: "submit" }, "Sign in")),
       this.#why,
-      html("p", { class: "note" }, "Whoever runs this service makes one with ", html("code", {}, "rotorwatch token create NAME --scope read --scope operate"), ". The browser keeps it until it is closed, or you sign out."),
+      html("p", { class: "note" }, "Whoever runs this service creates one with ", html("code", {}, "rotorwatch token create NAME --scope read --scope operate"), ". The browser keeps it until it is closed, or you sign out."),
     );
     this.#token.focus();
   }

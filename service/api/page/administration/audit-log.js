@@ -75,7 +75,7 @@ class AuditLog extends LiveElement {
         html("span", {}, one.reason),
       ],
     }));
-    lay(this.#rows, rows.length ? table(["time", "outcome", "who", "from", "what", "reason"], rows, "Audit log, newest first") : html("div", {}, html("h2", {}, "Audit log"), html("p", { class: "note" }, "Nothing has been asked for that changes anything.")));
+    lay(this.#rows, rows.length ? table(["time", "outcome", "who", "from", "what", "reason"], rows, "Audit log, newest first") : html("div", {}, html("h2", {}, "Audit log"), html("p", { class: "note" }, "No changes have been requested yet.")));
     this.#older.hidden = this.#before === null;
   }
 }

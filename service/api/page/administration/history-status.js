@@ -23,7 +23,7 @@ class HistoryStatusTable extends LiveElement {
       this,
       html("h2", {}, "History"),
       html("dl", {}, ...fact("database", found.database), ...fact("size", size(found.size_bytes)), ...fact("alarm events", "kept for ever"), ...fact("full reports", `kept for ${found.reports_days} days`), ...fact("readings of each window", `kept for ${found.readings_days} days`), ...fact("reduced readings", `kept for ${found.buckets_days} days`)),
-      rows.length ? table(["machine", "alarm event", "report", "reading"], rows, "Oldest data, by machine") : html("p", { class: "note" }, "Nothing is kept of any machine yet."),
+      rows.length ? table(["machine", "alarm event", "report", "reading"], rows, "Oldest data, by machine") : html("p", { class: "note" }, "Nothing is stored for any machine yet."),
     );
   }
 

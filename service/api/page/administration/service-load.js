@@ -47,7 +47,7 @@ class ServiceLoad extends LiveElement {
         cells: [
           html("a", { href: `#/machines/${place}` }, place),
           html("state-mark", { state: one.state }),
-          number(age !== null ? lasting(age) : monitor.machines.has(place) ? "never any" : "–"),
+          number(age !== null ? lasting(age) : monitor.machines.has(place) ? "never received" : "–"),
           number(one.queue_blocks),
           number(one.worker_busy_s < 1 ? "idle" : `${one.worker_busy_s.toFixed(0)} s on one block`),
           number(quality?.queue_dropped_blocks),
@@ -58,14 +58,14 @@ class ServiceLoad extends LiveElement {
         ],
       };
     });
-    const heads = ["machine", "state", "age of data", "blocks waiting", "at work", "dropped, too slow", "lost on the way", "steps not in history", "recording", "trouble"];
+    const heads = ["machine", "state", "age of data", "blocks waiting", "at work", "dropped (overload)", "lost in transit", "steps not in history", "recording", "trouble"];
     renew(
       this,
       html("h2", {}, "Service"),
-      html("p", {}, found.ready ? "Ready: everything that monitoring needs works." : html("strong", {}, "Not ready.")),
+      html("p", {}, found.ready ? "Ready: everything that monitoring needs is working." : html("strong", {}, "Not ready.")),
       html("ul", {}, ...[...found.reasons, ...found.failing_webhooks.map((one) => `webhook ${one}`)].map((one) => html("li", {}, one))),
       rows.length ? table(heads, rows, "Lag and load by machine") : null,
-      html("p", { class: "note" }, "Blocks are those since the monitor started; what waits is evaluated in the order in which it came."),
+      html("p", { class: "note" }, "Block counts are since the monitor started; waiting blocks are evaluated in order of arrival."),
     );
   }
 }

@@ -11,7 +11,7 @@ const SCOPES = /** @type {[string, string][]} */ ([["read", "look"], ["operate",
 
 /** Who may use the service: tokens, a form for a new one, and the end of each. */
 class TokenTable extends LiveElement {
-  #open = html("p", { hidden: true }, "The API is open on this computer: everybody who can log in here may do everything, without a token. Tokens may be made for the day it is not.");
+  #open = html("p", { hidden: true }, "The API is open on this computer: anyone who can log in here may do everything, without a token. Tokens can already be created for later.");
   #message = html("p", { class: "message", role: "status" });
   #made = html("div", { class: "made", hidden: true });
   #rows = html("div");
@@ -34,9 +34,9 @@ class TokenTable extends LiveElement {
         "form",
         { class: "new-token", submit: (event) => this.#create(event) },
         html("h2", {}, "New token"),
-        html("label", {}, "Name, as the audit log shall say", this.#name),
-        html("label", {}, "Valid for, days (empty: until revoked)", this.#days),
-        html("fieldset", {}, html("legend", {}, "Scopes; none includes another"), ...boxes),
+        html("label", {}, "Name, as shown in the audit log", this.#name),
+        html("label", {}, "Valid for days (empty: until revoked)", this.#days),
+        html("fieldset", {}, html("legend", {}, "Scopes (none includes another)"), ...boxes),
         html("button", { type: "submit", class: "main" }, "Create token"),
       ),
     );
@@ -63,7 +63,7 @@ class TokenTable extends LiveElement {
         ],
       };
     });
-    renew(this.#rows, rows.length ? table(["token", "scopes", "state", "created", "expires", "last used", "actions"], rows, "") : html("p", { class: "note" }, "There is no token."));
+    renew(this.#rows, rows.length ? table(["token", "scopes", "state", "created", "expires", "last used", "actions"], rows, "") : html("p", { class: "note" }, "There are no tokens."));
   }
 
   /** @param {string} why */
@@ -116,7 +116,7 @@ class TokenTable extends LiveElement {
           "form",
           { method: "dialog" },
           html("h2", { id: "revoke" }, `Revoke the token of ${token.name}?`),
-          html("p", {}, own ? "It is the one you are signed in with: you are signed out at once." : "Its next request is refused. It cannot be given back; a new one can be created."),
+          html("p", {}, own ? "It is the one you are signed in with: you will be signed out immediately." : "Its next request will be refused. This cannot be undone; a new token can be created."),
           html("div", { class: "actions" }, html("button", { value: "do", class: "main" }, "Revoke"), html("button", { type: "button", click: () => dialog.close() }, "Cancel")),
         ),
       )

@@ -20,15 +20,15 @@ class WebhookTable extends LiveElement {
       cells: [
         html("div", {}, html("b", {}, one.name), html("div", { class: "note" }, one.target)),
         one.state === "working" ? html("span", {}, one.state) : html("strong", {}, one.state),
-        html("span", {}, [one.machines.join(", "), one.kinds.join(", ") || "every kind", one.severities.join(", ") || "every severity", one.annunciated_only && "not what is silenced"].filter(Boolean).join("; ")),
+        html("span", {}, [one.machines.join(", "), one.kinds.join(", ") || "every kind", one.severities.join(", ") || "every severity", one.annunciated_only && "not shelved, suppressed or out of service"].filter(Boolean).join("; ")),
         html("span", { class: "number" }, one.delivered),
         html("span", { class: "number" }, one.pending),
         html("time", { class: "number" }, one.last_delivered_ns === null ? "never" : clock(one.last_delivered_ns)),
         html("span", {}, one.last_error ? `${clock(one.last_error_ns)}: ${one.last_error} (${one.failed_attempts} failed in all)` : "none"),
       ],
     }));
-    const heads = ["webhook", "state", "is told of", "delivered", "pending", "last delivery", "last error"];
-    lay(this, rows.length ? table(heads, rows, "Webhooks, since the monitor started") : html("div", {}, html("h2", {}, "Webhooks"), html("p", { class: "note" }, "The settings name no webhook: nobody is told of alarms over HTTP.")));
+    const heads = ["webhook", "state", "receives", "delivered", "pending", "last delivery", "last error"];
+    lay(this, rows.length ? table(heads, rows, "Webhooks, since the monitor started") : html("div", {}, html("h2", {}, "Webhooks"), html("p", { class: "note" }, "The settings name no webhook: no alarm events are posted over HTTP.")));
   }
 
   /** @param {string} why */

@@ -60,7 +60,7 @@ class AlarmHistory extends MachineElement {
       html("p", { class: "message", role: "status" }, this.#message),
       html("h2", {}, `History of ${this.place}`),
       timeLine(this.#events, this.health?.report?.end_ns ?? 0),
-      rows.length ? table(["time", "what", "event", "by", "reason"], rows, "") : html("p", { class: "note" }, "Nothing has happened to an alarm of this machine."),
+      rows.length ? table(["time", "what", "event", "by", "reason"], rows, "") : html("p", { class: "note" }, "This machine has no alarm events yet."),
       this.#before === null ? "" : html("button", { type: "button", click: () => this.#load() }, "Older"),
     );
   }

@@ -34,7 +34,7 @@ function operations(alarm) {
     ["reset", "Reset", "operate", alarm.state.startsWith("latched")],
     ["shelve", "Shelve …", "operate", !silenced && alarm.state !== "normal"],
     ["unshelve", "Unshelve", "operate", alarm.state === "shelved"],
-    ["remove-from-service", "Out of service …", "configure", alarm.state !== "out-of-service"],
+    ["remove-from-service", "Take out of service …", "configure", alarm.state !== "out-of-service"],
     ["return-to-service", "Return to service", "configure", alarm.state === "out-of-service"],
   ];
   return all.filter(([, , scope, possible]) => possible && monitor.may(scope));
@@ -46,7 +46,7 @@ class AlarmList extends HTMLElement {
   #said = "";
   #message = html("p", { role: "status", class: "message" });
   #rows = html("div");
-  #order = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Order", change: () => this.#show() }, html("option", { value: "" }, "most urgent first"), html("option", { value: "first-out" }, "first out: in the order they came")));
+  #order = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Order", change: () => this.#show() }, html("option", { value: "" }, "most urgent first"), html("option", { value: "first-out" }, "first out: in order of occurrence")));
   #together = html("div", { class: "tools" });
   /** @type {Set<string>} alarms that something is to be done to together */
   #chosen = new Set();
@@ -84,7 +84,7 @@ class AlarmList extends HTMLElement {
     this.#offer(all);
     const rows = all.map((one) => this.#row(one));
     const heads = ["alarm", "state", "since", "what is known", "actions"];
-    renew(this.#rows, rows.length ? table(heads, rows, this.hasAttribute("alarm") ? "Now" : "Alarms that are not normal") : html("p", { class: "note" }, this.hasAttribute("alarm") ? "The alarm is normal now." : "No alarm is raised, and none waits to be acknowledged."));
+    renew(this.#rows, rows.length ? table(heads, rows, this.hasAttribute("alarm") ? "Now" : "Alarms that are not normal") : html("p", { class: "note" }, this.hasAttribute("alarm") ? "The alarm is normal now." : "No alarm is raised or waiting to be acknowledged."));
   }
 
   /** What can be done to those that are chosen. @param {Placed[]} all */

@@ -26,7 +26,7 @@ class AlarmsView extends HTMLElement {
 
   /** Every machine that has been heard of, the one with the most urgent alarm chosen first. */
   #offer() {
-    this.#rights.textContent = !monitor.connected || monitor.may("operate") ? "" : "You may look: whoever acknowledges or shelves needs the scope operate.";
+    this.#rights.textContent = !monitor.connected || monitor.may("operate") ? "" : "You have read access only: acknowledging and shelving need the scope operate.";
     const places = [...monitor.machines.keys()].sort();
     if ([...this.#choice.options].map((one) => one.value).join() === places.join()) return;
     const chosen = this.#chosen || standing()[0]?.place; // machines are heard of one after the other

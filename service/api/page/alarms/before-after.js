@@ -49,7 +49,7 @@ class BeforeAfter extends HTMLElement {
     offered(this.#pair, pairs.map((one, at) => [String(at), pairName(one)]));
     const distances = pairs.map((one) => apart(this.#was(one), one) ?? -1);
     this.#pair.value = String(Math.max(0, distances.indexOf(Math.max(...distances)))); // the one that has changed most
-    const missing = [!orbits.length && after.orbits.reason, !channels.length && after.spectra.reason, after.correlations ? after.correlations.reason : "Correlation functions were not kept with this alarm: it is from an earlier version."];
+    const missing = [!orbits.length && after.orbits.reason, !channels.length && after.spectra.reason, after.correlations ? after.correlations.reason : "Correlation functions were not kept with this alarm, which is from an earlier version."];
     lay(
       this,
       html(
@@ -99,7 +99,7 @@ class BeforeAfter extends HTMLElement {
     const distance = apart(was, now);
     const lines = measuredLines(now, { ...AFTER, values: now.measured });
     if (was && distance !== null) lines.push({ ...BEFORE, values: was.measured });
-    const said = distance === null ? "nothing of before to compare with" : `${figure(distance)} standard errors apart (rms)`;
+    const said = distance === null ? "nothing from before to compare with" : `${figure(distance)} standard errors apart (rms)`;
     this.#said.textContent = said;
     this.#printed[1].textContent = pairName(now);
     this.#correlations.setAttribute("aria-label", `correlation function of ${pairName(now)} before and after, ${printed(now.unit)}: ${said}`);

@@ -22,5 +22,5 @@ export function curve(text, before, after) {
   const lines = [{ label: "after", values: likelihood(after, x), colour: "estimated", width: 2 }];
   if (before) lines.unshift(/** @type {any} */ ({ label: "before", values: likelihood(before, x), colour: "nominal", dash: [6, 4], width: 2 }));
   queueMicrotask(() => chart.draw({ x, lines, marks: [{ at: 0, axis: "x", colour: "ink-2", text: "nominal", dash: [2, 3] }], time: false, include: [0, 1], unit: "likelihood", xUnit: "change from nominal, %", height: 200 }));
-  return html("figure", {}, html("figcaption", {}, `${text}: how likely each change is, beside the likeliest`), chart);
+  return html("figure", {}, html("figcaption", {}, `${text}: how likely each change is, relative to the likeliest`), chart);
 }

@@ -62,7 +62,7 @@ class WhyView extends HTMLElement {
       html("p", { class: "verdict" }, this.#sentence(found, read, finding, event)),
       html("alarm-list", { place, alarm: name }),
       html("h2", {}, "Before and after"),
-      html("p", { class: "note" }, before ? `Before: window to ${clock(before.report.end_ns)}. ` : "No picture of before was kept: nothing was ever calm for a whole window. ", found.settled ? `After: first window without older data, to ${clock(found.settled.report.end_ns)}.` : `After: the window that raised it, to ${clock(raised.report.end_ns)}; part of it is from before.`),
+      html("p", { class: "note" }, before ? `Before: window to ${clock(before.report.end_ns)}. ` : "No picture from before was kept: there was no whole window without an alarm. ", found.settled ? `After: first window without older data, to ${clock(found.settled.report.end_ns)}.` : `After: the window that raised it, to ${clock(raised.report.end_ns)}; part of its data is from before.`),
       name.startsWith("level:") && this.#levels(name.slice("level:".length), before?.report, after.report),
       read && stated && curve(stated.text, was, read),
       this.#pictures(before, after),
@@ -80,7 +80,7 @@ class WhyView extends HTMLElement {
     if (!read || !finding) return `${event?.text ?? found.name}${event ? `, ${clock(event.time_ns)}` : ""}. ${found.raised.report.reason}`;
     const change = within(Number(read.relative_change), Z95 * Number(read.standard_error));
     const range = finding.between_ns ? ` (between ${clock(finding.between_ns[0])} and ${clock(finding.between_ns[1])})` : "";
-    const sure = confidence === null ? "" : ` Probability that it is this and nothing else: ${probability(confidence)}.`;
+    const sure = confidence === null ? "" : ` Probability that exactly this has changed: ${probability(confidence)}.`;
     return `${read.text} changed by ${change} since ${clock(finding.since_ns)}${range}, found in ${lasting(finding.stretch_s)} of data.${sure}`;
   }
 
@@ -104,8 +104,8 @@ class WhyView extends HTMLElement {
       ],
     }));
     return [
-      table(["what changed", "probability", "explains of the data"], rows, "What else was considered"),
-      html("p", { class: "note" }, "Explains: share of what all parameters together would explain of the stretch that decided. A set of several pays for its size."),
+      table(["what changed", "probability", "share of the data explained"], rows, "What else was considered"),
+      html("p", { class: "note" }, "Share explained: relative to what all parameters together would explain of the data that decided. Larger sets are penalised for their size."),
     ];
   }
 
@@ -114,7 +114,7 @@ class WhyView extends HTMLElement {
     const { verdict, misfit_z: misfit } = after;
     const rpm = (/** @type {Report | undefined} */ report) => (report?.speed_rad_s ? `${((report.speed_rad_s * 30) / Math.PI).toFixed(0)} rpm` : "unknown");
     const model = verdict?.outside_model
-      ? `Not ruled out: the window is outside the model${after.suspect ? `, best explained by ${after.suspect}` : ""}. Take what is named with reserve.`
+      ? `Not ruled out: the window is outside the model${after.suspect ? `, best explained by ${after.suspect}` : ""}. What is named has low confidence.`
       : misfit !== null && `Another kind of fault: the model explains the window (misfit ${figure(misfit)} standard deviations).`;
     const found = new Set(verdict?.changed.map((one) => one.name));
     const [also, others] = [true, false].map((changed) =>
@@ -127,9 +127,9 @@ class WhyView extends HTMLElement {
     const heard = after.opinions.filter((opinion) => opinion.parameters.some((one) => one.name === name && one.relative_change !== null)).map((one) => one.by);
     return [
       model || "",
-      after.sensors.length ? `Not ruled out, a sensor: ${after.sensors.map((one) => one.text).join("; ")}.` : "A sensor: none is at fault by the checks of gain, noise, phase and against the others.",
+      after.sensors.length ? `Not ruled out, a sensor fault: ${after.sensors.map((one) => one.text).join("; ")}.` : "A sensor fault: the checks of gain, noise and phase, and against the other sensors, found none.",
       `Another speed: ${rpm(before)} before, ${rpm(after)} after.`,
-      also.length ? `Not ruled out, what has changed besides, 95 % intervals: ${also.join("; ")}.` : "",
+      also.length ? `Not ruled out, other changed parameters, 95 % intervals: ${also.join("; ")}.` : "",
       others.length ? `Other parameters, 95 % intervals: ${others.join("; ")}.` : "",
       apart.length ? `Disagrees: ${apart.join(", ")}.` : heard.length ? `Agrees: ${heard.join(", ")}.` : "",
       after.level_growth ? `Levels: ${after.level_growth.text}.` : "",
@@ -163,12 +163,12 @@ class WhyView extends HTMLElement {
       "dl",
       {},
       html("dt", {}, "Raised"),
-      html("dd", {}, event ? `${clock(event.time_ns)}: ${event.text}` : "no longer in the latest hundred events of this alarm"),
+      html("dd", {}, event ? `${clock(event.time_ns)}: ${event.text}` : "no longer among the latest hundred events of this alarm"),
       html("dt", {}, "Data that decided"),
       html("dd", {}, `${clock(start)} to ${clock(end)}`),
       html("dt", {}, "Recordings"),
-      html("dd", {}, html("a", { href: "#/recordings" }, "of this plant"), ", if any are made: what holds this time can be replayed with another machine file or limit"),
-      html("dt", {}, "As the API tells it"),
+      html("dd", {}, html("a", { href: "#/recordings" }, "of this plant"), ", if any are made: those of this time can be replayed with another machine file or limit"),
+      html("dt", {}, "From the API"),
       html("dd", {}, html("a", { href: `${pathOf(place)}/alarms/${encodeURIComponent(found.name)}/evidence?occurrence=${found.occurrence}` }, "evidence"), ", ", html("a", { href: `${pathOf(place)}/reports?since_ns=${start}&until_ns=${end + 1}` }, "reports of that time")),
     );
   }

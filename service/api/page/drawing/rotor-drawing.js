@@ -34,7 +34,7 @@ class RotorDrawing extends MachineElement {
         html("figcaption", {}, file.description || "The machine", html("small", {}, report ? ` ${stretch(report.start_ns, report.end_ns)}` : " nothing has been evaluated yet")),
         known ? rotorPicture(file, health, readings, said) : plainPicture(file.sensors, health, said),
         elsewhere.length ? plainPicture(elsewhere, health, "measuring points elsewhere") : null,
-        html("p", { class: "note" }, read ? "Not to scale. Change ± 95 % interval; in brackets the smallest loss and gain that would be seen now." : known ? "Not to scale." : "Measuring points and levels; of the machine between them nothing is known."),
+        html("p", { class: "note" }, read ? "Not to scale. Change ± 95 % interval; in brackets the smallest loss and gain that would be detected now." : known ? "Not to scale." : "Measuring points and levels; nothing is known of the machine between them."),
       ),
     );
   }

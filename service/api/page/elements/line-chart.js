@@ -17,7 +17,7 @@ function charts() {
   library ??= new Promise((resolve, reject) => {
     const at = (/** @type {string} */ name) => new URL(`../${name}`, import.meta.url).href;
     document.head.append(html("link", { rel: "stylesheet", href: at("uPlot.min.css") }));
-    const script = html("script", { src: at("uPlot.iife.js"), load: () => resolve(/** @type {any} */ (window).uPlot), error: () => reject(new Error("charts cannot be loaded; load the page again")) });
+    const script = html("script", { src: at("uPlot.iife.js"), load: () => resolve(/** @type {any} */ (window).uPlot), error: () => reject(new Error("charts cannot be loaded; reload the page")) });
     document.head.append(script);
   });
   return library;

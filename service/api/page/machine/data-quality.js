@@ -19,7 +19,7 @@ class DataQuality extends MachineElement {
     const refused = Object.entries(quality.refused_blocks);
     /** @type {[string, string | false][]} */
     const facts = [
-      ["newest data", age === null ? "never any" : `${lasting(age)} old`],
+      ["newest data", age === null ? "never received" : `${lasting(age)} old`],
       ["silent", stream.silent && `since ${clock(stream.silent_since_ns)}`],
       ["window", `${(100 * health.filled).toFixed(0)} % full, until ${clock(report?.end_ns)}`],
       ["speed", speed !== null && `${figure((speed * 30) / Math.PI)} rpm (${figure(speed)} rad/s)`],
@@ -31,12 +31,12 @@ class DataQuality extends MachineElement {
       ["last gap", quality.last_gap],
       ["dropped", quality.queue_dropped_blocks > 0 && `${quality.queue_dropped_blocks} blocks, the monitor could not keep up`],
       ["not evaluated", quality.skipped_windows > 0 && `${quality.skipped_windows} windows, the monitor could not keep up`],
-      ["lost on the way", quality.link_missed_blocks > 0 && `${quality.link_missed_blocks} blocks`],
+      ["lost in transit", quality.link_missed_blocks > 0 && `${quality.link_missed_blocks} blocks`],
       ["publisher", stream.publisher_alive ? "announced" : "not announced"],
-      ["replay", stream.replay_announced && "somebody announces a replay on the machine's own keys; it is not evaluated"],
+      ["replay", stream.replay_announced && "a replay is announced on the machine's own keys; it is not evaluated"],
       ["descriptor differs", stream.descriptor_mismatch.join(", ")],
       ["restart", health.restart],
-      ["errors of the monitor", health.worker_errors > 0 && `${health.worker_errors}: ${health.last_worker_error}`],
+      ["monitor errors", health.worker_errors > 0 && `${health.worker_errors}: ${health.last_worker_error}`],
     ];
     this.replaceChildren(html("h2", {}, "Data"), html("dl", {}, ...facts.filter(([, text]) => text).flatMap(([name, text]) => [html("dt", {}, name), html("dd", {}, text)])));
   }

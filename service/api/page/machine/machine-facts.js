@@ -22,7 +22,7 @@ class MachineFacts extends MachineElement {
     if (!this.file || this.file === this.#shown) return;
     this.#shown = this.file;
     this.replaceChildren(
-      html("p", { class: "note" }, `The machine file as it is in use, what it leaves out filled in; units are in the names. Identity ${this.health?.machine_hash}.`),
+      html("p", { class: "note" }, `The machine file in use, with its defaults filled in; units are in the names. Identity ${this.health?.machine_hash}.`),
       html("dl", { class: "facts" }, ...facts(this.file, "").flatMap(([name, text]) => [html("dt", {}, name), html("dd", {}, text)])),
     );
   }

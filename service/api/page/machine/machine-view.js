@@ -15,7 +15,7 @@ import "../drawing/rotor-drawing.js";
 import "../plots/spectrum-plot.js";
 import "../elements/state-mark.js";
 
-const RANGES = /** @type {[string, string][]} */ ([["1", "last hour"], ["24", "last 24 h"], ["720", "last 30 days"], ["", "all there is"]]);
+const RANGES = /** @type {[string, string][]} */ ([["1", "last hour"], ["24", "last 24 h"], ["720", "last 30 days"], ["", "all data"]]);
 const RAW = ["health", "reports", "alarms", "alarms/events", "detectable", "configuration"];
 
 /** What is loaded only when it is opened: element and heading. */
@@ -63,7 +63,7 @@ class MachineView extends MachineElement {
   #shapes() {
     const shapes = this.health?.report?.shapes ?? [];
     if (!shapes.length) return null;
-    return html("div", {}, html("p", {}, "Each channel beside its own healthy form; no part of the machine can be named:"), html("ul", {}, ...shapes.map((one) => html("li", {}, one.text))));
+    return html("div", {}, html("p", {}, "Each channel compared with its own healthy shape; no part of the machine can be named:"), html("ul", {}, ...shapes.map((one) => html("li", {}, one.text))));
   }
 
   #build() {
@@ -99,7 +99,7 @@ class MachineView extends MachineElement {
       html("data-quality", { place }),
       html("alarm-history", { place }),
       html("plot-fold", { place, shows: "machine/machine-facts", heading: "Machine file" }),
-      html("p", { class: "note" }, "As the API tells it: ", ...RAW.flatMap((part, at) => [at ? ", " : "", html("a", { href: `${pathOf(place)}/${part}` }, part)])),
+      html("p", { class: "note" }, "From the API: ", ...RAW.flatMap((part, at) => [at ? ", " : "", html("a", { href: `${pathOf(place)}/${part}` }, part)])),
     );
   }
 }

@@ -46,10 +46,10 @@ class ParameterForest extends MachineElement {
       html(
         "figure",
         {},
-        html("figcaption", {}, "Who reads what", html("small", {}, ` changes with 95 % intervals, ${stretch(report.start_ns, report.end_ns)}`)),
+        html("figcaption", {}, "Readings of each diagnostician", html("small", {}, ` changes with 95 % intervals, ${stretch(report.start_ns, report.end_ns)}`)),
         svg(
           "svg",
-          { viewBox: `0 0 ${WIDTH} ${bottom + 22}`, role: "img", "aria-label": "changes that each diagnostician reads of each parameter; the table has the numbers" },
+          { viewBox: `0 0 ${WIDTH} ${bottom + 22}`, role: "img", "aria-label": "change of each parameter as read by each diagnostician; the table has the numbers" },
           ...ticks.map((each) => svg("text", { x: x(each), y: bottom + 16, "text-anchor": "middle", class: "least" }, percent(each).replace(".0", ""))),
           ...ticks.map((each) => svg("line", { class: each ? "grid" : "zero", x1: x(each), x2: x(each), y1: TOP, y2: bottom })),
           ...rows.flatMap((row, at) => this.#row(row, TOP + at * ROW, x, end)),
@@ -58,9 +58,9 @@ class ParameterForest extends MachineElement {
           "p",
           { class: "keys" },
           ...who.map((name, at) => html("span", { class: "key shape" }, svg("svg", { viewBox: "0 0 12 12", "aria-hidden": "true" }, mark(at, 6, 6)), at ? name : `${name}, which decides`)),
-          html("span", { class: "key unseen" }, "would not be seen"),
-          html("span", { class: "key alert" }, "alert from"),
-          html("span", { class: "key danger" }, "danger from"),
+          html("span", { class: "key unseen" }, "too small to be detected"),
+          html("span", { class: "key alert" }, "alert limit"),
+          html("span", { class: "key danger" }, "danger limit"),
         ),
       ),
     );

@@ -38,7 +38,7 @@ class ParameterTable extends MachineElement {
         cells: [name, severity ? html("state-mark", { state: severity }) : "", ...said(reading), least, ...report.opinions.map((opinion) => other(opinion, stated.name))],
       };
     });
-    const heads = ["parameter", "alarm", "change", "95 % interval", "seen from", ...report.opinions.map((one) => one.by)];
+    const heads = ["parameter", "alarm", "change", "95 % interval", "detectable from", ...report.opinions.map((one) => one.by)];
     const silent = report.opinions.filter((one) => one.reason).map((one) => `${one.by}: ${one.reason}. `);
     renew(
       this,
@@ -46,10 +46,10 @@ class ParameterTable extends MachineElement {
       html(
         "p",
         { class: "note" },
-        `Decided on the ${report.parameters[0].by}${report.opinions.length ? "; the others read the whole window beside it" : ""}. `,
-        verdict.settled ? "" : "While the window straddles a change, what is read is the machine since then. ",
+        `Decided on the ${report.parameters[0].by}${report.opinions.length ? "; the others read the whole window in addition" : ""}. `,
+        verdict.settled ? "" : "While the window straddles a change, the values are those of the machine since then. ",
         ...silent,
-        "Seen from: smallest loss and gain that one window shows with 95 % probability.",
+        "Detectable from: smallest loss and gain that one window shows with 95 % probability.",
       ),
     );
   }

@@ -86,7 +86,7 @@ export class ReadingTrend extends MachineElement {
     const { shown, buckets, events } = this.#read;
     for (const one of shown) this.#draw(one, buckets.filter((bucket) => bucket.name === one.name), events);
     const ends = buckets.map((bucket) => bucket.start_ns + bucket.length_ns);
-    if (ends.length) this.#when.textContent = `${stretch(Math.min(...buckets.map((bucket) => bucket.start_ns)), Math.min(Math.max(...ends), this.health?.report?.end_ns ?? Infinity))}: a point for each window, or for several their mean; the band holds their 95 % intervals.${this.note}`;
+    if (ends.length) this.#when.textContent = `${stretch(Math.min(...buckets.map((bucket) => bucket.start_ns)), Math.min(Math.max(...ends), this.health?.report?.end_ns ?? Infinity))}: a point for each window, or for the mean of several; the band shows the 95 % intervals.${this.note}`;
     this.#message.textContent = buckets.length ? "" : "Nothing has been read yet.";
   }
 

@@ -95,7 +95,7 @@ export class Monitor extends EventTarget {
       this.machines.clear();
       this.listen();
     } else {
-      this.#lost("the stream of events has ended");
+      this.#lost("the event stream has ended");
       if (kind === "ended") setTimeout(() => this.listen(), AGAIN_MS);
     }
   }

@@ -63,7 +63,7 @@ export function levelUnit(levels, measure) {
 export function limitText(limit, levels) {
   if (!limit) return "";
   const [factor] = shownIn(levelUnit(levels, limit.measure));
-  const parts = [["alert from", limit.alert], ["danger from", limit.danger], ["alert below", limit.fall]];
+  const parts = [["alert limit", limit.alert], ["danger limit", limit.danger], ["alert below", limit.fall]];
   return parts.filter(([, value]) => value !== null).map(([word, value]) => `${word} ${figure(factor * Number(value))}`).join(", ");
 }
 
@@ -97,7 +97,7 @@ function parameters(health) {
     if (change === null || error === null || !name) return [];
     const seen = report.detectable.find((one) => one.name === name);
     const least = seen && (change < 0 ? seen.loss : seen.gain);
-    return [{ title: text ?? name, value: within(change, Z95 * error), limit: least ? `seen from ${percent(least)}` : "", quantity: "parameter", series: name, nearness: least ? change / least : 0 }];
+    return [{ title: text ?? name, value: within(change, Z95 * error), limit: least ? `detectable from ${percent(least)}` : "", quantity: "parameter", series: name, nearness: least ? change / least : 0 }];
   });
 }
 

@@ -62,7 +62,7 @@ class MachineTile extends MachineElement {
 
   age() {
     const age = monitor.dataAge(this.place);
-    this.#age.textContent = age === null ? "never any data" : `data ${lasting(age)} old`;
+    this.#age.textContent = age === null ? "no data received yet" : `data ${lasting(age)} old`;
   }
 }
 

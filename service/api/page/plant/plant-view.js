@@ -80,7 +80,7 @@ class PlantView extends HTMLElement {
     this.#summary.textContent = `${silent.length} without data`;
     this.#apart.hidden = !silent.length;
     this.#none.hidden = chosen.length > 0;
-    this.#none.textContent = all.length ? "No machine is like that." : "Waiting to hear of the machines …";
+    this.#none.textContent = all.length ? "No machine matches." : "Waiting for the machines …";
   }
 
   /** How many are in each state; states that none is in are not offered. @param {Health[]} healths */

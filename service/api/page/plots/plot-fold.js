@@ -18,7 +18,7 @@ class PlotFold extends HTMLElement {
         await import(`../${shows}.js`);
         if (target.open) this.#fill(shows.slice(shows.indexOf("/") + 1));
       } catch {
-        this.#inside.replaceChildren(html("p", { class: "note" }, "The monitor serves another page by now: load this one again."));
+        this.#inside.replaceChildren(html("p", { class: "note" }, "The monitor now serves a newer page: reload this one."));
       }
     };
     this.replaceChildren(html("details", { toggle: toggled, open: this.hasAttribute("open") }, html("summary", {}, html("h2", {}, this.getAttribute("heading"))), this.#inside));

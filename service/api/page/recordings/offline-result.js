@@ -66,7 +66,7 @@ class OfflineResult extends HTMLElement {
     this.#reports = reports.reports;
     this.#events = alarms.events.map((/** @type {{data: AlarmEvent}} */ one) => one.data);
     this.#said();
-    if (!this.#reports.length) return lay(this, this.#facts, html("p", {}, "No window was evaluated: there were too few data."));
+    if (!this.#reports.length) return lay(this, this.#facts, html("p", {}, "No window was evaluated: there were not enough data."));
     this.#scrub.max = String(windows - 1);
     const [first, last] = [this.#reports[0], this.#reports[this.#reports.length - 1]];
     const read = [...this.#reports].reverse().find((one) => one.parameters.some((each) => each.relative_change !== null)) ?? last;
@@ -88,7 +88,7 @@ class OfflineResult extends HTMLElement {
       ...this.#tables,
       this.#plots,
       ...this.#trends,
-      html("p", { class: "note" }, "As the API tells it: ", html("a", { href: this.#path }, "replay"), ", ", html("a", { href: `${this.#path}/reports` }, "reports"), ", ", html("a", { href: `${this.#path}/alarms` }, "alarms")),
+      html("p", { class: "note" }, "From the API: ", html("a", { href: this.#path }, "replay"), ", ", html("a", { href: `${this.#path}/reports` }, "reports"), ", ", html("a", { href: `${this.#path}/alarms` }, "alarms")),
     );
     this.#strip.show(this.#reports, (/** @type {number} */ at) => this.#go(at * this.#every, true));
     this.#alarms.show(this.#job, this.#events, [first.start_ns, last.end_ns], (/** @type {number} */ ns) => this.#goTo(ns));

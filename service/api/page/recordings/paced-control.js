@@ -31,7 +31,7 @@ class PacedControl extends HTMLElement {
     const step = (/** @type {number} */ by_s, /** @type {string} */ text) => html("button", { type: "button", click: () => this.#order("seek", { by_s }) }, text);
     lay(this.#tools, this.#pause, step(-10, "− 10 s"), step(10, "+ 10 s"), this.#seek, this.#place);
     for (const [kind, held] of /** @type {[string, boolean][]} */ ([["pointerdown", true], ["pointerup", false], ["pointercancel", false]])) this.#seek.addEventListener(kind, () => { this.#held = held; });
-    lay(this, this.#said, this.#tools, this.#message, html("h2", {}, "Where it stands"));
+    lay(this, this.#said, this.#tools, this.#message, html("h2", {}, "Progress"));
   }
 
   /** @param {ReplayJob} job */

@@ -4,7 +4,7 @@ import { within } from "./stretches.js";
 import "../elements/state-mark.js";
 
 const [WIDTH, HEIGHT, LEAST, SHOWN, AROUND_S] = [1000, 26, 2, 10, 600];
-const RANGES = /** @type {[string, string][]} */ ([["", "all that is shown below"], ["720", "last 30 days"], ["24", "last 24 h"], ["1", "last hour"]]);
+const RANGES = /** @type {[string, string][]} */ ([["", "everything shown below"], ["720", "last 30 days"], ["24", "last 24 h"], ["1", "last hour"]]);
 
 /** @typedef {import("../monitor/records.js").RecordingEntry} RecordingEntry */
 /** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
@@ -32,7 +32,7 @@ class RecordingLine extends HTMLElement {
     if (!this.#known) return;
     const { recordings, alarms, chosen } = this.#known;
     if (!recordings.length) {
-      lay(this.#picture, html("p", { class: "note" }, "No recording of this machine is complete yet."));
+      lay(this.#picture, html("p", { class: "note" }, "No recording of this machine has been completed yet."));
       return lay(this.#alarms);
     }
     const last = Math.max(...recordings.map((one) => Number(one.data_end_ns)));
@@ -74,7 +74,7 @@ class RecordingLine extends HTMLElement {
         html("div", { class: "actions" }, this.#around(one).size ? html("button", { type: "button", "aria-label": `Choose ten minutes before and after ${one.text}`, click: () => this.#choose(one) }, "Choose ± 10 min") : html("span", { class: "note" }, "not recorded")),
       ],
     }));
-    renew(this.#alarms, rows.length ? table(["raised", "severity", "alarm", "recording"], rows, seen.length > SHOWN ? `Alarms, the latest ${SHOWN} of ${seen.length}` : "Alarms") : html("p", { class: "note" }, "No alarm was raised in this time, as far as this monitor's history goes."));
+    renew(this.#alarms, rows.length ? table(["raised", "severity", "alarm", "recording"], rows, seen.length > SHOWN ? `Alarms, the latest ${SHOWN} of ${seen.length}` : "Alarms") : html("p", { class: "note" }, "No alarm was raised in this time, according to this monitor's history."));
   }
 
   /** @param {AlarmEvent} one @returns {Set<string>} */

@@ -18,12 +18,12 @@ class ReplayOrder extends HTMLElement {
   #raise = /** @type {HTMLInputElement} */ (html("input", { type: "number", min: 0.1, max: 99, step: "any", placeholder: "as in the file" }));
   #delay = /** @type {HTMLInputElement} */ (html("input", { type: "number", min: 0, max: 86400, step: "any", placeholder: "as in the file" }));
   #lines = /** @type {HTMLTextAreaElement} */ (html("textarea", { rows: 2, spellcheck: "false", placeholder: "alarms.parameters.k_by.raise_above = 0.2" }));
-  #mode = /** @type {HTMLSelectElement} */ (html("select", { change: () => this.#offer() }, html("option", { value: "offline" }, "as fast as possible, with reports and alarms as result"), html("option", { value: "paced" }, "onto the network at a pace, for a monitor in its own namespace")));
+  #mode = /** @type {HTMLSelectElement} */ (html("select", { change: () => this.#offer() }, html("option", { value: "offline" }, "as fast as possible, resulting in reports and alarms"), html("option", { value: "paced" }, "onto the network at a pace, for a monitor in its own namespace")));
   #pace = /** @type {HTMLInputElement} */ (html("input", { type: "number", min: 0.1, max: 1000, step: "any", value: 10, required: true }));
   #offline = html("div", { class: "offline" });
   #paced = html("label", { hidden: true }, "Seconds of data per second", this.#pace);
   #start = /** @type {HTMLButtonElement} */ (html("button", { type: "submit", class: "main" }, "Start replay"));
-  #clear = html("button", { type: "button", click: () => this.dispatchEvent(new CustomEvent("choose", { detail: { ids: new Set(), stretch: null } })) }, "Choose nothing");
+  #clear = html("button", { type: "button", click: () => this.dispatchEvent(new CustomEvent("choose", { detail: { ids: new Set(), stretch: null } })) }, "Clear selection");
   /** @type {Chosen} */
   #chosen = { ids: new Set(), stretch: null };
 
@@ -32,9 +32,9 @@ class ReplayOrder extends HTMLElement {
       this.#offline,
       html("label", {}, "Machine file", this.#machine),
       html("label", {}, "Or a file from this computer (TOML)", this.#file),
-      html("label", {}, "Alert when a parameter changed by more than, %", this.#raise),
-      html("label", {}, "Alarm when that has lasted, s", this.#delay),
-      html("label", { class: "lines" }, "Other lines instead of the machine file's, one each", this.#lines),
+      html("label", {}, "Alert when a parameter has changed by more than, %", this.#raise),
+      html("label", {}, "On-delay, s", this.#delay),
+      html("label", { class: "lines" }, "Lines that override the machine file, one per line", this.#lines),
     );
     lay(this, html("form", { submit: (event) => this.#submit(event) }, html("h2", {}, "Replay"), this.#what, html("label", {}, "How", this.#mode), this.#offline, this.#paced, html("div", { class: "actions" }, this.#start, this.#clear), this.#message));
     this.show("", [], [], this.#chosen);
@@ -52,15 +52,15 @@ class ReplayOrder extends HTMLElement {
     const others = [...monitor.machines.keys()].filter((one) => one !== place).sort();
     if (this.#machine.options.length !== others.length + 1 || this.#machine.dataset.place !== place) {
       this.#machine.dataset.place = place;
-      this.#machine.replaceChildren(html("option", { value: "" }, "that of the machine"), ...others.map((one) => html("option", { value: one }, `that of ${one}`)));
+      this.#machine.replaceChildren(html("option", { value: "" }, "of this machine"), ...others.map((one) => html("option", { value: one }, `of ${one}`)));
     }
     const count = chosen.ids.size;
     const may = monitor.may("operate");
     this.#what.textContent = !may
-      ? "You may look: whoever starts a replay needs the scope operate."
+      ? "You have read access only: starting a replay needs the scope operate."
       : count
         ? `${counted(count, "recording")} of ${place}${chosen.stretch ? `, of them ${stretch(...chosen.stretch)}` : ""}.`
-        : "Choose recordings below, or what is around an alarm above.";
+        : "Choose recordings below, or those around an alarm above.";
     this.#start.disabled = !count || !may;
     this.#clear.hidden = !count;
   }

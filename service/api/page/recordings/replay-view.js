@@ -46,7 +46,7 @@ class ReplayView extends LiveElement {
     const [site, machine] = job.recordings[0].split("/");
     const what = `${site}/${machine}`;
     document.title = `Replay of ${what} · rotorwatch`;
-    lay(this.#banner, html("b", {}, "REPLAY"), ` of ${what}${job.machine_file_sent ? ` with another machine file, ${job.machine}` : ""}. Nothing on this view is live, and nobody is told of its alarms. `, html("a", { href: `#/machines/${what}` }, "The live machine"));
+    lay(this.#banner, html("b", {}, "REPLAY"), ` of ${what}${job.machine_file_sent ? ` with another machine file, ${job.machine}` : ""}. Nothing in this view is live, and its alarms notify nobody. `, html("a", { href: `#/machines/${what}` }, "The live machine"));
     const times = job.from_ns !== null && job.to_ns !== null ? `, of them ${stretch(job.from_ns, job.to_ns)}` : "";
     lay(
       this.#head,

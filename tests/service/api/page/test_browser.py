@@ -228,7 +228,7 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
         for text in (
             *(verdict["text"], "Best explained by: a rub at the bearing.", report["sensors"][0]["text"]),
             *(report["shapes"][0]["text"], growth[1:], quality["last_refusal"], quality["last_gap"]),
-            *("not-finite 3", told["restart"], "1320 rpm", "0.4 standard deviations", "zone", "seen from", "relation"),
+            *("not-finite 3", told["restart"], "1320 rpm", "0.4 standard deviations", "zone", "detectable", "relation"),
             *(told["alarms"][0]["text"], "−24.7 %", "disagrees"),
         ):
             expect(view).to_contain_text(text)

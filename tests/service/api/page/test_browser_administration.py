@@ -50,7 +50,7 @@ def test_what_there_is_none_of_has_its_heading(browser: Browser, tmp_path: Path)
         page.goto(f"{running.http_url}/#/administration")
         for heading in ("Access tokens", "Webhooks", "Audit log"):
             expect(page.get_by_role("heading", name=heading, exact=True)).to_be_visible()
-        expect(page.locator("token-list")).to_contain_text("There is no token.")
+        expect(page.locator("token-list")).to_contain_text("There are no tokens.")
         assert not violations(page)
         with browser.new_page() as other:  # whose console says that something was refused
             other.goto(f"{running.http_url}/#/recordings")
@@ -73,7 +73,7 @@ def test_a_token_is_created_used_to_sign_in_and_revoked(browser: Browser, runtim
         expect(page.locator("token-list tr", has_text="chief")).to_contain_text("(yours)")
         expect(page.get_by_label("operate")).to_be_disabled()  # nobody gives what is not his own
 
-        page.get_by_label("Name, as the audit log shall say").fill("screen <b>1</b>")
+        page.get_by_label("Name, as shown in the audit log").fill("screen <b>1</b>")
         page.get_by_role("button", name="Create token").click()
         made = page.get_by_label("New token")
         expect(made).to_have_value(re.compile(r"rw_[0-9A-Za-z]{12}_[0-9A-Za-z]{43}"))
@@ -134,7 +134,7 @@ def test_a_token_is_created_used_to_sign_in_and_revoked(browser: Browser, runtim
             assert not unreached(page)
             assert page.evaluate("document.documentElement.scrollWidth") == width
         page.locator("token-list tr", has_text="chief").get_by_role("button", name="Revoke").click()
-        expect(page.get_by_role("dialog")).to_contain_text("you are signed out at once")
+        expect(page.get_by_role("dialog")).to_contain_text("you will be signed out immediately")
         page.get_by_role("dialog").get_by_role("button", name="Cancel").click()
         expect(page.get_by_role("dialog")).to_have_count(0)
     assert not faults

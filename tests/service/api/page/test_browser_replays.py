@@ -68,11 +68,11 @@ def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browse
         with page.expect_download() as download:
             page.get_by_role("link", name="Download 20260101T000000Z.mcap").click()
         assert download.value.suggested_filename == "20260101T000000Z.mcap"
-        page.get_by_label("Alarm when that has lasted, s").fill("10")
+        page.get_by_label("On-delay, s").fill("10")
         page.get_by_role("button", name="Start replay").click()
         view = page.locator("replay-view")
         expect(view.get_by_role("status").first).to_contain_text("Finished")
-        expect(page.locator(".replay-banner")).to_contain_text("REPLAY of demo/lab. Nothing on this view is live")
+        expect(page.locator(".replay-banner")).to_contain_text("REPLAY of demo/lab. Nothing in this view is live")
         expect(view).to_contain_text("alarms.on_delay_s = 10")
 
         # After twice the delay of the live machine; and windows are full from the twentieth second on.
@@ -105,8 +105,8 @@ def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browse
         assert not unreached(page)
 
         chosen(page, url)
-        page.get_by_label("Alert when a parameter changed by more than, %").fill("80")
-        page.get_by_label("Other lines").fill("alarms.limits.danger_above = 0.9")
+        page.get_by_label("Alert when a parameter has changed by more than, %").fill("80")
+        page.get_by_label("Lines that override").fill("alarms.limits.danger_above = 0.9")
         text = Path(runtime.settings.machines[0].file).read_bytes()
         sent = page.get_by_label("Or a file from this computer")
         sent.set_input_files({"name": "calm.toml", "mimeType": "application/toml", "buffer": text})
@@ -114,7 +114,7 @@ def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browse
         kept(page, "replay-order-file")
         page.get_by_role("button", name="Start replay").click()
         expect(page.locator(".replay-banner")).to_contain_text(
-            "with another machine file, calm.toml. Nothing on this view is live"
+            "with another machine file, calm.toml. Nothing in this view is live"
         )
         expect(view.get_by_role("status").first).to_contain_text("raised at the end: none")
         expect(page.locator("alarm-comparison tbody tr").first).to_contain_text("live only")
@@ -123,7 +123,7 @@ def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browse
 
     with browser.new_page() as page:  # whose console says that something was refused
         chosen(page, url)
-        page.get_by_label("Alert when a parameter changed by more than, %").fill("80")
+        page.get_by_label("Alert when a parameter has changed by more than, %").fill("80")
         page.get_by_role("button", name="Start replay").click()
         expect(page.locator("replay-order [role=alert]")).to_contain_text("Not started. changes: ")
         expect(page.locator("replay-order [role=alert]")).to_contain_text("raise_above < danger_above")
