@@ -32,7 +32,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
-    help="Condition monitoring of rotating machines: which parameter changed, by how much, how sure.",
+    help="Condition monitoring of rotating machines: which parameter changed, by how much, and how sure it is.",
     epilog="Exit codes: 0 fine, 1 trouble at run time, 2 a file or argument that cannot be used. Of status "
     "also: 3 no data, 4 no answer.",
 )
@@ -165,7 +165,7 @@ def _serve(settings: "ServiceSettings", config: Path | None, ray_address: str | 
             networks = worker.identity["bundle"] or "none: the equations are not evaluated"
             typer.echo(f"machine {worker.machine.title}, bundle {networks}")
         if settings.link.namespace:
-            typer.echo(f"Zenoh namespace {settings.link.namespace}: nothing from outside it is heard")
+            typer.echo(f"Zenoh namespace {settings.link.namespace}: nothing outside it is received")
         for what, ends in (("listening on", settings.link.listen), ("connecting to", settings.link.connect)):
             if ends:
                 typer.echo(f"Zenoh {what} {', '.join(ends)}")
@@ -180,7 +180,7 @@ def _serve(settings: "ServiceSettings", config: Path | None, ray_address: str | 
 def check_config(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Settings or machine files (TOML).")],
 ) -> None:
-    """Check settings and machine files; says what is wrong with which field.
+    """Check settings and machine files; reports what is wrong with which field.
 
     Machine files, trained networks, certificates, secrets and passwords that a settings file names are checked with it.
 
@@ -209,7 +209,7 @@ def router(
         bool,
         typer.Option(
             "--without-grants",
-            help="Whoever reaches the router may do everything. Without this it listens off loopback only with grants.",
+            help="Allow everything to anyone who reaches it. Without this it listens off loopback only with grants.",
         ),
     ] = False,
 ) -> None:
@@ -244,13 +244,13 @@ def demo(
         Literal["k_by", "c_by", "k_bz", "c_bz", "e", "none"],
         typer.Option("--fault", help="What breaks first; with none, the machine stays healthy."),
     ] = "k_by",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Another realisation of all random forces and noise.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of all random forces and noise.")] = 1,
     pace: Annotated[
         float, typer.Option("--pace", min=0.1, max=100, callback=finite, help="Data seconds per second.")
     ] = 10.0,
     once: Annotated[
         bool,
-        typer.Option("--once", help="End after the first fault; exit 0 only if exactly what was injected was named."),
+        typer.Option("--once", help="End after the first fault; exit 0 only if exactly the injected fault was named."),
     ] = False,
     http_port: Annotated[
         int | None,

@@ -50,14 +50,14 @@ def _say_version(context: typer.Context, wanted: bool) -> None:
 
 
 VersionOption = Annotated[
-    bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say the version, and nothing else.")
+    bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Show the version and exit.")
 ]
 
 
 def finite(value: float | None) -> float | None:
     """Refuse NaN, which no limit of an option does."""
     if value is not None and not math.isfinite(value):
-        raise typer.BadParameter(f"{value} is no finite number.")
+        raise typer.BadParameter(f"{value} is not a finite number.")
     return value
 
 

@@ -33,7 +33,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
-    help="Simulated rotor with unbalance, random excitation and faults that begin when you say, as a sensor stream.",
+    help="Simulated rotor with unbalance, random excitation and faults that begin when you choose, as a sensor stream.",
     epilog=f"Shipped scenarios: {', '.join(shipped_scenarios())}. Write your own: docs/scenario.md.",
 )
 
@@ -45,14 +45,14 @@ _ScenarioArgument = Annotated[
 _MachineOption = Annotated[
     str | None, typer.Option("--machine", help="Another machine than the scenario's: shipped name, or path.")
 ]
-_SeedOption = Annotated[int | None, typer.Option(min=0, help="Another realisation of all random forces and noise.")]
+_SeedOption = Annotated[int | None, typer.Option(min=0, help="Seed of all random forces and noise.")]
 _DurationOption = Annotated[float | None, typer.Option("--duration", help="Data seconds; the scenario's if left out.")]
 _FaultOption = Annotated[
     list[str] | None,
     typer.Option(
         "--fault",
         metavar="NAME=CHANGE@SECONDS",
-        help="Add a fault: k_by=-0.25@140 takes a quarter of the horizontal bearing stiffness away after 140 s. "
+        help="Add a fault: k_by=-0.25@140 removes a quarter of the horizontal bearing stiffness after 140 s. "
         "Names: k_by, c_by, k_bz, c_bz (bearing stiffness and damping), e (unbalance), EI (shaft). Repeatable.",
     ),
 ]
@@ -114,7 +114,7 @@ def publish(
     linger_s: Annotated[
         float,
         typer.Option(
-            "--linger", min=0, callback=finite, help="Stay this many seconds after the end, for subscribers that lag."
+            "--linger", min=0, callback=finite, help="Stay this many seconds after the end, for slow subscribers."
         ),
     ] = 2.0,
 ) -> None:
@@ -168,7 +168,7 @@ def record(
         "2026-01-01T00:00:00Z"
     ),
     run: Annotated[int, typer.Option(min=0, max=65535, help="Run number.")] = 1,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a recording that is already there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing recording.")] = False,
 ) -> None:
     """Write the same stream into a recording, at full speed.
 
@@ -188,7 +188,7 @@ def record(
         raise MachineFileError(f"{output}: is a folder, expected the name of a recording (.mcap)")
     for existing in (output, output.with_name(output.name + ".part")):
         if existing.exists() and not overwrite:
-            raise MachineFileError(f"{existing}: exists already; --overwrite replaces it")
+            raise MachineFileError(f"{existing}: already exists; --overwrite replaces it")
     from simulator.recorder import record as record_stream  # noqa: PLC0415  # keeps --help quick
 
     with _stop_on_signal() as stop, _progress(loaded.duration_s, "") as on_block:
@@ -295,10 +295,10 @@ class _ProgressLine:
         if summary.heard is not None and summary.heard != self._heard:
             self._heard = summary.heard
             self._say(
-                f"somebody listens to {self._key} now"
+                f"{self._key} now has a subscriber"
                 if summary.heard
-                else f"nobody listens to {self._key}: is a monitor running (rotorwatch run), and is it at the address "
-                "given by --connect?"
+                else f"{self._key} has no subscriber: is a monitor running (rotorwatch run), and is it "
+                "at the address given by --connect?"
             )
         if self._progress.disable and summary.elapsed_s >= self._next_s:
             self._next_s = summary.elapsed_s + _LINE_S

@@ -32,7 +32,7 @@ ProcessesOption = Annotated[int, typer.Option(min=1, help="Worker processes.")]
 WindowsOption = Annotated[int, typer.Option(min=20, help="Simulated training windows per relation network.")]
 DrawsOption = Annotated[
     int,
-    typer.Option(min=2000, help="Machines and conditions drawn for the amortised networks, and half as many again."),
+    typer.Option(min=2000, help="Machines and conditions drawn for the amortised networks, plus half as many again."),
 ]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 
@@ -122,10 +122,7 @@ def commission(
     wish: Annotated[
         float | None,
         typer.Option(
-            min=0.001,
-            max=0.9,
-            callback=finite,
-            help="Relative change that shall be found; the alarm limit if left out.",
+            min=0.001, max=0.9, callback=finite, help="Relative change to be detected; the alarm limit if left out."
         ),
     ] = None,
     why: Annotated[str, typer.Option(help="Why the machine is commissioned again; kept in the bundle.")] = "",

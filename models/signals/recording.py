@@ -92,7 +92,7 @@ class RecordingWriter:
         self.part = path.with_name(path.name + ".part")
         for existing in (self.path, self.part):
             if existing.exists() and not overwrite:
-                raise RecordingError(f"{existing}: exists already and is not overwritten")
+                raise RecordingError(f"{existing}: already exists and is not overwritten")
         self._channels: dict[tuple[str, str, str], int] = {}
         self._counts: dict[int, int] = {}
         self.messages = 0  # taken
@@ -154,7 +154,7 @@ class RecordingWriter:
             return
         self._complete()
         if self.path.exists() and not self._overwrite:
-            raise RecordingError(f"{self.path}: exists already and is not overwritten; see {self.part.name}")
+            raise RecordingError(f"{self.path}: already exists and is not overwritten; see {self.part.name}")
         with writing(self.path):
             self.part.replace(self.path)
 

@@ -63,7 +63,7 @@ def salvage_recording(damaged: Path, target: Path) -> Salvage:
     if first is None:
         raise RecordingError(f"{damaged}: nothing to recover: not a recording, or no part of it is whole")
     if target.exists():
-        raise RecordingError(f"{target}: exists already and is not overwritten")
+        raise RecordingError(f"{target}: already exists and is not overwritten")
     # Not under target's own .part name, which is what the damaged file usually has.
     writer = RecordingWriter(target.with_name(target.name + ".recovered"), overwrite=True)
     try:

@@ -33,13 +33,13 @@ _PAGE = 500
 
 @tokens.command()
 def create(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Who will use it, as the audit log shall say.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Who will use it, as shown in the audit log.")],
     scope: Annotated[
         list[str] | None,
         typer.Option("--scope", metavar="SCOPE", help="read, operate or configure; none includes another. Repeatable."),
     ] = None,
     days: Annotated[
-        int | None, typer.Option("--days", metavar="DAYS", help="How long it holds; until it is revoked if left out.")
+        int | None, typer.Option("--days", metavar="DAYS", help="How long it is valid; until revoked if left out.")
     ] = None,
     config: HistoryOption = None,
 ) -> None:
@@ -72,7 +72,7 @@ def create(
 def creation_hint(config: Path | None, history: "HistorySettings") -> str:
     """Say how a first token is created for a monitor, from any folder and without its environment."""
     if history.in_memory:
-        return "nobody can have a token for it: the history is in memory, where no other program finds tokens"
+        return "no tokens can exist for it: the history is in memory, where other programs cannot create them"
     command = ["rotorwatch" if shutil.which("rotorwatch") else sys.argv[0], "token", "create", "operator"]
     command += ["--scope", "read", "--scope", "operate"]
     if config is not None:
@@ -207,8 +207,8 @@ def _opened(config: Path | None) -> "Iterator[Store]":
     history = load_settings(config).history
     if history.in_memory:
         raise MachineFileError(
-            f"{config}: history.url is {history.database!r}: tokens would be in memory, where no other program "
-            "finds them; expected a file or a PostgreSQL server"
+            f"{config}: history.url is {history.database!r}: tokens would be in memory, where other "
+            "programs cannot read them; expected a file or a PostgreSQL server"
         )
     store = Store(history.database, history.retention)
     store.open()

@@ -132,7 +132,7 @@ class Outcome:
         if missed:
             return f"no alarm named {', '.join(missed)}"
         if self.others:
-            return f"{', '.join(sorted(self.others))} was raised, and nothing of it was injected"
+            return f"{', '.join(sorted(self.others))} was raised, and no such fault was injected"
         for name, true in self.injected.items():
             if abs(self.raised[name] - true) > 0.25 * abs(true):
                 return f"the alarm on {name} says {self.raised[name]:+.1%}, injected was {true:+.1%}"
@@ -250,10 +250,10 @@ class _Show:
     def _introduce(self) -> None:
         pace, window_s = self._options.pace, self._machine.window.length_s
         what = (
-            f"After {_HEALTHY_S:g} s of data the simulator damages the rotor; the monitor is not told, "
-            "and has to find out what changed, and by how much."
+            f"After {_HEALTHY_S:g} s of data the simulator damages the rotor; the monitor does not "
+            "know, and has to find out what changed and by how much."
             if self._rounds[0][0]
-            else "Nothing breaks in this run, and nothing must be raised."
+            else "Nothing breaks in this run, and no alarm may be raised."
         )
         program = _command()
         self._console.print(
@@ -310,7 +310,7 @@ class _Show:
         self._outcome.injected |= changes
         if changes:
             text = with_minus_signs(", ".join(f"{name} by {value:+.0%}" for name, value in changes.items()))
-            self._console.print(f"          [bold]the simulator has just changed {text}[/] (the monitor is not told)")
+            self._console.print(f"          [bold]the simulator has just changed {text}[/] (the monitor does not know)")
 
     def _end_of_round(self) -> str | None:
         """Say what was named against what was injected; after the only round, what was wrong, empty if nothing."""

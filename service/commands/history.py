@@ -12,13 +12,13 @@ if TYPE_CHECKING:  # imports sqlalchemy, which --help must not wait for
     from service.history.file import HistoryFile
 
 commands = typer.Typer(
-    name="history", no_args_is_help=True, help="The SQLite file of the history: is it whole, copy it, go back."
+    name="history", no_args_is_help=True, help="The SQLite file of the history: check it, back it up, restore it."
 )
 
 
 @commands.command()
 def check(config: HistoryOption = None) -> None:
-    """Look through the whole file, also while a monitor runs; exit code 1 if it is damaged.
+    """Check the whole file, even while a monitor runs; exit code 1 if it is damaged.
 
     [bold]Example[/bold]
 
@@ -39,7 +39,7 @@ def check(config: HistoryOption = None) -> None:
 def backup(
     copy: Annotated[Path, typer.Argument(metavar="FILE", help="New file.")], config: HistoryOption = None
 ) -> None:
-    """Copy the history, also while a monitor runs, and check the copy.
+    """Copy the history, even while a monitor runs, and check the copy.
 
     [bold]Example[/bold]
 
@@ -49,7 +49,7 @@ def backup(
 
     file = _chosen(config).path
     back_up(file, copy)
-    typer.echo(f"{file} is copied to {copy}; it holds hashes of the access tokens: keep it where others cannot read it")
+    typer.echo(f"{file} copied to {copy}, which holds hashes of the access tokens: keep it where others cannot read it")
 
 
 @commands.command()
@@ -57,7 +57,7 @@ def restore(
     backup_file: Annotated[Path, typer.Argument(metavar="FILE", help="From: rotorwatch history backup.")],
     config: HistoryOption = None,
 ) -> None:
-    """Put a backup in the place of the history; the monitor must be stopped. The former file is kept.
+    """Replace the history with a backup; the monitor must be stopped. The previous file is kept.
 
     [bold]Example[/bold]
 
@@ -70,7 +70,7 @@ def restore(
         raise MachineFileError(f"{backup_file}: {why}")
     file = _chosen(config)
     kept = put_back(file, backup_file)
-    typer.echo(f"{file.path} is that of {backup_file} now" + (f"; the former is kept as {kept}" if kept else ""))
+    typer.echo(f"{file.path} restored from {backup_file}" + (f"; the previous file is kept as {kept}" if kept else ""))
 
 
 def _chosen(config: Path | None) -> "HistoryFile":

@@ -25,7 +25,7 @@ _EXAMPLE = "DE-H acceleration g DE horizontal"
 @commands.command()
 def init(
     folder: Annotated[
-        Path, typer.Option("--folder", metavar="DIR", help="Where the two files go; made if it is not there.")
+        Path, typer.Option("--folder", metavar="DIR", help="Where the two files go; created if it does not exist.")
     ] = Path(),
     site: Annotated[str | None, typer.Option("--site", help="Site of the machine: a group of machines.")] = None,
     name: Annotated[str | None, typer.Option("--name", help="Name of the machine.")] = None,
@@ -37,8 +37,8 @@ def init(
         typer.Option(
             "--sensor",
             metavar="'NAME QUANTITY UNIT LOCATION DIRECTION [ANGLE]'",
-            help=f"A channel of the stream, in their order, such as '{_EXAMPLE}'; of a probe at an angle also that, in "
-            "degrees from +y towards +z: 'VE-1X displacement um bearing X 45'. Repeatable.",
+            help=f"A channel of the stream, in stream order, such as '{_EXAMPLE}'; for a probe at an angle "
+            "add it, in degrees from +y towards +z: 'VE-1X displacement um bearing X 45'. Repeatable.",
         ),
     ] = None,
     speed_rpm: Annotated[
@@ -49,14 +49,14 @@ def init(
         typer.Option(
             "--snapshots",
             metavar="'SECONDS EVERY'",
-            help="Where samples come in pieces, their length and period in seconds, such as '0.1 10'.",
+            help="If samples come in snapshots, their length and period in seconds, such as '0.1 10'.",
         ),
     ] = None,
     zones: Annotated[
         list[str] | None,
         typer.Option("--zones", help="Zones of a standard, such as 'ISO 20816-3 group 2 rigid'. Repeatable."),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there already.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
     """Write a machine file with nothing but sensors, and settings of a monitor for it; asks for what is left out.
 
@@ -90,7 +90,7 @@ def init(
     machine = checked(MachineFile, {key: value for key, value in fields.items() if value is not None}, machine_path)
     for path in (machine_path, settings_path):
         if path.exists() and not overwrite:
-            raise MachineFileError(f"{path}: exists already; --overwrite replaces it")
+            raise MachineFileError(f"{path}: already exists; --overwrite replaces it")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         machine_path.write_text(_machine_text(machine, speed_rpm), encoding="utf-8")
@@ -111,7 +111,7 @@ def init(
 
 def _asked(option: str, text: str, kind: type[str] | type[float] = str, *, empty: bool = False) -> str:
     if not sys.stdin.isatty():
-        raise MachineFileError(f"{option} is missing, and there is nobody to ask")
+        raise MachineFileError(f"{option} is missing, and there is no terminal to ask for it")
     return str(typer.prompt(text, type=kind, default="" if empty else None, show_default=False))
 
 
@@ -120,10 +120,10 @@ def _asked_sensors() -> list[str]:
     from models.mistakes import checked  # noqa: PLC0415  # keeps --help quick
     from models.signals.channels import Channel  # noqa: PLC0415
 
-    typer.echo(f"Channels of the stream, in their order: {' '.join(_SENSOR)} [{_ANGLE}]; such as: {_EXAMPLE}")
+    typer.echo(f"Channels of the stream, in stream order: {' '.join(_SENSOR)} [{_ANGLE}]; such as: {_EXAMPLE}")
     found: list[str] = []
     while True:
-        more = " (empty: no more)" if found else ""
+        more = " (leave empty to finish)" if found else ""
         line = _asked("--sensor", f"Channel {len(found) + 1}{more}", empty=bool(found))
         if not line.strip():
             return found
@@ -180,7 +180,7 @@ def doctor(
             min=1,
             max=86400,
             callback=finite,
-            help="How long to listen; 10 s if left out, or until a snapshot must have come.",
+            help="How long to listen; 10 s if left out, or long enough for a snapshot.",
         ),
     ] = None,
 ) -> None:

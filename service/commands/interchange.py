@@ -27,7 +27,7 @@ def import_(
     ],
     machine: Annotated[str, typer.Option("--machine", metavar="FILE", help="Machine file, or name of a shipped one.")],
     out: Annotated[Path, typer.Option("--out", metavar="RECORDING", help="Recording to write (.mcap).")],
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a recording that is there already.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing recording.")] = False,
 ) -> None:
     """Turn measurements from another program into a recording.
 
@@ -63,12 +63,12 @@ def export(
     machine: Annotated[
         str | None, typer.Option("--machine", metavar="SITE/MACHINE", help="Which one, if there are several.")
     ] = None,
-    from_: Annotated[str | None, typer.Option("--from", metavar="TIME", help="Data from this time (UTC) on.")] = None,
+    from_: Annotated[str | None, typer.Option("--from", metavar="TIME", help="Data from this time (UTC).")] = None,
     to_time: Annotated[
         str | None, typer.Option("--to-time", metavar="TIME", help="Data up to this time (UTC).")
     ] = None,
     si: Annotated[bool, typer.Option("--si", help="Samples in SI units instead of those of the channels.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
     """Write samples, reports or alarms of recordings for MATLAB, pandas, Excel and others.
 

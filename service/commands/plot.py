@@ -23,17 +23,17 @@ _SPEEDS = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)")
 commands = typer.Typer(name="plot", cls=Commands, no_args_is_help=True, rich_markup_mode="rich")
 
 _AtOption = Annotated[
-    str | None, typer.Option("--at", metavar="TIME", help="The latest data up to then. Else up to the end.")
+    str | None, typer.Option("--at", metavar="TIME", help="Latest data up to this time; else up to the end.")
 ]
-_WindowOption = Annotated[float, typer.Option("--window", metavar="S", help="Seconds it is taken over.")]
-_ResolutionOption = Annotated[float, typer.Option("--resolution", metavar="HZ", help="Distance of the lines.")]
+_WindowOption = Annotated[float, typer.Option("--window", metavar="S", help="Seconds of data used.")]
+_ResolutionOption = Annotated[float, typer.Option("--resolution", metavar="HZ", help="Line spacing.")]
 _DensityOption = Annotated[
     bool, typer.Option("--density", help="Power spectral density, not amplitudes (displacement p-p, others rms).")
 ]
 _ToHzOption = Annotated[
     float | None,
     typer.Option(
-        "--to-hz", metavar="HZ", help="Highest frequency shown. Else as far as there is anything, 4× at least."
+        "--to-hz", metavar="HZ", help="Highest frequency shown; if left out, as far as there is content, at least 4×."
     ),
 ]
 _ChannelsOption = Annotated[
@@ -43,10 +43,10 @@ _PlaceOption = Annotated[
     str | None, typer.Option("--place", metavar="NAME", help="Where the probes are; all places if left out.")
 ]
 _OrderOption = Annotated[int, typer.Option("--order", min=1, max=3, help="Multiple of running speed: 1, 2 or 3.")]
-_EachOption = Annotated[int, typer.Option("--revolutions", min=1, max=1000, help="How many each point is taken of.")]
+_EachOption = Annotated[int, typer.Option("--revolutions", min=1, max=1000, help="How many are averaged per point.")]
 _SlowRollOption = Annotated[
     float | None,
-    typer.Option("--slow-roll", metavar="RPM", help="Take away the mean vector up to this speed, which is run-out."),
+    typer.Option("--slow-roll", metavar="RPM", help="Subtract the mean vector up to this speed (run-out)."),
 ]
 
 
@@ -85,17 +85,17 @@ class _Picture:
         typer.Option(
             "--history",
             metavar="FILE",
-            help="Settings (TOML) of a monitor: what its history has, instead of recordings. For trend, bode, polar "
+            help="Settings (TOML) of a monitor: plot its history instead of recordings. For trend, bode, polar "
             "and centreline.",
         ),
     ] = None
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a picture that is there already.")] = False
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False
     key: Annotated[
-        str | None, typer.Option("--key", metavar="SITE/MACHINE", help="Which machine, if the recordings hold several.")
+        str | None, typer.Option("--key", metavar="SITE/MACHINE", help="Which machine, if the recordings have several.")
     ] = None
     from_: FromOption = None
     to: ToOption = None
-    title: Annotated[str | None, typer.Option("--title", help="Instead of the picture's own.")] = None
+    title: Annotated[str | None, typer.Option("--title", help="Title, instead of the default one.")] = None
     size: Annotated[
         str | None, typer.Option("--size", metavar="WxH", help="Width and height in inches, such as 10x6.")
     ] = None
@@ -108,7 +108,7 @@ class _Picture:
         if self.out.suffix.lower() not in (".png", ".svg"):
             raise MachineFileError(f"--out is {self.out}, expected a name that ends in .png or .svg")
         if self.out.exists() and not self.overwrite:
-            raise MachineFileError(f"{self.out}: exists already; --overwrite replaces it")
+            raise MachineFileError(f"{self.out}: already exists; --overwrite replaces it")
         try:
             import matplotlib  # noqa: F401, PLC0415  # an extra that may be missing
         except ImportError as error:
@@ -121,7 +121,7 @@ class _Picture:
         from service.analysis.recorded import Recorded  # noqa: PLC0415  # keeps --help quick
 
         if self.history is not None:
-            raise MachineFileError("--history: a history has no samples, which this picture is of; name recordings")
+            raise MachineFileError("--history: this picture needs samples, which a history lacks; name recordings")
         if not self.files:
             raise MachineFileError("no recordings are named: expected FILE...")
         return Recorded.find(self.files, self.key, (self.from_, self.to), at, reports=reports)
@@ -130,7 +130,7 @@ class _Picture:
         """The recorded data it is of, or what the history has."""
         if self.history is None or self.files:
             if self.history is not None:
-                raise MachineFileError("recordings and --history are named, expected one of them")
+                raise MachineFileError("both recordings and --history are given, expected one of them")
             return self.recorded(reports=reports)
         from service.analysis.past import Past  # noqa: PLC0415
 
@@ -176,12 +176,12 @@ def trend(
         typer.Option(
             "--machine",
             metavar="FILE[@BUNDLE]",
-            help="Evaluate anew with this machine file, and after @ its bundle. If left out, the recorded reports are "
+            help="Evaluate again with this machine file, and after @ its bundle. If left out, the recorded reports are "
             "shown; without any, those of the shipped machine with the recorded site and name.",
         ),
     ] = None,
     levels: Annotated[
-        bool, typer.Option("--levels", help="Vibration levels and their limits, also where parameters were read.")
+        bool, typer.Option("--levels", help="Vibration levels and their limits, even where parameters were read.")
     ] = False,
 ) -> "Paint":
     """Every parameter's change with its 95 % interval over time, or vibration levels; state, alarms and speed."""
@@ -248,7 +248,7 @@ def waterfall(
     channel: Annotated[
         list[str] | None, typer.Option("--channel", metavar="NAME", help="The first displacement if left out.")
     ] = None,
-    window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds that each spectrum is of.")] = 4.0,
+    window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds of data per spectrum.")] = 4.0,
     resolution: _ResolutionOption = 0.5,
     density: _DensityOption = False,
     scale: Annotated[
@@ -307,7 +307,7 @@ def full_spectrum(
 def centreline(
     picture: _Picture,
     place: _PlaceOption = None,
-    window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds that each mean is of.")] = 1.0,
+    window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds of data per mean.")] = 1.0,
     clearance: Annotated[
         float | None,
         typer.Option("--clearance", metavar="UM", help="Diametral clearance, µm: its circle, the start at the bottom."),
@@ -331,7 +331,7 @@ def bode(
     speeds: Annotated[
         str | None,
         typer.Option(
-            "--speeds", metavar="RPM-RPM", help="Without a keyphasor: where to look for the speed. There is no phase."
+            "--speeds", metavar="RPM-RPM", help="Without a keyphasor: where to search for the speed. No phase."
         ),
     ] = None,
 ) -> "Paint":

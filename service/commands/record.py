@@ -204,7 +204,7 @@ def _recover(file: Path, out: Path | None) -> None:
 
     partial = file.suffix == PART
     if partial and is_locked(file.parent):
-        raise RecordingError(f"{file}: a recorder is at work in {file.parent}, and recovers what is left there itself")
+        raise RecordingError(f"{file}: a recorder is running in {file.parent} and recovers what is left there")
     if not partial and inspect_recording(file).complete:
         typer.echo(f"{file}: complete, nothing to recover")
         return

@@ -30,7 +30,7 @@ _SLOWEST, _FASTEST = 0.1, 1000.0
 
 NamespaceOption = Annotated[
     str | None,
-    typer.Option("--namespace", metavar="PREFIX", help="Hear and publish only below this prefix: that of a replay."),
+    typer.Option("--namespace", metavar="PREFIX", help="Listen and publish only below this prefix: that of a replay."),
 ]
 
 
@@ -52,7 +52,7 @@ def in_namespace(link: "LinkSettings", namespace: str | None) -> "LinkSettings":
 def replay(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap), in any order.")],
     offline: Annotated[
-        bool, typer.Option("--offline", help="Evaluate at full speed, without a network; JSON lines come out.")
+        bool, typer.Option("--offline", help="Evaluate at full speed, without a network; writes JSON lines.")
     ] = False,
     machine: Annotated[
         str | None,
@@ -68,7 +68,7 @@ def replay(
         typer.Option(
             "--set",
             metavar="FIELD=VALUE",
-            help="Offline: a line that holds instead of the machine file's, as alarms.on_delay_s=60. Repeatable.",
+            help="Offline: a line that overrides the machine file, such as alarms.on_delay_s=60. Repeatable.",
         ),
     ] = None,
     config: Annotated[
@@ -80,8 +80,8 @@ def replay(
         typer.Option(
             "--ray",
             metavar="ADDRESS",
-            help="Offline: every recorded machine, each a task on this Ray cluster (auto: that of this computer); "
-            "--out is a folder then, with a file for each.",
+            help="Offline: every recorded machine, each a task on this Ray cluster (auto: that of this "
+            "computer); --out is then a folder, with one file for each.",
         ),
     ] = None,
     out: Annotated[
@@ -90,7 +90,7 @@ def replay(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Offline: replace the file of --out.")] = False,
     key: Annotated[
         str | None,
-        typer.Option("--key", metavar="SITE/MACHINE", help="Only this machine, if the recordings hold several."),
+        typer.Option("--key", metavar="SITE/MACHINE", help="Only this machine, if the recordings contain several."),
     ] = None,
     from_: FromOption = None,
     to: ToOption = None,
@@ -99,15 +99,15 @@ def replay(
         typer.Option(
             "--prefix",
             metavar="PREFIX",
-            help='Goes before every key; replay/<name of the first file> if left out. "" is the original keys, '
+            help='Prefix of every key; replay/<name of the first file> if left out. "" is the original keys, '
             "which is refused while a publisher or monitor of the machine is alive.",
         ),
     ] = None,
     pace: Annotated[
-        str, typer.Option("--pace", help="Seconds of data per second, 0.1 to 1000, or max: as fast as it is taken.")
+        str, typer.Option("--pace", help="Seconds of data per second, 0.1 to 1000, or max: as fast as accepted.")
     ] = "1",
     loop: Annotated[
-        str, typer.Option("--loop", metavar="N", help="Passes, or forever; each has a prefix of its own: PREFIX/1, ...")
+        str, typer.Option("--loop", metavar="N", help="Passes, or forever; each has its own prefix: PREFIX/1, ...")
     ] = "1",
     everything: Annotated[
         bool, typer.Option("--all", help="Every recorded key, not only stream, descriptor and truth.")
@@ -126,15 +126,15 @@ def replay(
             metavar="S",
             min=0,
             callback=finite,
-            help="Hold the first block back at most this long.",
+            help="Wait at most this long before the first block.",
         ),
     ] = 0.0,
     progress: Annotated[
         Literal["auto", "json", "none"],
-        typer.Option("--progress", help="A bar if a terminal is there; or JSON lines on standard output; or nothing."),
+        typer.Option("--progress", help="A bar if there is a terminal; or JSON lines on standard output; or nothing."),
     ] = "auto",
-    control: Annotated[bool, typer.Option("--control", hidden=True, help="Take orders from standard input.")] = False,
-    nice: Annotated[int, typer.Option("--nice", min=0, max=19, hidden=True, help="Give way to others.")] = 0,
+    control: Annotated[bool, typer.Option("--control", hidden=True, help="Take commands from standard input.")] = False,
+    nice: Annotated[int, typer.Option("--nice", min=0, max=19, hidden=True, help="Run at lower priority.")] = 0,
 ) -> None:
     """Replay recordings: offline through the monitor, or onto the network byte for byte.
 
@@ -246,7 +246,7 @@ def _evaluate(source: "RecordingSource", request: _Offline, control: "Control") 
             typer.echo(line, err=True)
     if summary.stopped:
         if request.out is not None:
-            typer.echo(f"{request.out} holds the lines up to there", err=True)
+            typer.echo(f"{request.out} holds the lines up to that point", err=True)
         raise typer.Exit(130)
     if summary.blocks == 0:
         raise RotorwatchError(f"no block was accepted: {summary.last_refusal or 'there was none'}")
@@ -265,7 +265,7 @@ def _evaluate_all(source: "RecordingSource", requests: Sequence[_Offline], ray: 
         title = f"{one.keys.site}/{one.keys.machine}"
         tasks.append(MachineTask(title, files, one.machine, one.changes, one.from_ns, one.to_ns))
         if (file := _file_of(folder, title)).exists() and not one.overwrite:
-            raise MachineFileError(f"{file}: exists already; --overwrite replaces it")
+            raise MachineFileError(f"{file}: already exists; --overwrite replaces it")
     typer.echo(f"{len(tasks)} machines in {len(source.paths)} recordings ...", err=True)
     for done, (summary, text) in enumerate(on_cluster(ray, tasks), start=1):
         file, data_s = _file_of(folder, f"{summary.site}/{summary.machine}"), data_s + summary.data_s
@@ -324,7 +324,7 @@ def summary_lines(summary: "OfflineSummary") -> list[str]:
         + (f"; latest reason: {summary.last_refusal}" if refused else ""),
     ]
     if summary.skipped_windows:
-        lines.append(f"{summary.skipped_windows} windows not evaluated, as by the monitor that could not keep up")
+        lines.append(f"{summary.skipped_windows} windows not evaluated, as in the monitor, which could not keep up")
     if summary.gaps:
         lines.append(f"{summary.gaps} gaps, {summary.missing_s:.1f} s missing")
     if summary.stopped:
@@ -344,7 +344,7 @@ def _lines(out: Path | None, overwrite: bool) -> "Iterator[Callable[[str], objec
             raise typer.Exit(1) from None
         return
     if out.exists() and not overwrite:
-        raise MachineFileError(f"{out}: exists already; --overwrite replaces it")
+        raise MachineFileError(f"{out}: already exists; --overwrite replaces it")
     try:
         with out.open("w", encoding="utf-8", newline="\n") as file:
             yield lambda line: file.write(line + "\n")
@@ -399,7 +399,7 @@ def _passes(text: str, prefix: str | None) -> int | None:
     if passes == 0:
         raise MachineFileError(f"--loop is {text!r}, expected a number from 1, or forever")
     if passes != 1 and prefix == "":
-        raise MachineFileError("--loop needs a prefix: on the original keys there is room for one pass")
+        raise MachineFileError("--loop needs a prefix: on the original keys only one pass is possible")
     return passes
 
 

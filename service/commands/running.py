@@ -52,7 +52,7 @@ FromOption = Annotated[
         help="Data from then on: seconds after their start, or a time of the data such as 2026-01-01T00:02:30Z (UTC).",
     ),
 ]
-ToOption = Annotated[str | None, typer.Option("--to", metavar="TIME", help="Data before then; the same.")]
+ToOption = Annotated[str | None, typer.Option("--to", metavar="TIME", help="Data before this time; same format.")]
 
 
 def _say_version(wanted: bool) -> None:
@@ -64,14 +64,14 @@ def _say_version(wanted: bool) -> None:
 
 
 VersionOption = Annotated[
-    bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say the version, and nothing else.")
+    bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Show the version and exit.")
 ]
 
 
 def finite(value: float | None) -> float | None:
     """Refuse NaN, which no limit of an option does."""
     if value is not None and not math.isfinite(value):
-        raise typer.BadParameter(f"{value} is no finite number.")
+        raise typer.BadParameter(f"{value} is not a finite number.")
     return value
 
 
@@ -153,5 +153,5 @@ def exit_codes() -> Iterator[None]:
         limit, _ = resource.getrlimit(resource.RLIMIT_AS)
         if limit == resource.RLIM_INFINITY or (isinstance(error, RuntimeError) and _NO_THREAD not in str(error)):
             raise
-        typer.echo(f"no memory is left ({str(error) or type(error).__name__}): {_too_small(limit)}", err=True)
+        typer.echo(f"out of memory ({str(error) or type(error).__name__}): {_too_small(limit)}", err=True)
         raise typer.Exit(1) from error

@@ -20,7 +20,7 @@ _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
 @commands.command()
 def size(
     machines: Annotated[int, typer.Option("--machines", min=1, max=1_000_000, help="How many.")],
-    channels: Annotated[int, typer.Option("--channels", min=1, max=1000, help="Of each, the shaft angle too.")] = 9,
+    channels: Annotated[int, typer.Option("--channels", min=1, max=1000, help="Of each, with the shaft angle.")] = 9,
     rate: Annotated[
         float, typer.Option("--rate", metavar="HZ", min=1.0, max=1e6, help="Samples per second and channel.")
     ] = 2000.0,
@@ -28,11 +28,11 @@ def size(
     levels_only: Annotated[
         bool, typer.Option("--levels-only", help="Vibration levels are watched, nothing is diagnosed.")
     ] = False,
-    networks: Annotated[bool, typer.Option(help="Trained networks beside the likelihood.")] = True,
+    networks: Annotated[bool, typer.Option(help="Trained networks in addition to the likelihood.")] = True,
     cores: Annotated[int, typer.Option("--cores", min=1, max=1024, help="Of a computer.")] = 8,
     busy: Annotated[
         float,
-        typer.Option("--busy", min=0.05, max=1.0, callback=finite, help="How much of them may be used in the mean."),
+        typer.Option("--busy", min=0.05, max=1.0, callback=finite, help="How much of them may be used on average."),
     ] = 0.6,
     reports_days: Annotated[
         float | None, typer.Option("--reports-days", metavar="DAYS", help="How long reports are kept.")
@@ -44,7 +44,7 @@ def size(
         float | None, typer.Option("--keep-days", metavar="DAYS", help="How long recordings without an alarm are kept.")
     ] = None,
     keep_gb: Annotated[
-        float | None, typer.Option("--keep-gb", metavar="GB", help="Most of them that is kept of a machine.")
+        float | None, typer.Option("--keep-gb", metavar="GB", help="Most that is kept of them per machine.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The figures of all machines, for another program.")] = False,
 ) -> None:
@@ -109,7 +109,7 @@ def _lines(
     yield row("  kept for alarms, at most", found.alarm_recordings_gb * 1e9, "B")
     yield ""
     yield f"processes     {f'{found.shards} ([shards] count) beside the one that serves' if found.shards else 'one'}"
-    yield f"computers     {found.computers} with {cores} cores, {busy:.0%} busy at most in the mean"
+    yield f"computers     {found.computers} with {cores} cores, {busy:.0%} busy at most on average"
     if found.machine_core > busy:
         yield f"One machine takes {found.machine_core:.2g} cores, and a process uses one: choose a longer hop or fewer"
         yield "channels."

@@ -43,7 +43,7 @@ def watch(
     ] = "*/*",
     connect: ConnectOption = None,
     link: LinkOption = None,
-    windows: Annotated[bool, typer.Option("--windows", help="One line per evaluated window as well.")] = False,
+    windows: Annotated[bool, typer.Option("--windows", help="Also one line per evaluated window.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object per line: topic and message.")] = False,
     namespace: NamespaceOption = None,
 ) -> None:
@@ -98,7 +98,7 @@ def status(
             "--token",
             envvar="ROTORWATCH_TOKEN",
             show_envvar=True,
-            help="Token with the scope read, if the API asks for one; better given in the environment.",
+            help="Token with the scope read, if the API requires one; preferably set in the environment.",
         ),
     ] = None,
     ca: Annotated[
@@ -106,7 +106,7 @@ def status(
     ] = None,
     certificate: Annotated[
         tuple[Path, Path] | None,
-        typer.Option("--certificate", metavar="FILE KEY", help="Own certificate and key (PEM), if the API wants one."),
+        typer.Option("--certificate", metavar="FILE KEY", help="Own certificate and key (PEM), if required."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document, for another program.")] = False,
 ) -> None:

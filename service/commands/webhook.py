@@ -7,7 +7,7 @@ import typer
 
 from models.errors import MachineFileError
 
-commands = typer.Typer(name="webhook", no_args_is_help=True, help="Programs that are told of alarm events.")
+commands = typer.Typer(name="webhook", no_args_is_help=True, help="Programs that receive alarm events.")
 
 
 @commands.command()
@@ -43,4 +43,4 @@ def test(
         there = ", ".join(webhook.name for webhook in webhooks) or "none"
         raise MachineFileError(f"{config}: no webhook {name}; there are: {there}")
     took_s = send_test(settings)
-    typer.echo(f"{name}: {settings.target} took the test event, in {took_s:.2f} s")
+    typer.echo(f"{name}: {settings.target} accepted the test event, in {took_s:.2f} s")

@@ -48,7 +48,7 @@ def export(
         If the recordings cannot be read, have nothing of what is wanted, or the file cannot be written.
     """
     if out.exists() and not overwrite:
-        raise RecordingError(f"{out}: exists already and is not overwritten")
+        raise RecordingError(f"{out}: already exists and is not overwritten")
     if any(path.exists() and out.exists() and path.samefile(out) for path in selection.recordings):
         raise RecordingError(f"{out}: is one of the recordings")
     table = _TABLES[what](selection)

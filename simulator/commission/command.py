@@ -173,8 +173,8 @@ def _before(out: Path, machine: MachineFile, why: str) -> Commissioned | None:
         raise BundleError(f"{error}; give another directory with --out") from error
     if not why:
         raise MachineFileError(
-            f"{out} holds version {before.version} of the commissioning of {before.site}/{before.machine}: say why it "
-            'is replaced, as --why "bearing exchanged", or give another directory with --out'
+            f"{out} holds version {before.version} of the commissioning of {before.site}/{before.machine}: say why "
+            'it is replaced, such as --why "bearing exchanged", or give another directory with --out'
         )
     return before
 

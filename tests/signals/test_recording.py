@@ -108,7 +108,7 @@ def test_an_exception_leaves_a_readable_part(tmp_path: Path) -> None:
 def test_an_existing_recording_is_kept_unless_asked(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     _write(path, _some(1))
-    with pytest.raises(RecordingError, match=r"run\.mcap: exists already"):
+    with pytest.raises(RecordingError, match=r"run\.mcap: already exists"):
         RecordingWriter(path)
     with RecordingWriter(path, overwrite=True):
         pass
@@ -171,12 +171,12 @@ def test_what_a_crash_left_is_kept_and_recovered_to_its_name(tmp_path: Path) -> 
     _write(path, _some(400))
     path.rename(part)
     part.write_bytes(part.read_bytes()[:-1000])
-    with pytest.raises(RecordingError, match=r"run\.mcap\.part: exists already"):
+    with pytest.raises(RecordingError, match=r"run\.mcap\.part: already exists"):
         RecordingWriter(path)
     assert salvage_recording(part, path).count == 400
     assert list(read_recording(path)) == _some(400)
     assert sorted(tmp_path.iterdir()) == [path, part]
-    with pytest.raises(RecordingError, match=r"run\.mcap: exists already"):
+    with pytest.raises(RecordingError, match=r"run\.mcap: already exists"):
         salvage_recording(part, path)
     with pytest.raises(RecordingError, match=r"none\.part: cannot be read"):
         salvage_recording(tmp_path / "none.part", tmp_path / "none")
@@ -288,7 +288,7 @@ def test_a_name_that_was_taken_meanwhile_is_not_overwritten(tmp_path: Path) -> N
     writer = RecordingWriter(tmp_path / "run.mcap")
     writer.write(_some(1)[0])
     writer.path.write_bytes(b"somebody else's")
-    with pytest.raises(RecordingError, match=r"run\.mcap: exists already and is not overwritten; see run\.mcap\.part"):
+    with pytest.raises(RecordingError, match=r"run\.mcap: already exists and is not overwritten; see run\.mcap\.part"):
         writer.close()
     assert writer.path.read_bytes() == b"somebody else's"
     assert list(read_recording(writer.part)) == _some(1)

@@ -94,7 +94,7 @@ def test_start_run_machine_and_arrow_are_options(tmp_path: Path) -> None:
     [
         (["publish", "--duration", "-1"], "duration_s"),
         (["publish", "--pace", "0"], "--pace is '0', expected a number above 0"),
-        (["record", "healthy", str(Path(__file__))], "exists already; --overwrite replaces it"),
+        (["record", "healthy", str(Path(__file__))], "already exists; --overwrite replaces it"),
         (["publish", "--run", "70000"], "--run"),
         (["publish", "--speed", "1"], "--speed"),
     ],
@@ -162,4 +162,4 @@ def test_publishing_shows_how_far_it_is_and_whether_anybody_listens(listened: bo
         result = _run("publish", "healthy", "--duration", 4, "--connect", where, "--linger", 0)
     assert result.exit_code == 0, result.output
     assert "of 4.0 s of data" in result.stderr
-    assert ("nobody listens to rotorwatch/demo/lab/stream" in result.stderr) is not listened
+    assert ("rotorwatch/demo/lab/stream has no subscriber" in result.stderr) is not listened

@@ -99,11 +99,11 @@ def test_pictures_of_the_history(settings: Path, tmp_path: Path, kind: str) -> N
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("spectrum", "--history"), "--history: a history has no samples, which this picture is of"),
+        (("spectrum", "--history"), "--history: this picture needs samples, which a history lacks"),
         (("polar", "--key", "demo/fan", "--history"), "machines: demo/lab; name one, as --key SITE/MACHINE"),
         (("bode", "--slow-roll", "300", "--history"), "--slow-roll and --speeds need samples"),
         (("trend", "--machine", "lab", "--history"), "--machine needs samples: name recordings instead of --history"),
-        (("trend", "some.mcap", "--history"), "recordings and --history are named, expected one of them"),
+        (("trend", "some.mcap", "--history"), "both recordings and --history are given, expected one of them"),
     ],
 )
 def test_what_a_history_does_not_have_is_said(

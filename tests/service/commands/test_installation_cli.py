@@ -187,4 +187,4 @@ def test_init_asks_until_a_channel_is_empty_and_again_for_what_cannot_be_used(tm
 def test_init_asks_nobody_where_nobody_is(tmp_path: Path) -> None:
     done = run("init", "--folder", str(tmp_path))
     assert done.returncode == 2
-    assert "--site is missing, and there is nobody to ask" in done.stderr
+    assert "--site is missing, and there is no terminal to ask for it" in done.stderr

@@ -142,7 +142,7 @@ def test_names_of_pictures(faulty: Path, tmp_path: Path) -> None:
     out = tmp_path / "orbit.PNG"
     out.write_bytes(b"another picture")
     code, said = run("orbit", faulty, "--out", out)
-    assert (code, "exists already; --overwrite replaces it" in said) == (2, True)
+    assert (code, "already exists; --overwrite replaces it" in said) == (2, True)
     assert out.read_bytes() == b"another picture"
     assert run("orbit", faulty, "--out", out, "--overwrite", "--size", "4x3")[0] == 0
     assert pixels(out)[0] > 0

@@ -38,7 +38,7 @@ def test_lines_go_to_a_file_or_to_the_terminal_and_are_the_same(faulty: Path, tm
     assert "800 blocks accepted, refused: none" in to_file.stderr
     assert "1 alarm events, raised at the end: c_bz" in to_file.stderr
     again = run(faulty, "--offline", "--out", out)
-    assert (again.returncode, "exists already" in again.stderr) == (2, True)
+    assert (again.returncode, "already exists" in again.stderr) == (2, True)
     assert out.read_text(encoding="utf-8") == text
 
 
@@ -49,7 +49,7 @@ def test_interrupted_offline_replay_is_no_success_and_says_what_it_leaves(faulty
         started.wait_for('"progress"')
         assert started.stop(signal.SIGINT) == 130
         assert '"stopped":true' in started.output()
-        assert f"{out} holds the lines up to there" in started.errors()
+        assert f"{out} holds the lines up to that point" in started.errors()
 
 
 def test_what_if_with_another_machine_file_and_another_limit(faulty: Path, tmp_path: Path) -> None:

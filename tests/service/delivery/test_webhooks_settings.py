@@ -161,7 +161,7 @@ def test_command_sends_a_test_event_that_is_no_alarm(tmp_path: Path, command: ty
         arguments = ["webhook", "test", "pager", "--config", str(file)]
         done = CliRunner().invoke(command, arguments)
         assert done.exit_code == 0, done.output
-        assert "took the test event" in done.output
+        assert "accepted the test event" in done.output
         (got,) = receiver.got
         event = got.verified(secret)
         assert (event["type"], event["id"]) == ("org.rotorwatch.webhook.test", got.id)

@@ -183,7 +183,7 @@ def test_recover_says_what_was_recovered_and_what_was_lost(tmp_path: Path) -> No
     assert part.exists()
     again = recover(part)
     assert again.returncode == 1
-    assert f"{tmp_path}/run.mcap: exists already and is not overwritten" in again.stderr
+    assert f"{tmp_path}/run.mcap: already exists and is not overwritten" in again.stderr
     os.utime(part, ns=(0, back[-1].log_time_ns + 2 * NS))
     other = recover(part, "--out", tmp_path / "other.mcap")
     assert other.returncode == 0

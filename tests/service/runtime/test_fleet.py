@@ -129,7 +129,7 @@ def test_an_archive_and_a_study_on_a_cluster(cluster: "Cluster", tmp_path: Path)
     assert "2 of 2" in found.output
     again = CliRunner().invoke(app, command)
     assert again.exit_code == 2
-    assert "exists already; --overwrite replaces it" in again.output
+    assert "already exists; --overwrite replaces it" in again.output
     (tmp_path / "other.toml").write_text(machines.partition("\n[[")[0], encoding="utf-8")
     missing = CliRunner().invoke(app, [*command, "--overwrite", "--config", str(tmp_path / "other.toml")])
     assert missing.exit_code == 2
