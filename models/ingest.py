@@ -262,8 +262,8 @@ class Gate:
         if any(course.covers(block) for course in self._earlier):
             return self._refuse(
                 Reason.OVERLAP,
-                f"block {block.sequence} of run {block.run} was there before the publisher restarted or its clock was "
-                "set: a repetition",
+                f"block {block.sequence} of run {block.run} was received before the publisher restarted or "
+                "its clock was set: a repetition",
             )
         if any(course.covers(block) for course in self._refused):
             return self._refuse(Reason.OVERLAP, f"block {block.sequence} was refused before: a repetition")
@@ -298,15 +298,15 @@ class Gate:
             return self._resynchronise(
                 block,
                 Reason.PAST,
-                f"start_ns {block.start_ns} of block {block.sequence} lies {lasting(-late_s)} before what was received "
-                "already; believed if the clock stays there",
+                f"start_ns {block.start_ns} of block {block.sequence} lies {lasting(-late_s)} before what was "
+                "already received; accepted if the clock stays there",
             )
         if late_s > self._settings.max_jump_s:
             return self._resynchronise(
                 block,
                 Reason.FUTURE,
                 f"start_ns {block.start_ns} of block {block.sequence} lies {lasting(late_s)} ahead, expected at most "
-                f"{self._settings.max_jump_s:g} s; believed if the clock stays there",
+                f"{self._settings.max_jump_s:g} s; accepted if the clock stays there",
             )
         next_in_sequence = block.run == expected.run and block.sequence == expected.sequence
         if next_in_sequence and late_s > _SURELY_S and schedule is None:
@@ -314,7 +314,7 @@ class Gate:
                 block,
                 Reason.FUTURE,
                 f"start_ns {block.start_ns} lies {lasting(late_s)} ahead although block {block.sequence} is the next "
-                "one; believed if the clock stays there",
+                "one; accepted if the clock stays there",
             )
         what = "the publisher restarted and " if block.run != expected.run else ""
         missed = block.sequence - expected.sequence if block.run == expected.run else 0

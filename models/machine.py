@@ -91,14 +91,14 @@ def _known_alarms(field: str, names: Iterable[str]) -> None:
     if unknown:
         hint = did_you_mean(unknown[0], ALARMS)
         known = f"{', '.join(ALARMS)} and {LEVEL}CHANNEL"
-        raise ValueError(f"{field}: {', '.join(unknown)} is no alarm; there are {known}{hint}")
+        raise ValueError(f"{field}: {', '.join(unknown)} is not an alarm; there are {known}{hint}")
 
 
 class SuppressRule(BaseModel, extra="forbid", frozen=True):
     """When some alarms are suppressed by design: while another alarm's condition is there, or outside some speed."""
 
     alarms: tuple[str, ...] = Field(min_length=1, description="which, by name")
-    while_alarm: str | None = Field(default=None, description="as long as the condition of this alarm is there")
+    while_alarm: str | None = Field(default=None, description="as long as the condition of this alarm is present")
     below_rpm: float | None = Field(default=None, gt=0, description="as long as the machine turns slower than this")
     above_rpm: float | None = Field(default=None, gt=0, description="as long as the machine turns faster than this")
     because: str = Field(min_length=1, max_length=200, description="reason, as operators will read it")

@@ -43,7 +43,7 @@ class IngestSettings(BaseModel, extra="forbid", frozen=True):
         if self.no_data_after_s <= self.block_to_s:
             raise ValueError(
                 f"no_data_after_s is {self.no_data_after_s:g}, expected more than block_to_s, {self.block_to_s:g}: "
-                "between two blocks of that length nothing comes for as long"
+                "between two blocks of that length nothing arrives for as long"
             )
         return self
 

@@ -199,7 +199,7 @@ class Sensor(Channel):
         given = [name for name in names if getattr(self, name) is not None]
         if len(given) == 1:
             (other,) = set(names) - set(given)
-            raise ValueError(f"channel {self.name}: {given[0]} is given without {other}: a vector has both")
+            raise ValueError(f"channel {self.name}: {given[0]} is given without {other}: a vector needs both")
         if given and self.quantity is not Quantity.DISPLACEMENT:
             raise ValueError(
                 f"channel {self.name}: slow_roll_um_pp is {self.slow_roll_um_pp:g}, but run-out is that of a "
@@ -283,7 +283,7 @@ def turned_pairs(channels: Sequence[Channel]) -> list[tuple[int, int]]:
         if len(angled) == 1:
             beside = f"; {' and '.join(others)} has no angle_deg: 0 is that of y, 90 of z" if others else ""
             raise ValueError(
-                f"channel {said}: one alone cannot be turned to y and z, expected a second {quantity} sensor with "
+                f"channel {said}: one alone cannot be resolved into y and z, expected a second {quantity} sensor with "
                 f"angle_deg at {location}{beside}; at a place with another name (DE, NDE, …) its levels are watched"
             )
         if len(angled) > 2:
@@ -294,14 +294,14 @@ def turned_pairs(channels: Sequence[Channel]) -> list[tuple[int, int]]:
             )
         if others:
             raise ValueError(
-                f"channel {' and '.join(others)}: measures y or z of {location} beside {said}, which are turned to "
-                "them; expected two sensors of a quantity at a place"
+                f"channel {' and '.join(others)}: measures y or z of {location} beside {said}, which are "
+                "resolved into them; expected two sensors of a quantity at a place"
             )
         apart = apart_deg(channels[angled[0]], channels[angled[1]])
         if apart < LEAST_APART_DEG - 1e-9:
             raise ValueError(
                 f"channels {said}: their axes are {round(apart, 1):g}° apart, expected at least {LEAST_APART_DEG:g}°: "
-                "two sensors that look the same way do not tell y from z"
+                "two sensors that point the same way cannot tell y from z"
             )
         first, second = angled
         nearer = abs(channels[second].axis[0]) > abs(channels[first].axis[0]) + 1e-9
@@ -451,8 +451,8 @@ def unit_factor(quantity: str, unit: str) -> float:
     detected = _DETECTED.search(spelled)
     if detected and _spelled(spelled[: detected.start()]) in {name for units in _UNITS.values() for name in units}:
         raise ValueError(
-            f"unit {unit!r} is that of an overall value ({detected.group(1)}), but samples of a waveform are needed: "
-            f"they have no peak-to-peak or rms unit; {accepted}"
+            f"unit {unit!r} is that of an overall value ({detected.group(1)}), but waveform samples are "
+            f"needed: they have no peak-to-peak or rms unit; {accepted}"
         )
     others = [name for name, units in _UNITS.items() if spelled in units]
     if others:

@@ -114,7 +114,7 @@ def read_user_names(field: str, path: Path) -> frozenset[str]:
                 "comments or empty lines"
             )
         if name in names:
-            raise MachineFileError(f"link.{field}: {path}: line {number}: the user {name} has a line already")
+            raise MachineFileError(f"link.{field}: {path}: line {number}: the user {name} already has a line")
         names.append(name)
     if not names:
         raise MachineFileError(f"link.{field}: {path}: no users, expected a line name:password for each")
@@ -144,7 +144,7 @@ def check_key(field: str, path: Path) -> None:
     text = _secret(field, path)
     if "ENCRYPTED" in text:
         raise MachineFileError(
-            f"link.{field}: {path}: the private key needs a passphrase, which nobody is there to enter; expected none"
+            f"link.{field}: {path}: the private key needs a passphrase, which cannot be entered here; expected none"
         )
     if "PRIVATE KEY-----" not in text:
         raise MachineFileError(f"link.{field}: {path}: expected a private key in PEM (-----BEGIN PRIVATE KEY-----)")
@@ -202,19 +202,18 @@ class TlsSettings(BaseModel, extra="forbid", frozen=True):
     """
 
     root_certificate: Path | None = Field(
-        default=None, description="certificate of the authority by which the other side's certificate must be issued"
+        default=None, description="certificate of the authority that must have issued the other side's certificate"
     )
     certificate: Path | None = Field(default=None, description="this program's own certificate")
     key: Path | None = Field(default=None, description="private key of the certificate, without a passphrase, mode 600")
     mutual: bool = Field(
-        default=False,
-        description="whoever connects shows a certificate too: listening asks for it, connecting shows it",
+        default=False, description="clients present a certificate too: listening asks for it, connecting presents it"
     )
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
         if (self.certificate is None) != (self.key is None):
-            raise ValueError("certificate and key belong together, found one of them")
+            raise ValueError("certificate and key belong together, found only one of them")
         if self.mutual and (self.certificate is None or self.root_certificate is None):
             raise ValueError("mutual needs root_certificate, certificate and key")
         return self
@@ -236,8 +235,8 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
     namespace: str = Field(
         default="",
         pattern=NAMESPACE_PATTERN,
-        description='what goes before every key, as "replay/monday"; the program then hears nothing from outside it, '
-        "and nobody outside hears the program",
+        description='prefix of every key, such as "replay/monday"; the program then receives nothing from outside '
+        "it, and nothing outside receives from the program",
     )
     user: str | None = Field(
         default=None,
@@ -256,7 +255,7 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
     )
     tls: TlsSettings | None = Field(default=None, description='certificates of endpoints that begin with "tls/"')
     grants: tuple[Grant, ...] = Field(
-        default=(), description="who may do what; with one grant everything is refused that none allows"
+        default=(), description="who may do what; with any grant, everything that none allows is refused"
     )
     without_grants: bool = Field(
         default=False,
@@ -270,7 +269,7 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         for name in _SECRETS.keys() & fields.keys() if isinstance(fields, dict) else ():
             # Raised here, so that the value is in no message.
             raise ValueError(
-                f"{name} does not belong into settings, which many may read: put it into a file of mode 600 and name "
+                f"{name} does not belong in settings, which many may read: put it into a file of mode 600 and name "
                 f"that in {_SECRETS[name]}"
             )
         return fields
@@ -292,9 +291,9 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         far = [end for end in self.listen if endpoint_fault(end) is None and not is_local(end)]
         if far and not self.grants and not self.without_grants:
             raise MachineFileError(
-                f"{place}: link.listen is {', '.join(far)}, which other computers reach, and there are no grants: "
-                "whoever connects could send false data and alarms; expected [[link.grants]], an endpoint on 127.0.0.1 "
-                "or without_grants = true in [link] (of a router also --without-grants)"
+                f"{place}: link.listen is {', '.join(far)}, which other computers can reach, and there are "
+                "no grants: anyone who connects could send false data and alarms; expected [[link.grants]], an "
+                "endpoint on 127.0.0.1 or without_grants = true in [link] (of a router also --without-grants)"
             )
 
     def zenoh_items(self) -> dict[str, str]:
@@ -330,7 +329,7 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         Zenoh does not tell a program why it was turned away; what may be the reason with these settings is listed.
         """
         if "Address already in use" in error:
-            return "address already in use: does another program listen there?"
+            return "address already in use: is another program listening there?"
         if "Timeout" in error or "Unable to connect" in error:
             return self.refusal()
         return re.sub(r"\s*\(?at \S+\.rs:\d+\)?\.?", "", error)
@@ -342,21 +341,21 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
             where = (
                 f"environment variable {self.password_variable}" if self.password_file is None else self.password_file
             )
-            reasons.append(f"whoever listens there does not know the user {self.user} with the password in {where}")
+            reasons.append(f"the other side does not accept the user {self.user} with the password in {where}")
         else:
-            reasons.append("whoever listens there wants a user name, and link.user has none")
+            reasons.append("the other side requires a user name, and link.user has none")
         if self._encrypted(self.connect) and self.tls is not None:
             reasons.append(
-                f"the certificate there is not issued by {self.tls.root_certificate}, has expired, or is for "
+                f"the other side's certificate was not issued by {self.tls.root_certificate}, has expired, or is for "
                 "another name than the endpoint's"
             )
             if self.tls.mutual:
-                reasons.append(f"{self.tls.certificate} is not issued by the authority trusted there, or has expired")
+                reasons.append(f"{self.tls.certificate} was not issued by the authority trusted there, or has expired")
             else:
-                reasons.append("a certificate is wanted from whoever connects, and link.tls.mutual is false")
+                reasons.append("the other side requires a client certificate, and link.tls.mutual is false")
         elif self.connect:
-            reasons.append("only tls/ endpoints are served there")
-        return f"nobody answers there; or {'; or '.join(reasons)}"
+            reasons.append("the other side serves only tls/ endpoints")
+        return f"nothing answers there; or {'; or '.join(reasons)}"
 
     def _faults(self) -> Iterator[str]:
         """What cannot be an endpoint, and what contradicts what."""
@@ -366,9 +365,9 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         if self.user is None and (self.password_file or self.password_variable):
             yield "a password is given, but no user"
         if self.user is not None and (self.password_file is None) == (self.password_variable is None):
-            yield f"user is {self.user}: expected its password by one of password_file and password_variable"
+            yield f"user is {self.user}: expected its password in one of password_file and password_variable"
         if self.passwords_file is not None and not self.listen:
-            yield "passwords_file is for those who connect to this program, which has no listen endpoint"
+            yield "passwords_file is for clients of this program, which has no listen endpoint"
         if self._encrypted(self.listen) and (self.tls is None or self.tls.certificate is None):
             yield f"listen is {', '.join(self.listen)}: expected [link.tls] with certificate and key"
         if self._encrypted(self.connect) and (self.tls is None or self.tls.root_certificate is None):
@@ -380,16 +379,16 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
 
     def _faults_of_grants(self) -> Iterator[str]:
         if not self.listen:
-            yield "grants are for those who connect to this program, which has no listen endpoint"
+            yield "grants are for clients of this program, which has no listen endpoint"
         if self.connect:
             # Who is at the other end of an outgoing connection has shown no name, so all of it would be refused.
             yield "grants and connect endpoints do not go together: give the grants to the router that all connect to"
         if self.passwords_file is None:
             if self.tls is None or not self.tls.mutual:
-                yield "grants go by names, expected passwords_file or tls.mutual: without, nobody who connects has one"
+                yield "grants go by names, expected passwords_file or tls.mutual: clients have none"
             for endpoint in self.listen:
                 if not endpoint.startswith(_ENCRYPTED):
-                    yield f"grants go by certificates, but nobody shows one to {endpoint}: expected tls/ endpoints only"
+                    yield f"grants go by certificates, but clients show none to {endpoint}: expected tls/ endpoints only"
 
     @staticmethod
     def _encrypted(endpoints: tuple[str, ...]) -> bool:
@@ -433,8 +432,8 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         password = os.environ.get(self.password_variable or "", "")
         if not password:
             raise MachineFileError(
-                f"link.password_variable: the environment variable {self.password_variable} is empty or not there, "
-                f"expected the password of user {self.user}"
+                f"link.password_variable: the environment variable {self.password_variable} is empty or not "
+                f"set, expected the password of user {self.user}"
             )
         return password
 

@@ -283,7 +283,7 @@ def writing(path: Path) -> Iterator[None]:
         raise RecordingError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
-_RECOVER = "; rotorwatch recover writes the parts of it that are whole, if any is, into another"
+_RECOVER = "; rotorwatch recover writes its intact parts, if any, to another file"
 
 
 @contextmanager
@@ -299,7 +299,7 @@ def reading(path: Path) -> Iterator[None]:
         if not begins:
             why = "the file is empty, nothing was recorded in it"
         elif begins != MCAP0_MAGIC:
-            why = "not a recording (MCAP); rotorwatch import makes recordings of files of other programs"
+            why = "not a recording (MCAP); rotorwatch import makes recordings from files of other programs"
         elif isinstance(error, EndOfFile):
             why = f"the recording is incomplete{_RECOVER}"
         else:

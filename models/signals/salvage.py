@@ -61,7 +61,7 @@ def salvage_recording(damaged: Path, target: Path) -> Salvage:
     messages = _salvaged(damaged, salvage)
     first = next(messages, None)
     if first is None:
-        raise RecordingError(f"{damaged}: nothing to recover: not a recording, or no part of it is whole")
+        raise RecordingError(f"{damaged}: nothing to recover: not a recording, or no part of it is intact")
     if target.exists():
         raise RecordingError(f"{target}: already exists and is not overwritten")
     # Not under target's own .part name, which is what the damaged file usually has.

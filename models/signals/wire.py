@@ -78,7 +78,7 @@ def _message(stream: bytes, at: int) -> tuple[int, Table, tuple[int, int], int]:
     size = struct.unpack_from("<i", stream, at + 4)[0] if stream[at : at + 4] == _CONTINUES else 0
     start = at + 8
     if not 0 < size <= len(stream) - start:
-        raise WireError(f"Arrow stream of {len(stream)} bytes ends or is no Arrow stream at byte {at}")
+        raise WireError(f"Arrow stream of {len(stream)} bytes ends or is not an Arrow stream at byte {at}")
     flat = stream[start : start + size]
     message = Table(flat, struct.unpack_from("<I", flat)[0])
     length: int = message.GetSlot(10, 0, kinds.Int64Flags)

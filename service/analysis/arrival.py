@@ -72,8 +72,8 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
     if len(breaks) > _MOST_BREAKS:
         missing_s = sum(one.gap_s for one in breaks)
         troubles.append(
-            f"{len(breaks)} times a block does not follow the one before; {missing_s:.3g} s of data are missing, such "
-            "as here:"
+            f"{len(breaks)} times a block does not follow the one before; {missing_s:.3g} s of data are missing, "
+            "for example:"
         )
     troubles += [one.text for one in breaks[:_MOST_BREAKS]]
     for text, count in refused.most_common(5):

@@ -115,5 +115,5 @@ def http_connections(settings: HttpSettings, files: int) -> int:
 
 def _why(error: OSError) -> str:
     if error.errno == errno.EADDRINUSE:
-        return "the port is in use: does another program listen there? --http-port 0 takes a free one"
+        return "the port is in use: is another program listening there? --http-port 0 takes a free one"
     return (error.strerror or str(error)).partition(" (while")[0]

@@ -16,7 +16,7 @@ class HttpTlsSettings(BaseModel, extra="forbid", frozen=True):
     certificate: Path = Field(description="the service's certificate, followed by those that lead to its authority")
     key: Path = Field(description="private key, without a password and not readable by others")
     client_ca: Path | None = Field(
-        default=None, description="authorities of clients; with it, whoever has no certificate of theirs is refused"
+        default=None, description="authorities of clients; with it, clients without such a certificate are refused"
     )
 
 
@@ -42,7 +42,7 @@ class AccessSettings(BaseModel, extra="forbid", frozen=True):
         default=False, description="everybody on this computer may do everything without a token"
     )
     hosts: tuple[str, ...] = Field(
-        default=(), description="names under which browsers reach the API, if not as localhost, the host or an address"
+        default=(), description="names by which browsers reach the API, if not localhost, the host or an address"
     )
     proxies: tuple[str, ...] = Field(
         default=(), description="addresses of proxies that are believed when they say who the caller is"
@@ -65,7 +65,7 @@ class AccessSettings(BaseModel, extra="forbid", frozen=True):
     def _lower_case(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
         for host in hosts:
             if not re.fullmatch(r"[\w.-]+(:\d+)?", host) and not is_address(host.strip("[]")):
-                raise ValueError(f"{host!r} is no name of a host, expected one as in monitor.plant.example")
+                raise ValueError(f"{host!r} is not a host name, expected one such as monitor.plant.example")
         return tuple(host.lower() for host in hosts)
 
 
@@ -87,12 +87,12 @@ def check_access(place: str, access: AccessSettings, host: str) -> None:
     if not is_loopback(host):
         raise MachineFileError(
             f"{place}: access.open_on_loopback is true, but http.host is {host!r}, expected a loopback address such as "
-            "127.0.0.1: everybody who reaches this address could do everything; leave open_on_loopback out and create "
+            "127.0.0.1: anyone who reaches this address could do everything; leave open_on_loopback out and create "
             "tokens (rotorwatch token create)"
         )
     if access.proxies:
         raise MachineFileError(
-            f"{place}: access.open_on_loopback is true and access.proxies names {', '.join(access.proxies)}: whoever "
+            f"{place}: access.open_on_loopback is true and access.proxies names {', '.join(access.proxies)}: anyone "
             "the proxy serves could do everything; leave open_on_loopback out and create tokens "
             "(rotorwatch token create)"
         )

@@ -40,13 +40,13 @@ class HttpSettings(BaseModel, extra="forbid", frozen=True):
         default=100, ge=1, le=100_000, description="most connections of one address, proxies of [access] excepted"
     )
     head_timeout_s: float = Field(
-        default=10.0, ge=0.1, le=3600.0, description="longest time until the head of a request is there, in seconds"
+        default=10.0, ge=0.1, le=3600.0, description="longest time until the head of a request has arrived, in seconds"
     )
     body_timeout_s: float = Field(
-        default=60.0, ge=0.1, le=86_400.0, description="longest time until its body is there, in seconds"
+        default=60.0, ge=0.1, le=86_400.0, description="longest time until its body has arrived, in seconds"
     )
     send_timeout_s: float = Field(
-        default=60.0, ge=0.1, le=86_400.0, description="longest time in which nothing of an answer is taken, in seconds"
+        default=60.0, ge=0.1, le=86_400.0, description="longest time without any of an answer being taken, in seconds"
     )
 
 
@@ -197,7 +197,7 @@ class ReplaySettings(BaseModel, extra="forbid", frozen=True):
         default=None, description="whether they may be started; if left out, only if the HTTP API stays on loopback"
     )
     jobs: int = Field(default=1, ge=1, le=64, description="most that run at once")
-    nice: int = Field(default=10, ge=0, le=19, description="how far they give way to the monitor, 19 is most")
+    nice: int = Field(default=10, ge=0, le=19, description="by how much their priority is lowered, at most 19")
     kept: int = Field(default=20, ge=1, le=10_000, description="latest replays whose results are kept")
 
 
@@ -232,7 +232,7 @@ class ServiceSettings(BaseSettings):
     fleet: FleetSettings | None = Field(default=None, description="shards on the computers of a Ray cluster")
     recording: RecordingSettings = Field(default=RecordingSettings(), description="recordings; off without directory")
     replay: ReplaySettings = Field(default=ReplaySettings(), description="replays over HTTP")
-    webhooks: tuple[WebhookSettings, ...] = Field(default=(), description="who is told of alarm events")
+    webhooks: tuple[WebhookSettings, ...] = Field(default=(), description="who receives alarm events")
     log: LogSettings = Field(default=LogSettings(), description="log")
 
     @model_validator(mode="after")
@@ -278,7 +278,7 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
     """
     fields = {} if path is None else read_toml(path)
     if path is not None and not fields:  # of an editor that found the disk full, for example
-        raise MachineFileError(f"{path}: nothing is in it, expected settings (TOML)")
+        raise MachineFileError(f"{path}: is empty, expected settings (TOML)")
     place = Path("default settings") if path is None else path
     refuse_truths(fields, ServiceSettings, place)
     try:

@@ -1,4 +1,4 @@
-"""Settings of webhooks: who is told of alarm events, of which, and how patiently."""
+"""Settings of webhooks: who receives alarm events, of which, and how patiently."""
 
 from pathlib import Path
 from typing import Any, Self
@@ -19,7 +19,7 @@ class WebhookSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_erro
     )
     url: str = Field(description="where events are posted: https, or http on this computer")
     insecure: bool = Field(
-        default=False, description="allow http to another computer, where everybody on the way can read along"
+        default=False, description="allow http to another computer, where anyone in between can read it"
     )
     secret_file: Path | None = Field(
         default=None,
@@ -55,7 +55,7 @@ class WebhookSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_erro
         if isinstance(fields, dict) and "secret" in fields:
             # Raised here, so that the value is in no message.
             raise ValueError(
-                "secret does not belong into settings, which many may read: put it into a file of mode 600 and name "
+                "secret does not belong in settings, which many may read: put it into a file of mode 600 and name "
                 "that in secret_file, or name an environment variable in secret_variable"
             )
         return fields
@@ -63,7 +63,7 @@ class WebhookSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_erro
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if (self.secret_file is None) == (self.secret_variable is None):
-            raise ValueError("expected the secret by one of secret_file and secret_variable")
+            raise ValueError("expected the secret in one of secret_file and secret_variable")
         self._check_url()
         for pattern in self.machines:
             if pattern.count("/") != 1 or not all(pattern.split("/")):
@@ -82,10 +82,10 @@ class WebhookSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_erro
         if port == 0:
             raise ValueError("url has port 0, expected 1 to 65535")
         if parts.username is not None or parts.password is not None:
-            raise ValueError("url holds a user name, expected one without: receivers know us by the signature")
+            raise ValueError("url contains a user name, expected none: receivers identify the sender by the signature")
         if parts.scheme == "http" and not self.insecure and not is_loopback(host):
             raise ValueError(
-                "url is http and not on this computer, so everybody on the way could read along: expected https, or "
+                "url is http and not on this computer, so anyone in between could read it: expected https, or "
                 "insecure = true"
             )
         if self.ca_file is not None and parts.scheme == "http":

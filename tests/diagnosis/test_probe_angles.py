@@ -187,7 +187,7 @@ def test_a_descriptor_says_the_angle_and_comes_back() -> None:
 @pytest.mark.parametrize(
     ("sensors", "says"),
     [
-        ([probe("P-X", angle_deg=45)], "P-X: .*one alone cannot be turned to y and z"),
+        ([probe("P-X", angle_deg=45)], "P-X: .*one alone cannot be resolved into y and z"),
         ([probe("P-X", angle_deg=45), probe("P-z")], "P-X: .*one alone.*P-z has no angle_deg"),
         ([probe("P-X", angle_deg=45), probe("P-Y", angle_deg=225)], "P-X and P-Y: .*0° apart, expected at least 30°"),
         ([probe("P-X", angle_deg=45), probe("P-Y", angle_deg=70)], "25° apart, expected at least 30°"),

@@ -58,8 +58,8 @@ def inserted(link: LinkSettings) -> zenoh.Config:
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
-        ({"user": "lab"}, "expected its password by one of password_file and password_variable"),
-        ({"user": "lab", "password_file": "a", "password_variable": "B"}, "by one of password_file"),
+        ({"user": "lab"}, "expected its password in one of password_file and password_variable"),
+        ({"user": "lab", "password_file": "a", "password_variable": "B"}, "in one of password_file"),
         ({"password_file": "a"}, "a password is given, but no user"),
         ({"user": "a:b", "password_file": "a"}, "user"),
         ({"passwords_file": "a", "connect": ENDPOINT}, "no listen endpoint"),
@@ -77,7 +77,7 @@ def inserted(link: LinkSettings) -> zenoh.Config:
                 "listen": (*TLS_ENDPOINT, *ENDPOINT),
                 "tls": {"root_certificate": "a", "certificate": "b", "key": "c", "mutual": True},
             },
-            "nobody shows one to tcp/127.0.0.1:7447",
+            "clients show none to tcp/127.0.0.1:7447",
         ),
         ({"grants": [{"who": ["lab"]}]}, "the grant allows nothing"),
         ({"grants": [{"who": [], "views": ["demo/*"]}]}, "who"),
@@ -103,7 +103,7 @@ def test_contradictions_that_a_command_line_brings_are_found_at_opening(tmp_path
 def test_a_password_in_the_settings_is_refused_and_not_repeated(tmp_path: Path, name: str) -> None:
     path = tmp_path / "link.toml"
     path.write_text(f'[link]\nconnect = ["tcp/127.0.0.1:7447"]\nuser = "lab"\n{name} = "{HIDDEN}"\n', encoding="utf-8")
-    with pytest.raises(MachineFileError, match=f"{name} does not belong into settings.*{name}_file") as caught:
+    with pytest.raises(MachineFileError, match=f"{name} does not belong in settings.*{name}_file") as caught:
         load_link(path)
     assert HIDDEN not in f"{caught.value} {caught.value.__cause__}"
 
@@ -123,7 +123,7 @@ def test_secrets_are_in_what_goes_to_zenoh_and_nowhere_else(tmp_path: Path, monk
 def test_a_missing_variable_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("LAB_PASSWORD", raising=False)
     link = LinkSettings.model_validate(BY_VARIABLE)
-    with pytest.raises(MachineFileError, match="LAB_PASSWORD is empty or not there, expected the password of user lab"):
+    with pytest.raises(MachineFileError, match="LAB_PASSWORD is empty or not set, expected the password of user lab"):
         link.zenoh_items()
 
 
@@ -155,7 +155,7 @@ def test_secrets_that_everybody_may_read_are_refused(tmp_path: Path, mode: int) 
         (f"lab:{HIDDEN}\n# pump:x", "line 2"),
         (f"lab:{HIDDEN}\n:x", "line 2"),
         (f"lab:{HIDDEN}\npump:", "line 2"),
-        (f"lab:{HIDDEN}\nlab:{HIDDEN}", "line 2: the user lab has a line already"),
+        (f"lab:{HIDDEN}\nlab:{HIDDEN}", "line 2: the user lab already has a line"),
         (f"pump:{HIDDEN}", "who: lab has no line in"),
     ],
 )
@@ -225,13 +225,13 @@ def test_a_certificate_serves_the_role_of_the_endpoint(tmp_path: Path) -> None:
 def test_refusals_name_every_reason_the_settings_leave_open(tmp_path: Path) -> None:
     error = "Unable to connect to any of [tcp/127.0.0.1:7447]. Timeout! at /x/orchestrator.rs:388."
     plain = LinkSettings(connect=ENDPOINT).explain(error)
-    assert plain.startswith("nobody answers there; or ")
-    assert "wants a user name" in plain
+    assert plain.startswith("nothing answers there; or ")
+    assert "requires a user name" in plain
     assert "only tls/" in plain
     user = LinkSettings(connect=ENDPOINT, user="lab", password_file=tmp_path / "p").explain(error)
-    assert f"does not know the user lab with the password in {tmp_path / 'p'}" in user
+    assert f"does not accept the user lab with the password in {tmp_path / 'p'}" in user
     tls = certificate(tmp_path)
-    assert "lab.pem is not issued by" in LinkSettings(connect=TLS_ENDPOINT, tls=tls).explain(error)
+    assert "lab.pem was not issued by" in LinkSettings(connect=TLS_ENDPOINT, tls=tls).explain(error)
     one_sided = tls.model_copy(update={"mutual": False})
     assert "mutual is false" in LinkSettings(connect=TLS_ENDPOINT, tls=one_sided).explain(error)
     assert "another program" in LinkSettings(listen=ENDPOINT).explain("Address already in use (os error 98)")

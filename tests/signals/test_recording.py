@@ -153,11 +153,11 @@ def test_a_cut_off_recording_is_refused_and_can_be_recovered(tmp_path: Path, par
     _write(path, content)
     whole = path.read_bytes()
     cut.write_bytes(whole[: int(len(whole) * part)])
-    told = "the file is empty" if part == 0.0 else "the parts of it that are whole, if any is"
+    told = "the file is empty" if part == 0.0 else "its intact parts, if any"
     with pytest.raises(RecordingError, match=rf"cut\.mcap: .*{told}"):
         list(read_recording(cut))
     if part < 0.01:  # not one chunk is left
-        with pytest.raises(RecordingError, match=r"cut\.mcap: nothing to recover: .* no part of it is whole"):
+        with pytest.raises(RecordingError, match=r"cut\.mcap: nothing to recover: .* no part of it is intact"):
             salvage_recording(cut, new)
         return
     count = salvage_recording(cut, new).count

@@ -62,9 +62,9 @@ def test_only_the_right_password_opens(router: Plant, tmp_path: Path) -> None:
     stranger = router.link("lab").model_copy(update={"user": "stranger"})
     anonymous = LinkSettings(mode="client", connect=(router.address,))
     for link, reason in (
-        (wrong, f"does not know the user lab with the password in {tmp_path / 'wrong'}"),
-        (stranger, "does not know the user stranger"),
-        (anonymous, "wants a user name, and link.user has none"),
+        (wrong, f"does not accept the user lab with the password in {tmp_path / 'wrong'}"),
+        (stranger, "does not accept the user stranger"),
+        (anonymous, "requires a user name, and link.user has none"),
     ):
         with pytest.raises(PublishError, match=re.escape(reason)) as caught:
             knock(link)
@@ -101,13 +101,13 @@ def test_only_a_certificate_of_the_authority_opens(tmp_path: Path) -> None:
         good = ours.tls("lab")
         knock(LinkSettings(mode="client", connect=(address,), tls=good))
         for tls, reason in (
-            (good.model_copy(update={"mutual": False}), "a certificate is wanted from whoever connects"),
-            (foreign.tls("rogue", trusted=good.root_certificate), "rogue.pem is not issued by the authority"),
-            (foreign.tls("other"), "the certificate there is not issued by"),
+            (good.model_copy(update={"mutual": False}), "requires a client certificate"),
+            (foreign.tls("rogue", trusted=good.root_certificate), "rogue.pem was not issued by the authority"),
+            (foreign.tls("other"), "the other side's certificate was not issued by"),
         ):
             with pytest.raises(PublishError, match=reason):
                 knock(LinkSettings(mode="client", connect=(address,), tls=tls))
-        with pytest.raises(PublishError, match="only tls/ endpoints are served there"):
+        with pytest.raises(PublishError, match="the other side serves only tls/ endpoints"):
             knock(LinkSettings(mode="client", connect=(address.replace("tls/", "tcp/"),)))
 
 
@@ -434,7 +434,7 @@ def test_rotorsim_says_what_it_cannot_use(tmp_path: Path) -> None:
         f'[link]\nmode = "client"\nconnect = ["{address}"]\nuser = "lab"\npassword_file = "p"\n', encoding="utf-8"
     )
     arguments = ("simulator.rotorsim", "publish", "--duration", "3", "--link", str(tmp_path / "link.toml"))
-    for mode, code, said in ((0o644, 2, "chmod 600"), (0o600, 1, "does not know the user lab")):
+    for mode, code, said in ((0o644, 2, "chmod 600"), (0o600, 1, "does not accept the user lab")):
         kept(tmp_path / "p", "word-of-lab").chmod(mode)
         with program(tmp_path, *arguments) as publisher:
             assert publisher.process.wait(180) == code

@@ -137,4 +137,4 @@ def test_a_monitor_in_the_namespace_of_a_replay(faulty: Path, tmp_path: Path) ->
 def test_nobody_to_connect_to_is_exit_code_1(faulty: Path) -> None:
     found = run(faulty, "--connect", endpoint())
     assert found.returncode == 1
-    assert "nobody answers there" in found.stderr
+    assert "nothing answers there" in found.stderr
