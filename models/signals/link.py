@@ -388,7 +388,7 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
                 yield "grants go by names, expected passwords_file or tls.mutual: clients have none"
             for endpoint in self.listen:
                 if not endpoint.startswith(_ENCRYPTED):
-                    yield f"grants go by certificates, but clients show none to {endpoint}: expected tls/ endpoints only"
+                    yield f"grants go by certificate, but clients show none to {endpoint}: expected tls/ endpoints only"
 
     @staticmethod
     def _encrypted(endpoints: tuple[str, ...]) -> bool:

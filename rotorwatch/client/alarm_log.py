@@ -102,7 +102,7 @@ class _Follower:
         try:
             self._heard.put_nowait(message)
         except queue.Full:
-            _log.debug("%s: a message was left out, it will be read from the log", message.place)
+            _log.debug("%s: a message was missed and will be read from the log", message.place)
 
     def _order(self, place: str) -> LogOrder:
         if place not in self._orders:

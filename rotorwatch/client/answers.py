@@ -46,6 +46,5 @@ def understood(model: type[M], text: str | bytes, place: str) -> M:
         fault = error.errors()[0]
         field = ".".join(str(part) for part in fault["loc"])
         raise ClientError(
-            f"{place}: what was received is not what this version understands; do versions differ? "
-            f"{field}: {fault['msg']}"
+            f"{place}: the data received do not match this version; do versions differ? {field}: {fault['msg']}"
         ) from error

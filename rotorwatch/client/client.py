@@ -82,7 +82,7 @@ class Client:
     ) -> None:
         text = (os.environ.get(TOKEN_VARIABLE, "") if token is None else token).strip()
         if not text.isascii() or not text.isprintable() or " " in text:
-            raise ClientError("the token has characters that no token has; expected rw_ and what follows, on one line")
+            raise ClientError("the token has invalid characters; expected rw_ and what follows, on one line")
         self._http = httpx.Client(
             base_url=_checked(url),
             headers={"Authorization": f"Bearer {text}"} if text else {},
@@ -353,7 +353,7 @@ class Client:
             # Of TLS, 1.3 at least, nothing comes back that would say so.
             dropped = isinstance(error, httpx.RemoteProtocolError | httpx.ReadError | httpx.WriteError)
             secure = self._http.base_url.scheme == "https"
-            why = "it wants a certificate of an authority it trusts" if secure else "the address begins with https"
+            why = "it requires a certificate from an authority it trusts" if secure else "the address begins with https"
             hint = f"; perhaps {why}" if dropped else ""
             raise NoAnswer(f"{self._http.base_url}: {str(error) or type(error).__name__}{hint}") from error
         except ValueError as error:  # NaN and infinity are no JSON

@@ -54,7 +54,7 @@ def check_origin(
     origin = headers.get("origin")
     if kept and origin is None:
         raise HTTPException(
-            403, "by a cookie alone nothing is changed: the header Origin, which browsers send, is missing"
+            403, "a cookie alone may not change anything: the header Origin, which browsers send, is missing"
         )
     if origin is not None and not _is_ours(origin, host, hosts):
         raise HTTPException(403, f"a page from {origin[:200]} may not do this")

@@ -36,11 +36,11 @@ _DETAILS = {
     400: "There was an error parsing the body",
     401: "an access token is needed; programs send it as header Authorization: Bearer rw_…",
     403: "this needs the scope operate; screen has read",
-    409: "k_by is acknowledged (version 18), not as it was seen (version 17): look again",
+    409: "k_by is acknowledged (version 18), no longer as it was seen (version 17): look again",
     413: "the request body is too large, expected at most 1000000 bytes",
     415: "content type is text/plain, expected application/json",
     422: "limit: expected at most 1000 (found '5000')",
-    428: "say how you saw the alarm: header If-Match with its ETag, or expected_state in the body",
+    428: "state how you saw the alarm: header If-Match with its ETag, or expected_state in the body",
     429: "more than 600 requests in a minute; try again in 3 s",
     500: "an error inside the service; its log says more",
     503: "demo/lab: busy for 10 s; nothing was done",
@@ -129,8 +129,8 @@ def add_problems(app: FastAPI) -> None:
             )
         elif error.status_code == HTTPStatus.NOT_FOUND and "endpoint" not in request.scope:
             near = _nearest(request)
-            detail = f"nothing is at {request.url.path[:_LONGEST_PATH]}"
-            detail += f"; did you mean {near}?" if near else "; everything there is stands in /docs and /openapi.json"
+            detail = f"there is nothing at {request.url.path[:_LONGEST_PATH]}"
+            detail += f"; did you mean {near}?" if near else "; all of it is listed in /docs and /openapi.json"
         response = problem_answer(request, error.status_code, detail)
         response.headers.update(headers)
         return response

@@ -99,9 +99,9 @@ class StreamSeats:
             If there is none.
         """
         if self._taken[key] >= self._per_caller:
-            raise TooManyStreamsError(f"{self._per_caller} event streams of yours are open, which is the most: end one")
+            raise TooManyStreamsError(f"{self._per_caller} of your event streams are open, the most allowed: close one")
         if self.taken >= self._total:
-            raise TooManyStreamsError(f"{self._total} event streams are open, which is the most this service has")
+            raise TooManyStreamsError(f"{self._total} event streams are open, the most this service allows")
         self._taken[key] += 1
         try:
             yield

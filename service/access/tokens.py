@@ -72,7 +72,7 @@ def new_token(name: str, scopes: Iterable[Scope], *, now_ns: int, days: int | No
             f"name is {name!r}, expected 1 to {_LONGEST_NAME} printable characters without spaces at the ends"
         )
     if name == ANONYMOUS or _ANY_SECRET.search(name):
-        raise MachineFileError(f"name is {masked(name)!r}, which is no name of a token's user")
+        raise MachineFileError(f"name is {masked(name)!r}, which is not a valid name of a token's user")
     granted = tuple(scope.value for scope in Scope if scope in set(scopes))
     if not granted:
         raise MachineFileError(f"scope: none is given, expected one or more of {', '.join(Scope)}")
@@ -101,7 +101,7 @@ def check_name_is_free(name: str, there: Iterable[TokenRecord], now_ns: int) -> 
         If one of the tokens that are there is valid and has the name.
     """
     if any(one.name == name and token_state(one, now_ns) == "valid" for one in there):
-        raise NameTakenError(f"a token of {name!r} is valid already: take another name, or revoke it first")
+        raise NameTakenError(f"a token of {name!r} is already valid: choose another name, or revoke it first")
 
 
 def token_state(record: TokenRecord, now_ns: int) -> Literal["valid", "expired", "revoked"]:

@@ -72,7 +72,7 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
     if len(breaks) > _MOST_BREAKS:
         missing_s = sum(one.gap_s for one in breaks)
         troubles.append(
-            f"{len(breaks)} times a block does not follow the one before; {missing_s:.3g} s of data are missing, "
+            f"{len(breaks)} times a block does not follow the previous one; {missing_s:.3g} s of data are missing, "
             "for example:"
         )
     troubles += [one.text for one in breaks[:_MOST_BREAKS]]
@@ -113,5 +113,5 @@ def _of_samples(machine: MachineFile, blocks: Sequence[SampleBlock], troubles: l
     lines += [f"  {channel.text}" for channel in watch.judged(found)]
     for column, name in enumerate(machine.sensors[at].name for at in plan.columns):
         if np.ptp(vibration[:, column]) == 0:
-            troubles.append(f"{name} does not move: a sensor that is not connected, or a range far too wide")
+            troubles.append(f"{name} shows no signal: a sensor that is not connected, or a range far too wide")
     return lines

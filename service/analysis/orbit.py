@@ -200,8 +200,7 @@ def read_orbits(data: Recorded, revolutions: int) -> Orbits:
     """
     if not data.has_angle:
         raise MachineFileError(
-            f"{data.place}: {data.name} has no channel with the shaft angle (keyphasor), and an orbit is seen "
-            "against it"
+            f"{data.place}: {data.name} has no channel with the shaft angle (keyphasor), and an orbit needs one"
         )
     pairs = recorded_pairs(data)
     channels = [channel for pair in pairs for channel in pair]

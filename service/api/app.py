@@ -36,7 +36,7 @@ A token with the scope of the route is needed for everything but `/healthz`. Err
 Times in ns count from 1970-01-01 UTC.
 """
 _TAGS = [
-    {"name": "machines", "description": "What is monitored, and how it stands."},
+    {"name": "machines", "description": "What is monitored, and its state."},
     {"name": "alarms", "description": "What needs attention, and what operators do about it."},
     {"name": "history", "description": "What has happened and was read, and who asked for what."},
     {

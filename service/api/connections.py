@@ -40,7 +40,7 @@ _NO_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 _BUSY = Problem(
     title="Service Unavailable",
     status=503,
-    detail="as many connections are open as this service has for you, and all are being answered; try again in 5 s",
+    detail="you have as many connections open as this service allows, and all are in use; try again in 5 s",
     instance="",
 ).model_dump_json()
 _REFUSAL = (
@@ -212,7 +212,7 @@ class HttpConnections:
         self._open[address] = _Connection(accepted, address[0], network, now_s, now_s)
         if waiting:
             longest = min(waiting, key=waiting.__getitem__)
-            self._say("ended", longest.address, f"another one came; this one was waited for: {longest.doing}")
+            self._say("ended", longest.address, f"another one arrived; this one was kept waiting for: {longest.doing}")
             longest.end()
         return not crowd
 
@@ -237,11 +237,11 @@ class HttpConnections:
                     )
                 one.end()
             elif now_s - one.taken_s > self._send_s:
-                self._say("ended", one.address, f"nothing of the answer was taken for {self._send_s:g} s")
+                self._say("ended", one.address, f"the client took nothing of the answer for {self._send_s:g} s")
                 one.end()
 
     def _say(self, what: str, address: str, why: str) -> None:
-        text = f"connection {what}; said at most once a minute"
+        text = f"connection {what}; logged at most once a minute"
         self._limiter.say(what, _log.warning, text, address=address, why=why)
 
     def _is_proxy(self, address: str) -> bool:
@@ -253,7 +253,7 @@ class HttpConnections:
             loop.default_exception_handler(context)
             return
         self.exhausted += 1
-        text = "no connection can be accepted; said at most once a minute"
+        text = "no connection can be accepted; logged at most once a minute"
         self._limiter.say("accept", _log.error, text, why=error.strerror)
 
 

@@ -192,7 +192,7 @@ class SampleReader:
 @contextmanager
 def _taking_turns() -> Iterator[None]:
     if not _ONE_AT_A_TIME.acquire(timeout=_PATIENCE_S):
-        raise HTTPException(503, "recordings are being read for somebody else; ask again")
+        raise HTTPException(503, "recordings are being read for another caller; try again")
     try:
         yield
     finally:

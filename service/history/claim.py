@@ -76,7 +76,7 @@ class Claim:
     lost: StoreError | None = None  # why this monitor must not write the machine any more
     trouble: str = ""  # why the database, which works, does not take what waits; empty if it does
     retry_s: float = 0.0  # when that is tried again, by the monotonic clock
-    generation: int = 0  # goes up when the history goes on in another file, which may lack what was written before
+    generation: int = 0  # goes up when the history continues in another file, which may lack what was written before
     waiting: StepBundle = field(default_factory=StepBundle)
     attempt: StepBundle | None = None
     dropped_reports: int = 0

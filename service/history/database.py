@@ -292,7 +292,7 @@ class Database:
         if self.generation == generation:  # not set aside
             self.generation += 1
             self.news = f"{why} while it was in use; " + (
-                "all that it held is in a new one" if rescued else "what was recorded before is not in it"
+                "its contents are in a new one" if rescued else "what was recorded before is not in it"
             )
             self.lost = "" if rescued else self.news
 
@@ -305,7 +305,7 @@ class Database:
             if not set_aside or self.file is None or not is_damage(error):
                 raise
             kept = self.file.set_aside("damaged")
-            self.news = self.lost = f"{self.failure(error)}: it is kept as {kept}, and the history begins anew"
+            self.news = self.lost = f"{self.failure(error)}: it is kept as {kept}, and a new history is begun"
             self.generation += 1
             return self._opened()
 

@@ -47,7 +47,7 @@ class HistoryFile:
             header = file.read(len(_HEADER))
         if header.strip(b"\0") and not _HEADER.startswith(header) and header.isascii():
             raise StoreError(
-                f"{self.path} is no history (SQLite), and stays as it is: expected a new file, or a history"
+                f"{self.path} is not a history (SQLite), and is left as it is: expected a new file, or a history"
             )
 
     def opened(self) -> None:
@@ -157,7 +157,7 @@ def faults(file: Path) -> tuple[str, ...]:
         with closing(_opened(file)) as connection:
             names = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
             if "alembic_version" not in names:
-                return ("it holds no history of rotorwatch",)
+                return ("it contains no rotorwatch history",)
             found = tuple(text for (text,) in connection.execute("PRAGMA integrity_check"))
     except sqlite3.OperationalError as error:
         raise StoreError(f"{file}: {error}") from error

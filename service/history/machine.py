@@ -66,7 +66,7 @@ class MachineStore:
 
     @property
     def generation(self) -> int:
-        """Goes up when the history goes on in another file, which may lack what was written before."""
+        """Goes up when the history continues in another file, which may lack what was written before."""
         return self._claim.generation
 
     @property

@@ -59,7 +59,7 @@ class Reduction:
             try:
                 dropped = self.run(self._now_ns())
             except StoreError as error:
-                _log.warning("the history could not be tidied", why=str(error))
+                _log.warning("the history could not be cleaned up", why=str(error))
                 continue
             if dropped != Dropped():
                 _log.debug("tidied", reports=dropped.reports, windows=dropped.windows, buckets=dropped.buckets)

@@ -227,7 +227,7 @@ def bring_up_to_date(connection: sa.Connection) -> None:
         migrate(connection)
     elif not found and (others := sa.inspect(connection).get_table_names()):
         raise StoreError(
-            f"the database holds a table {min(others)!r} that is not ours: give the history a database of its own"
+            f"the database holds a table {min(others)!r} not of the history: give the history a database of its own"
         )
     elif not found:
         _create(connection)

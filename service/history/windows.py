@@ -46,7 +46,7 @@ def unpacked(values: Sequence[bytes], kind: np.dtype[np.void]) -> tuple[npt.NDAr
         try:
             opened.append(decompressor.decompress(each))
         except zstandard.ZstdError as error:
-            _log.error("the readings of a window are damaged; they are passed over", why=str(error))
+            _log.error("the readings of a window are damaged; they are skipped", why=str(error))
             opened.append(b"")
     records = np.frombuffer(bytearray().join(opened), kind)
     sizes = np.array([len(each) for each in opened], np.intp) // kind.itemsize

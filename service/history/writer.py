@@ -208,7 +208,7 @@ class Writer:
                 f"{why or self._database.news}; it could not be begun anew: {self._database.failure(error)}",
             )
             return False
-        _log.error("the history goes on in another file", why=self._database.news)
+        _log.error("the history continues in another file", why=self._database.news)
         self._recover()
         return True
 
@@ -304,7 +304,7 @@ class Writer:
     def _fail(self, claims: Iterable[Claim], trouble: str) -> None:
         with self._lock:
             if trouble != self.trouble:
-                _log.error("the history cannot be written; it waits in memory", why=trouble)
+                _log.error("the history cannot be written; events wait in memory", why=trouble)
             self.trouble = trouble
             for claim in claims:
                 claim.put_off()
@@ -313,7 +313,7 @@ class Writer:
         """The database does not take one machine's step: that machine's trouble, and tried again after a while."""
         with self._lock:
             if trouble != claim.trouble:
-                _log.error("the history does not take what happens", machine=claim.title, why=trouble)
+                _log.error("the history does not accept what happens", machine=claim.title, why=trouble)
             claim.trouble = trouble
             claim.retry_s = time.monotonic() + self._retry_s
             claim.put_off()
@@ -330,7 +330,7 @@ class Writer:
                         machine=claim.title, reports=claim.dropped_reports, readings=claim.dropped_readings,
                     )  # fmt: skip
                     claim.dropped_reports = claim.dropped_readings = 0
-        _log.info("the history is written again")
+        _log.info("the history is being written again")
 
 
 def _taken(claim: Claim) -> StoreError:

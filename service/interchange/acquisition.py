@@ -185,14 +185,14 @@ class UniversalSource(Source):
             read = file.read_sets(numbers) if numbers else []
             # Each data set stands between two such lines.
             whole = len(re.findall(rb"(?m)^    -1 *\r?$", path.read_bytes())) % 2 == 0
-            self._cut = "" if whole else "; the file is cut, it ends within a further one"
+            self._cut = "" if whole else "; the file is truncated, it ends within another one"
         sets: list[dict[str, Any]] = [read] if isinstance(read, dict) else list(read)
         sets = [found for found in sets if found["func_type"] == _TIME_RESPONSE]
         for found in sets:
             if len(found["data"]) != found["num_pts"]:
                 raise SourceError(
-                    f"{path}: is cut: {len(found['data'])} samples of {str(found['id1']).strip()} are there, expected "
-                    f"the {found['num_pts']} that its header says"
+                    f"{path}: is truncated: {len(found['data'])} samples of {str(found['id1']).strip()} are there, "
+                    f"expected the {found['num_pts']} that its header says"
                 )
         if not sets:
             raise SourceError(f"{path}: holds no time response (data set 58 with function type 1){self._cut}")

@@ -140,7 +140,7 @@ class WavSource(_Arrays):
                     if size == _UNKNOWN_SIZE or size <= there:
                         return
                     raise SourceError(
-                        f"{path}: is cut: {there // frame} samples of each channel are there, "
+                        f"{path}: is truncated: {there // frame} samples of each channel are there, "
                         f"expected the {size // frame} that its header says"
                     )
                 content = file.read(min(size, 16))

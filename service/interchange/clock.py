@@ -74,7 +74,7 @@ def clock_for(
     declared = _declared_rate(source, base, timing)
     if column is None:
         if declared is None:
-            raise SourceError(f"{path}: nothing tells the rate; give time.column or time.rate_hz in the mapping")
+            raise SourceError(f"{path}: the rate is not known; give time.column or time.rate_hz in the mapping")
         first, measured, tolerance = np.zeros(1), declared, 0.0
         origin_ns = _start_ns(path, base, timing, start_ns)
     else:
@@ -124,7 +124,7 @@ def _start_ns(path: Path, base: TimeBase, timing: Timing, known_ns: int | None) 
     start_ns = next(told, None)
     if start_ns is None:
         raise SourceError(
-            f"{path}: nothing tells when the first row was sampled; give time.start in the mapping, such as "
+            f"{path}: the time of the first row is not known; give time.start in the mapping, such as "
             'start = "2026-01-31T12:00:00Z"'
         )
     return start_ns

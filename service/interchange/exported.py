@@ -61,7 +61,7 @@ class Selection:
         if self.machine is not None and self.machine not in machines:
             raise MachineFileError(f"{names}: no machine {self.machine}; there are {', '.join(machines) or 'none'}")
         if not machines:
-            raise RecordingError(f"{names}: no message of a machine in there")
+            raise RecordingError(f"{names}: contains no message of a machine")
         if self.machine is None and len(machines) != 1:
             raise MachineFileError(
                 f"{names}: expected one machine, there are {', '.join(machines)}; choose one with --machine"
@@ -181,9 +181,7 @@ def _descriptor(selection: Selection, key: str) -> ChannelDescriptor:
             told = "; ".join(text for _, text in mistakes(error, ChannelDescriptor))
             raise RecordingError(f"{path}: the channel descriptor on {key} cannot be read: {told}") from error
         if found is not None and descriptor != found:
-            raise RecordingError(
-                f"{path}: the channels on {key} are not those of before; export what belongs together by itself"
-            )
+            raise RecordingError(f"{path}: the channels on {key} have changed; export each part separately")
         found = descriptor
     if found is None:
         names = ", ".join(str(path) for path in selection.recordings)

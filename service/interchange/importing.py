@@ -112,9 +112,9 @@ def import_file(
                 alone = [one.row for one, following in pairwise(read.gaps) if following.row == one.row + 1]
                 if len(alone) > _MOST_ALONE * read.rows:
                     raise SourceError(
-                        f"{path}: from row {alone[0] + 1} on rows stand alone at {clock.rate_hz:.9g} Hz, {len(alone)} "
-                        "of them; expected one rate throughout: import what has another rate by itself, with "
-                        "time.resample = true in the mapping, or fill such gaps with time.fill_gaps_up_to_s"
+                        f"{path}: from row {alone[0] + 1} on, rows are isolated at {clock.rate_hz:.9g} Hz, "
+                        f"{len(alone)} of them; expected one rate throughout: import what has another rate by itself, "
+                        "with time.resample = true in the mapping, or fill such gaps with time.fill_gaps_up_to_s"
                     )
         except BaseException:
             writer.part.unlink(missing_ok=True)

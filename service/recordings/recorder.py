@@ -145,7 +145,7 @@ class MachineRecorder:
         if self._thread.is_alive():
             self._thread.join(_JOIN_S)
             if self._thread.is_alive():
-                self._log.error("the disk does not answer; the recording stays incomplete", file=self._file_name())
+                self._log.error("the disk does not respond; the recording remains incomplete", file=self._file_name())
 
     def status(self) -> RecorderStatus:
         """Where the recorder stands."""
@@ -340,7 +340,7 @@ class MachineRecorder:
             self._retain()
         except (RecordingError, OSError) as error:
             if (withheld := self._limiter.admit("tidy")) is not None:
-                self._log.error("the recordings could not be put in order", why=str(error), withheld=withheld)
+                self._log.error("the recordings could not be cleaned up", why=str(error), withheld=withheld)
 
     def _recover(self) -> None:
         for unfinished in self.folder.glob(f"*{SUFFIX}.recovered*"):
@@ -352,7 +352,7 @@ class MachineRecorder:
                 self._log.error("an incomplete recording could not be recovered", file=part.name, why=str(error))
                 continue
             if salvage is None:
-                self._log.warning("an incomplete recording waits for room on the disk", file=part.name)
+                self._log.warning("an incomplete recording is waiting for space on the disk", file=part.name)
             else:
                 self._log.warning(
                     "incomplete recording recovered", file=part.name, messages=salvage.count, lost=loss_text(salvage)
@@ -367,7 +367,7 @@ class MachineRecorder:
             self._unread = ""
         except RotorwatchError as error:  # those that are known hold on
             if str(error) != self._unread:
-                self._log.warning("the history cannot be read: no further alarm keeps recordings", why=str(error))
+                self._log.warning("the history cannot be read: alarms keep no more recordings", why=str(error))
             self._unread = str(error)
         decision = decide(recordings, self._marks, self.settings, self._now_ns())
         kept = {one.path.name: one.kept_because for one in recordings if one.kept_because}

@@ -134,7 +134,7 @@ class Fleet:
                     if one["Alive"] and one["Resources"].get("CPU")
                 }
             except Exception as error:  # whatever it is, shards go on where they are
-                _log.warning("the cluster does not say which computers there are", why=str(error))
+                _log.warning("the cluster does not report its computers", why=str(error))
                 continue
             placed = [one for one in self._processes if one.computer]
             if len(placed) < len(self._processes):
@@ -142,7 +142,7 @@ class Fleet:
             move = better_place([(one.computer, one.cores) for one in placed], cores)
             if move is not None:
                 number, computer = move
-                _log.info("a shard moves to a computer with less to do", shard=number + 1)
+                _log.info("a shard moves to a less busy computer", shard=number + 1)
                 placed[number].move_to(computer)
 
 

@@ -135,7 +135,7 @@ class LocalMachines:
         if self._settings.recording.directory is None:
             return
         if self._settings.link.namespace:
-            _log.warning("not recorded: what is heard in a namespace is a replay", machine=machine.name)
+            _log.warning("not recorded: what is received in a namespace is a replay", machine=machine.name)
             return
         committed = partial(self._store.alarms_since, machine.site, machine.name)
         recorder = MachineRecorder(machine, self._settings.recording, committed)

@@ -126,7 +126,7 @@ class _Spawned:
                     ours.close()
                     raise
         except OSError as error:
-            raise RotorwatchError(f"the system lets no further process begin: {error.strerror or error}") from error
+            raise RotorwatchError(f"the system does not allow another process: {error.strerror or error}") from error
         self._connection, self._process = ours, process
 
     def said(self, wait_s: float) -> str | None:

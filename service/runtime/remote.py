@@ -78,7 +78,7 @@ class RemoteMachine:
         """Why what was told does not count any more; empty if it does."""
         silent_s = time.monotonic() - self._told_s
         return self.down or (
-            f"the process that monitors it has said nothing for more than {_SILENT_S:g} s"
+            f"the process that monitors it has not responded for more than {_SILENT_S:g} s"
             if silent_s > _SILENT_S
             else ""
         )

@@ -185,7 +185,7 @@ class Runtime:
             if refused := self._machines.refused():
                 raise StoreError(f"the history refused the latest step, which is lost: {refused}")
         except StoreError as error:
-            _log.error("stopped; not everything is in the history", why=str(error))
+            _log.error("stopped; not everything was written to the history", why=str(error))
             raise
         _log.info("stopped")
 
@@ -220,9 +220,9 @@ def readiness_of(
     if not history_open:
         reasons.append("the history is not open, or its tables are not up to date")
     if history_trouble:
-        reasons.append(f"the history cannot be written, what happens waits in memory: {history_trouble}")
+        reasons.append(f"the history cannot be written; events wait in memory: {history_trouble}")
     if history_lost:
-        reasons.append(f"{history_lost}; see docs/history.md, and start the monitor again when it is seen to")
+        reasons.append(f"{history_lost}; see docs/history.md, and restart the monitor once that is fixed")
     for machine in machines:
         place = f"{machine.site}/{machine.machine}"
         if not machine.worker_alive:

@@ -153,7 +153,7 @@ class _Shard:
                 else:
                     wait_s = _AGAIN_S
                     self._say("")
-                    self._log.info("a shard goes on")
+                    self._log.info("a shard continues")
                     break
 
     def _look(self) -> None:
@@ -161,7 +161,7 @@ class _Shard:
         hangs = any(one.not_monitored for one in self.machines)
         if hangs != self._hangs:
             self._hangs = hangs
-            self._log.error("a shard says nothing" if hangs else "a shard is heard again")
+            self._log.error("a shard does not respond" if hangs else "a shard responds again")
             self._tell()
 
     def _say(self, down: str) -> None:

@@ -205,13 +205,13 @@ def restored(
         monitor.restore_alarms(head.alarms, next_sequence, head.end_ns or None)
     except CheckpointError as error:
         monitor.restore_alarms(NO_ALARMS, next_sequence)
-        return monitor, f"all alarms begin anew: {error}"
+        return monitor, f"all alarms start afresh: {error}"
     if differs:
         try:  # a machine that has become louder since its first windows must not be taken for a healthy one
             monitor.restore(head.state, tuple(data for _, data in checkpoint.parts), levels_alone=True)
         except CheckpointError as error:
-            differs = [*differs, f"where first windows are the reference of levels they are taken anew ({error})"]
-        return monitor, f"alarms are as they were at {at}; the window fills anew: {'; '.join(differs)}"
+            differs = [*differs, f"where first windows are the reference of levels, they are taken again ({error})"]
+        return monitor, f"alarms are as they were at {at}; the window is filling anew: {'; '.join(differs)}"
     return monitor, f"went on where it stood at {at}"
 
 

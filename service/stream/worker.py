@@ -140,7 +140,7 @@ class MachineWorker:
         refused = self.steps.refused
         reasons = [] if refused is None else [f"the history refuses what happens: {refused}"]
         if self.history.trouble:
-            reasons.append(f"the history does not take what happens: {self.history.trouble}")
+            reasons.append(f"the history does not accept what happens: {self.history.trouble}")
         if self._unevaluated_s > 2 * self.machine.hop_data_s and not self._silent:
             why = self._snapshot.reason
             reasons.append(f"{self._unevaluated_s:.0f} s of data have come in and no window was evaluated: {why}")
@@ -178,7 +178,7 @@ class MachineWorker:
         """Take note of a replay on the machine's own keys that begins or ends; its blocks do not arrive here."""
         self._replay_announced = announced
         if announced:
-            self._warn("replay", "a replay is announced on this machine's own keys; the machine's own blocks count")
+            self._warn("replay", "a replay is announced on this machine's own keys; only its own blocks count")
 
     def descriptor(self, announced: bytes) -> None:
         """Compare an announced channel descriptor with the machine file."""
@@ -435,7 +435,7 @@ class MachineWorker:
         if self.steps.refused is not None:
             self._failed(self.steps.refused)
         elif not written:
-            self._warn("history", "the history cannot be written; what happened waits in memory and is published")
+            self._warn("history", "the history cannot be written; events wait in memory and are published")
         tally = self.tally
         self.tally = replace(
             tally,

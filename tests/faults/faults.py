@@ -305,7 +305,7 @@ def refused_step(plant: Plant) -> None:
     plant.flowing(60)
     reports("'many'")
     plant.broken()
-    plant.stated(lambda seen: "the history does not take what happens" in seen.why_not, "refused step")
+    plant.stated(lambda seen: "the history does not accept what happens" in seen.why_not, "refused step")
     plant.rest(1.0, 3.0)
     reports("1000")
     plant.over()

@@ -194,7 +194,7 @@ def test_what_is_not_there_and_what_is_there_already_is_said(tmp_path: Path) -> 
         export(Selection((tmp_path / "run.mcap",)), "stream", "csv", tmp_path / "none" / "a.csv")
     with RecordingWriter(tmp_path / "nothing.mcap"):
         pass
-    with pytest.raises(RecordingError, match=r"nothing\.mcap: no message of a machine in there"):
+    with pytest.raises(RecordingError, match=r"nothing\.mcap: contains no message of a machine"):
         export(Selection((tmp_path / "nothing.mcap",)), "stream", "csv", tmp_path / "a.csv")
     with pytest.raises(RecordingError, match="is a folder, expected the name of a file"):
         export(Selection((tmp_path / "run.mcap",)), "stream", "csv", Path(), overwrite=True)

@@ -101,7 +101,7 @@ def test_files_that_follow_each_other_are_one_stretch(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("mapping", "every_s", "says"),
     [
-        (NAMED, EVERY_S, "acc_1.npz: nothing tells when the first row was sampled"),
+        (NAMED, EVERY_S, "acc_1.npz: the time of the first row is not known"),
         (DATED, 1.0, "acc_2.npz: begins 1 s before the end of acc_1.npz"),
         (
             PULSES.replace("= 0.5", "= 5").replace("rate_hz", START),

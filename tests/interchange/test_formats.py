@@ -276,7 +276,7 @@ def test_a_data_set_that_is_cut_off_is_missing_and_said_to_be_cut(tmp_path: Path
     write_uff(tmp_path / "run.uff", {"t": t, "x": x, "v": v, "a": a})
     (tmp_path / "run.uff").write_bytes((tmp_path / "run.uff").read_bytes()[:-100])
     with pytest.raises(
-        SourceError, match=r"no data set 'a'; there are set 1, set 2, x, v; the file is cut, it ends with"
+        SourceError, match=r"no data set 'a'; there are set 1, set 2, x, v; the file is truncated, it ends with"
     ):
         imported(tmp_path, tmp_path / "run.uff", f'[time]\nstart = "{START}"\n' + without_units(CHANNELS))
 
@@ -288,7 +288,7 @@ def test_a_data_set_with_fewer_samples_than_its_header_says_is_refused(tmp_path:
     content = (tmp_path / "run.uff").read_bytes()
     assert content.count(b"         4      1000") == 3
     (tmp_path / "run.uff").write_bytes(content.replace(b"         4      1000", b"         4      1200"))
-    with pytest.raises(SourceError, match=r"run.uff: is cut: 1000 samples of x are there, expected the 1200"):
+    with pytest.raises(SourceError, match=r"run.uff: is truncated: 1000 samples of x are there, expected the 1200"):
         imported(tmp_path, tmp_path / "run.uff", f'[time]\nstart = "{START}"\n' + without_units(CHANNELS))
 
 

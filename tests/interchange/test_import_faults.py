@@ -89,7 +89,7 @@ def test_days_of_a_spreadsheet_are_times(tmp_path: Path) -> None:
             f"row {at + 1}, column t: found 7e+306, expected a time",
         )) for at in (1, 600)),
         ([*GOOD[:500], *GOOD[500::2]], TEXT, HEADER, (
-            "run.csv: from row 502 on rows stand alone at 2000 Hz", "time.resample", "time.fill_gaps_up_to_s",
+            "run.csv: from row 502 on, rows are isolated at 2000 Hz", "time.resample", "time.fill_gaps_up_to_s",
         )),
         # Times with too few decimals.
         ([f"{number // 2 * 0.001:.3f},1.0,2.0,3.0" for number in range(1000)], TEXT, HEADER, (
@@ -236,7 +236,7 @@ def test_a_wav_file_whose_header_has_no_rate_asks_for_it(tmp_path: Path) -> None
     wavfile.write(source, 2000, np.zeros((1000, 3), dtype=np.float32))
     source.write_bytes(source.read_bytes()[:24] + bytes(4) + source.read_bytes()[28:])
     mapping = f'[time]\nstart = "{START}"\n' + IN_ORDER
-    with pytest.raises(MachineFileError, match=r"nothing tells the rate; give time.column or time.rate_hz"):
+    with pytest.raises(MachineFileError, match=r"the rate is not known; give time.column or time.rate_hz"):
         imported(tmp_path, source, mapping)
     done, _ = imported(tmp_path, source, mapping.replace("[time]", "[time]\nrate_hz = 2000.0"))
     assert done.written.samples == 1000
@@ -252,7 +252,7 @@ def test_texts_of_a_tdms_file_that_are_no_rate_and_no_time_are_left_to_the_mappi
                 for name, column in zip("xva", signals(1000)[1:], strict=True)
             ]
         )
-    with pytest.raises(MachineFileError, match=r"nothing tells the rate"):
+    with pytest.raises(MachineFileError, match=r"the rate is not known"):
         imported(tmp_path, source, CHANNELS)
     with pytest.raises(MachineFileError, match=r"give time.start in the mapping"):
         imported(tmp_path, source, f"[time]\nrate_hz = 2000.0\n{CHANNELS}")

@@ -89,8 +89,8 @@ def test_the_channel_that_is_watched_least_says_what_would_have_been_seen() -> N
     assert (seen.channel, seen.measure) == ("D", "x2")
     assert seen.growth == pytest.approx(2.0)
     assert seen.text == (
-        "every channel that had grown by 200 % would have raised an alert; D last, whose 2x is 1 µm pp and its alert "
-        "from 3"
+        "growth of 200 % in any channel would have raised an alert; last in D, whose 2x is 1 µm pp with an alert "
+        "limit of 3"
     )
     sooner = growth_seen(judged(window(), limits=[*limits, {"channel": "D", "alert": 50}]))
     assert (sooner.channel, sooner.measure) == ("A", "overall")

@@ -137,7 +137,7 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
         view = found_machine(service, site, machine)
         if if_match is None and order.expected_state is None:
             raise HTTPException(
-                428, "say how you saw the alarm: header If-Match with its ETag, or expected_state in the body"
+                428, "state how you saw the alarm: header If-Match with its ETag, or expected_state in the body"
             )
         operation = OperatorAction(
             kind=kind,

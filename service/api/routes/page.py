@@ -69,7 +69,7 @@ def add_page_routes(app: FastAPI) -> None:
     ) -> Response:
         """Serve what the page loads."""
         if version != digest or name not in found:
-            raise HTTPException(404, f"the page has no file {name[:80]} of this version; load / again")
+            raise HTTPException(404, f"the page has no file {name[:80]} in this version; reload /")
         # What runs as a worker goes by the policy it comes with.
         keep = {"Content-Security-Policy": _POLICY, "Cache-Control": "public, max-age=31536000, immutable"}
         return Response(found[name], media_type=_TYPES[Path(name).suffix], headers=keep)

@@ -103,8 +103,8 @@ class ReplayRequests:
         if not offline and (link.grants or link.tls or link.user or link.passwords_file):  # it would not be let in
             raise HTTPException(
                 409,
-                "mode: a paced replay needs a network without grants, passwords and certificates, expected offline, or "
-                "rotorwatch replay on a network of its own",
+                "mode: a paced replay needs a network without grants, passwords and certificates; expected "
+                "offline, or rotorwatch replay on a separate network",
             )
         sent = request.machine_file is not None
         machine = self._machine(request, machines[0]) if offline and not sent else None
@@ -166,7 +166,7 @@ class ReplayRequests:
         try:
             return choose_machine(keys, sent or job.machine, "\n".join(job.changes))
         except RotorwatchError as error:  # where the file is concerns nobody who asks over HTTP
-            raise HTTPException(404, f"what replay {job.id} was evaluated with cannot be read any more") from error
+            raise HTTPException(404, f"what replay {job.id} was evaluated with can no longer be read") from error
 
     def report(self, job: ReplayJob, end_ns: int) -> Report | None:
         """What an offline replay found in the window that ends at a time, which may be rounded to a microsecond."""
@@ -337,7 +337,7 @@ def _switch(desk: ReplayRequests) -> Callable[[], None]:
 
     def check() -> None:
         if not desk.enabled:
-            raise HTTPException(403, "replays over HTTP are switched off in the settings ([replay] enabled)")
+            raise HTTPException(403, "replays over HTTP are disabled in the settings ([replay] enabled)")
 
     return check
 

@@ -52,7 +52,7 @@ def add_token_routes(app: FastAPI, guard: Guard) -> None:
         said = f"{wish.name}, {' '.join(one for one in Scope if one in scopes)}"
         request.state.audit = AuditNote("create-token", reason=said)
         if beyond := [str(one) for one in Scope if one in scopes - caller.scopes]:
-            text = f"{caller.name} has not the scope {', '.join(beyond)}, and so cannot give it to a token"
+            text = f"{caller.name} does not have the scope {', '.join(beyond)}, and so cannot give it to a token"
             request.state.audit = AuditNote("create-token", reason=f"{said}: {text}")
             raise HTTPException(403, text)
         now_ns = time.time_ns()

@@ -53,7 +53,7 @@ def answer_of(status: int, headers: Mapping[str, str], now_s: float) -> Answer:
     if status == HTTPStatus.GONE:
         return Answer(Meaning.GONE, text)
     if 300 <= status < 400:
-        return Answer(Meaning.REFUSED, f"{text}: redirects are not followed, set url to where the receiver is")
+        return Answer(Meaning.REFUSED, f"{text}: redirects are not followed, set url to the receiver's address")
     if status in {HTTPStatus.REQUEST_TIMEOUT, HTTPStatus.TOO_EARLY, HTTPStatus.TOO_MANY_REQUESTS} or status >= 500:
         return Answer(Meaning.TROUBLE, text, _wished_s(headers.get("retry-after", ""), now_s))
     return Answer(Meaning.REFUSED, text)

@@ -227,7 +227,7 @@ class Dispatcher:
         self._note(answer.text)
         if answer.meaning is Meaning.GONE:
             self._disabled = True
-            self._log.error("disabled: the receiver wants no more events", why=answer.text)
+            self._log.error("disabled: the receiver refuses further events", why=answer.text)
             return
         if answer.meaning is Meaning.REFUSED:
             self._failures = 0  # it is there and answers

@@ -90,5 +90,5 @@ def send_test(settings: WebhookSettings) -> float:
     with closing(Receiver(settings)) as receiver:
         answer = receiver.post(f"test/{now_ns}", json.dumps(event).encode())
     if answer.meaning is not Meaning.DELIVERED:
-        raise RotorwatchError(f"{settings.name}: {settings.target} did not take the test event: {answer.text}")
+        raise RotorwatchError(f"{settings.name}: {settings.target} did not accept the test event: {answer.text}")
     return time.monotonic() - begin_s

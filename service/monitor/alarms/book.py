@@ -386,7 +386,7 @@ class AlarmBook:
         if (state is not None and state != alarm.state) or (version is not None and version != alarm.version):
             seen = f"state {state}" if state is not None else f"version {version}"
             raise OperationConflict(
-                f"{alarm.name} is {alarm.state.value} (version {alarm.version}), not as it was seen ({seen}): "
+                f"{alarm.name} is {alarm.state.value} (version {alarm.version}), no longer as it was seen ({seen}): "
                 "look again"
             )
 

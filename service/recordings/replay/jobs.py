@@ -224,7 +224,7 @@ class RunningJob:
         try:
             line = ReplayLine.model_validate_json(text)
         except ValidationError:
-            _log.warning("a replay says what is not understood", id=self.view.id, line=text[:200])
+            _log.warning("a replay sent an unknown message", id=self.view.id, line=text[:200])
             return
         update = {name: value for name in ("progress", "summary") if (value := getattr(line, name)) is not None}
         with self._lock:

@@ -47,7 +47,7 @@ class RecordingSource:
         files = [_File(path, summarize_recording(path)) for path in distinct]
         filled = [file for file in files if file.summary.messages]
         if not filled:
-            raise RecordingError(f"{', '.join(str(path) for path in paths)}: no message in there")
+            raise RecordingError(f"{', '.join(str(path) for path in paths)}: contains no messages")
         self._files = sorted(filled, key=lambda file: (file.summary.start_ns, file.summary.end_ns))
         self._spans: dict[tuple[Path, str], DataSpan | None] = {}
 
@@ -100,7 +100,7 @@ class RecordingSource:
         place = ", ".join(path.name for path in self.paths)
         if wanted is None:
             if not there:
-                raise MachineFileError(f"{place}: no {what} in there")
+                raise MachineFileError(f"{place}: contains no {what}")
             if len(there) != 1:
                 raise MachineFileError(f"{place}: machines with {what}: {listed}; name one, as --key SITE/MACHINE")
             return next(iter(there.values()))

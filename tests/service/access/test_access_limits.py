@@ -169,11 +169,11 @@ def test_so_many_streams(tmp_path: Path) -> None:
                 pieces = first.iter_text()
                 assert "data: 0" in next(pieces)
                 refused = one.get("/events")
-                assert "event streams of yours" in problem(refused, 429)
+                assert "of your event streams" in problem(refused, 429)
                 assert int(refused.headers["retry-after"]) >= 1
                 with other.stream("GET", "/events") as third:
                     assert third.status_code == 200
-                    assert "which is the most this service has" in problem(other.get("/events"), 429)
+                    assert "the most this service allows" in problem(other.get("/events"), 429)
             until(lambda: seats.taken == 0, "streams that were left give their seats back")
             with one.stream("GET", "/events") as again:
                 assert again.status_code == 200

@@ -233,7 +233,7 @@ def test_a_client_without_a_certificate_is_refused_where_one_is_asked_for(
         found = CliRunner().invoke(app, [*status, "--certificate", str(file), str(key)])
         assert "answers 404" in found.stderr  # of an application that has no machines
         found = CliRunner().invoke(app, status)
-        assert (found.exit_code, "perhaps it wants a certificate" in found.stderr) == (4, True)
+        assert (found.exit_code, "perhaps it requires a certificate" in found.stderr) == (4, True)
         for context in (stranger, trusting(authority)):
             with monitor.client(token, verify=context) as client, pytest.raises(httpx.TransportError):
                 client.get("/health")

@@ -192,7 +192,7 @@ def test_recordings_are_read_for_one_at_a_time_and_not_too_many(
         assert "expected at most" in problem(http.get(path), 422).detail
     monkeypatch.setattr(samples, "_PATIENCE_S", 0.01)
     with samples._ONE_AT_A_TIME:
-        assert "for somebody else" in problem(http.get(path), 503).detail
+        assert "for another caller" in problem(http.get(path), 503).detail
     assert answered(http.get(path), WaterfallSnapshot).rows
 
 

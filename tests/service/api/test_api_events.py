@@ -360,7 +360,7 @@ def test_streams_are_counted_and_given_back() -> None:
             one.next("start")
             two.next("start")
             answer = http.get(EVENTS)
-            assert "2 event streams of yours are open" in problem(answer, 429).detail
+            assert "2 of your event streams are open" in problem(answer, 429).detail
             assert int(answer.headers["retry-after"]) > 0
             problem(http.get(f"{EVENTS}?machine=demo/pump"), 429)
 

@@ -83,7 +83,7 @@ def test_an_alarm_that_is_not_as_it_was_seen_is_left_alone(
     untouched: httpx.Client, headers: dict[str, str], body: dict[str, str]
 ) -> None:
     found = problem(untouched.post(f"{GAP}/acknowledge", json=body, headers=headers), 409)
-    assert found.detail.startswith("data-gap is unacknowledged (version 0), not as it was seen (")
+    assert found.detail.startswith("data-gap is unacknowledged (version 0), no longer as it was seen (")
     assert found.detail.endswith("): look again")
     assert state(untouched) == "unacknowledged"
 
@@ -163,7 +163,7 @@ def test_latched_alarms_are_reset_and_out_of_service_is_for_who_configures(
 @pytest.mark.parametrize(
     ("path", "headers", "body", "status", "text"),
     [
-        ("data-gap/acknowledge", {}, {}, 428, "say how you saw the alarm"),
+        ("data-gap/acknowledge", {}, {}, 428, "state how you saw the alarm"),
         ("data-gap/acknowledge", {"If-Match": "0"}, {}, 422, 'If-Match: expected an ETag such as "17", or *'),
         ("data-gap/acknowledge", {"If-Match": '"0", "1"'}, {}, 422, 'If-Match: expected an ETag such as "17"'),
         ("data-gap/acknowledge", {"If-Match": "*"}, {"reason": "a\u0000b"}, 422, "reason: expected one line of text"),

@@ -63,7 +63,7 @@ def test_a_token_is_created_used_and_revoked(monitor: Guarded, capfd: pytest.Cap
             used_ns = sure(listed(chief)["control room"].last_used_ns)
             assert before_ns < used_ns <= time.time_ns()
 
-            assert "valid already" in problem(chief.post(TOKENS, json={"name": told.name, "scopes": ["read"]}), 409)
+            assert "already valid" in problem(chief.post(TOKENS, json={"name": told.name, "scopes": ["read"]}), 409)
             gone = TokenEntry.model_validate_json(chief.delete(f"{TOKENS}/{told.token_id}").raise_for_status().content)
             assert gone.state == "revoked"
             problem(user.get("/health"), 401)
@@ -89,7 +89,7 @@ def test_nobody_gives_a_scope_that_is_not_his_own(monitor: Guarded) -> None:
     with monitor.client(monitor.token(READ, CONFIGURE, name="clerk")) as clerk:
         for scopes in (["operate"], ["read", "operate", "configure"]):
             told = problem(clerk.post(TOKENS, json={"name": "more", "scopes": scopes}), 403)
-            assert told == "clerk has not the scope operate, and so cannot give it to a token"
+            assert told == "clerk does not have the scope operate, and so cannot give it to a token"
         assert set(listed(clerk)) == {"clerk"}
         assert create(clerk, "less", scopes=["configure", "read", "read"]).token.scopes == ("read", "configure")
     refused = [one for one in monitor.entries() if one.status == 403]
@@ -109,8 +109,8 @@ def test_nobody_gives_a_token_that_is_valid_for_longer_than_his_own(monitor: Gua
     ("wish", "said"),
     [
         ({"name": " x"}, "name is ' x'"),
-        ({"name": "anonymous"}, "is no name of a token's user"),
-        ({"name": "rw_000000000000_" + 43 * "0"}, "is no name of a token's user"),
+        ({"name": "anonymous"}, "is not a valid name of a token's user"),
+        ({"name": "rw_000000000000_" + 43 * "0"}, "is not a valid name of a token's user"),
         ({"name": "a\nb"}, "name is"),
         ({"scopes": []}, "scopes: "),
         ({"scopes": ["admin"]}, "scopes"),

@@ -221,7 +221,7 @@ def test_operators_work(tmp_path: Path) -> None:
         first = plant.alarm(PLACE, "data-gap")
         done = plant.acknowledge(PLACE, first, "cable was moved")
         assert (done.alarm.state, done.events[0].data.reason) == ("acknowledged", "cable was moved")
-        with pytest.raises(Conflict, match="not as it was seen"):
+        with pytest.raises(Conflict, match="no longer as it was seen"):
             plant.shelve(PLACE, first, "by somebody who saw it earlier")
         with pytest.raises(ClientError, match="expected finite numbers"):
             plant.shelve(PLACE, first, "is being repaired", duration_s=float("nan"))

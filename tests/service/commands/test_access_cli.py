@@ -65,7 +65,7 @@ def test_a_token_works_at_once_and_not_a_request_longer(tmp_path: Path, commands
 
         again = run(commands, "token", "create", "control room", "--scope", "read", "--config", config)
         assert again.exit_code == 2
-        assert "valid already" in again.stderr
+        assert "already valid" in again.stderr
 
         revoked = run(commands, "token", "revoke", token_id, "--config", config)
         assert revoked.exit_code == 0

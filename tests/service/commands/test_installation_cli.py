@@ -139,7 +139,7 @@ def test_the_doctor_sums_up_gaps_that_are_many(tmp_path: Path) -> None:
         for block, _ in blocks(12.0, every_s=0.6)
     ]
     troubles = examined(machine, messages).troubles
-    assert "19 times a block does not follow the one before; 1.9 s of data are missing, for example:" in troubles
+    assert "19 times a block does not follow the previous one; 1.9 s of data are missing, for example:" in troubles
     assert sum("0.1 s" in one for one in troubles) == 3
 
 

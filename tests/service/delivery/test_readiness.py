@@ -47,9 +47,7 @@ def test_a_history_that_cannot_be_written_is_a_reason_until_it_can(
         status, found = asked(runtime)
         assert (status, found.history_open, found.session_open) == (503, True, True)
         assert str(file) in found.history_trouble
-        assert found.reasons == (
-            f"the history cannot be written, what happens waits in memory: {found.history_trouble}",
-        )
+        assert found.reasons == (f"the history cannot be written; events wait in memory: {found.history_trouble}",)
         assert found.machines[0].history_waiting >= 1
         read = parsed(runtime.metrics.text().decode())
         assert (read("ready"), read("history_failing")) == (0.0, 1.0)
@@ -133,7 +131,7 @@ def machine(**changes: object) -> MachineReadiness:
         ({"machines": [machine(), machine(machine="pump", trouble="no window")]}, "demo/pump: no window"),
         ({"session_open": False}, "the Zenoh session is closed: nothing arrives and nothing is published"),
         ({"history_open": False}, "the history is not open, or its tables are not up to date"),
-        ({"history_trouble": "disk full"}, "the history cannot be written, what happens waits in memory: disk full"),
+        ({"history_trouble": "disk full"}, "the history cannot be written; events wait in memory: disk full"),
     ],
 )
 def test_each_reason_in_a_sentence(change: dict[str, object], reason: str) -> None:

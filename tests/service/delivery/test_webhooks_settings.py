@@ -169,7 +169,7 @@ def test_command_sends_a_test_event_that_is_no_alarm(tmp_path: Path, command: ty
         receiver.answer = lambda _: (404, {})
         refused = CliRunner().invoke(command, arguments)
         assert (refused.exit_code, len(receiver.got)) == (1, 2)
-        assert "did not take the test event: 404 Not Found" in refused.output
+        assert "did not accept the test event: 404 Not Found" in refused.output
         assert "hush" not in done.output + refused.output
         unknown = CliRunner().invoke(command, ["webhook", "test", "lamp", "--config", str(file)])
         assert unknown.exit_code == 2

@@ -309,7 +309,7 @@ def test_another_machine_file_keeps_the_time_of_the_alarms(later_ns: int, expect
     changed = install(machine(on_delay_s=77.0), None)
     now = identity_of(changed)
     after, text = restored(lambda: MachineMonitor(changed), now, then, 1)
-    assert "the window fills anew: machine file was old" in text
+    assert "the window is filling anew: machine file was old" in text
     assert after.end_ns == end_ns
     report = after.step(block(1, end_ns + later_ns - BLOCK_NS))
     assert named(report.events) == expected

@@ -158,10 +158,10 @@ def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -
         first, second = (shard.process.pid for shard in runtime._machines._shards)  # type: ignore[attr-defined]  # processes of this computer  # of lab and of pump
         os.kill(second, signal.SIGSTOP)
         until(lambda: not http.get("/readyz").is_success, "that it is told")
-        assert "demo/pump: the process that monitors it has said nothing" in problem(http.get("/readyz"), 503).detail
+        assert "demo/pump: the process that monitors it has not responded" in problem(http.get("/readyz"), 503).detail
         assert pump.health().state is HealthState.NOT_EVALUABLE
         # Nobody waits for one that hangs until it does not answer.
-        assert "has said nothing" in problem(http.get("/api/v1/machines/demo/pump/orbits"), 503).detail
+        assert "has not responded" in problem(http.get("/api/v1/machines/demo/pump/orbits"), 503).detail
         assert http.get("/api/v1/machines/demo/lab/orbits").status_code == 200
         os.kill(second, signal.SIGCONT)
         until(lambda: bool(http.get("/readyz").is_success), "that it is heard again")

@@ -95,7 +95,7 @@ def test_alarms_and_what_operators_did_survive_kill_9(tmp_path: Path) -> None:
         third.wait_for("HTTP API")
         health = third.health()
         assert health.restart.startswith("alarms are as they were at 2026-01-01T00:01:20")
-        assert "the window fills anew: machine file was " in health.restart
+        assert "the window is filling anew: machine file was " in health.restart
         assert health.filled == 0.0
         assert states(third)["c_bz"] == "acknowledged"
         assert health.state in {"alert", "danger"}  # a raised alarm outranks warming

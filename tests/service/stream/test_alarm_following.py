@@ -290,7 +290,7 @@ def test_nonsense_on_the_topic_is_left_to_the_log(caplog: pytest.LogCaptureFixtu
         machine.happen(published=False)
         machine.happen()
         following.reaches(2)
-    assert "is not what this version understands" in caplog.text
+    assert "do not match this version" in caplog.text
 
 
 def test_log_that_cannot_be_read_is_waited_for(caplog: pytest.LogCaptureFixture) -> None:
