@@ -313,9 +313,13 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
 
     @property
     def time_scale(self) -> float:
-        """How much slower it moves than machines that the usual window suits, see `models.stream_settings`."""
+        """How much slower it moves than machines that the usual window suits, see `models.stream_settings`.
+
+        One of a fast machine whose file gives lags for a slower one: those are what it is evaluated by.
+        """
         speed_hz = None if self.operation is None else self.operation.speed_rpm / 60
-        return time_scale(() if self.rotor is None else self.rotor.modes_hz, speed_hz)
+        scale = time_scale(() if self.rotor is None else self.rotor.modes_hz, speed_hz)
+        return scale if scale > 1 or self.window.lag_to_s <= 1.001 * scale * WindowSettings().lag_to_s else 1.0
 
     @property
     def title(self) -> str:

@@ -1,7 +1,8 @@
 """How a machine's samples come and what windows are made of them: settings, and what they are where a file is silent.
 
 Windows, lags and band suit machines whose motion lies between some 6 and 120 Hz. Of a faster or slower one the natural
-frequencies say how far off that is, or where they are not known the speed; all times are multiplied by one factor then.
+frequencies say how far off that is, or where they are not known the speed; all times are multiplied by one factor then,
+unless it is near one.
 """
 
 import math
@@ -15,7 +16,9 @@ _USABLE = 0.4
 _SLOW_HZ, _FAST_HZ = 6.0, 120.0
 """Lowest and fourth natural frequency, those of bearing and disc across, between which the usual window suits."""
 _FAST_SPEED_HZ = 50.0
-_SLOWEST = 60.0
+_SLOWEST = 59.0  # segments of two minutes are the longest
+NEAR = 0.8
+"""Time scale, or one over it, from which on the usual window is near enough."""
 _LENGTHS = ("segment_s", "hop_s", "length_s", "max_span_s")
 
 
@@ -153,8 +156,9 @@ def time_scale(modes_hz: Sequence[float], speed_hz: float | None) -> float:
     elif modes_hz[3] > _FAST_HZ and modes_hz[0] >= _SLOW_HZ:
         scale = _FAST_HZ / modes_hz[3]
     elif modes_hz[0] < _SLOW_HZ and modes_hz[3] <= _FAST_HZ:
-        scale = min(_SLOWEST, _SLOW_HZ / modes_hz[0])
-    return float(f"{scale:.2g}")
+        scale = min(_SLOWEST, _SLOW_HZ / modes_hz[0], _FAST_HZ / modes_hz[3])
+    scale = float(f"{scale:.2g}")
+    return 1.0 if NEAR <= scale <= 1 / NEAR else scale
 
 
 def default_window(
@@ -164,7 +168,8 @@ def default_window(
 
     Data acquisition often divides a clock by whole numbers (51 200 / 3 Hz), and slow machines are sampled slowly: the
     nearest settings that are whole numbers of samples are taken, and the band ends within what the rate allows. Fast
-    and slow machines have their own, see `time_scale`. A fast one tells more in the same time, so that what leaks from
+    and slow machines have their own, see `time_scale`; a slow one has the usual where one of the lengths is given, for
+    the others have to go with that. A fast one tells more in the same time, so that what leaks from
     one frequency into the next has to be smaller too: segments are not shortened.
 
     Examples
@@ -177,9 +182,12 @@ def default_window(
     (20.0, 1000.0)
     """
     usual, scale = WindowSettings(), time_scale(modes_hz, speed_hz)
-    low_hz, high_hz = (float(f"{edge / scale:.3g}") for edge in usual.band_hz)
+    if {*_LENGTHS} & {*given}:  # the others have to go with them, and longer lags might not
+        scale = min(scale, 1.0)
+    low_hz, high_hz = (edge / scale for edge in usual.band_hz)
     if modes_hz:
         low_hz, high_hz = min(low_hz, modes_hz[0] / 2), max(high_hz, 1.25 * modes_hz[3])
+    low_hz, high_hz = float(f"{low_hz:.3g}"), float(f"{high_hz:.3g}")
     if high_hz >= rate_hz / 2 and _USABLE * rate_hz > low_hz:
         high_hz = _USABLE * rate_hz
     found: dict[str, object] = {} if (low_hz, high_hz) == usual.band_hz else {"band_hz": (low_hz, high_hz)}

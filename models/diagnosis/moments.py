@@ -165,7 +165,7 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False,
     segment = round(window.segment_s * rate_hz)
     lag_step = round(window.lag_step_s * rate_hz)
     lags = np.arange(0, round(window.lag_to_s * rate_hz) + 1, lag_step)
-    first, last = (round(edge * window.segment_s) for edge in window.band_hz)
+    first, last = (max(1, round(edge * window.segment_s)) for edge in window.band_hz)  # a mean is no vibration
     preamble = max(int(lags[-1]), segment // 2)
     # A snapshot has no history but its own beginning.
     hop = math.floor(machine.hop_data_s * rate_hz + 1e-6) - (0 if machine.schedule is None else preamble)

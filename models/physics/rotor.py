@@ -36,6 +36,11 @@ class KnownRotor(BaseModel, extra="forbid", frozen=True):
     def modes_hz(self) -> tuple[float, ...]:
         """Natural frequencies at rest and without damping, ascending, Hz; none where parameters are missing.
 
+        Raises
+        ------
+        ValueError
+            If parameters are so small or large that there are none.
+
         Examples
         --------
         >>> from models.machine import load_machine
@@ -45,9 +50,15 @@ class KnownRotor(BaseModel, extra="forbid", frozen=True):
         if self.unknown:
             return ()
         rotor = RotorParameters.model_validate(self, from_attributes=True)
-        root = 1 / np.sqrt(np.diag(M_matrix(rotor)))
-        squares = np.linalg.eigvalsh(Q_matrix(rotor) * np.outer(root, root))
-        return tuple(float(one) for one in np.sqrt(np.maximum(squares, 0)) / (2 * np.pi))
+        try:
+            with np.errstate(divide="raise", over="raise", invalid="raise"):
+                root = 1 / np.sqrt(np.diag(M_matrix(rotor)))
+                squares = np.linalg.eigvalsh(Q_matrix(rotor) * np.outer(root, root))
+        except (ArithmeticError, np.linalg.LinAlgError):
+            squares = np.zeros(1)
+        if squares[0] <= 0:
+            raise ValueError("[rotor] has no natural frequencies: expected masses, lengths and stiffness of a machine")
+        return tuple(float(one) for one in np.sqrt(squares) / (2 * np.pi))
 
 
 class RotorParameters(KnownRotor):

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from models.diagnosis.moments import plan_for
 from models.errors import MachineFileError
 from models.machine import Machine, load_machine, load_machine_file
 from models.physics.response import synchronous_response
 from models.physics.rotor import PARAMETERS, changed, system_A
-from models.stream_settings import WindowSettings
+from models.stream_settings import WindowSettings, time_scale
 
 LAB = (Path(__file__).parents[2] / "models" / "machines" / "lab.toml").read_text(encoding="utf-8")
 
@@ -150,6 +151,50 @@ def test_a_window_that_is_given_is_taken(tmp_path: Path) -> None:
     assert (given.window.hop_s, given.window.length_s, given.window.segment_s) == (10, 120, 2)
     assert (given.window.lag_from_s, given.window.lag_to_s) == (0.01, 0.05)
     assert given.window.band_hz[1] > 1000
+
+
+@pytest.mark.parametrize("given", ["hop_s = 1.0", "segment_s = 1.0", "max_span_s = 120.0"])
+def test_a_slow_machine_whose_file_gives_one_length_has_the_usual_others(tmp_path: Path, given: str) -> None:
+    """Longer lags would not go into a hop that is given, nor a longer window into a span that is."""
+    window = load_machine(write(tmp_path, in_time(0.01, 200.0, "[window]", given))).window
+    usual = WindowSettings()
+    assert (window.length_s, window.lag_to_s) == (usual.length_s, usual.lag_to_s)
+
+
+@pytest.mark.parametrize("lag_to_s", [0.1, 0.125])
+def test_lags_of_a_usual_machine_that_are_given_are_what_a_fast_one_is_evaluated_by(
+    tmp_path: Path, lag_to_s: float
+) -> None:
+    """What was commissioned with such a file before goes on as it was."""
+    text = SENSORS_ALONE.replace("2000", "25600") + "[operation]\nspeed_rpm = 6000\n"
+    assert load_machine_file(write(tmp_path, text)).time_scale == 0.5
+    given = load_machine_file(write(tmp_path, f"{text}[window]\nlag_from_s = 0.01\nlag_to_s = {lag_to_s}\n"))
+    assert given.time_scale == 1
+
+
+def test_the_usual_window_is_near_enough_for_a_machine_a_little_off() -> None:
+    assert [time_scale((), rpm / 60) for rpm in (3600, 3750, 4200)] == [1, 1, 0.71]
+    assert [time_scale((low, low, 80.0, 80.0), None) for low in (6.0, 5.0, 4.0)] == [1, 1, 1.5]
+    # As slow as the slowest motion, as far as the fastest lets it.
+    assert [time_scale((0.5, 0.5, high, high), None) for high in (8.0, 40.0, 100.0, 120.0)] == [12, 3, 1, 1]
+
+
+def test_the_longest_segments_are_whole_numbers_of_samples_at_any_rate(tmp_path: Path) -> None:
+    assert 117 < load_machine(write(tmp_path, in_time(0.0035, 33.345))).window.segment_s < 120
+
+
+def test_a_rotor_without_natural_frequencies_is_refused(tmp_path: Path) -> None:
+    text = LAB.replace("shaft_length_m = 0.15", "shaft_length_m = 1e-200")
+    with pytest.raises(MachineFileError, match=r"\[rotor\] has no natural frequencies"):
+        load_machine(write(tmp_path, text))
+
+
+def test_the_mean_is_no_part_of_the_band(tmp_path: Path) -> None:
+    """Snapshots of a slow machine may be too short for segments that tell its slowest motion from rest."""
+    text = in_time(0.05, 200.0, "[schedule]", "on_s = 2.0", "every_s = 60.0")
+    machine = load_machine(write(tmp_path, text))
+    assert round(machine.window.band_hz[0] * machine.window.segment_s) == 0
+    assert plan_for(machine).bins[0] == 1
 
 
 def test_where_the_rotor_is_not_known_a_fast_speed_says_so_and_a_slow_one_nothing(tmp_path: Path) -> None:
