@@ -20,7 +20,7 @@ from models.diagnosis.window import WindowStatistics
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETER_TEXT
 from models.signals.channels import with_channel_names
-from models.stream_settings import time_scale
+from models.stream_settings import NEAR, time_scale
 from rotorwatch.records.windows import SensorFault
 
 _FEWEST_HOPS = 8
@@ -31,7 +31,6 @@ _STEADY_LEVEL = 2.0  # ratio of the rms between the halves of a recording; chanc
 SAME_SPEED = 0.03  # relative difference within which speeds count as one
 _MOST_OUTSIDE = 0.8  # share of healthy windows outside a theory beyond which it is not the machine's
 _RATE = 1e-3  # probability that a healthy machine fails a comparison of its own windows
-_SUITED = 0.8  # of the time scale that a machine's speed asks for: within this its windows are near enough
 # Part of the limit from which a parameter's alarm is raised, within which a difference is none that matters. Sensors
 # are calibrated to some per cent, and where one force moves everything, standard errors are less than a thousandth.
 _MATTERS = 1 / 3
@@ -113,16 +112,20 @@ def check_sensors_of(
 def check_speed_given(machine: MachineFile, windows: Sequence[WindowStatistics]) -> Check | None:
     """Refusal of a machine that turns so fast that other windows suit it, where its file does not say so."""
     speeds = [window.speed_rad_s / (2 * np.pi) for window in windows if np.isfinite(window.speed_rad_s)]
-    fastest_hz = max(speeds, default=0.0)
+    fastest_hz = max(map(abs, speeds), default=0.0)  # an angle that falls is a matter of its own
     modes_hz = () if machine.rotor is None else machine.rotor.modes_hz
-    if time_scale(modes_hz, fastest_hz) > _SUITED * machine.time_scale:
+    stated_hz, tolerance = 0.0, 0.0
+    if machine.operation is not None:
+        stated_hz, tolerance = machine.operation.speed_rpm / 60, machine.operation.speed_tolerance
+    suited = time_scale(modes_hz, fastest_hz) >= NEAR * time_scale(modes_hz, stated_hz)
+    if suited or fastest_hz <= stated_hz * (1 + tolerance):
         return None
     return Check(
         name="window settings",
         verdict="refused",
         text=f"the shaft turns at {60 * fastest_hz:.0f} rpm, and the windows are those of a slower machine",
-        advice=f"give speed_rpm = {60 * fastest_hz:.0f} in [operation] of the machine file: what [window] leaves out "
-        "follows from it; the recordings can stay",
+        advice=f"give speed_rpm = {60 * fastest_hz:.0f} in [operation] of the machine file, and where its speed varies "
+        "speed_tolerance: what [window] leaves out follows from it; the recordings can stay",
     )
 
 
@@ -348,7 +351,10 @@ def _compared(
     rate = _RATE / len(readable)
     isolations = [isolate_window(each, rate) for each in readable]
     differ = [
-        (name, _difference(each, name)) for each, one in zip(readable, isolations, strict=True) for name in one.changed
+        (reading.name, reading.relative_change or 0.0)
+        for each, one in zip(readable, isolations, strict=True)
+        for reading in each.evaluable
+        if reading.name in one.changed
     ]
     named = Counter(name for name, by in differ if abs(by) > _MATTERS * machine.alarms.for_parameter(name).raise_above)
     outside = sum(one.outside for one in isolations)
@@ -382,10 +388,3 @@ def _compared(
     worst_z = max(abs(r.z or 0.0) for each in readable for r in each.evaluable)
     text = f"no difference {between}: at most {worst_z:.1f} standard errors in {len(readable)} windows"
     return Check(name=name, verdict="passed", text=text)
-
-
-def _difference(diagnosis: Diagnosis, name: str) -> float:
-    """Relative difference; of the unbalance, which may only have turned, the size of its vector's."""
-    if name == "e" and diagnosis.unbalance is not None:
-        return diagnosis.unbalance.change
-    return next(one.relative_change or 0.0 for one in diagnosis.evaluable if one.name == name)

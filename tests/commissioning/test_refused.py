@@ -282,9 +282,18 @@ def test_a_machine_that_is_no_such_rotor_is_told_the_cure() -> None:
     assert "leave [rotor] out of the machine file" in verdict_of(made, "agrees with the identified rotor")[2]
 
 
-@pytest.mark.parametrize(("rpm", "given", "refused"), [(3300, False, False), (6600, False, True), (6600, True, False)])
-def test_a_fast_machine_has_to_say_so(rpm: float, given: bool, refused: bool) -> None:
-    machine = NOTHING.model_copy(update={"operation": Operation(speed_rpm=rpm) if given else None})
+@pytest.mark.parametrize(
+    ("rpm", "given", "refused"),
+    [
+        (3600, None, False),
+        (6600, None, True),
+        (6600, Operation(speed_rpm=3000), True),
+        (6600, Operation(speed_rpm=6600), False),
+        (6600, Operation(speed_rpm=4500, speed_tolerance=0.6), False),  # of a drive with variable speed
+    ],
+)
+def test_a_fast_machine_has_to_say_so(rpm: float, given: Operation | None, refused: bool) -> None:
+    machine = NOTHING.model_copy(update={"operation": given})
     windows = [replace(window, speed_rad_s=rpm * np.pi / 30) for window in windows_of(healthy(NOTHING, HEALTHY_S, 55))]
     found = check_speed_given(machine, windows)
     assert (found is not None) == refused
@@ -298,6 +307,7 @@ def test_a_fast_machine_has_to_say_so(rpm: float, given: bool, refused: bool) ->
 @pytest.mark.parametrize(("turned_rad", "verdict"), [(0.02, "passed"), (0.2, "refused")])
 def test_an_unbalance_that_is_elsewhere_differs_by_its_vector(turned_rad: float, verdict: str) -> None:
     vector = UnbalanceVector(np.cos(turned_rad), np.sin(turned_rad), 1e-7, 0.0, 1e-7)
-    read = (parameter_reading("e", "likelihood", vector.magnitude_change, 3e-4, vector),)
+    change = vector.change if vector.turned else vector.magnitude_change
+    read = (parameter_reading("e", "likelihood", change, 3e-4, vector),)
     diagnoses = [Diagnosis("likelihood", read, misfit_z=0.0, unbalance=vector)] * 6
     assert check_agreement(LAB, diagnoses, "the parameters in the file").verdict == verdict
