@@ -152,6 +152,7 @@ class _Spawned:
 
 
 def _run(settings: ServiceSettings, inner: LinkSettings, connection: Connection) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):  # meant for whoever started this process, and decides when it ends
+    # Meant for whoever started this process, and decides when it ends.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     run_shard(settings, inner, connection)

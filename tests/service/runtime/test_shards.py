@@ -218,6 +218,10 @@ def test_processes_end_with_the_monitor_that_started_them(tmp_path: Path) -> Non
         own = {one: Path(f"/proc/{one}/cmdline").read_bytes() for one in children_of(monitor.process.pid)}
         started = [one for one, command in own.items() if b"spawn_main" in command]  # to share its machines
         assert len(started) == 2
+        # A terminal that is closed tells all of its processes; the monitor alone decides when these end.
+        states = [Path(f"/proc/{one}/status").read_text().partition("SigIgn:")[2].split()[0] for one in started]
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            assert all(int(ignored, 16) >> (number - 1) & 1 for ignored in states)
         monitor.kill()
     until(lambda: not any(Path(f"/proc/{one}").exists() for one in started), "end of all processes")
     with running(plan) as runtime:  # which has their machines at once
