@@ -188,6 +188,8 @@ def default_window(
     if modes_hz:
         low_hz, high_hz = min(low_hz, modes_hz[0] / 2), max(high_hz, 1.25 * modes_hz[3])
     low_hz, high_hz = float(f"{low_hz:.3g}"), float(f"{high_hz:.3g}")
+    if 2 * low_hz > _USABLE * rate_hz:  # the rate shows nothing of that: levels are left
+        scale, (low_hz, high_hz) = 1.0, usual.band_hz
     if high_hz >= rate_hz / 2 and _USABLE * rate_hz > low_hz:
         high_hz = _USABLE * rate_hz
     found: dict[str, object] = {} if (low_hz, high_hz) == usual.band_hz else {"band_hz": (low_hz, high_hz)}

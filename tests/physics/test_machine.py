@@ -216,3 +216,13 @@ def test_snapshots_of_a_fast_machine_have_its_band_and_lags(tmp_path: Path) -> N
     assert (window.hop_s, window.length_s, window.segment_s) == (60, 720, 1)
     assert window.band_hz == (15, 750)
     assert (window.lag_from_s, window.lag_to_s) == pytest.approx((0.002, 0.025))
+
+
+@pytest.mark.parametrize(("rpm", "rate_hz"), [(15000, 60.0), (60000, 100.0), (60000, 50.0)])
+def test_a_rate_that_shows_nothing_of_a_fast_machine_still_goes_with_the_usual_window(
+    tmp_path: Path, rpm: int, rate_hz: float
+) -> None:
+    text = SENSORS_ALONE.replace("2000.0", repr(rate_hz)) + "[operation]\nspeed_rpm = "
+    machine = load_machine_file(write(tmp_path, f"{text}{rpm}\n"))
+    assert machine.window == load_machine_file(write(tmp_path, f"{text}1500\n")).window
+    assert machine.time_scale == 1
