@@ -87,12 +87,27 @@ class UnbalanceVector:
     # Why what turns with the shaft is not what an unbalance makes, so that none of this should be believed; empty if it
     # is.
     foreign: str = ""
+    directed: bool = True  # whether its direction says something
 
     def widened(self, variance: float) -> "UnbalanceVector":
         """Return the same with an error added to both parts."""
         return replace(
             self, variance_real=self.variance_real + variance, variance_imaginary=self.variance_imaginary + variance
         )
+
+    def read_as(self, change: float, own: float) -> "UnbalanceVector":
+        """Return the same as large as e is read: a window that is astride a change shows a part of it.
+
+        Parameters
+        ----------
+        change, own : float
+            Relative change of e as read, and as the window by itself says; see `parameter_reading`.
+        """
+        if self.moved:
+            part = change / own if own else 1.0
+            return replace(self, real=1 + part * (self.real - 1), imaginary=part * self.imaginary)
+        part = abs((1 + change) / (1 + own)) if own != -1 else 1.0
+        return replace(self, real=part * self.real, imaginary=part * self.imaginary)
 
     @property
     def magnitude_change(self) -> float:
@@ -124,6 +139,12 @@ class UnbalanceVector:
         size = math.hypot(self.real, self.imaginary)
         turn = math.hypot(self.real - size, self.imaginary)
         return turn > max(_TURNED * size * math.radians(self.turned_error_deg), _LEAST_TURN)
+
+    @property
+    def moved(self) -> bool:
+        """Whether most of the change is the turn, so that what is read as e is the size of the vector of change."""
+        size = math.hypot(self.real, self.imaginary)
+        return self.directed and self.turned and math.hypot(self.real - size, self.imaginary) > abs(size - 1)
 
     @property
     def change(self) -> float:

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtri
 
 from models.diagnosis.likelihood.motions import BinGroups
 from models.diagnosis.likelihood.spectral_model import STRUCTURAL, ModelPoint, SpectralModel
@@ -18,6 +19,11 @@ from models.diagnosis.readings import UnbalanceVector, foreign_rotation
 from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray
+
+# Probability that vectors of one unbalance contradict each other by chance, and the least error that is tried where
+# they do.
+_CHANCE, _LEAST_ERROR = 1e-3, 1e-3
+_HALVINGS = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,14 +54,13 @@ class UnbalanceRatios:
         """Take that of the descriptions which holds, see this module; the size alone where directions say nothing."""
         known, real, imaginary = self.values.tolist()
         variances = float(self.variances[1]), self.between, float(self.variances[2])
-        vector = UnbalanceVector(real, imaginary, *variances, self.foreign)
-        size = math.hypot(real, imaginary)
-        turn, turned = math.hypot(real - size, imaginary), vector.turned
-        if directed and not turned and known > 0:
+        vector = UnbalanceVector(real, imaginary, *variances, self.foreign, directed)
+        if directed and not vector.turned and known > 0:
             return Unbalance(known - 1, float(self.variances[0]), self.covariance[0], vector, self.weights)
-        if directed and turned and turn > abs(size - 1):
+        if vector.moved:
             along = np.array([real - 1, imaginary]) / vector.change
             return Unbalance(vector.change, vector.change_error**2, along @ self.covariance[1:], vector, self.weights)
+        size = math.hypot(real, imaginary)
         along = np.array([real, imaginary]) / size
         return Unbalance(size - 1, vector.magnitude_error**2, along @ self.covariance[1:], vector, self.weights)
 
@@ -110,10 +115,14 @@ def estimate_unbalance(
     g2, turned2, q2 = (np.concatenate([part.real, part.imag]) for part in (g, turned, q))
     values, variances, with_structural = np.empty(3), np.empty(3), np.empty((3, len(STRUCTURAL)))
     between = 0.0
+    shifts = np.stack(slopes) * ratio
+    J = np.concatenate([shifts.real, shifts.imag], axis=1).T
+    size = np.maximum(np.abs(q), np.abs(g))
+    apart = _contradiction(q2, np.stack([g2, turned2], axis=1), own + J @ covariance @ J.T, size)
     for design, at, expected in ((g2[:, None], [0], ratio.real), (np.stack([g2, turned2], axis=1), [1, 2], ratio)):
         shifts = np.stack(slopes) * expected
         J = np.concatenate([shifts.real, shifts.imag], axis=1).T
-        total = own + J @ covariance @ J.T
+        total = own + J @ covariance @ J.T + apart
         weight = np.linalg.solve(total, design).T
         precision = weight @ design
         if not precision[0, 0] > 0:
@@ -123,11 +132,45 @@ def estimate_unbalance(
         variances[at] = np.diag(spread)
         with_structural[at] = -spread @ (weight @ J) @ covariance
         between = float(spread[0, -1])
-    foreign = foreign_rotation(q2, design @ values[1:], total)
+    foreign = foreign_rotation(q2, design @ values[1:], total - apart)
     if foreign:
         foreign = f"{machine.name}: the 1× vibration is not what an unbalance causes on this rotor: {foreign}"
     weights = np.asarray(weighted.conj() @ combined[0] / total_weight, dtype=np.complex128)
     return UnbalanceRatios(values, variances, between, with_structural, foreign, weights)
+
+
+def _contradiction(observed: FloatArray, design: FloatArray, spread: FloatArray, size: FloatArray) -> FloatArray:
+    """Covariance of the least relative error of every vector with which they are those of one unbalance; none mostly.
+
+    Run-out and gains that are a little off are no chance, and weights for chance alone, which where one force shakes
+    the machine are large and of either sign, make many times as much of them (R. C. Paule and J. Mandel, Journal of
+    Research of the National Bureau of Standards 87 (1982)).
+
+    Parameters
+    ----------
+    observed : ndarray, shape (2n,)
+        Real parts of the vectors, then imaginary ones.
+    design : ndarray, shape (2n, 2)
+        Those of the nominal unbalance, and of it turned by 90°.
+    spread : ndarray, shape (2n, 2n)
+        Covariance of what was observed, by chance.
+    size : ndarray, shape (n,)
+        What the error is relative to.
+    """
+    relative = np.diag(np.tile(size**2 / 2, 2))
+
+    def chi2(variance: float) -> float:
+        weighted = np.linalg.solve(spread + variance * relative, np.column_stack([observed, design]))
+        to_fit = design.T @ weighted
+        return float(observed @ weighted[:, 0] - to_fit[:, 0] @ np.linalg.solve(to_fit[:, 1:], to_fit[:, 0]))
+
+    most, low, high = float(chdtri(max(1, observed.size - 2), _CHANCE)), _LEAST_ERROR**2, 1.0
+    if observed.size <= design.shape[1] or chi2(0.0) <= most:
+        return 0 * relative
+    for _ in range(_HALVINGS):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if chi2(middle) > most else (low, middle)
+    return high * relative
 
 
 def estimate_unbalance_by_hop(

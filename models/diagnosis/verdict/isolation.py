@@ -189,4 +189,6 @@ def reading_of(stretch: Stretch, name: str, by: str, value: float, error: float)
     if name != "e":
         return possible_reading(name, by, from_scale(name, value), error * slope(name, value))
     # Where errors put an unbalance that is all but gone below none, it is as much of one on the other side.
-    return possible_reading(name, by, abs(1 + value) - 1, error, stretch.unbalance)
+    own = float(stretch.estimate()[0][stretch.names.index(name)])
+    vector = None if stretch.unbalance is None else stretch.unbalance.read_as(value, own)
+    return possible_reading(name, by, abs(1 + value) - 1, error, vector)

@@ -8,8 +8,9 @@ import pytest
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.motions import integrated
-from models.diagnosis.readings import Diagnosis, UnbalanceVector
-from models.diagnosis.verdict.isolation import isolate_window
+from models.diagnosis.readings import Diagnosis, UnbalanceVector, parameter_reading
+from models.diagnosis.verdict.isolation import isolate_window, reading_of
+from models.diagnosis.verdict.stretch import stretch_of
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine, load_machine
 from models.signals.block import FloatArray
@@ -97,6 +98,31 @@ def test_vectors_that_no_unbalance_makes_are_not_read_as_one() -> None:
     verdict = isolate_window(diagnosis, 0.001)
     assert "e" not in verdict.changed
     assert not verdict.outside
+
+
+@pytest.mark.parametrize(("number", "layout", "e"), [(4, Layout.INDEPENDENT, 0.0), (8, Layout.ONE_SOURCE, 0.4)])
+def test_run_out_is_no_more_of_an_unbalance_than_it_is(number: int, layout: Layout, e: float) -> None:
+    """Every sensor shows 1x that is 5 % off, in a direction of its own: weights of chance alone made it 23 and 14 %."""
+    window = drawn(number, e, layout)
+    off = 0.05 * np.exp(1j * np.random.default_rng(number).uniform(0, 2 * np.pi, len(window.states)))
+    reading, vector = e_of(replace(window, synchronous=sure(window.synchronous) * (1 + off)))
+    assert not vector.foreign
+    assert sure(reading.relative_change) == pytest.approx(e, abs=0.05 * (1 + e))
+
+
+@pytest.mark.parametrize("turn", [0.0, 60.0])
+def test_the_vector_is_as_large_as_what_is_read_of_a_window_astride_a_change(turn: float) -> None:
+    """Half of the window is from after the change: half of it is in the window's vector, and all of it is told."""
+    new = 1.8 * np.exp(1j * np.radians(turn)) if not turn else np.exp(1j * np.radians(turn))
+    half = (1 + new) / 2
+    vector = UnbalanceVector(half.real, half.imag, 1e-6, 0.0, 1e-6)
+    own = vector.change if turn else half.real - 1
+    diagnosis = Diagnosis("likelihood", (parameter_reading("e", "likelihood", own, 1e-3, vector),), unbalance=vector)
+    reading = reading_of(stretch_of(diagnosis, 0, 60 * 10**9), "e", "likelihood", abs(new - 1), 1e-3)
+    told = sure(reading.vector)
+    assert told.change == pytest.approx(sure(reading.relative_change))
+    assert told.magnitude_change == pytest.approx(abs(new) - 1, abs=1e-9)
+    assert f"a vector of {100 * abs(new - 1):.0f} %" in told.text
 
 
 @pytest.mark.slow
