@@ -64,7 +64,7 @@ class AccessSettings(BaseModel, extra="forbid", frozen=True):
     @classmethod
     def _lower_case(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
         for host in hosts:
-            if not re.fullmatch(r"[\w.-]+(:\d+)?", host) and not is_address(host.strip("[]")):
+            if not re.fullmatch(r"[\w.-]+(:\d+)?", host) and not is_address(re.sub(r"^\[(.*)\](:\d+)?$", r"\1", host)):
                 raise ValueError(f"{host!r} is not a host name, expected one such as monitor.plant.example")
         return tuple(host.lower() for host in hosts)
 

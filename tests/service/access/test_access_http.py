@@ -177,10 +177,11 @@ def test_another_page_changes_nothing_even_with_a_token(monitor: Guarded) -> Non
 
 
 def test_our_own_page_may(tmp_path: Path) -> None:
-    with guarded(tmp_path, AccessSettings(hosts=("plant.example",))) as monitor:
+    with guarded(tmp_path, AccessSettings(hosts=("plant.example", "[2001:db8::1]:8443"))) as monitor:
         ours: tuple[dict[str, str], ...] = (
             {"origin": monitor.url, "sec-fetch-site": "same-origin"},
             {"origin": "https://plant.example"},
+            {"origin": "https://[2001:db8::1]:8443"},
             {},
         )
         with monitor.client(monitor.token(*Scope)) as client:
