@@ -419,17 +419,14 @@ def _check_prefix(option: str, prefix: str) -> None:
 
 
 def link_of(connect: list[str] | None, listen: list[str] | None, link: Path | None = None) -> "LinkSettings":
-    """Link settings of a command line that names endpoints, or none, or of a file, whose endpoints they replace."""
+    """Link settings of a command line, or of a file whose endpoints and role those of the command line replace."""
     from models.mistakes import checked  # noqa: PLC0415  # keeps --help quick
     from models.signals.link import LinkSettings, load_link  # noqa: PLC0415
 
+    ends = {"mode": "peer" if listen else "client", "listen": tuple(listen or ()), "connect": tuple(connect or ())}
     if link is not None:
-        given = {name: tuple(ends) for name, ends in (("connect", connect), ("listen", listen)) if ends}
-        return load_link(link).model_copy(update=given)
-    ends: dict[str, object] = {"mode": "client", "connect": connect or [ENDPOINT]}
-    if listen:
-        ends = {"mode": "peer", "listen": listen, "connect": connect or []}
-    return checked(LinkSettings, ends, "command line")
+        return load_link(link).model_copy(update=ends if listen or connect else {})
+    return checked(LinkSettings, ends if listen or connect else ends | {"connect": (ENDPOINT,)}, "command line")
 
 
 def _announce(plan: "NetworkPlan") -> None:

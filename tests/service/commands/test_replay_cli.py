@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from models.signals.recording import read_recording
+from service.commands.replay import link_of
 from simulator.scenario import parse_fault
 from tests.service.rig.live import LAB, endpoint, machine_file, program, scenario_blocks, until
 from tests.service.rig.preloaded import rotorwatch
@@ -138,3 +139,14 @@ def test_nobody_to_connect_to_is_exit_code_1(faulty: Path) -> None:
     found = run(faulty, "--connect", endpoint())
     assert found.returncode == 1
     assert "nothing answers there" in found.stderr
+
+
+def test_endpoints_of_the_command_line_replace_those_of_a_link_file(tmp_path: Path) -> None:
+    """All of them: who connects elsewhere with the file of a router does not listen where the router does."""
+    file, here, there = tmp_path / "link.toml", "tcp/127.0.0.1:7001", "tcp/127.0.0.1:7002"
+    file.write_text(f'[link]\nmode = "router"\nlisten = ["{here}"]\nmax_message_mb = 3\n', encoding="utf-8")
+    ends = [(one.mode, one.listen, one.connect) for one in (
+        link_of(None, None, file), link_of([there], None, file), link_of(None, [there], file)
+    )]  # fmt: skip
+    assert ends == [("router", (here,), ()), ("client", (), (there,)), ("peer", (there,), ())]
+    assert link_of([there], None, file).max_message_mb == 3
