@@ -310,9 +310,10 @@ def load_commissioned(directory: Path, machine: MachineFile, *, same_description
     now = described(machine)
     different = [name for name in sorted(now) if now[name] != found.described.get(name)]
     if same_description and different:
+        left_out = " (what [window] leaves out may be chosen otherwise since)"
         raise BundleError(
             f"{path}: {', '.join(different)} in the machine file of {machine.title} differ from what was "
-            "commissioned: commission the machine again"
+            f"commissioned{left_out if 'window' in different else ''}: commission the machine again"
         )
     return found
 

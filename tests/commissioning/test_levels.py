@@ -221,6 +221,9 @@ def test_a_bundle_is_refused_for_another_machine_or_when_damaged(tmp_path: Path)
     fewer = NOTHING.model_copy(update={"sensors": NOTHING.sensors[1:]})
     with pytest.raises(BundleError, match=r"sensors in the machine file of demo/lab differ.*commission"):
         load_commissioned(tmp_path, fewer)
+    shorter = NOTHING.model_copy(update={"window": NOTHING.window.model_copy(update={"lag_to_s": 0.12})})
+    with pytest.raises(BundleError, match=r"window in the .* \(what \[window\] leaves out may be chosen otherwise"):
+        load_commissioned(tmp_path, shorter)
     first, *others = NOTHING.model_dump()["sensors"]
     rolled = NOTHING.model_dump() | {"sensors": [first | {"slow_roll_um_pp": 5.0, "slow_roll_phase_lag_deg": 40.0}]}
     rolled["sensors"] += others
