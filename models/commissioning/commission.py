@@ -85,7 +85,7 @@ class ParameterSummary(BaseModel, extra="forbid", frozen=True):
     detectable_gain: float | None = None
     wished: float | None = Field(default=None, description="change that is wished to be found, either sign")
     window_s_for_wished: float | None = Field(default=None, description="window that this takes")
-    healthy_s_for_wished: float | None = Field(default=None, description="healthy data that this takes besides")
+    healthy_s_for_wished: float | None = Field(default=None, description="healthy data that this takes in addition")
     readings: tuple[HealthyReading, ...] = ()
 
 

@@ -58,8 +58,8 @@ class LevelSettings(BaseModel):
         default="",
         max_length=200,
         exclude_if=lambda text: not text,  # machine files from before keep their hash
-        description="since when first windows count, and why, such as '2026-11-25, new bearing': with another text "
-        "they are taken anew",
+        description="since when first windows count, and why, such as '2026-11-25, new bearing': with another "
+        "text they are taken again",
     )
 
     @model_validator(mode="after")

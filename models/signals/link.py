@@ -259,8 +259,8 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
     )
     without_grants: bool = Field(
         default=False,
-        description="whoever may connect from other computers may do everything; without grants, monitor and router "
-        "listen on no other endpoint than this computer's own unless this is true",
+        description="anyone who can connect from other computers may do everything; without grants, monitor "
+        "and router listen only on this computer's own endpoints unless this is true",
     )
 
     @model_validator(mode="before")

@@ -46,8 +46,8 @@ def tls_context(tls: HttpTlsSettings) -> ssl.SSLContext:
             _check_readable(name, path)
     if tls.key.stat().st_mode & _READABLE_BY_OTHERS:
         raise MachineFileError(
-            f"{tls.key}: tls.key is readable by every user of this computer: chmod 600 {tls.key}, and have the "
-            "certificate issued anew if others may have read it"
+            f"{tls.key}: tls.key is readable by every user of this computer: chmod 600 {tls.key}, and have "
+            "the certificate reissued if others may have read it"
         )
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2

@@ -116,8 +116,8 @@ def estimated_vectors(data: Sampled, channels: Sequence[Channel], between_rad_s:
         found = Vectors(*(getattr(found, field.name)[follows] for field in fields(Vectors))) if follows.any() else None
     if found is None:
         raise RotorwatchError(
-            f"{data.place}: no line between {low * 30 / np.pi:g} and {high * 30 / np.pi:g} rpm stands out of the "
-            f"vibration of {data.name} as that of its rotation would"
+            f"{data.place}: no line between {low * 30 / np.pi:g} and {high * 30 / np.pi:g} rpm stands out "
+            f"from the vibration of {data.name} as that of its rotation would"
         )
     return found
 

@@ -58,7 +58,7 @@ _METRICS = (
 
 def _sizeable(change: float) -> float:
     if abs(change) < _SMALLEST_CHANGE:
-        raise ValueError(f"{change:g} is no change that could be found, expected at least 0.000001 up or down")
+        raise ValueError(f"{change:g} is not a change that could be found, expected at least 0.000001 up or down")
     return change
 
 

@@ -77,7 +77,7 @@ def creation_hint(config: Path | None, history: "HistorySettings") -> str:
     command += ["--scope", "read", "--scope", "operate"]
     if config is not None:
         command += ["--config", str(config.absolute())]
-    said, prefix = "nobody has a token for it yet", ""
+    said, prefix = "no tokens exist for it yet", ""
     overridden = bool({"ROTORWATCH_HISTORY", "ROTORWATCH_HISTORY__URL"} & {name.upper() for name in os.environ})
     if overridden and urlsplit(history.database).password is not None:
         said += " (create one with ROTORWATCH_HISTORY__URL as it is here)"

@@ -437,4 +437,4 @@ def _announce(plan: "NetworkPlan") -> None:
         where = f"under {plan.prefix}" if plan.prefix else "on the original keys"
     typer.echo(f"replaying {names} {where}", err=True)
     if plan.prefix:
-        typer.echo(f"a monitor hears it with: rotorwatch run --namespace {plan.prefix_of(1)}", err=True)
+        typer.echo(f"a monitor receives it with: rotorwatch run --namespace {plan.prefix_of(1)}", err=True)

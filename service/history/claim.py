@@ -179,6 +179,6 @@ def _check(machine: str, of: str, record: StoredReport | StoredReading | StoredE
             try:
                 value.encode()
             except UnicodeEncodeError as error:
-                raise StoreError(f"{machine}: {of}: {value!r} is no valid text: {error.reason}") from error
+                raise StoreError(f"{machine}: {of}: {value!r} is not valid text: {error.reason}") from error
             if "\0" in value:
                 raise StoreError(f"{machine}: {of}: {value!r} holds a NUL character, which no text may")

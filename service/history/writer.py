@@ -205,7 +205,7 @@ class Writer:
             # As in `_write`: this thread must go on, and try again.
             self._fail(
                 self._claims,
-                f"{why or self._database.news}; it could not be begun anew: {self._database.failure(error)}",
+                f"{why or self._database.news}; a new one could not be begun: {self._database.failure(error)}",
             )
             return False
         _log.error("the history continues in another file", why=self._database.news)

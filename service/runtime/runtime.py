@@ -150,7 +150,7 @@ class Runtime:
             self._machines.connect(undo)
             self.store.open(set_aside=True)
             if self.store.lost:
-                _log.error("the history begins anew", why=self.store.lost)
+                _log.error("a new history is begun", why=self.store.lost)
             undo.callback(self.store.close)
             self._history_open = True
             # After the machines, whose last events they tell, and before the history that these are read from.

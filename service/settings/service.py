@@ -177,8 +177,8 @@ class FleetSettings(BaseModel, extra="forbid", frozen=True):
     """Where shards on other computers reach the process that serves their machines; only for ``rotorwatch fleet``."""
 
     listen: str = Field(
-        description='endpoint that all computers of the fleet reach, as "tcp/10.0.0.5:7448"; whoever connects has to '
-        "know a password that is made anew at each start"
+        description='endpoint that all computers of the fleet reach, as "tcp/10.0.0.5:7448"; clients need a '
+        "password that is generated at each start"
     )
     tls: TlsSettings | None = Field(default=None, description='certificates, if listen begins with "tls/"')
 

@@ -46,7 +46,7 @@ def parse_secret(text: str) -> bytes:
     except (binascii.Error, ValueError):
         key = b""
     if not text.startswith(PREFIX) or not _SHORTEST <= len(key) <= _LONGEST:
-        raise MachineFileError(f"this is no secret of a webhook, {_EXPECTED}")
+        raise MachineFileError(f"this is not a webhook secret, {_EXPECTED}")
     return key
 
 

@@ -396,7 +396,7 @@ def test_wrong_argument_is_a_problem_that_names_it(http: httpx.Client, query: st
 def test_a_change_too_small_to_be_one_is_refused(http: httpx.Client) -> None:
     for change in ("0", "1e-300", "-9e-7"):
         found = problem(http.get(f"{PLACE}/detectable?change={change}"), 422)
-        assert found.detail.endswith("is no change that could be found, expected at least 0.000001 up or down")
+        assert found.detail.endswith("is not a change that could be found, expected at least 0.000001 up or down")
     tiny = answered(http.get(f"{PLACE}/detectable?change=1e-6"), DetectableChanges)
     assert all(one.length_s is not None and one.length_s > 1e6 for one in tiny.parameters)
 

@@ -184,7 +184,7 @@ def test_events_that_contradict_the_log_are_refused_with_their_step(lab: Machine
     ("step", "message"),
     [
         (Step(events=(alarm_event(0, text="a\0b"),)), "alarm event 0: .* holds a NUL character"),
-        (Step(events=(alarm_event(0, actor="\ud800"),)), "alarm event 0: .* is no valid text"),
+        (Step(events=(alarm_event(0, actor="\ud800"),)), "alarm event 0: .* is not valid text"),
         (Step(events=(alarm_event(0, time_ns=-1),)), "alarm event 0: time_ns is -1, expected 0 or more"),
         (Step(readings=(StoredReading(T0, "misfit", "z", float("nan"), None),)), "misfit z: value is nan"),
         (Step(readings=(StoredReading(2**63, "misfit", "z", 0.0, None),)), "end_ns is 9223372036854775808"),
