@@ -76,7 +76,7 @@ _AlarmInterval = Annotated[
 
 _LowConfidence = Annotated[
     bool,
-    Field(description="the data are outside the model: take the parameter named here with reserve", examples=[False]),
+    Field(description="the data are outside the model: the parameter named here has low confidence", examples=[False]),
 ]
 
 _Note = Annotated[
@@ -122,18 +122,18 @@ class Alarm(Record):
     text: str = Field(description="what it is about, in words", examples=["bearing stiffness, horizontal"])
     state: AlarmState = Field(description=_STATE_TEXT, examples=["unacknowledged"])
     pending: bool = Field(
-        description="its condition has begun to show, and must last before it is raised", examples=[False]
+        description="its condition has begun, and must last for the on-delay before it is raised", examples=[False]
     )
     clearing: bool = Field(
-        description="its condition no longer shows, which must last before it clears", examples=[False]
+        description="its condition has ended, which must last for the off-delay before it clears", examples=[False]
     )
-    present: bool = Field(description="its condition is there, delays included", examples=[True])
+    present: bool = Field(description="its condition is present, delays included", examples=[True])
     raised: bool = Field(
-        description="its condition is there and operators are to see it: not shelved, suppressed or out of service",
+        description="its condition is present and shown to operators: not shelved, suppressed or out of service",
         examples=[True],
     )
     severity: Severity = Field(
-        description="of the present occurrence while its condition is there; otherwise of the last one",
+        description="of the present occurrence while its condition is present; otherwise of the last one",
         examples=["alert"],
     )
     since_ns: int = Field(description="data time at which `state` was entered", examples=[EXAMPLE_NS])
@@ -150,8 +150,8 @@ class Alarm(Record):
     out_of_service_by: str = Field(description="who took it out of service; empty otherwise", examples=[""])
     out_of_service_reason: str = Field(description="and why", examples=[""])
     version: int = Field(
-        description="sequence number of its latest event, -1 before the first; give it back with what you want done, "
-        "and it is done only if nothing has happened in between",
+        description="sequence number of its latest event, -1 before the first; send it back with an operation, "
+        "which is then done only if nothing has happened in between",
         examples=[0],
     )
 
@@ -183,8 +183,7 @@ class AlarmEventData(OfMachine):
     before: AlarmState = Field(description="state of the alarm before the event", examples=["normal"])
     state: AlarmState = Field(description="state after it", examples=["unacknowledged"])
     annunciated: bool = Field(
-        description="operators are to hear of it: the alarm is not shelved, suppressed or out of service",
-        examples=[True],
+        description="operators are notified: the alarm is not shelved, suppressed or out of service", examples=[True]
     )
     severity: Severity = Field(description="alert or danger", examples=["alert"])
     time_ns: int = Field(description="data time of the event", examples=[EXAMPLE_NS])
@@ -229,7 +228,7 @@ class AlarmCloudEvent(Record):
 class AlarmLogPage(OfMachine):
     """Part of a machine's alarm log, from a given sequence number on: the answer to a query on ``alarm/event``."""
 
-    events: tuple[AlarmCloudEvent, ...] = Field(description="events after the one asked for, in order, without a hole")
+    events: tuple[AlarmCloudEvent, ...] = Field(description="events after the one asked for, in order, without a gap")
     latest: int = Field(
         description="sequence number of the machine's latest event; -1 before the first. Ask again from the last event "
         "as long as it is smaller",

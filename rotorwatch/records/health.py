@@ -125,7 +125,7 @@ class Quality(Record):
         default=0, description="windows not evaluated because the monitor could not keep up", examples=[0]
     )
     link_missed_blocks: int = Field(
-        default=0, description="blocks lost on the way, as far as the link knows", examples=[0]
+        default=0, description="blocks lost in transit, as far as the link knows", examples=[0]
     )
     last_refusal: str = Field(
         default="",
@@ -141,7 +141,7 @@ class StreamStatus(Record):
     """What is known about whoever publishes the stream."""
 
     publisher_alive: bool = Field(
-        description="a publisher's liveliness token is there; publishers need not have one", examples=[True]
+        description="a publisher's liveliness token is present; publishers need not have one", examples=[True]
     )
     silent: bool = Field(
         description="no usable block for longer than `no_data_after_s` of the machine file", examples=[False]
@@ -154,8 +154,7 @@ class StreamStatus(Record):
         description="time since the last accepted block was processed; null before the first", examples=[0.04]
     )
     replay_announced: bool = Field(
-        description="somebody announces a replay on the machine's own keys; what is replayed is not evaluated",
-        examples=[False],
+        description="a replay is announced on the machine's own keys; replayed data are not evaluated", examples=[False]
     )
     descriptor_mismatch: tuple[str, ...] = Field(
         description="fields of the announced channel descriptor that differ from the machine file", examples=[()]
@@ -176,7 +175,7 @@ class Health(OfMachine):
         description="since when there are no data, and why nothing is said of the machine; empty otherwise",
         examples=[""],
     )
-    filled: float = Field(description="fraction of a full window that is there now", examples=[1.0])
+    filled: float = Field(description="fraction of a full window that is filled now", examples=[1.0])
     report: Report | None = Field(description="the latest window; null before the first hop")
     alarms: tuple[Alarm, ...] = Field(description="alarms that are not normal")
     sequence: int = Field(

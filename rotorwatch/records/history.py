@@ -126,17 +126,17 @@ class AuditRecord(Record):
 
     number: int = Field(description="counts the entries", examples=[291])
     at_ns: int = Field(
-        description="when the request arrived, this computer's time; the same for the entry before and after the deed",
+        description="when the request arrived, this computer's time; the same before and after the operation",
         examples=[EXAMPLE_NS],
     )
     actor: str = Field(description="name of the token; empty for nobody in particular", examples=["anna"])
     address: str = Field(description="where the request came from", examples=["127.0.0.1"])
     method: str = Field(description="HTTP method", examples=["POST"])
     path: str = Field(description="path of the request", examples=["/api/v1/machines/demo/lab/alarms/k_by/acknowledge"])
-    status: int = Field(description="HTTP status of the answer; 0 before the deed", examples=[200])
-    action: str = Field(description="what was meant, in one word; started before the deed", examples=["acknowledge"])
-    machine: str = Field(description="site/machine it was done to; empty if none", examples=["demo/lab"])
-    alarm: str = Field(description="alarm it was done to; empty if none", examples=["k_by"])
+    status: int = Field(description="HTTP status of the answer; 0 before the operation", examples=[200])
+    action: str = Field(description="operation, in one word; started before it is done", examples=["acknowledge"])
+    machine: str = Field(description="site/machine it concerns; empty if none", examples=["demo/lab"])
+    alarm: str = Field(description="alarm it concerns; empty if none", examples=["k_by"])
     reason: str = Field(description="why, or why it was refused", examples=["seen, inspection is ordered"])
 
 

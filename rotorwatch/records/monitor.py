@@ -22,7 +22,7 @@ class MachineReadiness(OfMachine):
     worker_errors: int = Field(description="blocks lost to an error inside the monitor", examples=[0])
     last_worker_error: str = Field(description="the latest of them; empty if none", examples=[""])
     worker_busy_s: float = Field(
-        description="how long the thread has been at work on the same block; more than 60 is a reason", examples=[0.0]
+        description="how long the thread has been working on the same block; more than 60 is a reason", examples=[0.0]
     )
     trouble: str = Field(
         description="why the machine is not monitored as it should be although data come in: no window has been "
@@ -170,19 +170,19 @@ class WebhookStatus(Record):
     target: str = Field(
         description="where it is, without path and query, which may hold a secret", examples=["https://pager.example"]
     )
-    machines: tuple[str, ...] = Field(description="machines it is told of", examples=[["*/*"]])
-    kinds: tuple[str, ...] = Field(description="kinds of event it is told of; all if empty", examples=[["raised"]])
-    severities: tuple[str, ...] = Field(description="severities it is told of; all if empty", examples=[[]])
+    machines: tuple[str, ...] = Field(description="machines whose events it receives", examples=[["*/*"]])
+    kinds: tuple[str, ...] = Field(description="kinds of event it receives; all if empty", examples=[["raised"]])
+    severities: tuple[str, ...] = Field(description="severities it receives; all if empty", examples=[[]])
     annunciated_only: bool = Field(
-        description="not told of alarms that are shelved, suppressed or out of service", examples=[True]
+        description="receives nothing of alarms that are shelved, suppressed or out of service", examples=[True]
     )
     state: Literal["working", "failing", "disabled"] = Field(
         description="failing: the latest attempt failed, and others will follow. disabled: the receiver has answered "
-        "410 Gone; it is tried again when the monitor is started again",
+        "410 Gone; it is retried when the monitor is restarted",
         examples=["working"],
     )
     pending: int = Field(
-        description="alarm events after the last one delivered, those included that will be left out", examples=[0]
+        description="alarm events after the last one delivered, including those that will be left out", examples=[0]
     )
     delivered: int = Field(description="events the receiver has taken", examples=[12])
     failed_attempts: int = Field(description="attempts at which it did not", examples=[1])

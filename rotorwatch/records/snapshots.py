@@ -30,7 +30,7 @@ class _OfWindow(OfMachine):
         description="oldest data in the window; null without one", examples=[EXAMPLE_NS - 60_000_000_000]
     )
     end_ns: int | None = Field(description="end of the newest data in the window", examples=[EXAMPLE_NS])
-    filled: float = Field(description="fraction of a full window that is there now", examples=[1.0])
+    filled: float = Field(description="fraction of a full window that is filled now", examples=[1.0])
     speed_rad_s: float | None = Field(
         description="mean speed in the window; null if it is not known", examples=[138.23]
     )

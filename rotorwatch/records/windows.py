@@ -161,7 +161,7 @@ class Verdict(Record):
         "left out while nothing is seen",
     )
     low_confidence: bool = Field(
-        description="take what is said of parameters with reserve: outside the model, or several sets explain the data",
+        description="parameters have low confidence: outside the model, or several sets explain the data",
         examples=[False],
     )
     outside_model: bool = Field(

@@ -8,7 +8,7 @@ from rotorwatch.records.machines import Channel, DetectableChanges, DetectablePa
 from service.monitor.alarm_conversion import alarm_entries, rfc3339
 from service.monitor.reports import Identity, MachineHealth
 
-_REPLAYED = "a replay is announced on this machine's own keys: what is replayed is not evaluated"
+_REPLAYED = "a replay is announced on this machine's own keys: replayed data are not evaluated"
 
 
 def health(  # noqa: PLR0913  # what the worker counts

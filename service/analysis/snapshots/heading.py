@@ -28,7 +28,7 @@ class LatestData:
     """What a monitor holds at one moment; nothing in it is changed afterwards."""
 
     window: WindowStatistics | None = None  # the latest full window
-    filled: float = 0.0  # fraction of a full window that is there now
+    filled: float = 0.0  # fraction of a full window that is filled now
     # Readings of that window by the diagnostician that decides; empty if it was not evaluated.
     parameters: tuple[Parameter, ...] = ()
     why_not: str = ""  # why it was not evaluated
