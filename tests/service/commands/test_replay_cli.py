@@ -112,7 +112,7 @@ def test_files_that_cannot_be_used(tmp_path: Path, faulty: Path) -> None:
     other = [message for message in read_recording(faulty) if message.key != LAB.keys.stream]
     found = run(write(tmp_path / "empty.mcap", other), "--offline")
     assert found.returncode == 2
-    assert "empty.mcap: no sample blocks in there" in found.stderr
+    assert "empty.mcap: contains no sample blocks" in found.stderr
 
 
 def test_a_monitor_in_the_namespace_of_a_replay(faulty: Path, tmp_path: Path) -> None:
