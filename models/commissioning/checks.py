@@ -11,6 +11,7 @@ from pydantic import BaseModel, Field
 
 from models.commissioning.healthy import HealthyRecording, foreign_lines
 from models.diagnosis.baseline.relation import one_source
+from models.diagnosis.misfit import ACROSS
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.level import at_range_end
 from models.diagnosis.sensors.reference import Naming
@@ -29,6 +30,8 @@ _MUCH_REFUSED, _TOO_MUCH_REFUSED = 0.01, 0.2
 _STEADY_SPEED = 0.05
 _STEADY_LEVEL = 2.0  # ratio of the rms between the halves of a recording; chance alone reaches 1.3 in half a minute
 SAME_SPEED = 0.03  # relative difference within which speeds count as one
+# Part of the other plane's motion in a sensor, as of one that is mounted to two degrees, that is no other machine.
+_LITTLE = 0.035
 _MOST_OUTSIDE = 0.8  # share of healthy windows outside a theory beyond which it is not the machine's
 _RATE = 1e-3  # probability that a healthy machine fails a comparison of its own windows
 # Part of the limit from which a parameter's alarm is raised, within which a difference is none that matters. Sensors
@@ -375,10 +378,14 @@ def _compared(
             "one file for each speed or load",
         )
     if 2 * outside > len(readable):
+        across = sum(one.outside and _little_across(each) for each, one in zip(readable, isolations, strict=True))
+        other = outside - across > _MOST_OUTSIDE * len(readable)
+        suspect = Counter(each.suspect.partition(" (")[0] for each in readable if each.suspect).most_common(1)
+        why = "".join(f"; best explained by: {one}, in {count} of them" for one, count in suspect)
         return Check(
             name=name,
-            verdict="refused" if theory and outside > _MOST_OUTSIDE * len(readable) else "limited",
-            text=f"{outside} of {len(readable)} windows differ by more than chance explains, {between}",
+            verdict="refused" if theory and other else "limited",
+            text=f"{outside} of {len(readable)} windows differ by more than chance explains, {between}{why}",
             advice="give fewer parameters in [rotor], so that more is learned from the recordings",
         )
     if differ:
@@ -388,3 +395,10 @@ def _compared(
     worst_z = max(abs(r.z or 0.0) for each in readable for r in each.evaluable)
     text = f"no difference {between}: at most {worst_z:.1f} standard errors in {len(readable)} windows"
     return Check(name=name, verdict="passed", text=text)
+
+
+def _little_across(diagnosis: Diagnosis) -> bool:
+    """Whether what explains a window best is a sensor that shows a little of the other plane: it is taken off later."""
+    tried = () if diagnosis.goodness is None else diagnosis.goodness.alternatives
+    best = max(tried, key=lambda one: abs(one.z), default=None)
+    return best is not None and best.quantity == ACROSS and abs(best.change) < _LITTLE

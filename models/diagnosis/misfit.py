@@ -16,6 +16,7 @@ from scipy.special import chdtri, log_ndtr, ndtri
 from models.physics.rotor import impossible
 from models.signals.block import FloatArray
 
+ACROSS = "share"  # first word of what a sensor shows of its place's motion in the other plane
 UNEQUAL = "shaft stiffer in y than in z"
 _LEAST_SUSPECT_Z = 5.0
 _LEAST_SUSPECT = 5e-3  # no sensor and no machine file is truer than that, and with one source a tenth of it stands out

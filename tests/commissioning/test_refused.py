@@ -9,6 +9,7 @@ import pytest
 
 from models.commissioning.checks import check_agreement, check_lines, check_shapes, check_speed_given
 from models.commissioning.commission import Commissioning
+from models.diagnosis.misfit import AlternativeTest, Goodness
 from models.diagnosis.readings import Diagnosis, UnbalanceVector, parameter_reading
 from models.diagnosis.shape import HealthyShape, ShapeSpread
 from models.machine import MachineFile, Operation
@@ -279,7 +280,7 @@ def test_a_machine_that_is_no_such_rotor_is_told_the_cure() -> None:
     wrong = PARTIAL.model_copy(update={"rotor": sure(PARTIAL.rotor).model_copy(update=masses)})
     made = commissioned(wrong, healthy(wrong, 45.0, 41))
     assert refused(made)
-    assert "leave [rotor] out of the machine file" in verdict_of(made, "agrees with the identified rotor")[2]
+    assert "leave [rotor] out of the machine file" in verdict_of(made, "can be learned")[2]
 
 
 @pytest.mark.parametrize(
@@ -311,3 +312,20 @@ def test_an_unbalance_that_is_elsewhere_differs_by_its_vector(turned_rad: float,
     read = (parameter_reading("e", "likelihood", change, 3e-4, vector),)
     diagnoses = [Diagnosis("likelihood", read, misfit_z=0.0, unbalance=vector)] * 6
     assert check_agreement(LAB, diagnoses, "the parameters in the file").verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("tried", "change", "verdict"),
+    [
+        ("share of z1 in y1", 0.02, "limited"),
+        ("share of z1 in y1", 0.06, "refused"),
+        ("mass of the disc", 0.02, "refused"),
+    ],
+)
+def test_a_sensor_that_is_a_degree_off_its_axis_makes_no_other_machine(tried: str, change: float, verdict: str) -> None:
+    read = (parameter_reading("k_by", "likelihood", 0.0, 3e-4),)
+    goodness = Goodness(3.0, (AlternativeTest(tried, 12.0, change),), 2)
+    one = Diagnosis("likelihood", read, misfit_z=goodness.misfit_z, goodness=goodness, suspect=goodness.suspect)
+    check = check_agreement(LAB, [one] * 6, "the parameters in the file")
+    assert check.verdict == verdict
+    assert check.text.endswith(f"; best explained by: {tried}, in 6 of them")

@@ -1,9 +1,10 @@
 """Whether the theory explains a window at all: where not, parameters fitted to it mean nothing, and what else would.
 
 At the maximum of the likelihood every direction that the model does not have is tried by its score (C. R. Rao, Proc.
-Cambridge Phil. Soc. 44 (1948)): the gain of every channel, masses, a shaft that is stiffer in one plane than in the
-other. Each is standard normal where the model holds, and its one-step estimate says how large the thing would be. What
-no such direction explains shows in the total excess of estimated over theoretical spectra.
+Cambridge Phil. Soc. 44 (1948)): the gain of every channel, what it shows of the other plane, masses, a shaft that is
+stiffer in one plane than in the other. Each is standard normal where the model holds, and its one-step estimate says
+how large the thing would be. What no such direction explains shows in the total excess of estimated over theoretical
+spectra.
 """
 
 import math
@@ -13,7 +14,7 @@ import numpy as np
 from models.diagnosis.likelihood.motions import Mismatch
 from models.diagnosis.likelihood.scoring import Maximum, Weights, Whitened, inverse_factor
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed, twice_packed
-from models.diagnosis.misfit import UNEQUAL, AlternativeTest, Goodness
+from models.diagnosis.misfit import ACROSS, UNEQUAL, AlternativeTest, Goodness
 from models.diagnosis.moments import ComplexArray, through
 from models.diagnosis.readings import beyond
 from models.machine import Machine
@@ -24,6 +25,7 @@ from models.signals.block import FloatArray
 _SIGNS = np.kron([[1.0, 0.0], [0.0, -1.0]], np.ones((3, 3)))
 # In which degree of freedom of y; that of z is three further on.
 _MASSES = {"mass at the bearing": 0, "mass of the disc": 1, "inertia of the disc": 2}
+_OTHER_PLANE = str.maketrans("yz", "zy")
 # An alternative of which less than this is left beside the model's own parameters cannot be told from them.
 _LEAST_INFORMATION = 1e-4
 
@@ -90,6 +92,14 @@ def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tup
     names = [f"gain of {state}" for state in shares]
     outer = L_inverse.transpose(2, 0, 1)[..., None] * coloured.swapaxes(0, 1)[:, :, None]  # of every motion
     slopes = list(twice_packed(np.array([share[:, None, None] * outer[number] for number, share in shares.values()])))
+    # A sensor that is turned, or sensitive across its axis, shows a part of its place's motion in the other plane.
+    dofs, factor = model.motions.dofs.tolist(), model.motions.factor(model.centre, model.centre)
+    for state, (number, share) in shares.items():
+        if (dofs[number] + 3) % 6 in dofs:
+            other = dofs.index((dofs[number] + 3) % 6)
+            names.append(f"{ACROSS} of {state.translate(_OTHER_PLANE)} in {state}")
+            seen = (share * factor[:, number] / factor[:, other])[:, None]
+            slopes.append(twice_packed(L_inverse[:, :, number, None] * (seen * coloured[:, other])[:, None]))
     w2 = (2 * np.pi * model.groups.nodes_hz) ** 2
     rotor, sides = machine.rotor, model.sides(point, whitened, response)
     for (name, first), mass in zip(_MASSES.items(), (rotor.m1_kg, rotor.m2_kg, rotor.I2_kg_m2), strict=True):

@@ -26,6 +26,8 @@ _AS_GOOD = 0.98  # a shorter delay that fits this well is preferred: a narrow ba
 _LINE_FITS = 5.0
 _RUNOUT = 0.03  # logarithm of the gain by which the rotation must differ besides
 _TOLD_APART = 2 * math.log(1e3)  # of squares in standard errors: phases are a thousand times likelier so than otherwise
+_MOST_ACROSS = 0.15  # part of the other plane's motion that a sensor may show: more is another fault, or none of these
+_PLANES, _RATES = str.maketrans("yz", "zy"), {"": 0, "dot": 1, "ddot": 2}
 _HANN_LOSS = 0.95  # part of the data's information that is left in half-overlapping Hann segments
 _FLOOR = 1e-10
 
@@ -160,6 +162,10 @@ def read_pair(
     start = _Start(1 if total >= 0 else -1, float(np.log(max(abs(total) / level, _FLOOR))), delay_s)
     shared = min(1.0, abs(total) / (math.sqrt(level) * math.sqrt(other)))
     alone = _fitted(pair, start, bands.w, h, variance, bias)
+    across = _across(alone, _other_plane(window, pair, bands), bands.w, h, variance)
+    if across is not None:
+        h = h - across
+        alone = _fitted(pair, start, bands.w, h, variance, bias)
     lead_rad_s = _lead(alone, bands.w, h, variance) if lead_rad_s is None else lead_rad_s
     if lead_rad_s:
         h = h * np.exp(-1j * lead_rad_s / bands.w)
@@ -204,6 +210,45 @@ def _fitted(
     gain_error = float(np.sqrt(scatter_gain / (2 * weight.sum())) + weight @ bias / weight.sum())
     delay_error_s = float(np.sqrt(scatter_delay / (2 * moment)))
     return PairReading(pair, log_gain, gain_error, start.polarity, delay_s, delay_error_s, 0.0, 0.0)
+
+
+def _other_plane(window: WindowStatistics, pair: MotionPair, bands: Banded) -> ComplexArray | None:
+    """What the same place does in the other plane, over z, shape (n_bands,); None where it is not measured."""
+    others = _others(window.states, pair)
+    own, _, order = window.states[pair.second].partition("_")
+    for at, column in enumerate(others, 2):
+        place, _, other_order = window.states[column].partition("_")
+        if place == own.translate(_PLANES):
+            rates = _RATES[order] - _RATES[other_order]
+            moved = bands.spectra[:, at, 0] / bands.spectra[:, 0, 0].real
+            return np.asarray(moved * (1j * bands.w) ** rates, dtype=np.complex128)
+    return None
+
+
+def _across(
+    alone: PairReading, other: ComplexArray | None, w: FloatArray, h: ComplexArray, variance: FloatArray
+) -> ComplexArray | None:
+    """What one of the two shows of the other plane, in the transfer; None unless that and nothing else explains it.
+
+    One that is turned, or sensitive across its axis, shows a small part: where one force moves both planes, that is in
+    the transfer, large where its own plane hardly moves, and passes for a gain or a delay.
+    """
+    if other is None:
+        return None
+    expected = alone.transfer(w)
+    aim, seen = h / expected - 1, other / expected
+    weight = np.tile(np.sqrt(2 / variance), 2)
+    sides = [np.ones_like(h), 1j * w, 1j / w, seen]
+    design = np.stack([np.concatenate([one.real, one.imag]) for one in sides], axis=1) * weight[:, None]
+    design /= np.linalg.norm(design, axis=0)
+    y = np.concatenate([aim.real, aim.imag]) * weight
+    with_it, without = (np.linalg.lstsq(part, y, rcond=None)[0] for part in (design, design[:, :-1]))
+    left = float(np.sum((y - design @ with_it) ** 2))
+    gained = float(np.sum((y - design[:, :-1] @ without) ** 2)) - left
+    size = float(with_it[-1]) / float(np.linalg.norm(np.concatenate([seen.real, seen.imag]) * weight))
+    scatter = max(1.0, left / max(1, y.size - design.shape[1]))
+    told = gained > _TOLD_APART * scatter and abs(size) < _MOST_ACROSS
+    return np.asarray(size * other, dtype=np.complex128) if told else None
 
 
 def _lead(alone: PairReading, w: FloatArray, h: ComplexArray, variance: FloatArray) -> float:

@@ -278,3 +278,12 @@ def test_one_sensor_is_enough_and_what_it_does_not_show_is_no_misfit(state: str)
         diagnosis = LikelihoodFit(lone).diagnose(window)
         assert not diagnosis.unexplained
         assert np.isfinite(sure(diagnosis.misfit_z))
+
+
+def test_a_sensor_that_shows_some_of_the_other_plane_is_told() -> None:
+    """y1 is turned by 1.7° towards z1: it was no misfit, and a gain where it was one."""
+    window = simulate_window(Draw(load_machine("lab"), 7_700_021, Purpose.EVALUATION, 0, layout=Layout.ONE_SOURCE), 2)
+    mixed = np.eye(len(window.states))
+    mixed[window.states.index("y1"), window.states.index("z1")] = 0.03
+    seen = replace(window, spectrum=mixed @ window.spectrum @ mixed.T, synchronous=mixed @ sure(window.synchronous))
+    assert LikelihoodFit(load_machine("lab")).diagnose(seen).suspect.startswith("share of z1 in y1 (+")

@@ -403,3 +403,12 @@ def test_an_angle_of_another_speed_is_named_with_what_the_pulses_do(factor: floa
     samples[:, -1] = factor * np.unwrap(samples[:, -1]) % (2 * np.pi)
     (finding,) = [one for one in found_in(samples, reference_of("lab")) if one.states == ("theta",)]
     assert told in finding.text
+
+
+def test_what_a_sensor_shows_of_the_other_plane_is_no_delay() -> None:
+    """One force moves both planes, so that it is in the transfer; two sensors were told as 0.13 ms late."""
+    samples, states = recorded("heavy", 1, one_source=True).copy(), plan_of("heavy").states
+    for state, other in (("z1_dot", "y1_dot"), ("y2", "z2")):
+        samples[:, states.index(state)] += 0.02 * samples[:, states.index(other)]
+    (window,) = windows_of(plan_of("heavy"), samples)
+    assert sensor_findings(window, None, load_machine("heavy").sensors) == ()
