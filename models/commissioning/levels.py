@@ -380,16 +380,25 @@ def learn(level: KnowledgeLevel, machine: MachineFile, pieces: Sequence[HealthyP
     """
     if level is KnowledgeLevel.NONE:
         return _learn_none(machine, pieces, progress)
-    found: list[Learned | EstimationError] = []
+    found: list[Learned] = []
+    errors: list[EstimationError] = []
     for sense in get_args(Gyroscopic):
         try:
-            learned = _BY_THEORY[level](machine, pieces, progress, sense)
+            found.append(_BY_THEORY[level](machine, pieces, progress, sense))
         except EstimationError as error:
-            found.append(error)
+            errors.append(error)
             continue
-        if all(check.verdict != "refused" for check in learned.checks):
-            return learned if not found else replace(learned, notes=(*learned.notes, _OPPOSITE))
-        found.append(learned)
-    if isinstance(found[0], EstimationError):
-        raise found[0]
-    return found[0]
+        if all(check.verdict == "passed" for check in found[-1].checks):
+            break
+    best = min(found, key=_doubt, default=None)  # the first of those that are as good
+    if best is None or (best.gyroscopic == "opposite" and _doubt(best) == _REFUSED):
+        raise errors[0]
+    return best if best.gyroscopic == "Eq. 27" else replace(best, notes=(*best.notes, _OPPOSITE))
+
+
+_DOUBTS = ("passed", "limited", "refused")
+_REFUSED = _DOUBTS.index("refused")
+
+
+def _doubt(learned: Learned) -> int:
+    return max(_DOUBTS.index(check.verdict) for check in learned.checks)

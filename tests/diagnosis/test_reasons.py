@@ -30,11 +30,11 @@ def window() -> WindowStatistics:
 
 
 def assert_beyond(sentence: str) -> None:
-    """The last number before "at most" (or "at least") is more (or less) than the one after it, as printed."""
-    found = re.search(rf"({_NUMBER})\D*?(at most|at least) ({_NUMBER})", sentence)
+    """The last number before "limit" or "at most" ("at least") is more (less) than the one after it, as printed."""
+    found = re.search(rf"({_NUMBER})\D*?(limit|at most|at least)\D*? ({_NUMBER})", sentence)
     assert found, sentence
     value, side, limit = float(found[1]), found[2], float(found[3])
-    assert value > limit if side == "at most" else value < limit, sentence
+    assert value < limit if side == "at least" else value > limit, sentence
 
 
 def reason_of(window: WindowStatistics) -> str:

@@ -163,7 +163,7 @@ def test_channels_that_change_on_the_way_are_refused(tmp_path: Path) -> None:
     sensors = [channel.model_dump() for channel in LAB.sensors]
     sensors[0]["unit"] = "mil"
     recording(tmp_path / "b.mcap", Machine.model_validate({**LAB.model_dump(), "sensors": sensors}), blocks=2)
-    with pytest.raises(RecordingError, match="the channels on rotorwatch/demo/lab/descriptor are not those of before"):
+    with pytest.raises(RecordingError, match="the channels on rotorwatch/demo/lab/descriptor have changed"):
         export(Selection((tmp_path / "a.mcap", tmp_path / "b.mcap")), "stream", "csv", tmp_path / "out.csv")
     assert not (tmp_path / "out.csv").exists()
 

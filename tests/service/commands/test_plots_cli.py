@@ -173,7 +173,7 @@ def test_a_recording_without_samples_and_reports(tmp_path: Path) -> None:
     path = write(
         tmp_path / "truth.mcap", [RecordedMessage(LAB.keys.truth, b"{}", b"", "application/json", START_NS, 0)]
     )
-    for kind, message in (("trend", "no reports or sample blocks in there"), ("orbit", "no sample blocks in there")):
+    for kind, message in (("trend", "contains no reports or sample blocks"), ("orbit", "contains no sample blocks")):
         code, said = run(kind, path, "--out", tmp_path / "picture.png")
         assert (code, message in said) == (2, True)
 

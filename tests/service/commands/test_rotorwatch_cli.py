@@ -105,7 +105,7 @@ def test_watch_and_status_without_a_monitor_say_so() -> None:
     found = run("watch", "--connect", address)
     assert found.returncode == 1
     assert f"connect {address}" in found.stderr
-    assert "nobody answers" in found.stderr
+    assert "nothing answers" in found.stderr
     url = f"http://{address.removeprefix('tcp/')}"
     found = run("status", "--url", url, "--json")
     assert found.returncode == 4

@@ -395,7 +395,7 @@ def test_a_file_that_is_no_database_is_named(tmp_path: Path) -> None:
     file = tmp_path / "history.sqlite"
     file.write_bytes(b"no database " * 100)
     store = Store(f"sqlite:///{file}", Retention())
-    with pytest.raises(StoreError, match=r"history\.sqlite is no history \(SQLite\), and stays as it is"):
+    with pytest.raises(StoreError, match=r"history\.sqlite is not a history \(SQLite\), and is left as it is"):
         store.open(set_aside=True)
     assert [path.name for path in tmp_path.iterdir()] == ["history.sqlite"]
     file.write_bytes(bytes(4096))  # as a power failure may leave it

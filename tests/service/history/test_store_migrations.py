@@ -80,7 +80,7 @@ def test_a_database_that_is_up_to_date_is_opened_without_what_only_migrations_ne
     ("change", "message"),
     [
         ("UPDATE alembic_version SET version_num = '9999'", "revision 9999, which this version of rotorwatch does not"),
-        ("DROP TABLE alembic_version", "a table 'alarm_events' that is not ours"),
+        ("DROP TABLE alembic_version", "a table 'alarm_events' not of the history"),
     ],
 )
 def test_a_database_of_others_is_left_alone(url: str, change: str, message: str) -> None:
@@ -94,7 +94,7 @@ def test_nothing_is_put_into_the_database_of_another_program(url: str) -> None:
     executed(url, "CREATE TABLE orders (number INTEGER)")
     file = Path(url.removeprefix("sqlite:///"))
     before = file.read_bytes() if file.is_file() else b""
-    with pytest.raises(StoreError, match="a table 'orders' that is not ours"):
+    with pytest.raises(StoreError, match="a table 'orders' not of the history"):
         opened_and_closed(url)
     assert before == (file.read_bytes() if file.is_file() else b"")
     assert executed(url, "SELECT * FROM orders") == []

@@ -236,10 +236,10 @@ def test_a_clock_that_is_set_leaves_shelving_as_long_as_it_was_meant() -> None:
 @pytest.mark.parametrize(
     ("field", "value", "match"),
     [
-        ("latching", ["k_bx"], "latching: k_bx is no alarm"),
+        ("latching", ["k_bx"], "latching: k_bx is not an alarm"),
         ("suppress", [{"alarms": ["e"], "because": "x"}], "expected exactly one of while_alarm"),
         ("suppress", [{"alarms": ["e"], "while_alarm": "e", "because": "x"}], "e would suppress itself"),
-        ("suppress", [{"alarms": ["e"], "while_alarm": "y", "because": "x"}], "while_alarm: y is no alarm"),
+        ("suppress", [{"alarms": ["e"], "while_alarm": "y", "because": "x"}], "while_alarm: y is not an alarm"),
     ],
 )
 def test_settings_that_make_no_sense(field: str, value: object, match: str) -> None:

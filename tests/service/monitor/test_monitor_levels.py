@@ -174,7 +174,7 @@ def test_first_windows_outlast_whatever_they_do_not_depend_on(changes: dict[str,
     now = install(FAN.model_copy(update=changes), None)
     told = Checkpoint(replace(step.head, code_version="0.0.9"), step.new_parts)
     after, text = restored(lambda: MachineMonitor(now), identity_of(now), told, 0)
-    assert ("they are taken anew (the levels are of other sensors or settings)" in text) == (not kept)
+    assert ("they are taken again (the levels are of other sensors or settings)" in text) == (not kept)
     _, events = run(after, blocks(8, 60, growth=(0.0, 3.0), first=130))
     assert [name for kind, name, _ in events if kind is EventKind.RAISED] == (["level:DE-H"] if kept else [])
 

@@ -110,7 +110,7 @@ def test_files_that_are_no_recordings_are_refused(tmp_path: Path, missing: str) 
 
 
 def test_an_empty_recording_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"empty\.mcap: no message"):
+    with pytest.raises(RecordingError, match=r"empty\.mcap: contains no message"):
         RecordingSource([write(tmp_path / "empty.mcap", [])])
 
 

@@ -70,7 +70,7 @@ BAD: dict[str, tuple[Reason, Callable[[Feed], None], str]] = {
     "repeated": (Reason.OVERLAP, elsewhere(-1, -0.3), "a repetition or out of order"),
     "two versions": (Reason.CONFLICT, elsewhere(-1, -0.1), "arrived in two versions"),
     "number skipped": (Reason.SEQUENCE, elsewhere(5, 0.0), "sequence is"),
-    "clock set back": (Reason.PAST, elsewhere(0, -60.0), "60 s before what was received"),
+    "clock set back": (Reason.PAST, elsewhere(0, -60.0), "60 s before what was already received"),
     "clock far ahead": (Reason.FUTURE, elsewhere(0, 7200.0), "lies 7200 s ahead, expected at most 3600 s"),
 }
 

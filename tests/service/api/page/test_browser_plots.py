@@ -36,7 +36,7 @@ PLOTS = (
     ("waterfall-plot", "waterfalls", "canvas", r"^Newest samples, 20 spectra of y1, .*strongest shade is \d+ µm p-p"),
     ("full-spectrum-plot", "full-spectra", "canvas", r"^Newest samples, .*, 19 averages"),
     ("centreline-plot", "centrelines", "svg", r"^History, \d+ mean positions"),
-    ("correlation-plot", "correlations", "canvas", r"^Window .*without mean and 1×; theory is apart"),
+    ("correlation-plot", "correlations", "canvas", r"^Window .*without mean and 1×; distance from theory"),
 )
 
 
