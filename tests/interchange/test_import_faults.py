@@ -156,7 +156,8 @@ def test_a_wav_file_that_was_cut_is_refused_with_what_is_there(tmp_path: Path, n
     assert done.written.samples == 1000
     whole = (tmp_path / "run.wav").read_bytes()
     (tmp_path / "run.wav").write_bytes(whole[: -400 * samples[0].nbytes])
-    with pytest.raises(MachineFileError, match="is truncated: 600 samples of each channel are there, expected"):
+    said = "is truncated: 600 samples of each channel are there, expected the 1000"
+    with pytest.raises(MachineFileError, match=said):
         imported(tmp_path, tmp_path / "run.wav", mapping)
 
 

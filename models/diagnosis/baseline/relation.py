@@ -421,7 +421,7 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
     believed = longest if (longest.fits or longest.unchanged) and not change.fits else change
     errors = zip(row.own, believed.error(relation), strict=True)
     if (change.unchanged or longest.unchanged) and any(error > LOST for own, error in errors if 0 in own.terms):
-        raise EstimationError(f"{row.title}: what this window holds beside its force's past does not determine it")
+        raise EstimationError(f"{row.title}: this window does not determine it at lags beyond the memory of its force")
     return believed
 
 
