@@ -22,14 +22,16 @@ from models.errors import MachineFileError
 from models.levels.settings import LevelSettings
 from models.mistakes import changed, checked, did_you_mean, read_toml
 from models.physics.rotor import PARAMETERS, KnownRotor, RotorParameters
-from models.signals.channels import Channel, ChannelDescriptor, Quantity, Sensor
+from models.signals.channels import Channel, ChannelDescriptor, Quantity, state_name
 from models.signals.keys import MachineKeys
+from models.signals.sensor import Sensor
 from models.stream_settings import IngestSettings, Schedule, WindowSettings, default_window, time_scale, whole
 
 _SHIPPED = Path(__file__).parent / "machines"
 
 
 _BINS = 20
+_MOST_OF_BAND = 2.0  # corner of a high-pass over the beginning of the band: one of first order halves it there
 _LONGEST_HOP_S = 600.0
 
 
@@ -263,6 +265,19 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
         for name in (*self.alarms.latching, *(name for rule in self.alarms.suppress for name in rule.alarms)):
             if name.startswith(LEVEL) and name.removeprefix(LEVEL) not in names:
                 raise ValueError(f"alarms: {name}: no channel of that name; there are {', '.join(names)}")
+        return self
+
+    @model_validator(mode="after")
+    def _high_passes(self) -> Self:
+        begin_hz = self.window.band_hz[0]
+        for sensor in self.sensors if self.holds_band else ():
+            corner_hz = sensor.high_pass_hz or 0.0
+            if corner_hz > _MOST_OF_BAND * begin_hz and not state_name(sensor).startswith("@"):
+                raise ValueError(
+                    f"channel {sensor.name}: high_pass_hz is {corner_hz:g}, expected at most twice the lowest "
+                    f"frequency of window.band_hz, {begin_hz:g} Hz: what a high-pass takes far below its corner is "
+                    f"lost in noise; let the band begin at {corner_hz / _MOST_OF_BAND:g} Hz or above"
+                )
         return self
 
     def _check_hops(self) -> None:

@@ -13,6 +13,7 @@ from models.machine import Machine
 from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity, parts_seen
+from models.signals.sensor import Sensor
 from simulator.plant import PlantSamples
 from simulator.scenario import Sensors, SensorSettings
 from simulator.timeline import SWAPPED_WITH, SensorFaults
@@ -25,7 +26,8 @@ _AHEAD = 8192
 class SimulatedSensor:
     """One channel: (value + noise) · gain + offset, clipped, rounded to a step, in the channel's unit.
 
-    A delay shifts the true value by whole samples, the nearest number; before the first sample it was what it is then.
+    The value goes through the high-pass and the delay that the machine file states. A delay that is a fault shifts it
+    by whole samples, the nearest number; before the first sample it was what it is then.
 
     Parameters
     ----------
@@ -38,7 +40,7 @@ class SimulatedSensor:
 
     def __init__(
         self,
-        channel: Channel,
+        channel: Sensor,
         settings: SensorSettings,
         rms_SI: float,
         rate_hz: float,
@@ -56,6 +58,8 @@ class SimulatedSensor:
         self._held: float | None = None
         self._rate_hz, self._reach = rate_hz, round(longest_delay_s * rate_hz)
         self._past: FloatArray | None = None
+        self._filter = _sections(channel, rate_hz)
+        self._filtered: FloatArray | None = None  # its state
 
     def noise(self, n_samples: int) -> FloatArray:
         """Take the next samples of unit-variance noise, first-order noise sampled exactly; shape (n_samples,)."""
@@ -85,7 +89,8 @@ class SimulatedSensor:
         """
         settings = self._settings
         level = _value(faults, "noise_relative", settings.noise_relative) * self._rms_SI
-        seen = self._delayed(value_SI, round(_value(faults, "delay", 0.0) * self._rate_hz)) + level * noise
+        seen = self._delayed(self._passed(value_SI), round(_value(faults, "delay", 0.0) * self._rate_hz))
+        seen = seen + level * noise
         seen = seen * settings.gain * _value(faults, "gain", 1.0) + settings.offset_SI + _value(faults, "offset", 0.0)
         if "clip" in faults:
             limit = _value(faults, "clip", np.inf)
@@ -98,6 +103,15 @@ class SimulatedSensor:
         if "dropout" in faults:
             return np.full_like(seen, np.nan)
         return np.asarray(seen / self.channel.to_si, dtype=np.float64)
+
+    def _passed(self, value_SI: FloatArray) -> FloatArray:
+        """Values behind the high-pass and the delay of the file; before the first sample it was what it is then."""
+        if self._filter is None:
+            return value_SI
+        if self._filtered is None:
+            self._filtered = scipy.signal.sosfilt_zi(self._filter) * value_SI[0]
+        passed, self._filtered = scipy.signal.sosfilt(self._filter, value_SI, zi=self._filtered)
+        return np.asarray(passed, dtype=np.float64)
 
     def _delayed(self, value_SI: FloatArray, late: int) -> FloatArray:
         """Values some samples ago."""
@@ -178,6 +192,27 @@ class SensorBank:
         begin, end = (bisect_right(states, sample, key=itemgetter(0)) for sample in (first, first + n_samples - 1))
         cuts = [0, *(sample - first for sample, _ in states[begin:end]), n_samples]
         return [(begin, end, _in_force(states, first + begin)) for begin, end in pairwise(cuts)]
+
+
+def _sections(sensor: Sensor, rate_hz: float) -> FloatArray | None:
+    """Second-order sections of a sensor's high-pass and delay; None without either.
+
+    The part of a delay below a sample is a Thiran all-pass of first order (Laakso et al., IEEE Signal Processing
+    Magazine 13(1), 1996): its delay is right at low frequencies, within 1 % up to a
+    twentieth of the sampling rate.
+    """
+    found = []
+    if sensor.high_pass_hz is not None:
+        found.append(
+            scipy.signal.butter(sensor.high_pass_order or 1, sensor.high_pass_hz, "high", fs=rate_hz, output="sos")
+        )
+    late = (sensor.delay_us or 0.0) * 1e-6 * rate_hz
+    if late > 0:
+        whole = max(0, round(late - 1))
+        part = (1 - (late - whole)) / (1 + (late - whole))
+        found += [np.array([[0.0, 1.0, 0.0, 1.0, 0.0, 0.0]])] * whole
+        found.append(np.array([[part, 1.0, 0.0, 1.0, part, 0.0]]))
+    return np.concatenate(found) if found else None
 
 
 def _in_force(states: Sequence[tuple[int, SensorFaults]], sample: int) -> SensorFaults:

@@ -25,6 +25,7 @@ import numpy.typing as npt
 from scipy.fft import next_fast_len
 
 from models.checkpoint import checked, prefixed, unprefixed
+from models.diagnosis.equaliser import Equaliser, equaliser_of
 from models.diagnosis.motion import MotionPair, motion_pairs, pair_powers
 from models.diagnosis.rotation import RotationLine, followed_speeds, rotation_line
 from models.levels.contact import contact
@@ -78,6 +79,7 @@ class Plan:
     # What each sensor of `states` shows at running speed without a vibration: q of x = Re{q e^{jθ}} for an angle that
     # grows; None where none is known.
     runout: ComplexArray | None = None
+    equaliser: Equaliser | None = None  # of the sensors of `states`, where they do not show the vibration as it is
 
     @property
     def need(self) -> int:
@@ -192,6 +194,7 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False,
         angled=tuple(state_name(one) for one in channels[: len(states)]),
         turn=None if np.array_equal(seen, np.eye(len(states))) else np.linalg.inv(seen),
         runout=runout[: len(states)] if np.any(runout[: len(states)]) else None,
+        equaliser=equaliser_of(channels[: len(states)]),
     )
 
 
@@ -313,7 +316,9 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
         last = own.shape[1] - 1
         waveform = waveform.of([*range(n_states), last, *range(n_states, last)])
     # The mean leaks from zero frequency into the lowest bins; the rotation obeys v = jωx and stays.
-    level_left = (waveform.mean[:n_states] - level) * segments[:, :, n_states, None]
+    moving = segments[:, :, :n_states] - (waveform.mean[:n_states] - level) * segments[:, :, n_states, None]
+    if plan.equaliser is not None:
+        moving /= plan.equaliser.response(plan.frequencies_hz)
     return HopMoments(
         start_ns=start_ns,
         end_ns=start_ns + round(own.shape[0] * 1e9 / plan.rate_hz),
@@ -323,7 +328,7 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
         jump_rad=jump_rad,
         line=line,
         waveform=waveform,
-        pair_powers=pair_powers(segments[:, :, :n_states] - level_left, plan.frequencies_hz, plan.pairs),
+        pair_powers=pair_powers(moving, plan.frequencies_hz, plan.pairs),
         levels=levels,
     )
 
@@ -484,16 +489,3 @@ def divided(values: ComplexArray, by: int | FloatArray) -> ComplexArray:
     parts = values.view(np.float64)
     parts /= by
     return values
-
-
-def relative_vectors(vectors: ComplexArray) -> ComplexArray:
-    """Turn each hop's vectors, shape (n_hops, n), so that the channel with the clearest line is at angle zero.
-
-    Its amplitude varies least from hop to hop, relative.
-    """
-    size = np.abs(vectors)
-    mean = size.mean(axis=0)
-    spread = size.std(axis=0) / np.where(mean > 0, mean, np.nan)
-    channel = int(np.nanargmin(spread)) if np.any(np.isfinite(spread)) else 0
-    turn = np.exp(-1j * np.angle(vectors[:, channel]))
-    return np.asarray(vectors * turn[:, None], dtype=np.complex128)

@@ -152,3 +152,16 @@ def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> Flo
     if followed.mean() < _FOLLOWED_PART:
         return None
     return np.where(followed, speed, np.nan)
+
+
+def relative_vectors(vectors: _ComplexArray) -> _ComplexArray:
+    """Turn each hop's vectors, shape (n_hops, n), so that the channel with the clearest line is at angle zero.
+
+    Its amplitude varies least from hop to hop, relative.
+    """
+    size = np.abs(vectors)
+    mean = size.mean(axis=0)
+    spread = size.std(axis=0) / np.where(mean > 0, mean, np.nan)
+    channel = int(np.nanargmin(spread)) if np.any(np.isfinite(spread)) else 0
+    turn = np.exp(-1j * np.angle(vectors[:, channel]))
+    return np.asarray(vectors * turn[:, None], dtype=np.complex128)

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from models.diagnosis.equaliser import Equaliser
 from models.diagnosis.excluded import ExcludedLine, KnownLine, excluded_lines
 from models.diagnosis.moments import (
     ComplexArray,
@@ -18,11 +19,11 @@ from models.diagnosis.moments import (
     divided,
     hop_coefficients,
     regression,
-    relative_vectors,
     rotation_of,
     through,
     turns,
 )
+from models.diagnosis.rotation import relative_vectors
 from models.diagnosis.stationarity import segment_levels, summed
 from models.levels.measures import WindowLevels, window_levels
 from models.signals.block import FloatArray
@@ -219,8 +220,35 @@ def window_statistics(
         if lagged
         else (),
     )
-    shaft = found if plan.runout is None else _without(found, plan.runout)
+    return _of_the_shaft(found, plan, by_bin)
+
+
+def _of_the_shaft(window: WindowStatistics, plan: Plan, by_bin: ComplexArray) -> WindowStatistics:
+    """The window of the motion itself, from that of the samples; `by_bin` has shape (n_bins, n_segments, n)."""
+    mounted = window if plan.equaliser is None else _equalised(window, plan.equaliser, by_bin)
+    shaft = mounted if plan.runout is None else _without(mounted, plan.runout)
     return shaft if plan.turn is None else _turned(shaft, plan.states, plan.turn)
+
+
+def _equalised(window: WindowStatistics, equaliser: Equaliser, by_bin: ComplexArray) -> WindowStatistics:
+    """The window as sensors would give it that show the vibration as it is."""
+    n_bins, _, n = by_bin.shape
+    by_hop = by_bin.swapaxes(0, 1).reshape(len(window.waveforms), -1, n_bins, n)
+    missing = equaliser.missing(by_hop, window.frequencies_hz, window.lags_s)
+    response = equaliser.response(window.frequencies_hz)
+    at_speed, at_speeds = (
+        equaliser.response(np.asarray(speed) / (2 * np.pi)) for speed in (window.speed_rad_s, window.hop_speed_rad_s)
+    )
+    relative = window.relative_synchronous
+    return replace(
+        window,
+        correlation=window.correlation + missing.mean(axis=0),
+        hop_correlation=window.hop_correlation + missing,
+        spectrum=window.spectrum / (response[:, :, np.newaxis] * response[:, np.newaxis].conj()),
+        synchronous=None if window.synchronous is None else window.synchronous / at_speed,
+        hop_synchronous=None if window.hop_synchronous is None else window.hop_synchronous / at_speeds,
+        relative_synchronous=None if relative is None else relative_vectors(relative / at_speeds),
+    )
 
 
 def _without(window: WindowStatistics, runout: ComplexArray) -> WindowStatistics:

@@ -1,6 +1,5 @@
 """What a stream's columns are: channels, their units here and elsewhere, and the descriptor beside the blocks."""
 
-import cmath
 import hashlib
 import json
 import math
@@ -73,7 +72,8 @@ ACCELERATIONS: tuple[str, ...] = tuple(
 """What accelerometers measure: rates of states, in the order in which they follow the states in statistics."""
 
 
-def _not_given(value: float | None) -> bool:
+def not_given(value: float | None) -> bool:
+    """Whether a field is left out of what is written, so that identities stay as they were before it was there."""
     return value is None
 
 
@@ -97,11 +97,7 @@ class Channel(BaseModel, extra="forbid", frozen=True):
     )
     # Left out where it is not given: descriptors of other sensors, and their hashes, are as they were before it.
     angle_deg: float | None = Field(
-        default=None,
-        ge=-360,
-        le=360,
-        exclude_if=_not_given,
-        description="angle of the sensor's axis from +y towards +z",
+        default=None, ge=-360, le=360, exclude_if=not_given, description="angle of the sensor's axis from +y towards +z"
     )
 
     @field_validator("unit", mode="before")
@@ -158,11 +154,6 @@ class Channel(BaseModel, extra="forbid", frozen=True):
         return exact or (math.cos(angle), math.sin(angle))
 
     @property
-    def runout(self) -> complex:
-        """Vector at running speed that it shows without a vibration, SI; a stream says nothing of it."""
-        return 0j
-
-    @property
     def way(self) -> str:
         """Direction, with the angle where there is one."""
         return self.direction if self.angle_deg is None else f"{self.direction} at {self.angle_deg:g}°"
@@ -176,43 +167,6 @@ class Channel(BaseModel, extra="forbid", frozen=True):
     def si_unit(self) -> str:
         """SI unit of the quantity."""
         return next(unit for unit, factor in UNIT_TO_SI[self.quantity].items() if factor == 1.0)
-
-
-class Sensor(Channel):
-    """A channel, and what is known of its sensor besides: its run-out, as it shows when the shaft turns slowly."""
-
-    slow_roll_um_pp: float | None = Field(
-        default=None, ge=0, le=1e6, exclude_if=_not_given, description="1x at slow roll, um peak to peak"
-    )
-    slow_roll_phase_lag_deg: float | None = Field(
-        default=None, ge=-360, le=360, exclude_if=_not_given, description="phase lag of that"
-    )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_a_channel(cls, fields: object) -> object:
-        return fields.model_dump() if isinstance(fields, Channel) else fields
-
-    @model_validator(mode="after")
-    def _vector(self) -> Self:
-        names = ("slow_roll_um_pp", "slow_roll_phase_lag_deg")
-        given = [name for name in names if getattr(self, name) is not None]
-        if len(given) == 1:
-            (other,) = set(names) - set(given)
-            raise ValueError(f"channel {self.name}: {given[0]} is given without {other}: a vector needs both")
-        if given and self.quantity is not Quantity.DISPLACEMENT:
-            raise ValueError(
-                f"channel {self.name}: slow_roll_um_pp is {self.slow_roll_um_pp:g}, but run-out is that of a "
-                f"displacement, and this measures {self.quantity}"
-            )
-        return self
-
-    @property
-    def runout(self) -> complex:
-        """Q of x = Re{q e^{jθ}} for a shaft angle that grows, SI; 0 where nothing is given."""
-        if self.slow_roll_um_pp is None or self.slow_roll_phase_lag_deg is None:
-            return 0j
-        return cmath.rect(self.slow_roll_um_pp * 0.5e-6, -math.radians(self.slow_roll_phase_lag_deg))
 
 
 def _cardinal(angle_deg: float) -> int:

@@ -12,7 +12,8 @@ from pydantic import BaseModel, BeforeValidator, Field, model_validator
 from models.errors import MachineFileError
 from models.machine import MachineFile
 from models.mistakes import checked, did_you_mean, read_toml
-from models.signals.channels import Channel, Quantity, Sensor, time_unit_ns, unit_factor
+from models.signals.channels import Channel, Quantity, time_unit_ns, unit_factor
+from models.signals.sensor import Sensor
 
 Format = Literal["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"]
 _DATETIME = "datetime"

@@ -20,7 +20,8 @@ from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.response import stochastic_covariance, synchronous_response
 from models.physics.rotor import PARAMETERS, STATE_INDEX, changed
-from models.signals.channels import Channel, Quantity
+from models.signals.channels import Quantity
+from models.signals.sensor import Sensor
 from simulator.plant import NonlinearPlant, theoretical_rms
 from simulator.scenario import Event, NamedSource, Rub, Scenario, Sensors
 from simulator.stream import blocks
@@ -101,7 +102,7 @@ def with_tilt(machine: Machine) -> Machine:
     """Return the machine with tilt and tilt-rate sensors added where it has none."""
     present = set(machine.descriptor.states)
     added = [
-        Channel.model_validate(
+        Sensor.model_validate(
             {"name": name, "quantity": quantity, "location": "disc", "direction": direction, "unit": unit}
         )
         for name, quantity, direction, unit in (

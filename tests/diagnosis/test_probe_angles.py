@@ -19,7 +19,8 @@ from models.diagnosis.shape import learn_shape
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import SampleBlock
-from models.signals.channels import Channel, ChannelDescriptor, state_name, with_channel_names
+from models.signals.channels import ChannelDescriptor, state_name, with_channel_names
+from models.signals.sensor import Sensor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
 from tests.commissioning.rotor_kit import mounted
@@ -253,7 +254,7 @@ def test_a_sentence_about_a_plane_names_both_probes() -> None:
     assert with_channel_names("gain of y1_dot (+10 %)", API_670.sensors) == "gain of y1 or z1 or y1_dot (+10 %)"
     assert with_channel_names("gain of y1_dot (+10 %)", LAB.sensors) == "gain of y1_dot (+10 %)"
     assert with_channel_names("y1_dot: changed", API_670.sensors) == "y1_dot: changed"
-    sensors = [Channel.model_validate(probe(f"XE-{way}", angle_deg=at)) for way, at in (("X", 45), ("Y", 135))]
+    sensors = [Sensor.model_validate(probe(f"XE-{way}", angle_deg=at)) for way, at in (("X", 45), ("Y", 135))]
     assert with_channel_names("z1: changed", sensors) == "XE-X or XE-Y: changed"
     assert with_channel_names("bearing@135: its shape", sensors) == "XE-Y: its shape"
     assert with_channel_names("gain of y2", sensors) == "gain of y2"

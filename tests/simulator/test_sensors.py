@@ -7,14 +7,14 @@ import pytest
 from models.machine import Machine, load_machine
 from models.physics.rotor import STATES
 from models.signals.block import FloatArray
-from models.signals.channels import Channel
+from models.signals.sensor import Sensor
 from simulator.plant import PlantSamples
 from simulator.scenario import ChannelSettings, Sensors, SensorSettings
 from simulator.sensors import SensorBank, SimulatedSensor
 from simulator.timeline import SensorFaults
 
 RATE_HZ = 2000.0
-DISPLACEMENT = Channel(name="XE", quantity="displacement", location="bearing", direction="y", unit="um")
+DISPLACEMENT = Sensor(name="XE", quantity="displacement", location="bearing", direction="y", unit="um")
 
 
 def _sensor(settings: SensorSettings, seed: int = 0, rms_SI: float = 1e-5) -> SimulatedSensor:
@@ -22,7 +22,7 @@ def _sensor(settings: SensorSettings, seed: int = 0, rms_SI: float = 1e-5) -> Si
 
 
 def _machine(*channels: dict[str, str], dtype: str = "float64") -> Machine:
-    sensors = tuple(Channel.model_validate(channel) for channel in channels)
+    sensors = tuple(Sensor.model_validate(channel) for channel in channels)
     return load_machine("lab").model_copy(update={"sensors": sensors, "dtype": dtype})
 
 

@@ -66,11 +66,13 @@ class LengthFits:
         """Whether the latest hops, of any of these lengths, may say more than that the machine is as the window says.
 
         The window is the latest of the sliding one. Its rotation is taken out of them, not their own: less work, and
-        hardly another spectrum away from it. Where no one rotation is that of all hops, or accelerations are measured,
-        they may.
+        hardly another spectrum away from it. Where no one rotation is that of all hops, accelerations are measured, or
+        sensors do not show the vibration as it is, they may.
         """
         rotation, by_hop, plan = window.as_mounted.synchronous, window.hop_synchronous, sliding.plan
         if rotation is None or by_hop is None or window.removed_by_hop or integrated(window) is not window:
+            return True
+        if plan.equaliser is not None:
             return True
         n, hops = len(plan.states), sliding.hops[-max(lengths, default=1) :]
         segments, each = np.concatenate([hop.segments for hop in hops]), hops[0].segments.shape[0]

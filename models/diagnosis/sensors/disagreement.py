@@ -162,6 +162,8 @@ def _delay(
         f"{naming.name(state)}: comes {1e3 * late:.3g} ms ({late * rate_hz:.2g} samples, ± "
         f"{1e3 * late / departure.delay_z:.2g} ms) after {naming.name(window.states[other])}, expected {expected}"
     )
+    if not departure.known:
+        text += "; if that is how it is sampled, state it as delay_us of its sensor"
     return SensorFault(states=(state,), kind=FaultKind.DELAY, text=text, value=late, z=departure.delay_z)
 
 
@@ -173,7 +175,7 @@ def _ahead(window: WindowStatistics, reading: PairReading, bands: Banded, naming
     text = (
         f"{naming.name(state)}: runs ahead of {naming.name(window.states[other])} as behind a high-pass at "
         f"{lead_rad_s / (2 * np.pi):.2g} Hz (AC coupling), expected at most {MOST_LEAD_RAD_S / (2 * np.pi):.2g} Hz: "
-        "couple both alike, choose a lower corner, or leave one of them out"
+        "state the corner as high_pass_hz of its sensor, couple both alike, or leave one of them out"
     )
     value = lead_rad_s * float(power @ bands.w**-2.0 / power.sum())
     return SensorFault(states=(state,), kind=FaultKind.DELAY, text=text, value=value)

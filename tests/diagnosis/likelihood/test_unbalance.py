@@ -14,7 +14,8 @@ from models.diagnosis.verdict.stretch import stretch_of
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine, load_machine
 from models.signals.block import FloatArray
-from models.signals.channels import Channel, Quantity
+from models.signals.channels import Quantity
+from models.signals.sensor import Sensor
 from rotorwatch.records.windows import Parameter
 from simulator.scenario import Event
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
@@ -189,7 +190,7 @@ def accelerometers() -> Machine:
     for channel in LAB.sensors:
         if channel.quantity is Quantity.VELOCITY:
             fields = channel.model_dump() | {"quantity": "acceleration", "unit": "m/s2"}
-            sensors.append(Channel.model_validate(fields))
+            sensors.append(Sensor.model_validate(fields))
         elif channel.quantity is Quantity.SHAFT_ANGLE:
             sensors.append(channel)
     return LAB.model_copy(update={"sensors": tuple(sensors)})

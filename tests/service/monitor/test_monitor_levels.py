@@ -14,7 +14,7 @@ from models.commissioning.healthy import healthy_from_blocks
 from models.diagnosis.moments import plan_for
 from models.machine import AlarmSettings, MachineFile, Operation
 from models.signals.block import SampleBlock
-from models.signals.channels import Channel
+from models.signals.sensor import Sensor
 from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, HealthState, Report
@@ -260,7 +260,7 @@ def test_a_dead_sensor_at_whatever_place_is_a_fault_of_that_sensor_and_no_quiet_
 
 
 def test_a_dead_sensor_elsewhere_is_told_and_the_rotor_is_diagnosed_as_before() -> None:
-    casing = Channel(name="DE-H", quantity="acceleration", location="DE", direction="horizontal", unit="m/s2")
+    casing = Sensor(name="DE-H", quantity="acceleration", location="DE", direction="horizontal", unit="m/s2")
     rig = LAB.model_copy(update={"sensors": (*LAB.sensors, casing)})
     monitor, alone = MachineMonitor(install(rig, None)), MachineMonitor(install(LAB, None))
     for block in scenario_blocks(72.0):

@@ -1,0 +1,78 @@
+"""What sensors and inputs do to a vibration, taken back: the high-pass of AC coupling, and delays between channels.
+
+Both are exact in the frequency domain, where the moments of a window are already: cross-spectra and vectors are divided
+by the response that the machine file states. Samples are left as they are: put back in time, what a high-pass has taken
+away below the band would be mostly noise, and a window would depend on the samples before it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from models.signals.block import FloatArray
+from models.signals.sensor import Sensor
+
+_ComplexArray = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class Equaliser:
+    """Responses of a machine's sensors, one column each."""
+
+    # (n,): corner and order of the high-pass, 0 Hz where there is none; delay behind the times of the samples.
+    corner_hz: FloatArray
+    order: npt.NDArray[np.intp]
+    delay_s: FloatArray
+
+    def response(self, frequency_hz: FloatArray) -> _ComplexArray:
+        """What each sensor gives for a vibration of amplitude 1; 1 where the frequency is not known (nan).
+
+        Parameters
+        ----------
+        frequency_hz : ndarray, shape (...)
+            Negative for a shaft angle that falls.
+
+        Returns
+        -------
+        ndarray, shape (..., n)
+        """
+        f = frequency_hz[..., np.newaxis]
+        below = self.corner_hz / (1j * np.where(f == 0, np.nan, f))
+        damped = np.where(self.order == 2, 1 + math.sqrt(2) * below + below**2, 1 + below)
+        return np.asarray(np.nan_to_num(np.exp(-2j * np.pi * f * self.delay_s) / damped, nan=1.0), dtype=np.complex128)
+
+    def missing(self, segments: _ComplexArray, frequencies_hz: FloatArray, lags_s: FloatArray) -> FloatArray:
+        """What correlations lack because the sensors are as they are.
+
+        Parameters
+        ----------
+        segments : ndarray, shape (n_hops, n_segments, n_bins, n)
+            Fourier coefficients as the sensors give them, two-sided densities.
+
+        Returns
+        -------
+        ndarray, shape (n_hops, n_lags, n, n)
+            To be added to E{x_i(t) x_j(t + τ)} of each hop.
+        """
+        n_hops, n_segments, n_bins, n = segments.shape
+        of_bins = segments.transpose(0, 2, 3, 1)
+        seen = of_bins.conj() @ of_bins.swapaxes(2, 3) / n_segments
+        response = self.response(frequencies_hz)
+        lacks = seen * (1 / (response[:, :, np.newaxis].conj() * response[:, np.newaxis]) - 1)
+        step_hz = float(frequencies_hz[1] - frequencies_hz[0])
+        turn = 2 * step_hz * np.exp(2j * np.pi * np.outer(lags_s, frequencies_hz))
+        return np.asarray((turn @ lacks.reshape(n_hops, n_bins, n * n)).real.reshape(n_hops, -1, n, n))
+
+
+def equaliser_of(sensors: Sequence[Sensor]) -> Equaliser | None:
+    """Equaliser of sensors, one a column; None where the file says of none that it differs from the vibration."""
+    if all(one.high_pass_hz is None and one.delay_us is None for one in sensors):
+        return None
+    return Equaliser(
+        np.array([one.high_pass_hz or 0.0 for one in sensors]),
+        np.array([one.high_pass_order or 1 for one in sensors], dtype=np.intp),
+        np.array([(one.delay_us or 0.0) * 1e-6 for one in sensors]),
+    )

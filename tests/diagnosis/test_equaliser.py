@@ -1,0 +1,134 @@
+"""A window of AC-coupled sensors, or of channels sampled one after the other, is that of the vibration itself."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from models.diagnosis.moments import plan_for
+from models.diagnosis.sensors.check import sensor_findings
+from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.window import WindowStatistics
+from models.machine import Machine, MachineFile, load_machine
+from models.signals.block import FloatArray
+from simulator.scenario import Event, load_scenario
+from simulator.stream import blocks
+from tests.sure import sure
+
+# Velocities behind geophones and AC-coupled inputs; channels one after the other.
+SIGNAL: dict[str, dict[str, Any]] = {
+    "y1_dot": {"high_pass_hz": 2.0},
+    "z1_dot": {"high_pass_hz": 4.5, "high_pass_order": 2},
+    "y2": {"delay_us": 250.0},
+    "z2": {"high_pass_hz": 0.5, "delay_us": 400.0},
+}
+
+
+def machine(*, declared: bool, without_angle: bool = False) -> Machine:
+    fields = load_machine("lab").model_dump() | {"dtype": "float64"}
+    fields["sensors"] = [
+        sensor | (SIGNAL.get(sensor["name"], {}) if declared else {})
+        for sensor in fields["sensors"]
+        if not (without_angle and sensor["quantity"] == "shaft_angle")
+    ]
+    return Machine.model_validate(fields)
+
+
+@cache
+def simulated(*, declared: bool = False, speed_rpm: float | None = None) -> FloatArray:
+    scenario, _ = load_scenario("healthy")
+    changes = () if speed_rpm is None else (Event(at_s=30, speed_rpm=speed_rpm),)
+    scenario = scenario.overridden(duration_s=64.0, seed=31_301, faults=changes)
+    made = blocks(scenario, machine(declared=declared), 1.0)
+    return np.concatenate([block.samples for block, _ in made])
+
+
+def behind_sensors(samples: FloatArray) -> FloatArray:
+    """Filtered by the responses themselves, as one piece that goes round and round."""
+    rate_hz, seen = machine(declared=False).rate_hz, samples.copy()
+    f = np.fft.rfftfreq(len(samples), 1 / rate_hz)
+    for column, sensor in enumerate(machine(declared=True).sensors):
+        signal = SIGNAL.get(sensor.name, {})
+        response = np.exp(-2j * np.pi * f * signal.get("delay_us", 0.0) * 1e-6)
+        if corner_hz := signal.get("high_pass_hz"):
+            s = 1j * f / corner_hz
+            response *= s**2 / (1 + np.sqrt(2) * s + s**2) if "high_pass_order" in signal else s / (1 + s)
+        seen[:, column] = np.fft.irfft(np.fft.rfft(samples[:, column]) * response, len(samples))
+    seen[:, -1] = samples[:, -1]  # the shaft angle
+    return seen
+
+
+def statistics(of: Machine, samples: FloatArray) -> WindowStatistics:
+    window = SlidingWindow(plan_for(of))
+    for _ in window.feed(window.plan.to_si(samples), 0):
+        pass
+    return sure(window.statistics())
+
+
+def apart(found: WindowStatistics, true: WindowStatistics) -> tuple[float, float, float]:
+    """Largest differences relative to the channels' sizes: spectra at their strongest bins, correlations, vectors."""
+    density = np.sqrt(np.einsum("fii->fi", true.spectrum).real)
+    strong = density > 0.1 * density.max(axis=0)
+    both = strong[:, :, np.newaxis] & strong[:, np.newaxis]
+    spectra = np.abs(found.spectrum - true.spectrum) / (density[:, :, np.newaxis] * density[:, np.newaxis])
+    size = np.sqrt(np.diag(true.correlation[0]))
+    correlations = np.abs(found.correlation - true.correlation) / np.outer(size, size)
+    vectors = sure(found.rotation_vectors), sure(true.rotation_vectors)
+    off = np.abs(vectors[0] - vectors[1]) / np.abs(vectors[1]).max(axis=0)
+    return float(spectra[both].max()), float(correlations.max()), float(off.max())
+
+
+@pytest.mark.parametrize(("without_angle", "speed_rpm"), [(False, None), (False, 1000.0), (True, None)])
+def test_a_window_is_that_of_the_vibration(without_angle: bool, speed_rpm: float | None) -> None:
+    true_machine, declared = (machine(declared=one, without_angle=without_angle) for one in (False, True))
+    true = statistics(true_machine, simulated(speed_rpm=speed_rpm))
+    seen = behind_sensors(simulated(speed_rpm=speed_rpm))
+    assert all(one < 0.06 for one in apart(statistics(declared, seen), true))
+    # What is not declared is far away.
+    assert all(one > 0.1 for one in apart(statistics(true_machine, seen), true))
+
+
+def test_simulated_sensors_are_those_of_the_file() -> None:
+    declared = machine(declared=True)
+    found = statistics(declared, simulated(declared=True))
+    assert all(one < 0.01 for one in apart(found, statistics(machine(declared=False), simulated())))
+
+
+def test_sensors_whose_signal_is_declared_do_not_contradict_each_other() -> None:
+    undeclared, declared = (machine(declared=one) for one in (False, True))
+    seen = behind_sensors(simulated())
+    assert sensor_findings(statistics(declared, seen), None, declared.sensors) == ()
+    findings = sensor_findings(statistics(undeclared, seen), None, undeclared.sensors)
+    assert any("state the corner as high_pass_hz of its sensor" in one.text for one in findings)
+
+
+def test_the_stream_and_what_identifies_a_machine_are_the_same_without() -> None:
+    undeclared, declared = (machine(declared=one) for one in (False, True))
+    assert declared.descriptor == undeclared.descriptor
+    assert not {"high_pass", "delay_us"} & set(undeclared.model_dump_json().split('"'))
+    assert plan_for(undeclared).equaliser is None
+    assert Machine.model_validate(declared.model_dump()) == declared
+
+
+@pytest.mark.parametrize(
+    ("name", "signal", "says"),
+    [
+        ("y1", {"high_pass_order": 2}, "y1: high_pass_order is 2 without high_pass_hz, its corner"),
+        ("y1", {"high_pass_hz": 2.0, "high_pass_order": 3}, "high_pass_order"),
+        ("theta", {"high_pass_hz": 2.0}, "theta: high_pass_hz is given, but this measures shaft_angle"),
+        ("theta", {"delay_us": 20.0}, "theta: delay_us is given, but this measures shaft_angle"),
+        (
+            "y1_dot",
+            {"high_pass_hz": 10.0},
+            "y1_dot: high_pass_hz is 10, expected at most twice the lowest frequency of window.band_hz, 3 Hz: "
+            ".*let the band begin at 5 Hz or above",
+        ),
+    ],
+)
+def test_what_is_no_signal_of_a_sensor_is_refused(name: str, signal: dict[str, Any], says: str) -> None:
+    fields = load_machine("lab").model_dump()
+    fields["sensors"] = [one | (signal if one["name"] == name else {}) for one in fields["sensors"]]
+    with pytest.raises(ValidationError, match=says):
+        MachineFile.model_validate(fields)
