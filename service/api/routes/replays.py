@@ -98,6 +98,8 @@ class ReplayRequests:
         machines = sorted({f"{recording.site}/{recording.machine}" for recording in recordings})
         if len(machines) != 1:
             raise HTTPException(422, f"recordings: of several machines ({', '.join(machines)}), expected one")
+        if request.from_ns is not None and request.to_ns is not None and request.from_ns >= request.to_ns:
+            raise HTTPException(422, f"to_ns: {request.to_ns} is not later than from_ns, {request.from_ns}")
         offline = request.mode == "offline"
         link = self._settings.link
         if not offline and (link.grants or link.tls or link.user or link.passwords_file):  # it would not be let in

@@ -251,6 +251,7 @@ def test_what_would_have_been_raised_with_a_machine_file_that_is_sent_and_anothe
         ({"machine_file": machine_text("lab"), "bundle": "/etc"}, 422, "is not the name of shipped networks"),
         ({"machine_file": machine_text("lab"), "changes": ["alarms.on_delay_s = -1"]}, 422, "alarms.on_delay_s"),
         ({"recordings": []}, 422, "recordings: "),
+        ({"from_ns": 5, "to_ns": 5}, 422, "to_ns: 5 is not later than from_ns, 5"),
         ({"recordings": ["demo/pump/20260101T020000Z.mcap.part"]}, 409, "incomplete"),
         ({"mode": "paced", "pace": 0.01}, 422, "pace: "),
         ({"shell": "rm"}, 422, "shell: "),
