@@ -26,6 +26,7 @@ _LEVEL = 15
 _LIKE_REPORTS = zstandard.ZstdCompressionDict(
     Path(__file__).with_name("reports.dictionary").read_bytes(), dict_type=zstandard.DICT_TYPE_RAWCONTENT
 )
+_LIKE_REPORTS.precompute_compress(_LEVEL)  # once, and not for every report, which takes as long again
 
 
 class PackedReport(NamedTuple):
