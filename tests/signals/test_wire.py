@@ -41,7 +41,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-
 Encoder = Callable[[SampleBlock, str], tuple[bytes, bytes, str]]
 
 
-def _page_blocks(language: str) -> list[str]:
+def page_blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
 
 
@@ -211,7 +211,7 @@ _C_TYPES = {
     "uint8_t": ctypes.c_uint8, "uint16_t": ctypes.c_uint16, "uint32_t": ctypes.c_uint32,
 }  # fmt: skip
 _C_FIELDS: list[tuple[str, Any]] = [
-    (name, _C_TYPES[kind]) for kind, name in re.findall(r"^ +(\w+) +(\w+);", _page_blocks("c")[0], re.MULTILINE)
+    (name, _C_TYPES[kind]) for kind, name in re.findall(r"^ +(\w+) +(\w+);", page_blocks("c")[0], re.MULTILINE)
 ]
 
 
@@ -243,7 +243,7 @@ def test_the_page_names_encodings_and_units() -> None:
 
 def test_the_page_arrow_example_is_a_block() -> None:
     names: dict[str, Any] = {}
-    exec(_page_blocks("python")[1], names)  # noqa: S102  # our own page
+    exec(page_blocks("python")[-1], names)  # noqa: S102  # our own page
     block, schema_hash = decode_block(names["payload"], b"", ARROW_ENCODING)
     np.testing.assert_array_equal(block.samples, np.array([[1, 2, 3], [4, 5, 6]], dtype=np.float32))
     assert (block.start_ns, block.sequence, block.run, block.rate_hz) == (1_767_225_600_000_000_000, 0, 1, 2000.0)
@@ -252,7 +252,7 @@ def test_the_page_arrow_example_is_a_block() -> None:
 
 def test_the_page_python_example_is_received(tmp_path: Path) -> None:
     script = tmp_path / "example.py"
-    script.write_text(_page_blocks("python")[0], encoding="utf-8")
+    script.write_text(page_blocks("python")[0], encoding="utf-8")
     address = endpoint()
     received: list[tuple[str, bytes, bytes, str]] = []
     complete = threading.Event()
@@ -271,7 +271,7 @@ def test_the_page_python_example_is_received(tmp_path: Path) -> None:
             assert process.wait(180) == 0
     descriptors = [payload for key, payload, _, _ in received if key.endswith("/descriptor")]
     descriptor = ChannelDescriptor.model_validate_json(descriptors[0])
-    assert descriptor == ChannelDescriptor.model_validate_json(_page_blocks("json")[0])
+    assert descriptor == ChannelDescriptor.model_validate_json(page_blocks("json")[0])
     stream = [decode_block(p, a, e) for key, p, a, e in received if key.endswith("/stream")]
     assert [block.sequence for block, _ in stream] == [0, 1, 2, 3]
     assert {schema_hash for _, schema_hash in stream} == {descriptor.schema_hash}
