@@ -11,8 +11,9 @@ from pydantic import BaseModel, Field
 
 from models.commissioning.healthy import HealthyRecording, foreign_lines
 from models.diagnosis.baseline.relation import one_source
-from models.diagnosis.misfit import ACROSS
+from models.diagnosis.misfit import ACROSS, DELAY
 from models.diagnosis.readings import Diagnosis
+from models.diagnosis.sensors.disagreement import LEAST_DELAY_S
 from models.diagnosis.sensors.level import at_range_end
 from models.diagnosis.sensors.reference import Naming
 from models.diagnosis.shape import SEEN_GROWTH, ShapePower
@@ -361,6 +362,8 @@ def _compared(
     ]
     named = Counter(name for name, by in differ if abs(by) > _MATTERS * machine.alarms.for_parameter(name).raise_above)
     outside = sum(one.outside for one in isolations)
+    suspect = Counter(each.suspect.partition(" (")[0] for each in readable if each.suspect).most_common(1)
+    why = "".join(f"; best explained by: {one}, in {count} of them" for one, count in suspect)
     if named:
         worst = named.most_common(1)[0][0]
         reading = max(
@@ -368,7 +371,7 @@ def _compared(
         )
         text = (
             f"{PARAMETER_TEXT[worst]} differs {between}: {reading.relative_change or 0.0:+.1%}, "
-            f"{abs(reading.z or 0.0):.1f} standard errors, in {named[worst]} of {len(readable)} windows"
+            f"{abs(reading.z or 0.0):.1f} standard errors, in {named[worst]} of {len(readable)} windows{why}"
         )
         return Check(
             name=name,
@@ -378,10 +381,8 @@ def _compared(
             "one file for each speed or load",
         )
     if 2 * outside > len(readable):
-        across = sum(one.outside and _little_across(each) for each, one in zip(readable, isolations, strict=True))
-        other = outside - across > _MOST_OUTSIDE * len(readable)
-        suspect = Counter(each.suspect.partition(" (")[0] for each in readable if each.suspect).most_common(1)
-        why = "".join(f"; best explained by: {one}, in {count} of them" for one, count in suspect)
+        little = sum(one.outside and _is_little(each) for each, one in zip(readable, isolations, strict=True))
+        other = outside - little > _MOST_OUTSIDE * len(readable)
         return Check(
             name=name,
             verdict="refused" if theory and other else "limited",
@@ -397,8 +398,11 @@ def _compared(
     return Check(name=name, verdict="passed", text=text)
 
 
-def _little_across(diagnosis: Diagnosis) -> bool:
-    """Whether what explains a window best is a sensor that shows a little of the other plane: it is taken off later."""
-    tried = () if diagnosis.goodness is None else diagnosis.goodness.alternatives
+def _is_little(diagnosis: Diagnosis) -> bool:
+    """Whether a sensor that shows a little of the other plane, or comes a little late, is best: it is taken off later.
+
+    What a delay does to the readings is looked at before.
+    """
+    tried = () if diagnosis.goodness is None or diagnosis.unexplained else diagnosis.goodness.alternatives
     best = max(tried, key=lambda one: abs(one.z), default=None)
-    return best is not None and best.quantity == ACROSS and abs(best.change) < _LITTLE
+    return best is not None and abs(best.change) < {ACROSS: _LITTLE, DELAY: LEAST_DELAY_S}.get(best.quantity, 0.0)

@@ -17,11 +17,17 @@ from models.physics.rotor import impossible
 from models.signals.block import FloatArray
 
 ACROSS = "share"  # first word of what a sensor shows of its place's motion in the other plane
+DELAY = "delay"  # first word of how late a channel comes, relative to the others
+EACH_LATE = f"{DELAY} of each channel after the one before"
 UNEQUAL = "shaft stiffer in y than in z"
 _LEAST_SUSPECT_Z = 5.0
 _LEAST_SUSPECT = 5e-3  # no sensor and no machine file is truer than that, and with one source a tenth of it stands out
 _SCATTER = 1e-4  # probability that a score scatters so much among healthy windows by chance
 _LINEAR = 0.5  # largest one-step estimate that is worth telling: farther out it only says that the thing is not small
+_LEAST_DELAY_S, _LONGEST_DELAY_S = 2e-6, 1e-3  # the same of delays
+# Part of the excess that a thing accounts for by itself, from which it is told although the window is unexplained. The
+# right one of delays and gains mostly accounts for more; where another rotor or force is at work a delay never did.
+_ACCOUNTS = 1 / 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +36,7 @@ class AlternativeTest:
 
     name: str
     z: float  # its score in standard errors
-    change: float  # one-step estimate of its relative size
+    change: float  # one-step estimate of its relative size; of a delay, s
     pair: tuple[str, ...] = ()  # two sensors whose disagreement it is, put down to the one that `name` says
 
     @property
@@ -43,6 +49,19 @@ class AlternativeTest:
         """What it is known by from window to window."""
         return " and ".join(self.pair) or self.name
 
+    @property
+    def told(self) -> str:
+        """The thing and its size in words; empty where that is too little to matter, or impossible."""
+        change, quantity = self.change, self.quantity
+        if quantity == DELAY:
+            least, most, size = _LEAST_DELAY_S, _LONGEST_DELAY_S, f"{1e6 * change:+.0f} µs"
+        else:
+            least, most, size = _LEAST_SUSPECT, _LINEAR, f"{change:+.1%}"
+        # What y gains by an unequal shaft z loses.
+        if abs(change) < least or impossible(-abs(change) if self.name == UNEQUAL else change, quantity):
+            return ""
+        return f"{self.name} ({size})" if abs(change) <= most else self.name
+
 
 @dataclass(frozen=True, slots=True)
 class Goodness:
@@ -51,6 +70,7 @@ class Goodness:
     excess_z: float  # total squared excess of the whitened spectra over its expectation, in standard deviations
     alternatives: tuple[AlternativeTest, ...]  # everything tried
     tests: int  # how many of them, and the total, say something of their own
+    excess: float = 0.0  # total squared excess beyond its expectation, in squared standard errors of a score
 
     @property
     def misfit_z(self) -> float:
@@ -70,12 +90,12 @@ class Goodness:
         if not self.alternatives:
             return ""
         best = max(self.alternatives, key=lambda one: abs(one.z))
-        small = abs(best.change) < _LEAST_SUSPECT
-        if abs(best.z) <= _LEAST_SUSPECT_Z or small or impossible(best.change, best.quantity):
-            return ""
-        if best.name == UNEQUAL and impossible(-best.change, best.quantity):
-            return ""  # what y gains z loses
-        return f"{best.name} ({best.change:+.1%})" if abs(best.change) <= _LINEAR else best.name
+        return best.told if abs(best.z) > _LEAST_SUSPECT_Z else ""
+
+    def suspected(self, *, unexplained: bool) -> str:
+        """`suspect`; of a window so far from theory that it is unexplained, only what alone accounts for much of it."""
+        accounted = max([one.z**2 for one in self.alternatives], default=0.0)
+        return "" if unexplained and accounted < _ACCOUNTS * self.excess else self.suspect
 
 
 def _two_sided(z: float) -> float:

@@ -237,10 +237,12 @@ class KnownMachineEvaluator(WindowEvaluator):
         stated = determined(diagnosis, window, self._machine.window_data_s)
         if self._healthy_misfit is not None and stated.goodness is not None:
             left = self._healthy_misfit.beyond(stated.goodness, window.duration_s / self._machine.window_data_s)
-            stated = replace(stated, misfit_z=left.misfit_z, suspect=left.suspect)
+            suspect = left.suspected(unexplained=bool(stated.unexplained))
+            stated = replace(stated, misfit_z=left.misfit_z, suspect=suspect)
         vector = stated.unbalance
         seen = any(state.endswith("_dot") for state in window.states)  # displacements alone may have run-out
-        if vector is not None and vector.foreign and seen and not self._commissioned and stated.misfit_z is not None:
+        usable = not (self._commissioned or stated.unexplained)
+        if vector is not None and vector.foreign and seen and usable and stated.misfit_z is not None:
             # Of a commissioned machine levels know what its 1x was.
             misfit_z = max(stated.misfit_z, _SURELY_OUTSIDE)
             stated = replace(stated, misfit_z=misfit_z, suspect=stated.suspect or vector.foreign)

@@ -452,7 +452,7 @@ class MachineMonitor:
         looks[whole] = stretch_of(evaluation.deciding, start_ns, end_ns)
         verdict = self._test.update(looks, foreign=foreign.text != "")
         unexplained = evaluation.deciding.unexplained
-        suspect = foreign.text if unexplained else evaluation.deciding.suspect
+        suspect = evaluation.deciding.suspect
         astride_s = 0.0 if foreign.text else self._test.astride_s
         self._alarms.found(verdict, self._test.unexplained, suspect, end_ns, hidden=foreign.hides, astride_s=astride_s)
         explained = bool(verdict.changed) and not verdict.outside_model

@@ -319,10 +319,14 @@ def test_an_unbalance_that_is_elsewhere_differs_by_its_vector(turned_rad: float,
     [
         ("share of z1 in y1", 0.02, "limited"),
         ("share of z1 in y1", 0.06, "refused"),
+        ("delay of y1", 4e-5, "limited"),
+        ("delay of y1", 3e-4, "refused"),
         ("mass of the disc", 0.02, "refused"),
     ],
 )
-def test_a_sensor_that_is_a_degree_off_its_axis_makes_no_other_machine(tried: str, change: float, verdict: str) -> None:
+def test_a_sensor_that_is_a_degree_off_its_axis_or_a_little_late_makes_no_other_machine(
+    tried: str, change: float, verdict: str
+) -> None:
     read = (parameter_reading("k_by", "likelihood", 0.0, 3e-4),)
     goodness = Goodness(3.0, (AlternativeTest(tried, 12.0, change),), 2)
     one = Diagnosis("likelihood", read, misfit_z=goodness.misfit_z, goodness=goodness, suspect=goodness.suspect)

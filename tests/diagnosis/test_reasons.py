@@ -168,6 +168,17 @@ def test_a_suspect_that_cannot_be_is_none() -> None:
     assert suspect("shaft stiffer in y than in z", 1.2) == ""
     assert suspect("shaft stiffer in y than in z", -0.0003) == ""  # as true as that no machine is built
     assert suspect("mass of the disc", 0.07, z=4.0) == "gain of y1 (+10.0%)"
+    assert suspect("delay of y1", -4e-5) == "delay of y1 (-40 µs)"
+    assert suspect("delay of y1", 1e-6) == ""
+    assert suspect("delay of y1", 2e-3) == "delay of y1"
+
+
+def test_of_an_unexplained_window_what_accounts_for_much_of_it_is_told() -> None:
+    delay = AlternativeTest("delay of y1", 20.0, 4e-5)
+    mostly, hardly = (Goodness(9.0, (delay,), 2, excess) for excess in (1000.0, 5000.0))
+    assert mostly.suspected(unexplained=True) == "delay of y1 (+40 µs)"
+    assert not hardly.suspected(unexplained=True)
+    assert hardly.suspected(unexplained=False) == "delay of y1 (+40 µs)"
 
 
 def test_a_misfit_of_which_nothing_could_be_tried_is_that_of_the_spectra() -> None:

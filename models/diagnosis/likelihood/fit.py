@@ -198,7 +198,7 @@ class LikelihoodFit:
             read,
             misfit_z=goodness.misfit_z,
             goodness=goodness,
-            suspect=goodness.suspect,
+            suspect=goodness.suspected(unexplained=bool(unexplained)),
             unexplained=unexplained,
             steps=found.steps,
         )

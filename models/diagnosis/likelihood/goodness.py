@@ -1,25 +1,27 @@
 """Whether the theory explains a window at all: where not, parameters fitted to it mean nothing, and what else would.
 
 At the maximum of the likelihood every direction that the model does not have is tried by its score (C. R. Rao, Proc.
-Cambridge Phil. Soc. 44 (1948)): the gain of every channel, what it shows of the other plane, masses, a shaft that is
-stiffer in one plane than in the other. Each is standard normal where the model holds, and its one-step estimate says
-how large the thing would be. What no such direction explains shows in the total excess of estimated over theoretical
-spectra.
+Cambridge Phil. Soc. 44 (1948)): gain and delay of every channel, what it shows of the other plane, masses, a shaft
+that is stiffer in one plane than in the other. Each is standard normal where the model holds, and its one-step estimate
+says how large the thing would be. What no such direction explains shows in the total excess of estimated over
+theoretical spectra.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from models.diagnosis.likelihood.motions import Mismatch
 from models.diagnosis.likelihood.scoring import Maximum, Weights, Whitened, inverse_factor
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed, twice_packed
-from models.diagnosis.misfit import ACROSS, UNEQUAL, AlternativeTest, Goodness
+from models.diagnosis.misfit import ACROSS, DELAY, EACH_LATE, UNEQUAL, AlternativeTest, Goodness
 from models.diagnosis.moments import ComplexArray, through
 from models.diagnosis.readings import beyond
 from models.machine import Machine
 from models.physics.rotor import PARAMETER_TEXT, Q_shaft
 from models.signals.block import FloatArray
+from models.signals.channels import Channel, parts_seen, state_name
 
 # Of the elements of the dynamic matrix: what couples motions in y, and what couples motions in z.
 _SIGNS = np.kron([[1.0, 0.0], [0.0, -1.0]], np.ones((3, 3)))
@@ -59,7 +61,8 @@ def goodness_of_fit(
     pairs = [_named(mismatch, {one.name: one for one in alternatives}) for mismatch in mismatches]
     # The gains of a pair are nearly one test, and how far the pair disagrees is hardly random.
     tests = len(alternatives) - len(pairs) + 1
-    return Goodness(_excess_z(model, weights, found), (*alternatives, *pairs), tests)
+    over, scatter = _excess(model, weights, found)
+    return Goodness(over / scatter, (*alternatives, *pairs), tests, over)
 
 
 def _named(mismatch: Mismatch, alternatives: dict[str, AlternativeTest]) -> AlternativeTest:
@@ -71,15 +74,15 @@ def _named(mismatch: Mismatch, alternatives: dict[str, AlternativeTest]) -> Alte
     return AlternativeTest(v, mismatch.z, mismatch.change, mismatch.states)
 
 
-def _excess_z(model: SpectralModel, weights: Weights, found: Maximum) -> float:
-    """Σ ν ‖L⁻¹ŜL⁻ᴴ - I‖² over its expectation, in its standard deviations.
+def _excess(model: SpectralModel, weights: Weights, found: Maximum) -> tuple[float, float]:
+    """Σ ν ‖L⁻¹ŜL⁻ᴴ - I‖² over its expectation, and its standard deviation.
 
     Where the model holds every element scatters as the groups say, less one for every parameter that was fitted.
     """
     shared, excess = model.groups.shared, found.whitened.excess
     total = float(weights.averages @ np.einsum("fij,fji->f", excess, excess).real)
     expected = model.n**2 * float(np.trace(shared)) - found.fitted
-    return float((total - expected) / (model.n * np.sqrt(2 * np.sum(shared**2))))
+    return total - expected, float(model.n * np.sqrt(2 * np.sum(shared**2)))
 
 
 def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tuple[list[str], FloatArray]:
@@ -88,18 +91,8 @@ def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tup
     whitened: ComplexArray = L_inverse[:, None] @ point.G
     response = through(point.C, whitened)
     coloured = point.S @ L_inverse.conj().swapaxes(1, 2)
-    shares = model.motions.shares(model.centre)
-    names = [f"gain of {state}" for state in shares]
-    outer = L_inverse.transpose(2, 0, 1)[..., None] * coloured.swapaxes(0, 1)[:, :, None]  # of every motion
-    slopes = list(twice_packed(np.array([share[:, None, None] * outer[number] for number, share in shares.values()])))
-    # A sensor that is turned, or sensitive across its axis, shows a part of its place's motion in the other plane.
-    dofs, factor = model.motions.dofs.tolist(), model.motions.factor(model.centre, model.centre)
-    for state, (number, share) in shares.items():
-        if (dofs[number] + 3) % 6 in dofs:
-            other = dofs.index((dofs[number] + 3) % 6)
-            names.append(f"{ACROSS} of {state.translate(_OTHER_PLANE)} in {state}")
-            seen = (share * factor[:, number] / factor[:, other])[:, None]
-            slopes.append(twice_packed(L_inverse[:, :, number, None] * (seen * coloured[:, other])[:, None]))
+    names, of_sensors = _of_sensors(machine, model, L_inverse, coloured)
+    slopes = list(of_sensors)
     w2 = (2 * np.pi * model.groups.nodes_hz) ** 2
     rotor, sides = machine.rotor, model.sides(point, whitened, response)
     for (name, first), mass in zip(_MASSES.items(), (rotor.m1_kg, rotor.m2_kg, rotor.I2_kg_m2), strict=True):
@@ -109,6 +102,52 @@ def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tup
     names.append(UNEQUAL)
     slopes.append(sides.slope(-np.ones_like(w2), change=shaft * _SIGNS))
     return names, np.stack(slopes)
+
+
+def _of_sensors(
+    machine: Machine, model: SpectralModel, L_inverse: ComplexArray, coloured: ComplexArray
+) -> tuple[list[str], FloatArray]:
+    """Names and packed slopes of what may be wrong with sensors: what each shows besides of which motion, or how late.
+
+    Parameters
+    ----------
+    coloured : ndarray, shape (n_groups, n, n)
+        SL⁻ᴴ.
+    """
+    motions, w = model.motions, model.centre
+    shares, dofs, factor = motions.shares(w), motions.dofs, motions.factor(w, w)
+    numbers = np.array([shares[state][0] for state in motions.states])
+    own, alone = np.eye(motions.n)[numbers], np.eye(numbers.size)
+    tried = {f"gain of {state}": one[:, None] * own for state, one in zip(motions.states, alone, strict=True)}
+    # A sensor that is turned, or sensitive across its axis, shows a part of its place's motion in the other plane.
+    across = (dofs[numbers, None] + 3) % 6 == dofs
+    for state, one, other in zip(motions.states, alone, across, strict=True):
+        if other.any():
+            tried[f"{ACROSS} of {state.translate(_OTHER_PLANE)} in {state}"] = np.outer(one, other)
+    late = {name: delay @ own for name, delay in _delays(machine.sensors, motions.states).items()}
+    weights = np.stack([*tried.values(), *late.values()])  # by state and the motion that it shows
+    by, shown = np.nonzero(weights.any(axis=0))
+    weights, into = weights[:, by, shown], numbers[by]
+    share = np.stack([shares[state][1] for state in motions.states])[by]
+    seen = (share * (factor[:, into] / factor[:, shown]).T)[..., None] * coloured.swapaxes(0, 1)[shown]
+    sides = L_inverse.transpose(2, 0, 1)[into][..., None] * seen[:, :, None]
+    at_once = np.tensordot(weights[: len(tried)], twice_packed(sides), axes=1)
+    delayed = np.tensordot(weights[len(tried) :], twice_packed((-1j * w)[:, None, None] * sides), axes=1)
+    return [*tried, *late], np.concatenate([at_once, delayed])
+
+
+def _delays(channels: Sequence[Channel], states: Sequence[str]) -> dict[str, FloatArray]:
+    """Names of delays, and what part of each state comes late as part of which state; shape (n_states, n_states).
+
+    One channel comes late, or each a little after the one before, as of a converter that samples one after the other.
+    """
+    measured = {part for channel in channels for part in parts_seen(channel)}
+    sources = [state if state in measured else state.replace("_dot", "_ddot") for state in states]  # integrated
+    seen = np.array([[parts_seen(channel).get(source, 0.0) for source in sources] for channel in channels])
+    late = np.linalg.pinv(seen).T[:, :, None] * seen[:, None]
+    single = {f"{DELAY} of {state_name(one)}": made for one, made in zip(channels, late, strict=True) if made.any()}
+    in_turn = {EACH_LATE: np.tensordot(np.arange(len(late)), late, axes=1)} if len(single) > 2 else {}
+    return single | in_turn
 
 
 # No stiffness or damping is believed to have changed by more than a factor of five within the model.

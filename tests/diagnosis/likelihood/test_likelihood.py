@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,10 +15,13 @@ from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL
 from models.diagnosis.moments import plan_for
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.rotor import M_matrix, P_matrix, Q_matrix, changed
+from models.signals.channels import parts_seen, with_channel_names
 from simulator.training.draws import Anomaly, Draw, Excitation, Layout, Purpose, simulate_window
+from tests.commissioning.rotor_kit import mounted
 from tests.sure import sure
 
 SEED = 7_700_001
@@ -287,3 +291,68 @@ def test_a_sensor_that_shows_some_of_the_other_plane_is_told() -> None:
     mixed[window.states.index("y1"), window.states.index("z1")] = 0.03
     seen = replace(window, spectrum=mixed @ window.spectrum @ mixed.T, synchronous=mixed @ sure(window.synchronous))
     assert LikelihoodFit(load_machine("lab")).diagnose(seen).suspect.startswith("share of z1 in y1 (+")
+
+
+def late(machine: Machine, window: WindowStatistics, delays_s: list[float]) -> WindowStatistics:
+    """The window with every channel of the machine, as it is mounted, coming later; of the random part alone."""
+    parts = np.array([[parts_seen(one).get(state, 0.0) for state in window.states] for one in machine.sensors])
+    turned = np.exp(-2j * np.pi * window.frequencies_hz[:, None] * np.array(delays_s))
+    made = np.linalg.pinv(parts) @ (turned[:, :, None] * parts)
+    return replace(window, spectrum=made @ window.spectrum @ made.conj().swapaxes(1, 2))
+
+
+def told(machine: Machine, window: WindowStatistics) -> tuple[str, float]:
+    """What explains a window best, and its delay, µs."""
+    diagnosis = LikelihoodFit(machine).diagnose(window)
+    assert sure(diagnosis.misfit_z) > 5
+    name, _, size = diagnosis.suspect.partition(" (")
+    return name, float(size.removesuffix(" µs)"))
+
+
+@cache
+def probes_of_lab(layout: Layout) -> tuple[Machine, WindowStatistics]:
+    """The rotor kit with its displacements alone, which do not check each other, healthy."""
+    lab = load_machine("lab")
+    probes = lab.model_copy(update={"sensors": tuple(one for one in lab.sensors if not one.name.endswith("_dot"))})
+    window = simulate_window(Draw(probes, SEED, Purpose.EVALUATION, 21, layout=layout), 0)
+    assert not LikelihoodFit(probes).diagnose(window).suspect
+    return probes, window
+
+
+@pytest.mark.parametrize("layout", [Layout.ONE_SOURCE, Layout.INDEPENDENT])
+def test_a_converter_that_samples_one_channel_after_the_other_is_told(layout: Layout) -> None:
+    """Its delays pass for damping: it was named, without reserve where independent forces shake the machine."""
+    machine, window = probes_of_lab(layout)
+    name, delay_us = told(machine, late(machine, window, [3e-5 * number for number in range(len(machine.sensors))]))
+    assert name == "delay of each channel after the one before"
+    assert delay_us == pytest.approx(30, rel=0.3)
+
+
+def test_delays_that_leave_a_window_unexplained_are_told() -> None:
+    machine, window = probes_of_lab(Layout.ONE_SOURCE)
+    seen = late(machine, window, [6e-5 * number for number in range(len(machine.sensors))])
+    assert LikelihoodFit(machine).diagnose(seen).unexplained
+    assert told(machine, seen)[0] == "delay of each channel after the one before"
+
+
+@pytest.mark.parametrize("at", [{}, {"y1": (45, 135), "y2": (30, 120)}])
+def test_a_channel_that_comes_late_is_told_however_it_is_mounted(at: dict[str, tuple[float, float]]) -> None:
+    lab, window = probes_of_lab(Layout.ONE_SOURCE)
+    machine = mounted(lab, at)
+    name, delay_us = told(machine, late(machine, window, [0.0, 0.0, 4e-5, 0.0, 0.0]))
+    assert with_channel_names(name, machine.sensors) == "delay of y2"
+    assert delay_us == pytest.approx(40, rel=0.15)
+
+
+def test_an_accelerometer_that_comes_late_is_told() -> None:
+    lab, window = probes_of_lab(Layout.ONE_SOURCE)
+    sensors = [one.model_dump() for one in lab.sensors]
+    sensors[2] |= {"quantity": "acceleration", "unit": "m/s2"}
+    w = 2 * np.pi * window.frequencies_hz
+    states = tuple({"y2": "y2_ddot"}.get(state, state) for state in window.states)
+    turn = np.where([state == "y2_ddot" for state in states], -(w[:, None] ** 2), 1.0)
+    accelerated = replace(window, states=states, spectrum=window.spectrum * turn[:, :, None] * turn[:, None, :])
+    machine = Machine.model_validate(lab.model_dump() | {"sensors": sensors})
+    name, delay_us = told(machine, late(machine, replace(accelerated, synchronous=None), [0.0, 0.0, 4e-5, 0.0, 0.0]))
+    assert with_channel_names(name, machine.sensors) == "delay of y2"
+    assert delay_us == pytest.approx(40, rel=0.15)

@@ -362,3 +362,24 @@ def test_a_1x_that_no_unbalance_makes_is_outside_the_model() -> None:
     windows, events = feed(MachineMonitor(install(machine, None)), [replace(a, samples=b) for a, b in parts])
     assert "the 1× vibration is not what an unbalance causes" in windows[-1].suspect
     assert [event.alarm.name for event in events if event.alarm.name in {MODEL, *PARAMETERS}] == [MODEL]
+
+
+def test_a_converter_that_samples_one_channel_after_the_other_is_told_where_nothing_is_read() -> None:
+    """The rotor kit's displacements under one force, 60 µs from channel to channel, of which its file is silent."""
+    kit = rotor_kit.LAB
+    sensors = [one for one in kit.sensors if not one.name.endswith("_dot")]
+    late = [
+        one if one.name == "theta" else one.model_copy(update={"delay_us": 60.0 * number})
+        for number, one in enumerate(sensors)
+    ]
+    file, simulated = (kit.model_copy(update={"sensors": tuple(those)}) for those in (sensors, late))
+    draw = Draw(simulated, SEED, Purpose.EVALUATION, 5, layout=Layout.ONE_SOURCE)
+    scenario = draw_condition(draw, 0).overridden(duration_s=70.0)
+    windows, events = feed(
+        MachineMonitor(install(file, None)), [block for block, _ in blocks(scenario, simulated, 1.0)]
+    )
+    assert "the theory does not explain this window" in windows[-1].reason
+    assert "delay of each channel after the one before (+" in windows[-1].suspect
+    (event,) = events
+    assert event.alarm.name == MODEL
+    assert event.alarm.note.endswith(windows[-1].suspect)
