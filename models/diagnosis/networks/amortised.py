@@ -116,7 +116,6 @@ class NetworkDiagnostician:
     def __init__(self, machine: Machine, amortised: AmortisedNetworks) -> None:
         self._machine, self._amortised = machine, amortised
         self._features = ForceFeatures(machine, amortised.states)
-        self._near = ForceFeatures(machine, amortised.states, near=True)
 
     def inputs(self, window: WindowStatistics) -> tuple[Float32Array, float] | None:
         """What the first reading looks at; None if a state the networks were trained with is not in the window.
@@ -167,7 +166,7 @@ class NetworkDiagnostician:
             if not (sharp and np.all(np.abs(mean) <= self._amortised.log_range)):  # nor what is not a number
                 return first
             centre[own[equation]] = mean
-        features = self._near.around(around(self._machine, centre))
+        features = self._features.around(around(self._machine, centre))
         again, _ = self._standardised(window, near.basis, features, centre[None].astype(np.float32))
         remainder = _stated(near.networks, again)
         if not all(np.all(np.abs(mean) <= trained[own[name]]) for name, (mean, _) in remainder.items()):

@@ -62,8 +62,9 @@ class ForceFeatures:
         self._take(machine)
 
     def around(self, machine: Machine) -> "ForceFeatures":
-        """The same features, with the cross-spectra taken through another machine with the same sensors."""
+        """The same features near another machine with the same sensors, which the cross-spectra are taken through."""
         found = copy(self)
+        found._near = True
         found._take(machine)
         return found
 
@@ -72,7 +73,6 @@ class ForceFeatures:
         self._corners_rad_s = self._corners()
         w = 2 * np.pi * self.frequencies_hz
         self._force = self._to_force(w, np.full(w.size, machine.operation.speed_rad_s))
-        self._force_adjoint = np.ascontiguousarray(self._force.conj().swapaxes(1, 2))
 
     @property
     def n_series(self) -> int:
@@ -141,7 +141,7 @@ class ForceFeatures:
         spectrum : ndarray of complex, shape (n_windows, n_bins, n, n)
             Cross-spectra of the measured states, SI²/Hz.
         """
-        return np.asarray(self._force @ spectrum @ self._force_adjoint, dtype=np.complex128)
+        return np.asarray(self._force @ spectrum @ self._force.conj().swapaxes(1, 2), dtype=np.complex128)
 
     def series(self, force: npt.NDArray[np.complexfloating]) -> Float32Array:
         """Functions of frequency, shape (n_series, n_windows, n_bins), of the cross-spectra of the forces."""
