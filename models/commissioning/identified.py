@@ -120,7 +120,9 @@ def _moved(
             "operation": moved.operation.model_copy(update={"unbalance_phase_rad": phase}),
         }
     )
-    return balanced, [fit.balanced(balanced, diagnosis) for fit, diagnosis in read]
+    return balanced, [
+        fit.balanced(balanced, window, diagnosis) for (fit, diagnosis), window in zip(read, windows, strict=True)
+    ]
 
 
 def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics]) -> Machine:

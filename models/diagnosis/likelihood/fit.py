@@ -20,7 +20,7 @@ from models.diagnosis.likelihood.motions import BinGroups, Motions, group_bins, 
 from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Weights, Whitened
 from models.diagnosis.likelihood.spectral_model import (
     STRUCTURAL,
-    ModelPoint,
+    Expected,
     SpectralModel,
     starting_point,
     usual_force,
@@ -73,7 +73,7 @@ class LikelihoodFit:
         self._line: Linearised | None = None
         self._line_segments = self._followed = 0
         self._line_band: tuple[FloatArray, npt.NDArray[np.bool_]] | None = None
-        self._latest: tuple[WindowStatistics, SpectralModel, ModelPoint, FloatArray, float] | None = None
+        self._latest: tuple[SpectralModel, Expected, FloatArray, float] | None = None
         self._said: tuple[Diagnosis, Unbalance, ComplexArray] | None = None  # with the window's synchronous vector
         self._groups: dict[bytes, BinGroups] = {}
 
@@ -189,8 +189,8 @@ class LikelihoodFit:
         n = len(STRUCTURAL)
         # A search that has not converged adds the step it would still take to the uncertainty.
         structural = covariance[:n, :n] + np.diag(found.remaining**2)
-        self._latest = window, model, found.whitened.point, structural, speed
-        read, unbalance = self._read(*self._latest)
+        self._latest = model, found.whitened.point.expected, structural, speed
+        read, unbalance = self._read(window, *self._latest)
         usual = window.synchronous
         self._said = None if unbalance is None or usual is None else (read, unbalance, usual)
         unexplained = unexplained or self._too_stiff(read)
@@ -203,7 +203,7 @@ class LikelihoodFit:
             steps=found.steps,
         )
 
-    def balanced(self, machine: Machine, diagnosis: Diagnosis) -> Diagnosis:
+    def balanced(self, machine: Machine, window: WindowStatistics, diagnosis: Diagnosis) -> Diagnosis:
         """Read the window that was diagnosed last relative to a machine that differs in its unbalance alone.
 
         What is random does not depend on the unbalance: nothing is searched again.
@@ -211,7 +211,7 @@ class LikelihoodFit:
         if self._latest is None:
             raise EstimationError(f"{machine.name}: no window has been diagnosed")
         self._machine = machine
-        read, _ = self._read(*self._latest)
+        read, _ = self._read(integrated(window), *self._latest)
         return replace(diagnosis, parameters=read.parameters, covariance=read.covariance, unbalance=read.unbalance)
 
     def glance(self, stretch: WindowStatistics) -> Diagnosis | None:
@@ -268,7 +268,7 @@ class LikelihoodFit:
         return window.speed_rad_s if np.isfinite(window.speed_rad_s) else self._machine.operation.speed_rad_s
 
     def _read(
-        self, window: WindowStatistics, model: SpectralModel, point: ModelPoint, structural: FloatArray, speed: float
+        self, window: WindowStatistics, model: SpectralModel, point: Expected, structural: FloatArray, speed: float
     ) -> tuple[Diagnosis, Unbalance | None]:
         """Readings of the structural parameters at a point, and of e from the window's synchronous part."""
         ratio = np.exp(point.theta[: len(STRUCTURAL)])
@@ -288,7 +288,7 @@ class LikelihoodFit:
         return Diagnosis(self.by, tuple(readings), covariance=covariance, unbalance=vector), e
 
     def _unbalance(
-        self, window: WindowStatistics, model: SpectralModel, point: ModelPoint, structural: FloatArray, speed: float
+        self, window: WindowStatistics, model: SpectralModel, point: Expected, structural: FloatArray, speed: float
     ) -> Unbalance:
         """Change of e; hop by hop where the speed varies."""
         known = (self._machine, model, point, structural)

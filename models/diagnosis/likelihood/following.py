@@ -24,7 +24,15 @@ from models.diagnosis.likelihood.scoring import (
     inverse_factor,
     whitened_at,
 )
-from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint, SpectralModel, factor_of, packed
+from models.diagnosis.likelihood.spectral_model import (
+    COLUMNS,
+    ROWS,
+    Expected,
+    ModelPoint,
+    SpectralModel,
+    factor_of,
+    packed,
+)
 from models.diagnosis.moments import ComplexArray
 from models.signals.block import FloatArray
 
@@ -41,7 +49,7 @@ _LEAST_EXCESS_Z, _EXCESS_MARGIN = 4.0, 1.15
 class Glance:
     """What one step from the window's maximum says of a stretch that holds nothing new."""
 
-    point: ModelPoint  # the window's spectra at the stretch's parameters: what is not diagnosed is the window's
+    point: Expected  # the window's spectra at the stretch's parameters: what is not diagnosed is the window's
     structural: FloatArray  # (n_diagnosed, n_diagnosed), covariance of the diagnosed parameters
 
 
@@ -52,9 +60,9 @@ class Linearised:
     ----------
     weights : Weights
         Those of the search that ended there.
-    searched : ModelPoint
+    searched : Expected
         Where it ended.
-    point : ModelPoint
+    point : Expected
         Where the maximum is now.
     derivatives : Derivatives
         At the search's end.
@@ -66,8 +74,8 @@ class Linearised:
         self,
         model: SpectralModel,
         weights: Weights,
-        searched: ModelPoint,
-        point: ModelPoint,
+        searched: Expected,
+        point: Expected,
         derivatives: Derivatives,
         left: FloatArray,
         fitted: float,
@@ -75,7 +83,7 @@ class Linearised:
         self.model, self.weights, self.derivatives = model, weights, derivatives
         self.theta = searched.theta
         self._point, self._left, self._fitted = point, left, fitted
-        self._searched_rad_s = searched.speed_rad_s  # no more of it: its receptances are a megabyte
+        self._searched_rad_s = searched.speed_rad_s
         self._L_inverse = inverse_factor(searched.S)
         self._S = np.einsum("fii->fi", searched.S).real.copy()
         self._pull = weights.pull
@@ -84,7 +92,7 @@ class Linearised:
     @classmethod
     def around(cls, model: SpectralModel, weights: Weights, found: Maximum) -> "Linearised":
         """The spectra around the maximum of a search that has just ended; its slopes are copied."""
-        point, slopes = found.whitened.point, found.slopes.copy()
+        point, slopes = found.whitened.point.expected, found.slopes.copy()
         information = np.asarray(found.information - np.diag(weights.pull), dtype=np.float64)
         derivatives = Derivatives(slopes, information, found.slopes_rad_s)
         # In directions that the data leave to the pulls on T the equation is solved as the search left it.
@@ -135,7 +143,7 @@ class Linearised:
             model,
             weights,
             model.at(theta, of_searched),
-            model.at(point, of_point, levels),
+            model.at(point, of_point, levels).expected,
             Derivatives(slopes, information, of_slopes),
             checked(arrays, "left", np.float64, (COLUMNS.size,)),
             float(checked(arrays, "fitted", np.float64, ())),
@@ -152,6 +160,7 @@ class Linearised:
             As `FisherScoring.maximise` has them.
         """
         model, point = self.model, self._point
+        there: ModelPoint | None = None
         covariance = self._inverse(1.0)
         diagnosed = slice(model.cutoff_at)
         errors = np.sqrt(np.diag(covariance)[diagnosed])
@@ -161,10 +170,11 @@ class Linearised:
             step = np.asarray(covariance @ gradient, dtype=np.float64)
             left = float(gradient @ step) / 2
             if np.all(np.abs(step[diagnosed]) < near * errors) and left < gain:
-                whitened = whitened_at(point, observed)
+                there = there or model.at(point.theta, point.speed_rad_s, point.C)
+                whitened = whitened_at(there, observed)
                 if whitened is None:
                     return None
-                self._point = point
+                self._point = there.expected
                 own = self.derivatives
                 information = own.information + np.diag(self._pull)
                 left_over = step[diagnosed]
@@ -174,7 +184,7 @@ class Linearised:
             if steps == _MOST_STEPS or left > before:
                 break
             before = left
-            point = self._moved(point, step, speed_rad_s)
+            point = there = self._moved(point, step, speed_rad_s)
             expected = np.einsum("fii->fi", point.S).real
             if not np.mean((expected / self._S - 1) ** 2) < _FARTHEST**2:
                 break
@@ -218,7 +228,7 @@ class Linearised:
         """What the data say about every parameter, levels by C."""
         return _gradient(self.derivatives.slopes, rest, self.weights)
 
-    def _pulled(self, gradient: FloatArray, point: ModelPoint, share: float) -> FloatArray:
+    def _pulled(self, gradient: FloatArray, point: Expected, share: float) -> FloatArray:
         """The gradient of a share of the data with the pulls."""
         levels = self.model.level_at
         pulled = share * gradient - self.weights.ridge * (point.theta - self.weights.centre)
@@ -231,7 +241,7 @@ class Linearised:
             self._inverses[share] = np.asarray(np.linalg.inv(information), dtype=np.float64)
         return self._inverses[share]
 
-    def _moved(self, point: ModelPoint, step: FloatArray, speed_rad_s: float) -> ModelPoint:
+    def _moved(self, point: Expected, step: FloatArray, speed_rad_s: float) -> ModelPoint:
         """The point after a step: logarithms by one at most, variances as the step on the variance itself says."""
         model = self.model
         theta = point.theta.copy()

@@ -43,19 +43,30 @@ _BEARING_DOFS = (0, 0, 3, 3)
 
 
 @dataclass(frozen=True, slots=True)
-class ModelPoint:
-    """Expected spectra at one parameter point and what their derivatives are made of, in the motions' units."""
+class Expected:
+    """Expected spectra at one parameter point, in the motions' units."""
 
     theta: FloatArray  # (size,), the parameter point
     S: ComplexArray  # (n_groups, n, n), cross-spectral matrices
+    C: FloatArray  # (6, 6), level matrix
+    speed_rad_s: float  # speed of the gyroscopic terms
+
+
+@dataclass(frozen=True, slots=True)
+class ModelPoint(Expected):
+    """The same with what their derivatives are made of, a megabyte that nobody should keep."""
+
     # (n_groups, n_nodes, n, 6): transfer from forces (in units of C, coloured) to measured motions, times the root of
     # the node's weight
     G: ComplexArray
     # (n_groups, n_nodes, 6, 6): receptance of all six degrees of freedom for the same forces, without that root
     H: ComplexArray
     colour: FloatArray  # (n_groups, 6), D
-    C: FloatArray  # (6, 6), level matrix
-    speed_rad_s: float  # speed of the gyroscopic terms
+
+    @property
+    def expected(self) -> Expected:
+        """The spectra alone."""
+        return Expected(self.theta, self.S, self.C, self.speed_rad_s)
 
 
 class SpectralModel:
@@ -176,7 +187,7 @@ class SpectralModel:
         S = _summed(through(C, G), G)
         diagonal = np.arange(self.n)
         S[:, diagonal, diagonal] += self.noise(theta)
-        return ModelPoint(theta, S, G, H * unit, colour, C, speed_rad_s)
+        return ModelPoint(theta, S, C, speed_rad_s, G, H * unit, colour)
 
     def filter(self, theta: FloatArray) -> tuple[float, float]:
         """Cutoff (Hz) and order of the low-pass."""

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from models.diagnosis.likelihood.motions import BinGroups
-from models.diagnosis.likelihood.spectral_model import STRUCTURAL, ModelPoint, SpectralModel
+from models.diagnosis.likelihood.spectral_model import STRUCTURAL, Expected, SpectralModel
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.readings import UnbalanceVector, foreign_rotation
 from models.errors import EstimationError
@@ -68,7 +68,7 @@ class UnbalanceRatios:
 def estimate_unbalance(
     machine: Machine,
     model: SpectralModel,
-    point: ModelPoint,
+    point: Expected,
     covariance: FloatArray,
     synchronous: ComplexArray,
     speed_rad_s: float,
@@ -81,7 +81,7 @@ def estimate_unbalance(
 
     Parameters
     ----------
-    point : ModelPoint
+    point : Expected
         The model's spectra at the estimate.
     covariance : ndarray, shape (5, 5)
         Of the logarithmic ratios of the structural parameters.
@@ -176,7 +176,7 @@ def _contradiction(observed: FloatArray, design: FloatArray, spread: FloatArray,
 def estimate_unbalance_by_hop(
     machine: Machine,
     model: SpectralModel,
-    point: ModelPoint,
+    point: Expected,
     covariance: FloatArray,
     hop_synchronous: ComplexArray,
     hop_speed_rad_s: FloatArray,
@@ -227,7 +227,7 @@ def estimate_unbalance_by_hop(
 
 
 def _around_rotation(
-    machine: Machine, model: SpectralModel, point: ModelPoint, speed_rad_s: float, duration_s: float
+    machine: Machine, model: SpectralModel, point: Expected, speed_rad_s: float, duration_s: float
 ) -> ComplexArray:
     """Stochastic cross-spectrum under the kernel of a plain window of the given length, centred on Ω, shape (n, n).
 
