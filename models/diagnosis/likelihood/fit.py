@@ -18,13 +18,7 @@ from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.likelihood.goodness import MOST_MISFIT, goodness_of_fit, unexplained_at, unseen
 from models.diagnosis.likelihood.motions import BinGroups, Motions, group_bins, integrated
 from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Weights, Whitened
-from models.diagnosis.likelihood.spectral_model import (
-    STRUCTURAL,
-    Expected,
-    SpectralModel,
-    starting_point,
-    usual_force,
-)
+from models.diagnosis.likelihood.spectral_model import STRUCTURAL, Expected, SpectralModel, starting_point, usual_force
 from models.diagnosis.likelihood.unbalance import Unbalance, estimate_unbalance, estimate_unbalance_by_hop
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.readings import Diagnosis, parameter_reading
