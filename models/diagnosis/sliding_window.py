@@ -6,7 +6,8 @@ all of them were stored.
 """
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache, partial
 
 import numpy as np
 import numpy.typing as npt
@@ -269,3 +270,12 @@ class SlidingWindow:
         if not 0 < count <= len(self._hops):
             return None
         return window_statistics(self.plan, tuple(self._hops)[-count:], lagged=hops is None, lines=self._lines)
+
+    def again(self) -> Callable[[], WindowStatistics] | None:
+        """What makes the statistics of the window as it is now when they are asked for; None before it is full.
+
+        They are megabytes, and the hops they are made of are there anyway. Once made they stay with it.
+        """
+        if len(self._hops) < self.plan.hops:
+            return None
+        return cache(partial(window_statistics, self.plan, tuple(self._hops), lines=self._lines))

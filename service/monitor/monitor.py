@@ -102,7 +102,7 @@ class MachineMonitor:
         self._drops: dict[tuple[int, int], int] = {}
         self._fault = ""
         self._defect: Exception | None = None
-        self.window: WindowStatistics | None = None  # that of the latest report, if it was full
+        self.window: Callable[[], WindowStatistics] | None = None  # makes that of the latest report, if it was full
         self._newest = NewestBlocks(20_000)
         self._used: SampleBlock | None = None
         self.used, self.could_use, self.begin = False, self._gate.could_use, self._gate.begin
@@ -418,7 +418,7 @@ class MachineMonitor:
         self._data_path.hop(end_ns, skipped=skipped)
         self._data_path.conflict(self._senders.conflict, end_ns)
         self._levels.take(self._window)
-        statistics = self.window = self._window.statistics()
+        statistics, self.window = self._window.statistics(), self._window.again()
         there = statistics or self._window.statistics(len(self._window.hops))  # while it fills
         stood = "" if there is None else self._standstill.found(there)
         if statistics is None:

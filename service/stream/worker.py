@@ -8,8 +8,11 @@ import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import partial
 
 from models.commissioning.commissioned import Installed
+from models.diagnosis.window import WindowStatistics
+from models.signals.block import SampleBlock
 from models.signals.keys import Topic
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
@@ -83,7 +86,7 @@ class MachineWorker:
         self.history = history
         self.identity = identity_of(installed)
         self.snapshots = MachineSnapshots(installed, self.identity)
-        self.latest = LatestData()
+        self._held: Callable[[], LatestData] = LatestData
         self.errors = 0
         self.last_error = ""
         self.recorder: MachineRecorder | None = None
@@ -412,7 +415,7 @@ class MachineWorker:
                 reports, told = self._commit(windows, whole=whole)
         finally:
             self._snapshot = snapshot
-            self.latest = self._held()
+            self._held = partial(_held, self._monitor.window, snapshot, self._monitor.blocks)
         texts = tuple(one.text for one in told if one.sequence >= self.told)
         for event in events:
             self._log.warning("alarm", kind=event.kind.value, text=event.text, time_ns=event.time_ns)
@@ -444,16 +447,10 @@ class MachineWorker:
         )
         return reports, told
 
-    def _held(self) -> LatestData:
-        """What the monitor holds, for snapshots."""
-        latest, monitor = self._snapshot.latest, self._monitor
-        return LatestData(
-            window=monitor.window,
-            filled=self._snapshot.filled,
-            parameters=() if latest is None else latest.parameters,
-            why_not="" if latest is None else latest.reason,
-            blocks=monitor.blocks,
-        )
+    @property
+    def latest(self) -> LatestData:
+        """What the monitor holds, for snapshots; the window is made when somebody looks at it."""
+        return self._held()
 
     def _publish(self, reports: Iterable[str], events: Iterable[str]) -> None:
         outlet = self._outlet
@@ -485,3 +482,16 @@ class MachineWorker:
 
     def _warn(self, kind: str, text: str, **details: object) -> None:
         self._limiter.say(kind, self._log.warning, text, **details)
+
+
+def _held(
+    window: Callable[[], WindowStatistics] | None, health: MachineHealth, blocks: tuple[SampleBlock, ...]
+) -> LatestData:
+    latest = health.latest
+    return LatestData(
+        window=None if window is None else window(),
+        filled=health.filled,
+        parameters=() if latest is None else latest.parameters,
+        why_not="" if latest is None else latest.reason,
+        blocks=blocks,
+    )

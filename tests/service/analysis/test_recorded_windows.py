@@ -56,7 +56,7 @@ def held_by_monitor(source: RecordingSource, installed: Installed) -> list[tuple
     held: list[tuple[Report, WindowStatistics | None]] = []
     for message in source.messages({source.machine("demo/lab").stream}):
         for step in monitor.step_payload(message.payload, message.attachment, message.encoding):
-            held += [(one, monitor.window) for one in step.windows]
+            held += [(one, monitor.window and monitor.window()) for one in step.windows]
     return held
 
 
