@@ -76,7 +76,7 @@ def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistic
     """
     window = window.as_mounted
     states = plan.mounted
-    every = np.concatenate([hop.segments for hop in hops])
+    every = np.concatenate([hop.segments for hop in hops], dtype=np.complex128)
     segments = every[:, :, : len(states)]
     if segments.shape[0] < _FEWEST_SEGMENTS:
         return ()

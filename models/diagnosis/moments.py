@@ -208,8 +208,8 @@ class HopMoments:
     # (n_lags, n, n): ``products[l, i, j] = Σ_t a_i(t - lag_l) a_j(t)`` over the t of the hop, a = (x, n)
     products: FloatArray
     # (n_segments, n_bins, n): Fourier coefficients of Hann-windowed segments, scaled so that their squared magnitude
-    # estimates the two-sided power spectral density per Hz
-    segments: ComplexArray
+    # estimates the two-sided power spectral density per Hz. Single precision, which is that of the samples, keeps them.
+    segments: npt.NDArray[np.complex64]
     turned_rad: float  # shaft angle covered in the hop (nan without a phase reference)
     jump_rad: float  # by which the angle jumped in it or just before (nan without a phase reference)
     # The most likely rotation where there is no phase reference. The regressors follow it, from an unknown angle.
@@ -251,7 +251,7 @@ class HopMoments:
             start_ns=start_ns,
             end_ns=end_ns,
             products=checked(arrays, "products", np.float64, (None, None, None)),
-            segments=checked(arrays, "segments", np.complex128, (None, None, None)),
+            segments=checked(arrays, "segments", np.complex64, (None, None, None)),
             turned_rad=turned_rad,
             jump_rad=jump_rad,
             line=RotationLine(*line) if line else None,
@@ -323,7 +323,7 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
         start_ns=start_ns,
         end_ns=start_ns + round(own.shape[0] * 1e9 / plan.rate_hz),
         products=_lagged_products(a, plan),
-        segments=segments,
+        segments=segments.astype(np.complex64),
         turned_rad=turned_rad,
         jump_rad=jump_rad,
         line=line,

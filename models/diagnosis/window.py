@@ -139,7 +139,7 @@ def window_statistics(
     n_lags = plan.lags_s.size if lagged else 1
     rotation = rotation_of(plan, hops)
     products = np.stack([hop.products[:n_lags] for hop in hops])
-    segments = np.concatenate([hop.segments for hop in hops])
+    segments = np.concatenate([hop.segments for hop in hops], dtype=np.complex128)
     if rotation.source == "unknown":  # a line may ride along, but it is not the shaft's
         products, segments = products[:, :, : n + 1, : n + 1], segments[:, :, : n + 1]
     total = products[0].copy()

@@ -53,7 +53,8 @@ def portrait(number: int, recording: HealthyRecording) -> Portrait | None:
         return None
     statistics = window_statistics(recording.plan, hops, lagged=False).as_mounted
     n = len(recording.plan.states)
-    power = np.mean([np.mean(np.abs(hop.segments[:, :, :n]) ** 2, axis=0) for hop in hops], axis=0)
+    every = np.concatenate([hop.segments[:, :, :n] for hop in hops], dtype=np.complex128)
+    power = np.mean(np.abs(every) ** 2, axis=0)
     starts = np.array([hop.start_ns for hop in hops], dtype=np.int64)
     first = [len(stretch) for stretch in recording.stretches]
     broken = np.zeros(len(hops), dtype=np.bool_)

@@ -75,7 +75,7 @@ class LengthFits:
         if plan.equaliser is not None:
             return True
         n, hops = len(plan.states), sliding.hops[-max(lengths, default=1) :]
-        segments, each = np.concatenate([hop.segments for hop in hops]), hops[0].segments.shape[0]
+        segments, each = np.concatenate([hop.segments for hop in hops], dtype=np.complex128), len(hops[0].segments)
         rest = segments[:, :, :n] - segments[:, :, n + 1 :] @ np.stack([rotation.real, -rotation.imag])
         by_bin = np.ascontiguousarray((rest if plan.turn is None else rest @ plan.turn.T).swapaxes(0, 1))
         return any(
