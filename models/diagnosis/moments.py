@@ -126,13 +126,13 @@ class Plan:
 
         Returns
         -------
-        ndarray, shape (n_samples, width)
+        ndarray, shape (n_samples, width), a channel's samples side by side
         """
-        si = np.empty((samples.shape[0], self.width))
-        np.multiply(samples[:, self.columns], self.scales, out=si[:, : self.columns.size])
+        si = np.empty((self.width, samples.shape[0]))
+        np.multiply(samples.T[self.columns], self.scales[:, np.newaxis], out=si[: self.columns.size])
         if self.angle_column is not None:
-            si[:, -1] = samples[:, self.angle_column]
-        return si
+            si[-1] = samples[:, self.angle_column]
+        return si.T
 
 
 def states_of(machine: MachineFile) -> tuple[str, ...]:

@@ -15,11 +15,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from models.checkpoint import checked
 from models.diagnosis.moments import HopMoments, Plan, hop_moments
-from models.signals.block import FloatArray
+from models.signals.block import FloatArray, SampleArray
 
 _DIGEST = 16
 
@@ -36,8 +35,8 @@ class Piece:
     digest: bytes
 
 
-def digest_of(samples: FloatArray) -> bytes:
-    """Digest of SI samples."""
+def digest_of(samples: SampleArray) -> bytes:
+    """Digest of samples as received."""
     # Processors have instructions for it: half the time of blake2b, which was a fiftieth of a hop.
     return hashlib.sha256(np.ascontiguousarray(samples).data).digest()[:_DIGEST]
 
@@ -50,6 +49,13 @@ def pieces_of(pieces: Iterable[Piece]) -> dict[str, np.ndarray]:
         "pieces": np.array(numbers, dtype=np.int64),
         "digests": np.frombuffer(b"".join(one.digest for one in found), np.uint8).reshape(-1, _DIGEST),
     }
+
+
+def samples_of(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, int]) -> SampleArray:
+    """Samples among named arrays, in the precision in which they were received; raises as `checked`."""
+    there = arrays.get(name)
+    single = there is not None and there.dtype == np.float32
+    return checked(arrays, name, np.float32, shape) if single else checked(arrays, name, np.float64, shape)
 
 
 class Recall:
@@ -88,10 +94,10 @@ class Recall:
         self.pieces, self.last = tuple(hops), last
         self._plan, self._level = plan, level
         self._oldest_ns = min(one.block_ns for one in (*hops, last) if one.rows) if hops or last.rows else 0
-        self._blocks: dict[int, npt.NDArray[np.float32] | FloatArray] = {}
+        self._blocks: dict[int, SampleArray] = {}
         self._found: dict[Piece, HopMoments] = {}
 
-    def take(self, samples: npt.NDArray[np.float32] | FloatArray, start_ns: int) -> None:
+    def take(self, samples: SampleArray, start_ns: int) -> None:
         """Take a block; one that is not of the window is left."""
         if start_ns >= self._oldest_ns:
             self._blocks[start_ns] = samples
@@ -104,23 +110,22 @@ class Recall:
         """The hops whose samples are there, oldest first."""
         for piece in self.pieces:
             if piece not in self._found and (found := self._samples(piece)) is not None:
-                self._found[piece] = hop_moments(self._plan, found[0], self._level, piece.start_ns)
+                self._found[piece] = hop_moments(self._plan, self._plan.to_si(found[0]), self._level, piece.start_ns)
         return tuple((piece, self._found[piece]) for piece in self.pieces if piece in self._found)
 
-    def pending(self) -> tuple[FloatArray, tuple[tuple[int, int], ...]] | None:
+    def pending(self) -> tuple[SampleArray, tuple[tuple[int, int], ...]] | None:
         """Samples of the unfinished hop, and the blocks they are of; None if they are not there."""
         return self._samples(self.last)
 
-    def _samples(self, piece: Piece) -> tuple[FloatArray, tuple[tuple[int, int], ...]] | None:
+    def _samples(self, piece: Piece) -> tuple[SampleArray, tuple[tuple[int, int], ...]] | None:
         if not piece.rows:
-            return np.empty((0, self._plan.width)), ()
+            return np.empty((0, 0), np.float32), ()
         starts = sorted(self._blocks)
         rows, blocks, samples = -piece.row, [], []
         for start_ns in starts[bisect_left(starts, piece.block_ns) :]:
             if rows >= piece.rows:
                 break
-            # Rows first, as in the window: sums depend on how samples lie in memory.
-            samples.append(np.ascontiguousarray(self._plan.to_si(self._blocks[start_ns])))
+            samples.append(np.ascontiguousarray(self._blocks[start_ns]))
             blocks.append((start_ns, len(samples[-1])))
             rows += len(samples[-1])
         if not samples:

@@ -10,16 +10,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
 
 import numpy as np
-import numpy.typing as npt
 
 from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.excluded import KnownLine
 from models.diagnosis.moments import HopMoments, Plan, hop_moments
-from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of
+from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of, samples_of
 from models.diagnosis.window import WindowStatistics, levels_of, window_statistics
 from models.errors import CheckpointError
 from models.levels.measures import WindowLevels
-from models.signals.block import FloatArray
+from models.signals.block import FloatArray, SampleArray
 
 
 class SlidingWindow:
@@ -35,15 +34,21 @@ class SlidingWindow:
         Whether `checkpoint` will be asked for: the samples of every hop have their digest taken then.
     lines : sequence of KnownLine
         Those of the healthy machine.
+    channels : int, optional
+        Of the samples, where these come as they were received; without it they are SI. What waits for its hop is then
+        what was received, which takes less memory, and less time than the samples of one block after the other.
     """
 
-    def __init__(self, plan: Plan, *, remembered: bool = False, lines: Sequence[KnownLine] = ()) -> None:
+    def __init__(
+        self, plan: Plan, *, remembered: bool = False, lines: Sequence[KnownLine] = (), channels: int | None = None
+    ) -> None:
         self.plan = plan
+        self._received, self._width = channels is not None, channels or plan.width
         self._lines = lines
         self._remembered = remembered
         self._hops: deque[HopMoments] = deque(maxlen=plan.hops)
         self._pieces: deque[Piece] = deque(maxlen=plan.hops)  # what each of them is made of
-        self._pending: list[FloatArray] = []
+        self._pending: list[SampleArray] = []
         self._pending_samples = 0
         self._pending_start_ns = 0
         self._blocks: deque[tuple[int, int]] = deque()  # start and length of those that the pending samples are of
@@ -71,13 +76,13 @@ class SlidingWindow:
         """The hop that was completed last."""
         return self._hops[-1] if self._hops else None
 
-    def feed(self, samples: FloatArray, start_ns: int) -> Iterator[int]:
+    def feed(self, samples: SampleArray, start_ns: int) -> Iterator[int]:
         """Add samples that continue the previous ones, stopping at every completed hop.
 
         Parameters
         ----------
         samples : ndarray, shape (n_samples, n_states [+ 1])
-            Finite SI samples as `Plan.to_si` gives them.
+            Finite SI samples as `Plan.to_si` gives them, or as received, shape (n_samples, n_channels).
 
         Yields
         ------
@@ -97,13 +102,20 @@ class SlidingWindow:
             self._leave(self._row)
         while self._pending_samples >= self.plan.need:
             first_ns = self._pending_start_ns
-            buffer = self._pending[0] if len(self._pending) == 1 else np.concatenate(self._pending)
+            buffer = self._joined()
             block_ns, row = self._blocks[0][0], self._row
             self._pending, self._row = [buffer], self._row + self.plan.stride
             self._leave(self.plan.stride)
             yield self._complete(buffer[: self.plan.need], first_ns, block_ns, row)
         if self._pending and self._pending[0].base is not None:  # a rest would hold all that it is the rest of
             self._pending[0] = self._pending[0].copy()
+
+    def _joined(self) -> SampleArray:
+        """All pending samples."""
+        if len(self._pending) == 1:
+            return self._pending[0]
+        joined: SampleArray = np.concatenate(self._pending or [np.empty((0, self._width), np.float32)])
+        return joined
 
     def _leave(self, count: int) -> None:
         """Go on so many samples after the first pending one; those that have not come yet are left when they come."""
@@ -116,7 +128,8 @@ class SlidingWindow:
         while self._blocks and self._row >= self._blocks[0][1]:
             self._row -= self._blocks.popleft()[1]
 
-    def _complete(self, samples: FloatArray, first_ns: int, block_ns: int, row: int) -> int:
+    def _complete(self, taken: SampleArray, first_ns: int, block_ns: int, row: int) -> int:
+        samples = self.plan.to_si(taken) if self._received else np.asarray(taken, dtype=np.float64)
         if self._level is None or not self._hops:
             # The median: one wild sample must not become the level of everything that follows.
             self._level = np.median(samples[:, : len(self.plan.states)], axis=0)
@@ -128,7 +141,7 @@ class SlidingWindow:
                 self._pieces.popleft()
         self._hops.append(hop)
         if self._remembered:
-            self._pieces.append(Piece(start_ns, block_ns, row, samples.shape[0], digest_of(samples)))
+            self._pieces.append(Piece(start_ns, block_ns, row, taken.shape[0], digest_of(taken)))
         return hop.end_ns
 
     def gap(self) -> None:
@@ -149,7 +162,7 @@ class SlidingWindow:
         """Whether samples are to be taken again: `recall` wants them."""
         return self._recall is not None
 
-    def recall(self, samples: npt.NDArray[np.float32] | FloatArray, start_ns: int, *, newest: bool) -> None:
+    def recall(self, samples: SampleArray, start_ns: int, *, newest: bool) -> None:
         """Take a block again that was in the window when `checkpoint` was called.
 
         Parameters
@@ -176,7 +189,7 @@ class SlidingWindow:
         found = recall.pending()
         if found is not None:
             samples, blocks = found
-            self._pending, self._pending_samples = [samples], samples.shape[0]
+            self._pending, self._pending_samples = ([samples] if samples.size else []), samples.shape[0]
             self._blocks, self._row = deque(blocks), recall.last.row
             self._pending_start_ns = recall.last.start_ns
         return len(recall.pieces) - len(there)
@@ -198,7 +211,7 @@ class SlidingWindow:
             raise ValueError("the window takes no digests: it cannot be remembered")
         if self._recall is not None:
             return dict(self._recall.arrays)
-        pending = np.concatenate(self._pending) if self._pending else np.empty((0, self.plan.width))
+        pending = self._joined()
         block_ns = self._blocks[0][0] if self._blocks else 0
         start_ns = self._pending_start_ns if pending.size else 0  # that of what a gap has taken away is of no use
         last = Piece(start_ns, block_ns, self._row, pending.shape[0], digest_of(pending))
@@ -230,7 +243,7 @@ class SlidingWindow:
                 f"level has no values, expected {len(self.plan.states)} for {len(recall.pieces)} hops"
             )
         if "pending" in arrays:
-            pending = checked(arrays, "pending", np.float64, (recall.last.rows, self.plan.width))
+            pending = samples_of(arrays, "pending", (recall.last.rows, self._width))
             blocks = checked(arrays, "pending_blocks", np.int64, (None, 2))
             ring = [HopMoments.restored(unprefixed(f"hop_{number}", arrays)) for number in range(len(recall.pieces))]
             for hop in ring:

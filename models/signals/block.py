@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
+SampleArray = npt.NDArray[np.float32] | FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +27,7 @@ class SampleBlock:
     run: int  # changes each time the publisher starts (0 where a device cannot say)
     rate_hz: float  # samples per second and channel
     # (n_samples, n_channels): float32 or float64, in the units of the channel descriptor
-    samples: npt.NDArray[np.float32] | FloatArray
+    samples: SampleArray
 
     @property
     def end_ns(self) -> int:

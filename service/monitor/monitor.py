@@ -82,12 +82,12 @@ class MachineMonitor:
         self._plan = plan = plan_for(machine, lagged=judge.needs_lags, levels=True, thorough=installed.thorough)
         self._watching = installed.watching or not plan.states
         self._levels = LevelWatch(plan, machine, installed)
-        self._senders = Senders()
-        self._arrivals = Arrivals(machine.ingest.reorder_blocks)
+        self._senders, self._arrivals = Senders(), Arrivals(machine.ingest.reorder_blocks)
         self._due: deque[Arrived] = deque()
         self._done: list[MonitorReport] = []
         self._gate = Gate(machine)
-        self._window = SlidingWindow(self._plan, remembered=remembered, lines=installed.lines)
+        channels = len(machine.sensors)
+        self._window = SlidingWindow(plan, remembered=remembered, lines=installed.lines, channels=channels)
         self._test = SequentialTest(SequentialSettings.for_machine(machine, short=judge.takes_short), by=judge.by)
         self._alarms = AlarmBook(machine.alarms)
         self._data_path = DataPathAlarms(self._alarms, machine)
@@ -253,7 +253,7 @@ class MachineMonitor:
         self._alarms.passed(block.start_ns)
         self._fault = self._data_path.accepted(verdict, block.start_ns, dropped) or self._fault
         self.end_ns = block.end_ns
-        return self._window.feed(self._plan.to_si(block.samples), block.start_ns)
+        return self._window.feed(block.samples, block.start_ns)
 
     def fault(self, what: str, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Raise the alarm on the monitor itself, at a data time; it clears once windows are evaluated again."""

@@ -202,7 +202,7 @@ def test_a_state_that_does_not_fit_is_refused_and_changes_nothing() -> None:
         empty.restore({name: array for name, array in window.items() if not name.startswith("hop_3/")})
     with pytest.raises(CheckpointError, match="other channels or settings"):
         SlidingWindow(plan_for(WITHOUT_ANGLE, lagged=True)).restore(window)
-    with pytest.raises(CheckpointError, match=r"pending has .* expected float64 and .*, 9\)"):
+    with pytest.raises(CheckpointError, match=r"pending has .* expected float32 and .*, 9\)"):
         SlidingWindow(plan_for(LAB, lagged=False)).restore(window)
     with pytest.raises(CheckpointError, match="level is missing"):
         empty.restore({name: array for name, array in window.items() if name != "level"})
