@@ -48,7 +48,7 @@ class SlidingWindow:
         self._remembered = remembered
         self._hops: deque[HopMoments] = deque(maxlen=plan.hops)
         self._pieces: deque[Piece] = deque(maxlen=plan.hops)  # what each of them is made of
-        self._pending: list[SampleArray] = []
+        self._pending: list[np.ndarray] = []
         self._pending_samples = 0
         self._pending_start_ns = 0
         self._blocks: deque[tuple[int, int]] = deque()  # start and length of those that the pending samples are of
@@ -110,12 +110,11 @@ class SlidingWindow:
         if self._pending and self._pending[0].base is not None:  # a rest would hold all that it is the rest of
             self._pending[0] = self._pending[0].copy()
 
-    def _joined(self) -> SampleArray:
+    def _joined(self) -> np.ndarray:
         """All pending samples."""
         if len(self._pending) == 1:
             return self._pending[0]
-        joined: SampleArray = np.concatenate(self._pending or [np.empty((0, self._width), np.float32)])
-        return joined
+        return np.concatenate(self._pending or [np.empty((0, self._width), np.float32)])
 
     def _leave(self, count: int) -> None:
         """Go on so many samples after the first pending one; those that have not come yet are left when they come."""
