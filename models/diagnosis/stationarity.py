@@ -50,8 +50,8 @@ def segment_levels(segments: ComplexArray, spectrum: ComplexArray, columns: Sequ
         return None
     levels = np.ones(count)
     for _ in range(_ROUNDS):
-        motions = own @ np.linalg.eigh(mean)[1].conj()[:, np.newaxis]
-        powers = (motions.real**2 + motions.imag**2).sum(axis=1)  # (blocks, n_segments, n)
+        motions = own.reshape(blocks, -1, n) @ np.linalg.eigh(mean)[1].conj()
+        powers = (motions.real**2 + motions.imag**2).reshape(own.shape).sum(axis=1)  # (blocks, n_segments, n)
         usual = np.maximum(powers.mean(axis=1, keepdims=True), np.finfo(float).tiny)
         levels = np.median(powers / usual, axis=(0, 2))
         levels /= max(float(levels.mean()), np.finfo(float).tiny)

@@ -248,7 +248,7 @@ class LikelihoodFit:
             return True
         read, unbalance, usual = self._said
         model, share, vector = line.model, segments.shape[1] / self._line_segments, unbalance.vector
-        seen = line.glance(model.motions.spectra(model.groups.cross_spectra(segments), model.centre), share)
+        seen = line.glance(model.observed(model.groups.cross_spectra(segments)), share)
         moved = complex(unbalance.weights @ (synchronous - usual))
         differs = max(moved.real**2 / vector.variance_real, moved.imag**2 / vector.variance_imaginary)
         if seen is None or not share * differs <= _DIFFERS**2:
@@ -421,7 +421,7 @@ def _searched(search: FisherScoring, line: Linearised) -> Maximum | None:
 
 def _observed(model: SpectralModel, window: WindowStatistics) -> ComplexArray:
     """Estimated spectra in the model's groups and units."""
-    return model.motions.spectra(model.groups.average(window.spectrum), model.centre)
+    return model.observed(model.groups.average(window.spectrum))
 
 
 def _near_lines(window: WindowStatistics, speed_rad_s: float) -> npt.NDArray[np.bool_]:

@@ -287,28 +287,25 @@ class Motions:
         averages : ndarray, shape (n_groups,)
             Independent averages they are made of.
         """
-        found = []
-        r = self._r(w)
-        for at in np.flatnonzero(self._has_x & self._has_v):
-            x, v = self._x[at], self._v[at]
-            units = self.scale[[x, v]]
-            pair = states[:, [x, v]][:, :, [x, v]] / np.outer(units, units)
-            root = np.sqrt(1 + r[:, at] ** 2)
-            to_z = np.stack([np.ones_like(root), -1j * r[:, at]], axis=1) / root[:, None]
-            to_d = np.stack([-1j * r[:, at], np.ones_like(root)], axis=1) / root[:, None]
-            regressor = 1j * r[:, at] / root**2
-            both = np.stack([to_z, to_d], axis=1)
-            seen = both @ pair @ both.conj().swapaxes(1, 2)
-            zz, dz, dd = seen[:, 0, 0], seen[:, 1, 0], seen[:, 1, 1]
-            power = np.abs(regressor) ** 2 * zz.real
-            total = averages @ power
-            delta = float(averages @ (dz * regressor.conj()).real / total)
-            # Group by group: leakage makes the rest largest where the motion is. Where noise is much of the motion,
-            # unequal noise of the two sensors passes for a difference of gain.
-            noise = averages @ (np.abs(regressor) ** 2 * dd.real) / total
-            error = float(np.sqrt(averages @ (power * dd.real) / 2 / total**2 + noise**2 + _GAIN_FLOOR**2))
-            found.append(Mismatch((self.states[x], self.states[v]), delta, delta / error))
-        return found
+        both = np.flatnonzero(self._has_x & self._has_v)
+        r, x, v = self._r(w)[:, both], self._x[both], self._v[both]
+        of_x, of_v, of_both = (states[:, i, j] / (self.scale[i] * self.scale[j]) for i, j in ((x, x), (v, v), (v, x)))
+        of_x, of_v, turned, share = of_x.real, of_v.real, of_both.imag, 1 / (1 + r**2)
+        zz = (of_x + r**2 * of_v + 2 * r * turned) * share
+        dd = (of_v + r**2 * of_x - 2 * r * turned) * share
+        dz = (r * (of_v - of_x) + (1 - r**2) * turned) * share  # imaginary part of d z*, as the regressor is imaginary
+        regressor = r * share
+        power = regressor**2 * zz
+        total = averages @ power
+        delta = averages @ (dz * regressor) / total
+        # Group by group: leakage makes the rest largest where the motion is. Where noise is much of the motion, unequal
+        # noise of the two sensors passes for a difference of gain.
+        noise = averages @ (regressor**2 * dd) / total
+        error = np.sqrt(averages @ (power * dd) / 2 / total**2 + noise**2 + _GAIN_FLOOR**2)
+        pairs = [(self.states[i], self.states[j]) for i, j in zip(x.tolist(), v.tolist(), strict=True)]
+        return [
+            Mismatch(pair, *each) for pair, *each in zip(pairs, delta.tolist(), (delta / error).tolist(), strict=True)
+        ]
 
 
 def integrated(window: WindowStatistics) -> WindowStatistics:

@@ -59,9 +59,14 @@ class ModelPoint(Expected):
     # (n_groups, n_nodes, n, 6): transfer from forces (in units of C, coloured) to measured motions, times the root of
     # the node's weight
     G: ComplexArray
-    # (n_groups, n_nodes, 6, 6): receptance of all six degrees of freedom for the same forces, without that root
-    H: ComplexArray
-    colour: FloatArray  # (n_groups, 6), D
+    receptance: ComplexArray  # (n_frequencies, 6, 6), of all six degrees of freedom, SI, at distinct frequencies
+    place: npt.NDArray[np.intp]  # (n_groups, n_nodes), where each node's is among these
+    unit: FloatArray  # (n_groups, 1, 1, 6), the forces' units and D
+
+    @property
+    def H(self) -> ComplexArray:
+        """The receptance for the same forces, without that root, shape (n_groups, n_nodes, 6, 6)."""
+        return np.asarray(self.receptance[self.place] * self.unit, dtype=np.complex128)
 
     @property
     def expected(self) -> Expected:
@@ -130,6 +135,7 @@ class SpectralModel:
         shares = self.motions.shares(self.centre)
         self._motion_of = np.array([shares[state][0] for state in self.motions.states])
         self._share = np.stack([shares[state][1] for state in self.motions.states], axis=1)
+        self._combined = self.motions.combine(self.centre)
 
     def receptance(self, structural: FloatArray, speed_rad_s: float, w: FloatArray) -> ComplexArray:
         """H(ω) = (-ω²M + jωP + Q)⁻¹ in SI units, shape (n_frequencies, 6, 6).
@@ -160,6 +166,11 @@ class SpectralModel:
         changes[4] = self._Q_shaft * np.exp(structural[4])
         return changes
 
+    def observed(self, states: ComplexArray) -> ComplexArray:
+        """Cross-spectra of the motions from those of the states, shape (n_groups, n, n)."""
+        matrix = self._combined
+        return np.asarray(matrix @ states @ matrix.conj().swapaxes(-1, -2), dtype=np.complex128)
+
     def measured(self, response: ComplexArray, w: FloatArray) -> ComplexArray:
         """Measured motions, each frequency by itself, of all coordinates' responses; shape (n_frequencies, n, …)."""
         return np.asarray(response[:, self.motions.dofs] * self.motions.factor(w, w)[:, :, None], dtype=np.complex128)
@@ -177,17 +188,18 @@ class SpectralModel:
 
     def at(self, theta: FloatArray, speed_rad_s: float, C: FloatArray | None = None) -> ModelPoint:
         """Expected spectra at a parameter point, or with another level matrix than its own."""
-        H = self.receptance(theta[: self.cutoff_at], speed_rad_s, self._distinct_w)[self._place]
+        H = self.receptance(theta[: self.cutoff_at], speed_rad_s, self._distinct_w)
         colour = np.exp(0.5 * self._b @ theta[self.shape_at].reshape(self.shapes, 6))
         unit = self.force_unit * colour[:, None, None, :]
         gain = low_pass(self.groups.nodes_hz, *self.filter(theta)) * self.groups.weights
-        seen = H[:, :, self.motions.dofs] * self._factor[..., None]
-        G = seen * unit * np.sqrt(gain)[:, :, None, None]
+        G = H[:, self.motions.dofs][self._place]
+        for factor in (self._factor[..., None], unit, np.sqrt(gain)[:, :, None, None]):
+            G *= factor
         C = self.levels(theta) if C is None else C
         S = _summed(through(C, G), G)
         diagonal = np.arange(self.n)
         S[:, diagonal, diagonal] += self.noise(theta)
-        return ModelPoint(theta, S, C, speed_rad_s, G, H * unit, colour)
+        return ModelPoint(theta, S, C, speed_rad_s, G, H, self._place, unit)
 
     def filter(self, theta: FloatArray) -> tuple[float, float]:
         """Cutoff (Hz) and order of the low-pass."""
@@ -253,8 +265,7 @@ class SpectralModel:
         whitened, response : ndarray, shape (n_groups, n_nodes, n, 6)
             L⁻¹G and L⁻¹GC.
         """
-        unit = self.force_unit * point.colour[:, None, None, :]
-        return Sides(whitened * (1 / unit), response.conj() @ point.H.swapaxes(2, 3))
+        return Sides(whitened * (1 / point.unit), response.conj() @ point.H.swapaxes(2, 3))
 
 
 @dataclass(frozen=True, slots=True)

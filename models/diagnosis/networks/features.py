@@ -70,7 +70,15 @@ class ForceFeatures:
 
     def _take(self, machine: Machine) -> None:
         self._machine = machine
-        self._corners_rad_s = self._corners()
+        rotor = machine.rotor
+        rows = [self._dofs.index(STATE_INDEX[name] % 6) for name in self.states]
+        self._rows, self._rates = np.array(rows), np.array([STATE_INDEX[name] >= 6 for name in self.states])
+        self._corners_rad_s = self._corners()[self._rows]
+        # What stands with 1, ω², jω and jωΩ (gyroscopic); measured degrees of freedom first.
+        still = P_matrix(rotor, 0.0)
+        order = [*self._dofs, *(dof for dof in range(6) if dof not in self._dofs)]
+        terms = np.array([Q_matrix(rotor), -M_matrix(rotor), still, P_matrix(rotor, 1.0) - still])
+        self._terms = terms[:, order][:, :, order].reshape(4, -1).astype(np.complex128)
         w = 2 * np.pi * self.frequencies_hz
         self._force = self._to_force(w, np.full(w.size, machine.operation.speed_rad_s))
 
@@ -112,26 +120,15 @@ class ForceFeatures:
         speed_rad_s : ndarray, shape (n_frequencies,)
             Speed Ω at each of them.
         """
-        rotor = self._machine.rotor
-        still = P_matrix(rotor, 0.0)
-        gyroscopic = P_matrix(rotor, 1.0) - still  # linear in Ω
-        W = w[:, None, None]
-        dynamic = 1j * W * (still + speed_rad_s[:, None, None] * gyroscopic) - W**2 * M_matrix(rotor) + Q_matrix(rotor)
+        m, jw = len(self._dofs), 1j * w
+        dynamic = (np.stack([np.ones_like(jw), w**2, jw, jw * speed_rad_s], axis=1) @ self._terms).reshape(-1, 6, 6)
         # No force acts where nothing is measured: those degrees of freedom follow the others (Schur complement).
-        rows = np.array(self._dofs)
-        others = np.setdiff1d(np.arange(6), rows)
-        stiffness = dynamic[:, rows[:, None], rows]
-        if others.size:
-            follow = np.linalg.solve(dynamic[:, others[:, None], others], dynamic[:, others[:, None], rows])
-            stiffness = stiffness - dynamic[:, rows[:, None], others] @ follow
-        force = np.empty((w.size, rows.size, len(self.states)), dtype=np.complex128)
-        for column, name in enumerate(self.states):
-            row = self._dofs.index(STATE_INDEX[name] % 6)
-            corner = self._corners_rad_s[row]
-            rate = np.ones_like(w) if corner == 0 else 1 / (1 + (corner / w) ** 2)
-            motion = 1 - rate if STATE_INDEX[name] < 6 else rate / (1j * w)
-            force[:, :, column] = stiffness[:, :, row] * motion[:, None]
-        return force
+        stiffness = dynamic[:, :m, :m]
+        if m < 6:
+            stiffness = stiffness - dynamic[:, :m, m:] @ np.linalg.solve(dynamic[:, m:, m:], dynamic[:, m:, :m])
+        rate = 1 / (1 + (self._corners_rad_s / w[:, None]) ** 2)
+        motion = np.where(self._rates, rate / jw[:, None], 1 - rate)
+        return np.asarray(stiffness[:, :, self._rows] * motion[:, None], dtype=np.complex128)
 
     def force(self, spectrum: npt.NDArray[np.complexfloating]) -> ComplexArray:
         """Cross-spectra of the equivalent forces, shape (n_windows, n_bins, n_dofs, n_dofs).
