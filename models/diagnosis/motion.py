@@ -6,6 +6,7 @@ within a window.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -27,6 +28,7 @@ class MotionPair:
     order: int  # 1 for the first derivative, 2 for the second
 
 
+@lru_cache(maxsize=64)
 def motion_pairs(states: tuple[str, ...]) -> tuple[MotionPair, ...]:
     """Pairs among measured states.
 
@@ -53,9 +55,12 @@ def motion_pairs(states: tuple[str, ...]) -> tuple[MotionPair, ...]:
     return tuple(pairs)
 
 
+@lru_cache(maxsize=64)
 def pair_bands(n_bins: int) -> npt.NDArray[np.intp]:
     """First bin of each band; shape (n_bands,)."""
-    return np.unique(np.linspace(0, n_bins, min(N_BANDS, n_bins), endpoint=False).astype(np.intp))
+    edges = np.unique(np.linspace(0, n_bins, min(N_BANDS, n_bins), endpoint=False).astype(np.intp))
+    edges.flags.writeable = False
+    return edges
 
 
 def pair_powers(segments: _ComplexArray, frequencies_hz: FloatArray, pairs: tuple[MotionPair, ...]) -> _ComplexArray:

@@ -23,6 +23,7 @@ from models.diagnosis.moments import (
     through,
     turns,
 )
+from models.diagnosis.motion import pair_bands
 from models.diagnosis.rotation import relative_vectors
 from models.diagnosis.stationarity import segment_levels, summed
 from models.levels.measures import WindowLevels, window_levels
@@ -117,6 +118,11 @@ class WindowStatistics:
             found = found.copy() if found is self.spectrum else found
             found[first:end] = ends[0] + way * (ends[-1] - ends[0])
         return found
+
+    @cached_property
+    def banded_spectrum(self) -> ComplexArray:
+        """Sums of the spectra over the bins of `pair_bands`, shape (n_bands, n, n)."""
+        return np.asarray(np.add.reduceat(self.spectrum, pair_bands(self.frequencies_hz.size)), dtype=np.complex128)
 
     @cached_property
     def hop_waveform(self) -> Waveform:

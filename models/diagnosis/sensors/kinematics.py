@@ -64,23 +64,28 @@ class Banded:
     total: ComplexArray  # (n_bands, 2, 2), the same of z and v with the rotation
     w: FloatArray  # (n_bands,), angular frequency around which each band's power lies
     averages: FloatArray  # (n_bands,), effectively independent samples
+    # Mean speed, and the rotation's z and v in every hop where it is known, shape (n_hops, 2); None if in none
+    rotation: tuple[float, ComplexArray] | None
 
 
 def banded(window: WindowStatistics, pair: MotionPair) -> Banded:
     """Average the window's spectra over bands, with the first channel turned into what the second measures."""
     w = 2 * np.pi * window.frequencies_hz
-    columns = [pair.first, pair.second, *_others(window.states, pair)]
+    columns = np.array([pair.first, pair.second, *_others(window.states, pair)])
     edges = pair_bands(w.size)
     counts = np.diff(np.append(edges, w.size))
-    spectra = window.spectrum[:, np.array(columns)[:, None], columns]
     turn = (1j * w) ** pair.order
-    spectra[:, 0] *= turn[:, None]
-    spectra[:, :, 0] *= turn.conj()[:, None]
-    power = spectra[:, 1, 1].real + _FLOOR * spectra[:, 1, 1].real.max() + np.finfo(float).tiny
+    turned = window.spectrum[:, pair.first, columns] * turn[:, None]
+    turned[:, 0] *= turn.conj()
+    own = window.spectrum[:, pair.second, pair.second].real
+    power = own + _FLOOR * own.max() + np.finfo(float).tiny
     centre = np.add.reduceat(power * w, edges) / np.add.reduceat(power, edges)
     step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
     averages = np.maximum(counts * step_hz * window.duration_s * _HANN_LOSS, 1.0)
-    spectra = np.asarray(np.add.reduceat(spectra, edges) / counts[:, None, None], dtype=np.complex128)
+    spectra = window.banded_spectrum[:, columns[:, None], columns]
+    spectra[:, 0] = np.add.reduceat(turned, edges)
+    spectra[:, 1:, 0] = spectra[:, 0, 1:].conj()
+    spectra /= counts[:, None, None]
     total = spectra[:, :2, :2].copy()
     rotation = _rotation(window, pair)
     if rotation is not None:
@@ -89,7 +94,7 @@ def banded(window: WindowStatistics, pair: MotionPair) -> Banded:
         if near >= 0 and speed <= w[-1]:
             line = vectors.T @ vectors.conj() / len(vectors)
             total[near] += line / (4 * counts[near] * step_hz)
-    return Banded(spectra, total, centre, averages)
+    return Banded(spectra, total, centre, averages, rotation)
 
 
 def _rotation(window: WindowStatistics, pair: MotionPair) -> tuple[float, ComplexArray] | None:
@@ -170,8 +175,7 @@ def read_pair(
     if lead_rad_s:
         h = h * np.exp(-1j * lead_rad_s / bands.w)
         alone = _fitted(pair, start, bands.w, h, variance, bias)
-    rotation = _rotation(window, pair)
-    line = None if rotation is None else _line(rotation, window, bands, incoherent)
+    line = None if bands.rotation is None else _line(bands.rotation, window, bands, incoherent)
     if line is None:
         return replace(alone, lead_rad_s=lead_rad_s, shared=shared)
     speed, ratio, spread = line
@@ -198,17 +202,17 @@ def _fitted(
 ) -> PairReading:
     """Gain and delay that fit the transfer of all bands best, from a first guess."""
     log_gain, delay_s, weight = start.log_gain, start.delay_s, 1 / variance
-    moment = float(weight @ w**2)
-    y = h
+    y, jw, total, by_delay = h * start.polarity, 1j * w, float(weight.sum()), weight * w
+    moment, right_way = float(by_delay @ w), y
     for _ in range(4):
-        y = h * start.polarity * np.exp(-log_gain + 1j * w * delay_s) - 1
-        log_gain += float(np.log1p(min(max(weight @ y.real / weight.sum(), -0.5), 1.0)))
-        delay_s -= float(min(max(weight @ (w * y.imag) / moment, -1e-3), 1e-3))
+        y = right_way * np.exp(jw * delay_s - log_gain) - 1
+        log_gain += math.log1p(min(max(float(weight @ y.real) / total, -0.5), 1.0))
+        delay_s -= min(max(float(by_delay @ y.imag) / moment, -1e-3), 1e-3)
     freedom = max(1, y.size - 1)
     scatter_gain = max(1.0, float(weight @ y.real**2) * 2 / freedom)
     scatter_delay = max(1.0, float(weight @ y.imag**2) * 2 / freedom)
-    gain_error = float(np.sqrt(scatter_gain / (2 * weight.sum())) + weight @ bias / weight.sum())
-    delay_error_s = float(np.sqrt(scatter_delay / (2 * moment)))
+    gain_error = math.sqrt(scatter_gain / (2 * total)) + float(weight @ bias) / total
+    delay_error_s = math.sqrt(scatter_delay / (2 * moment))
     return PairReading(pair, log_gain, gain_error, start.polarity, delay_s, delay_error_s, 0.0, 0.0)
 
 
@@ -240,15 +244,15 @@ def _across(
     weight = np.tile(np.sqrt(2 / variance), 2)
     sides = [np.ones_like(h), 1j * w, 1j / w, seen]
     design = np.stack([np.concatenate([one.real, one.imag]) for one in sides], axis=1) * weight[:, None]
-    design /= np.linalg.norm(design, axis=0)
+    design /= (lengths := np.linalg.norm(design, axis=0))
     y = np.concatenate([aim.real, aim.imag]) * weight
-    with_it, without = (np.linalg.lstsq(part, y, rcond=None)[0] for part in (design, design[:, :-1]))
-    left = float(np.sum((y - design @ with_it) ** 2))
-    gained = float(np.sum((y - design[:, :-1] @ without) ** 2)) - left
-    size = float(with_it[-1]) / float(np.linalg.norm(np.concatenate([seen.real, seen.imag]) * weight))
-    scatter = max(1.0, left / max(1, y.size - design.shape[1]))
-    told = gained > _TOLD_APART * scatter and abs(size) < _MOST_ACROSS
-    return np.asarray(size * other, dtype=np.complex128) if told else None
+    directions, triangle = np.linalg.qr(design)
+    along = directions.T @ y
+    left = y - directions @ along
+    if not along[-1] ** 2 > _TOLD_APART * max(1.0, float(left @ left) / max(1, y.size - design.shape[1])):
+        return None
+    size = float(along[-1] / triangle[-1, -1] / lengths[-1])
+    return np.asarray(size * other, dtype=np.complex128) if abs(size) < _MOST_ACROSS else None
 
 
 def _lead(alone: PairReading, w: FloatArray, h: ComplexArray, variance: FloatArray) -> float:
