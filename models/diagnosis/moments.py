@@ -22,10 +22,10 @@ from typing import Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from scipy.fft import next_fast_len
 
 from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.equaliser import Equaliser, equaliser_of
+from models.diagnosis.lagged import lagged_products
 from models.diagnosis.motion import MotionPair, motion_pairs, pair_powers
 from models.diagnosis.rotation import RotationLine, followed_speeds, rotation_line
 from models.levels.contact import contact
@@ -283,7 +283,8 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
     theta = None
     if plan.angle_column is not None:
         theta = rows[-1]
-        steps = (np.diff(theta) + np.pi) % (2 * np.pi) - np.pi
+        steps = np.diff(theta)
+        steps -= 2 * np.pi * np.floor((steps + np.pi) / (2 * np.pi))  # in half the time of a remainder
         turned_rad = float(np.sum(steps[plan.preamble - 1 :]))
         jump_rad = jump_within_a_turn(steps)
     elif plan.speed_rad_s is not None:
@@ -322,7 +323,7 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
     return HopMoments(
         start_ns=start_ns,
         end_ns=start_ns + round(own.shape[0] * 1e9 / plan.rate_hz),
-        products=_lagged_products(a, plan),
+        products=lagged_products(a, plan.lags, plan.preamble),
         segments=segments.astype(np.complex64),
         turned_rad=turned_rad,
         jump_rad=jump_rad,
@@ -331,31 +332,6 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
         pair_powers=pair_powers(moving, plan.frequencies_hz, plan.pairs),
         levels=levels,
     )
-
-
-def _lagged_products(a: FloatArray, plan: Plan) -> FloatArray:
-    """Sums of products at all lags: history as reference, hop as response.
-
-    The lags are short and the hop is long, so the hop is cut into blocks of twice the longest lag; their cross-spectra
-    (each block's reference reaches back by the longest lag, its response is zero there) are added up before one inverse
-    transform of a block's length.
-    """
-    longest, n = int(plan.lags[-1]), a.shape[0]
-    if longest == 0:
-        own = a[:, plan.preamble :]
-        return np.asarray((own @ own.T)[np.newaxis], dtype=np.float64)
-    size = next_fast_len(longest + max(2 * longest, 256), real=True)
-    block = size - longest
-    count = -(-plan.hop // block)
-    padded = np.zeros((n, longest + count * block))
-    padded[:, : longest + plan.hop] = a[:, plan.preamble - longest :]
-    reference = np.lib.stride_tricks.sliding_window_view(padded, size, axis=1)[:, ::block]
-    response = reference.copy()
-    response[:, :, :longest] = 0
-    spectrum_reference, spectrum_response = np.fft.rfft(reference), np.fft.rfft(response)  # (n, count, n_frequencies)
-    cross = spectrum_reference.transpose(2, 0, 1).conj() @ spectrum_response.transpose(2, 1, 0)
-    products = np.fft.irfft(np.ascontiguousarray(cross.reshape(-1, n * n).T), size)[:, plan.lags]
-    return np.ascontiguousarray(products.T).reshape(-1, n, n)
 
 
 def _segment_spectra(a: FloatArray, plan: Plan) -> ComplexArray:

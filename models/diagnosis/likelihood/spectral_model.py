@@ -135,7 +135,7 @@ class SpectralModel:
         shares = self.motions.shares(self.centre)
         self._motion_of = np.array([shares[state][0] for state in self.motions.states])
         self._share = np.stack([shares[state][1] for state in self.motions.states], axis=1)
-        self._combined = self.motions.combine(self.centre)
+        self._combined: ComplexArray | None = None
 
     def receptance(self, structural: FloatArray, speed_rad_s: float, w: FloatArray) -> ComplexArray:
         """H(ω) = (-ω²M + jωP + Q)⁻¹ in SI units, shape (n_frequencies, 6, 6).
@@ -168,7 +168,7 @@ class SpectralModel:
 
     def observed(self, states: ComplexArray) -> ComplexArray:
         """Cross-spectra of the motions from those of the states, shape (n_groups, n, n)."""
-        matrix = self._combined
+        matrix = self._combined = self.motions.combine(self.centre) if self._combined is None else self._combined
         return np.asarray(matrix @ states @ matrix.conj().swapaxes(-1, -2), dtype=np.complex128)
 
     def measured(self, response: ComplexArray, w: FloatArray) -> ComplexArray:

@@ -1,0 +1,54 @@
+"""Sums of products of samples with earlier ones: what correlation functions are made of."""
+
+import numpy as np
+import numpy.typing as npt
+from scipy.fft import next_fast_len
+
+from models.signals.block import FloatArray
+
+
+def lagged_products(a: FloatArray, lags: npt.NDArray[np.intp], before: int) -> FloatArray:
+    """Sums of products at all lags: history as reference, what follows it as response.
+
+    The lags are short and there are many samples, so these are cut into blocks of twice the longest lag; their
+    cross-spectra (each block's reference reaches back by the longest lag, its response is zero there) are added up
+    before one inverse transform. Where only some lags are wanted, the cross-spectra are folded before it, and it is
+    shorter: every second sample has a spectrum that is the sum of both halves.
+
+    Parameters
+    ----------
+    a : ndarray, shape (n, before + n_samples)
+    lags : ndarray of int, shape (n_lags,)
+        From zero on in equal steps, at most `before`.
+    before : int
+        Samples of history.
+
+    Returns
+    -------
+    ndarray, shape (n_lags, n, n)
+        ``[l, i, j] = Σ_t a_i(t - lag_l) a_j(t)`` over the samples after the history.
+    """
+    longest, n, n_samples = int(lags[-1]), a.shape[0], a.shape[1] - before
+    if longest == 0:
+        own = a[:, before:]
+        return np.asarray((own @ own.T)[np.newaxis], dtype=np.float64)
+    step = int(lags[1])
+    kept = next_fast_len(-(-(longest + max(2 * longest, 256)) // step), real=True)
+    size, half = step * kept, kept // 2 + 1
+    block = size - longest
+    count = -(-n_samples // block)
+    padded = np.zeros((n, longest + count * block))
+    padded[:, : longest + n_samples] = a[:, before - longest :]
+    reference = np.lib.stride_tricks.sliding_window_view(padded, size, axis=1)[:, ::block]
+    response = reference.copy()
+    response[:, :, :longest] = 0
+    spectrum_reference, spectrum_response = np.fft.rfft(reference), np.fft.rfft(response)  # (n, count, n_frequencies)
+    cross = (spectrum_reference.transpose(2, 0, 1).conj() @ spectrum_response.transpose(2, 1, 0)).reshape(-1, n * n)
+    folded = cross[:half].copy()
+    for first in range(kept, size, kept):  # from half the size on a spectrum mirrors itself
+        if 2 * first < size:
+            folded += cross[first : first + half]
+        else:
+            folded += cross[size - first - half + 1 : size - first + 1][::-1].conj()
+    products = np.fft.irfft(np.ascontiguousarray(folded.T), kept)[:, : lags.size].T / step
+    return np.ascontiguousarray(products).reshape(-1, n, n)
