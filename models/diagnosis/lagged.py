@@ -19,7 +19,7 @@ def lagged_products(a: FloatArray, lags: npt.NDArray[np.intp], before: int) -> F
     ----------
     a : ndarray, shape (n, before + n_samples)
     lags : ndarray of int, shape (n_lags,)
-        From zero on in equal steps, at most `before`.
+        From zero on, at most `before`.
     before : int
         Samples of history.
 
@@ -32,7 +32,7 @@ def lagged_products(a: FloatArray, lags: npt.NDArray[np.intp], before: int) -> F
     if longest == 0:
         own = a[:, before:]
         return np.asarray((own @ own.T)[np.newaxis], dtype=np.float64)
-    step = int(lags[1])
+    step = int(np.gcd.reduce(lags))
     kept = next_fast_len(-(-(longest + max(2 * longest, 256)) // step), real=True)
     size, half = step * kept, kept // 2 + 1
     block = size - longest
@@ -50,5 +50,5 @@ def lagged_products(a: FloatArray, lags: npt.NDArray[np.intp], before: int) -> F
             folded += cross[first : first + half]
         else:
             folded += cross[size - first - half + 1 : size - first + 1][::-1].conj()
-    products = np.fft.irfft(np.ascontiguousarray(folded.T), kept)[:, : lags.size].T / step
+    products = np.fft.irfft(np.ascontiguousarray(folded.T), kept)[:, lags // step].T / step
     return np.ascontiguousarray(products).reshape(-1, n, n)

@@ -145,13 +145,13 @@ def window_statistics(
     n_lags = plan.lags_s.size if lagged else 1
     rotation = rotation_of(plan, hops)
     products = np.stack([hop.products[:n_lags] for hop in hops])
-    segments = np.concatenate([hop.segments for hop in hops], dtype=np.complex128)
+    segments = np.concatenate([hop.segments.swapaxes(0, 1) for hop in hops], axis=1, dtype=np.complex128)  # bin by bin
     if rotation.source == "unknown":  # a line may ride along, but it is not the shaft's
         products, segments = products[:, :, : n + 1, : n + 1], segments[:, :, : n + 1]
     total = products[0].copy()
     for hop in products[1:]:  # one by one, in order: the sum must not depend on how numpy would pair them
         total += hop
-    synchronous = hop_synchronous = relative_synchronous = phase_kept = None
+    synchronous = hop_synchronous = relative_synchronous = phase_kept = angle = None
     if rotation.by_hop:
         phase_reference = rotation.source == "phase reference"
         level = regression(total[0] if phase_reference else total[0][: n + 1, : n + 1], n)
@@ -159,12 +159,12 @@ def window_statistics(
         remove = np.concatenate([np.broadcast_to(np.eye(n), (len(hops), n, n)), -own.hops], axis=2)[:, np.newaxis]
         hop_correlation = (remove @ products @ remove.transpose(0, 1, 3, 2)) / plan.hop
         correlation = hop_correlation.sum(axis=0) / len(hops)
-        cleaned = segments[:, :, :n] - segments[:, :, n:] @ own.segments.transpose(0, 2, 1)
+        by_bin = segments[:, :, :n] - (segments[:, :, n:].swapaxes(0, 1) @ own.segments.swapaxes(1, 2)).swapaxes(0, 1)
         if phase_reference:
             synchronous = _synchronous(level)
-            one, other = cleaned[:-2], cleaned[2:]  # those between overlap both
-            powers = (np.abs(one) ** 2).sum(axis=0) * (np.abs(other) ** 2).sum(axis=0)
-            phase_kept = _coherence((one * other.conj()).sum(axis=0), powers)
+            one, other = by_bin[:, :-2], by_bin[:, 2:]  # those between overlap both
+            powers = (np.abs(one) ** 2).sum(axis=1) * (np.abs(other) ** 2).sum(axis=1)
+            phase_kept = _coherence((one * other.conj()).sum(axis=1), powers)
         elif plan.states:
             relative_synchronous = relative_vectors(np.stack([_synchronous(one) for one in own.hops]))
     else:
@@ -173,18 +173,18 @@ def window_statistics(
         hop_correlation = remove @ through(remove, products) / plan.hop
         correlation = (remove @ total @ remove.T) / (len(hops) * plan.hop)
         hop_correlation, correlation = _undrifted(plan, hops, products, remove, (hop_correlation, correlation))
-        cleaned = through(remove, segments)
+        by_bin = through(remove, segments)
         if plan.angle_column is not None:
             synchronous = _synchronous(beta)
     if plan.angle_column is not None:
         turned = np.array([turns(hop) for hop in hops])[:, np.newaxis]
         hop_synchronous = np.where(turned, _synchronous(regression(products[:, 0], n)), 0)
-    by_bin = np.ascontiguousarray(cleaned.transpose(1, 0, 2), dtype=np.complex128)
+        angle = segments[:, :, n + 1].copy()
+    del segments, products  # megabytes that nothing below needs
     spectrum = summed(by_bin)
-    if synchronous is not None and phase_kept is None:
-        angle = segments[:, :, n + 1].T[:, :, None]
-        powers = np.einsum("fii->fi", spectrum).real * (np.abs(angle) ** 2).sum(axis=1)
-        phase_kept = _coherence((by_bin.transpose(0, 2, 1) @ angle.conj())[:, :, 0], powers)
+    if angle is not None and phase_kept is None:
+        powers = np.einsum("fii->fi", spectrum).real * (np.abs(angle) ** 2).sum(axis=1, keepdims=True)
+        phase_kept = _coherence((by_bin.transpose(0, 2, 1) @ angle[:, :, np.newaxis].conj())[:, :, 0], powers)
     levels = segment_levels(by_bin, spectrum, sorted({*range(n)} - {pair.second for pair in plan.pairs}))
     if levels is not None:
         spectrum = summed(by_bin / np.sqrt(levels)[:, np.newaxis])
@@ -194,11 +194,11 @@ def window_statistics(
         start_ns=hops[0].start_ns,
         end_ns=hops[-1].end_ns,
         n_samples=len(hops) * plan.hop,
-        n_segments=segments.shape[0],
+        n_segments=by_bin.shape[1],
         lags_s=plan.lags_s[:n_lags],
         correlation=correlation,
         hop_correlation=hop_correlation,
-        spectrum=divided(spectrum, segments.shape[0]),
+        spectrum=divided(spectrum, by_bin.shape[1]),
         frequencies_hz=plan.frequencies_hz,
         synchronous=synchronous,
         hop_synchronous=hop_synchronous,
@@ -216,12 +216,7 @@ def window_statistics(
         sensors=plan.sensors,
         pair_powers=tuple(hop.pair_powers for hop in hops),
         lines=excluded_lines(
-            by_bin,
-            spectrum,
-            plan.frequencies_hz,
-            speed_range,
-            lines,
-            None if plan.angle_column is None else segments[:, :, n + 1],
+            by_bin, spectrum, plan.frequencies_hz, speed_range, lines, None if angle is None else angle.T
         )
         if lagged
         else (),

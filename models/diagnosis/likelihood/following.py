@@ -91,8 +91,8 @@ class Linearised:
 
     @classmethod
     def around(cls, model: SpectralModel, weights: Weights, found: Maximum) -> "Linearised":
-        """The spectra around the maximum of a search that has just ended; its slopes are copied."""
-        point, slopes = found.whitened.point.expected, found.slopes.copy()
+        """The spectra around the maximum of a search that has just ended; its slopes are taken over."""
+        point, slopes = found.whitened.point.expected, found.slopes
         information = np.asarray(found.information - np.diag(weights.pull), dtype=np.float64)
         derivatives = Derivatives(slopes, information, found.slopes_rad_s)
         # In directions that the data leave to the pulls on T the equation is solved as the search left it.
