@@ -43,7 +43,8 @@ def lagged_products(a: FloatArray, lags: npt.NDArray[np.intp], before: int) -> F
     response = reference.copy()
     response[:, :, :longest] = 0
     spectrum_reference, spectrum_response = np.fft.rfft(reference), np.fft.rfft(response)  # (n, count, n_frequencies)
-    cross = (spectrum_reference.transpose(2, 0, 1).conj() @ spectrum_response.transpose(2, 1, 0)).reshape(-1, n * n)
+    np.conjugate(spectrum_reference, out=spectrum_reference)
+    cross = (spectrum_reference.transpose(2, 0, 1) @ spectrum_response.transpose(2, 1, 0)).reshape(-1, n * n)
     folded = cross[:half].copy()
     for first in range(kept, size, kept):  # from half the size on a spectrum mirrors itself
         if 2 * first < size:

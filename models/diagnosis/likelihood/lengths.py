@@ -7,6 +7,7 @@ import numpy as np
 from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.motions import integrated
+from models.diagnosis.moments import through
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.window import WindowStatistics
@@ -75,9 +76,9 @@ class LengthFits:
         if plan.equaliser is not None:
             return True
         n, hops = len(plan.states), sliding.hops[-max(lengths, default=1) :]
-        segments, each = np.concatenate([hop.segments for hop in hops], dtype=np.complex128), len(hops[0].segments)
-        rest = segments[:, :, :n] - segments[:, :, n + 1 :] @ np.stack([rotation.real, -rotation.imag])
-        by_bin = np.ascontiguousarray((rest if plan.turn is None else rest @ plan.turn.T).swapaxes(0, 1))
+        segments = np.concatenate([hop.segments.swapaxes(0, 1) for hop in hops], axis=1, dtype=np.complex128)
+        remove, each = np.column_stack([np.eye(n), np.zeros(n), -rotation.real, rotation.imag]), len(hops[0].segments)
+        by_bin = through(remove if plan.turn is None else plan.turn @ remove, segments)
         return any(
             self._window.may_be_news(by_bin[:, -length * each :], by_hop[-length:].mean(axis=0)) for length in lengths
         )
