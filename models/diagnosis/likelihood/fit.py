@@ -159,12 +159,13 @@ class LikelihoodFit:
         speed = self._speed(window)
         excluded = _near_lines(window, speed)
         power = self._checked_power(window, ~excluded)
+        states = self._grouped(window.frequencies_hz, excluded, 1.0).average(window.spectrum)
         no_maximum = f"{self._machine.name}: the likelihood has no maximum for this window: {_OUTSIDE}"
         try:
             # Trial points may lie far out; what comes of them is checked, not warned of.
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                model, weights, found = self._followed_or_searched(window, excluded, np.sqrt(power), speed)
-            covariance = np.asarray(np.linalg.inv(found.information), dtype=np.float64)
+                model, weights, found = self._followed_or_searched(window, excluded, np.sqrt(power), speed, states)
+            covariance = np.linalg.inv(found.information) if found.covariance is None else found.covariance
         except np.linalg.LinAlgError as error:
             self.reset()
             raise UnexplainedError(no_maximum) from error
@@ -172,7 +173,6 @@ class LikelihoodFit:
             self.reset()
             raise UnexplainedError(no_maximum)
         self._last, self._strength = found.theta, weights.strength
-        states = model.groups.average(window.spectrum)
         why, nowhere = unexplained_at(model, weights, found.whitened, states)
         unexplained = self._stated(why)
         if nowhere:
@@ -298,13 +298,18 @@ class LikelihoodFit:
         return ratios.decided(directed=window.directed)
 
     def _followed_or_searched(
-        self, window: WindowStatistics, excluded: npt.NDArray[np.bool_], scale: FloatArray, speed: float
+        self,
+        window: WindowStatistics,
+        excluded: npt.NDArray[np.bool_],
+        scale: FloatArray,
+        speed: float,
+        states: ComplexArray,
     ) -> tuple[SpectralModel, Weights, Maximum]:
         found = None
         line, self._line = self._line, None
         if line is not None and self._followed < _FOLLOWED and self._alike(line, window, excluded):
             self._followed += 1
-            found = line.follow(_observed(line.model, window), speed, _NEAR, _GAIN)
+            found = line.follow(line.model.observed(states), speed, _NEAR, _GAIN)
             if found is not None:
                 self._line = line
                 return line.model, line.weights, found

@@ -177,9 +177,16 @@ class Linearised:
                 self._point = there.expected
                 own = self.derivatives
                 information = own.information + np.diag(self._pull)
-                left_over = step[diagnosed]
                 return Maximum(
-                    point.theta, information, own.slopes, own.speed_rad_s, whitened, steps, self._fitted, left_over
+                    point.theta,
+                    information,
+                    own.slopes,
+                    own.speed_rad_s,
+                    whitened,
+                    steps,
+                    self._fitted,
+                    step[diagnosed],
+                    covariance,
                 )
             if steps == _MOST_STEPS or left > before:
                 break

@@ -62,6 +62,7 @@ class Maximum:
     # (n_diagnosed,): step of the diagnosed parameters that the search would still take; a small part of a standard
     # error if it has converged
     remaining: FloatArray
+    covariance: FloatArray | None = None  # (size, size), inverse of the information where that is known already
 
 
 class Weights:
