@@ -108,7 +108,7 @@ class WindowStatistics:
         Those of the window where lines are in all of them.
         """
         found, clear = self.spectrum, ~self.line_bins
-        if not clear.any():
+        if clear.all() or not clear.any():
             return found
         edges = np.flatnonzero(np.diff(self.line_bins, prepend=False, append=False)).reshape(-1, 2).tolist()
         for first, end in edges:

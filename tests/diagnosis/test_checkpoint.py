@@ -16,6 +16,7 @@ from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import plan_for
+from models.diagnosis.recall import digest_of
 from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.verdict.sequential_state import SequentialState, finding, hop_arrays
 from models.diagnosis.verdict.stretch import Stretch
@@ -192,6 +193,12 @@ def remembered() -> dict[str, np.ndarray]:
     return from_bytes(state.state) | {
         name: array for _, part in state.new_parts for name, array in from_bytes(part).items()
     }
+
+
+def test_samples_are_known_again_in_either_precision() -> None:
+    single = np.random.default_rng(7).standard_normal((50, 3)).astype(np.float32)
+    double = single.astype(np.float64)
+    assert digest_of(single) == digest_of(double) != digest_of(double * (1 + 1e-12))
 
 
 def test_a_state_that_does_not_fit_is_refused_and_changes_nothing() -> None:

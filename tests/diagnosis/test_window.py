@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models.diagnosis.excluded import ExcludedLine
+from models.diagnosis.lagged import lagged_products
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import Plan, hop_moments, plan_for
 from models.diagnosis.sliding_window import SlidingWindow
@@ -108,6 +109,24 @@ def test_products_are_their_definition_whatever_the_hop(hop: int) -> None:
     direct = np.stack([a[plan.preamble - lag : plan.preamble + hop - lag].T @ a[now] for lag in plan.lags])
     scale = np.sqrt(np.diag(direct[0]))
     np.testing.assert_allclose(products / np.outer(scale, scale), direct / np.outer(scale, scale), atol=1e-12)
+
+
+@pytest.mark.parametrize("lags", [[0, 1, 2, 3], [0, 3, 6, 9], [0, 7, 14], [0, 6, 9], [0, 40]])
+def test_products_are_their_definition_at_whatever_lags(lags: list[int]) -> None:
+    a = np.random.default_rng(32).standard_normal((3, 50 + 1000))
+    direct = np.stack([a[:, 50 - lag : 1050 - lag] @ a[:, 50:].T for lag in lags])
+    np.testing.assert_allclose(lagged_products(a, np.array(lags), 50), direct, atol=1e-9)
+
+
+def test_a_window_is_made_again_when_it_is_looked_at_although_the_stream_has_gone_on() -> None:
+    window, samples = SlidingWindow(small_plan()), signal(1200, 33)
+    feed(window, samples[:300])
+    assert window.again() is None
+    then = feed(window, samples[300:700], 300)[-1]
+    again = sure(window.again())
+    feed(window, samples[700:], 700)
+    assert_identical(again(), then)
+    assert again() is again()
 
 
 @settings(max_examples=12)

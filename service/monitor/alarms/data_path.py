@@ -64,7 +64,8 @@ class DataPathAlarms:
             Why nothing has been evaluated for long, although data come; empty if it has.
         """
         book, before_ns = self._book, start_ns - round(verdict.gap_s * 1e9)
-        missing, overloaded = Evidence(start_ns=before_ns, end_ns=start_ns), dropped > 0 and verdict.gap_s > 0
+        missing = Evidence(start_ns=before_ns, end_ns=start_ns) if verdict.gap_s > 0 else None
+        overloaded = dropped > 0 and verdict.gap_s > 0
         if verdict.gap_s >= self._silence_s and not overloaded:
             self._lost(before_ns)
         book.update_state(STREAM_LOST, False, self._found_again_ns(start_ns), at_once=True)
