@@ -278,7 +278,7 @@ def test_shapes_without_power_are_no_commissioning(count: int, varies: float, ve
 def test_a_machine_that_is_no_such_rotor_is_told_the_cure() -> None:
     masses = {"m1_kg": 1.5 * LAB.rotor.m1_kg, "m2_kg": 0.7 * LAB.rotor.m2_kg}
     wrong = PARTIAL.model_copy(update={"rotor": sure(PARTIAL.rotor).model_copy(update=masses)})
-    made = commissioned(wrong, healthy(wrong, 45.0, 41))
+    made = commissioned(wrong, healthy(wrong, 45.0, 43))
     assert refused(made)
     assert "leave [rotor] out of the machine file" in verdict_of(made, "can be learned")[2]
 

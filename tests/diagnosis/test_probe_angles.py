@@ -134,7 +134,8 @@ def test_turning_is_exact(first: float, apart: float, sign: int, seed: int, slop
     assert turned.removed_by_hop == plain.removed_by_hop == (slope > 0)
     for name in ("correlation", "hop_correlation", "spectrum", "synchronous", "hop_synchronous"):
         expected, found = getattr(plain, name), getattr(turned, name)
-        assert np.abs(found - expected).max() < 1e-9 * np.abs(expected).max(), name
+        exact = 1e-6 if name == "spectrum" else 1e-9  # Fourier coefficients are kept in single precision
+        assert np.abs(found - expected).max() < exact * np.abs(expected).max(), name
     c, s = np.cos(angles), np.sin(angles)
     R = plain.correlation[0]
     power = c**2 * R[0, 0] + s**2 * R[1, 1] + 2 * c * s * R[0, 1]
