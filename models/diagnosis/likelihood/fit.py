@@ -165,7 +165,8 @@ class LikelihoodFit:
             # Trial points may lie far out; what comes of them is checked, not warned of.
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
                 model, weights, found = self._followed_or_searched(window, excluded, np.sqrt(power), speed, states)
-            covariance = np.linalg.inv(found.information) if found.covariance is None else found.covariance
+            known = np.linalg.inv(found.information) if found.covariance is None else found.covariance
+            covariance: FloatArray = np.asarray(known, dtype=np.float64)
         except np.linalg.LinAlgError as error:
             self.reset()
             raise UnexplainedError(no_maximum) from error
