@@ -39,7 +39,7 @@ import scipy  # its sub-packages are loaded when they are first used
 
 from models.checkpoint import checked
 from models.levels.bands import BandLevels, band_edges
-from models.levels.kurtosis import random_kurtosis
+from models.levels.kurtosis import random_kurtosis, swell
 from models.levels.orders import ORDERS, Spectrum, hann_taper, order_vectors
 from models.signals.block import FloatArray
 from models.signals.channels import LEAST_APART_DEG, Channel, Quantity, apart_deg
@@ -55,6 +55,7 @@ _SUMS = (
     "fourth",
     "radius",
     "contact",
+    "swell",
     "mean_square",
     "velocity_square",
     "high_square",
@@ -62,7 +63,7 @@ _SUMS = (
 )
 CONTACT = _SUMS.index("contact")
 """Row of `HopLevels.sums`."""
-_SQUARES = slice(6, None)  # mean squares, of which a root is shown
+_SQUARES = slice(7, None)  # mean squares, of which a root is shown
 _HIGH_HZ = 1000.0
 NYQUIST_PART = 0.8
 """Part of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
@@ -194,11 +195,11 @@ class HopLevels:
     Attributes
     ----------
     n_samples : int
-    sums : ndarray, shape (10, n)
+    sums : ndarray, shape (11, n)
         Mean, largest deviation from it, peak to peak, fourth moment, at the first channel of a pair the largest
         distance from the mean position; at the two of a pair the two numbers of `models.levels.contact`, where it is
-        looked for; mean square about the mean, mean square velocity in the band, mean squares of the high-frequency
-        band and of its envelope about its mean. Nan where a quantity has none.
+        looked for; `swell`, mean square about the mean, mean square velocity in the band, mean squares of the
+        high-frequency band and of its envelope about its mean. Nan where a quantity has none.
     orders : ndarray of complex, shape (4, n)
         q of x = Re{q e^{jkθ}} for the orders k of `ORDERS`; nan without a rotation. At half running speed its angle
         means nothing: the shaft angle is known to a whole turn.
@@ -271,7 +272,7 @@ def hop_levels(
     square, peak = x * x, np.maximum(high - mean, mean - low)
     sums = np.full((len(_SUMS), n), np.nan)
     sums[:4] = mean, peak, high - low, np.vecdot(square, square) / n_samples
-    sums[6] = rms**2
+    sums[6:8] = swell(square), rms**2
     # Strong lines must not leak into the low end of a band, where integration would magnify them.
     taper, scale = hann_taper(n_samples)
     # In parts of the peak single precision is enough, and quicker.
@@ -288,11 +289,10 @@ def hop_levels(
     power = (scale * amplitude**2)[:, None]
     between = power * np.add.reduceat(parts[:, : 2 * cuts[-1]], 2 * cuts[:-1], axis=1)
     bands = np.add.reduceat(between[:, : edges[-1]], edges[:-1], axis=1)
-    sums[7, plan.velocities] = np.add.reduce(between[:, first:last], axis=1)[plan.velocities]
+    sums[8, plan.velocities] = np.add.reduce(between[:, first:last], axis=1)[plan.velocities]
     if (accelerations := plan.accelerations).any():
-        band = slice(cuts[first], cuts[last])
-        sums[7:, accelerations] = power[accelerations, 0] * _acceleration_squares(
-            plan, spectrum[accelerations], parts[accelerations], band, n_samples
+        sums[8:, accelerations] = power[accelerations, 0] * _acceleration_squares(
+            plan, spectrum[accelerations], parts[accelerations], slice(cuts[first], cuts[last]), n_samples
         )
     for (y, z), skew in zip(plan.pairs, plan.skew, strict=True):
         distance = square[y] + square[z]
@@ -436,7 +436,7 @@ def window_levels(
         amplitudes[1] = np.where(plan.runout == 0, amplitudes[1], np.abs(vectors[1]))
     # Peak to peak is a mean of the hops, what is rms that of the whole window.
     average = _mean(sums)
-    square = average[6] + _mean((sums[:, 0] - average[0]) ** 2)
+    square = average[7] + _mean((sums[:, 0] - average[0]) ** 2)
     peak = np.maximum.reduce(sums[:, 1])
     with np.errstate(divide="ignore", invalid="ignore"):
         values = {
@@ -446,7 +446,7 @@ def window_levels(
             "not_x1": np.sqrt(np.maximum(square - measured_1x**2 / 2, 0.0)),
             "mean": np.where(plan.displacements, average[0], np.nan),
             "crest": peak / np.sqrt(square),
-            "kurtosis": average[3] / average[6] ** 2,
+            "kurtosis": average[3] / average[7] ** 2,
         }
     edges_hz, freedom = _band_grid(plan.rate_hz, hops[0].n_samples, count)
     bands = BandLevels(
@@ -456,7 +456,7 @@ def window_levels(
         freedom,
     )
     lines = np.stack([hop.lines for hop in hops]) if plan.lines else None
-    moments = sums[:, 6], sums[:, 3], every_order[:, 1:], in_bands
+    moments = sums[:, 7], sums[:, 3] - sums[:, 6], every_order[:, 1:], in_bands
     unsteady = float(np.ptp(speeds_rad_s)) / abs(speed_rad_s) if speed_rad_s and turning.all() else math.inf
     return WindowLevels(values, scatter, vectors, speed_rad_s, count, bands, lines, unsteady, moments, sums[:, CONTACT])
 

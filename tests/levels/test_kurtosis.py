@@ -111,6 +111,24 @@ def test_a_gear_mesh_that_grows_or_goes_is_no_rub_but_a_rub_is_one(healthy_mesh:
     assert all("with impacts" in one for one in suspects(meshes[:2], healthy_mesh, knocking))
 
 
+def cycling(samples: FloatArray) -> FloatArray:
+    """Beside the same rotation a force that is twice as large every ten seconds as it is in between."""
+    steady = 2 * np.cos(THETA)
+    return np.asarray((samples - steady) * (1.5 + 0.5 * np.cos(2 * np.pi * T / 10)) + steady, dtype=np.float64)
+
+
+def test_a_load_that_cycles_is_no_impact_and_impacts_beside_it_are_told() -> None:
+    """Within a hop such a force makes a kurtosis of 3.6, which healthy recordings of a steady load never have."""
+    assert suspects((0.0,) * 4, 0.0, cycling) == [""] * 4
+    assert all("with impacts" in one for one in suspects((0.0,) * 4, 0.0, lambda samples: knocking(cycling(samples))))
+
+
+def test_a_machine_commissioned_under_a_load_that_cycles_is_no_rub_once_the_load_is_steady() -> None:
+    healthy = sure(learn_hops([kurtosis(cycling(noise(300 + n) + 2 * np.cos(THETA))) for n in range(5)]))
+    for n in range(4):
+        assert departure(kurtosis(noise(320 + n) + 2 * np.cos(THETA)), healthy, 1.25, 6.0) == 0.0
+
+
 LATE = np.arange(T.size) >= round(0.63 * T.size)  # in the midst of a hop
 
 
