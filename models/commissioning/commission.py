@@ -311,7 +311,7 @@ def commission(
             identified=learned.identified,
             gyroscopic=learned.gyroscopic,
             misfit=_healthy_misfit(machine, learned, pieces),
-            lines=() if knowledge.level is KnowledgeLevel.NONE else _excluded(windows),
+            lines=_excluded(windows, everywhere=knowledge.level is not KnowledgeLevel.NONE),
             baselines=learned.baselines,
             shape=learned.shape,
             sensors=learn_sensor_reference(windows),
@@ -328,9 +328,10 @@ def commission(
     )
 
 
-def _excluded(windows: Sequence[WindowStatistics]) -> tuple[KnownLine, ...]:
-    """Lines that the likelihood has left out, which it leaves out from now on."""
-    return tuple(sorted({line.known(window.speed_rad_s) for window in windows for line in window.lines}))
+def _excluded(windows: Sequence[WindowStatistics], *, everywhere: bool) -> tuple[KnownLine, ...]:
+    """Lines that were left out and are from now on; of correlations, which relations are learned on, not all can be."""
+    lines = [(line, window) for window in windows for line in window.lines if everywhere or line.power is not None]
+    return tuple(sorted({line.known(window.speed_rad_s) for line, window in lines}))
 
 
 def _only_levels(machine: MachineFile, text: str) -> Check:

@@ -236,7 +236,8 @@ class Commissioned(BaseModel, extra="forbid", frozen=True):
     lines: tuple[KnownLine, ...] = Field(
         default=(),
         exclude_if=lambda found: not found,
-        description="levels full and partial: steady lines of the healthy windows, which theory does not explain",
+        description="steady lines of the healthy windows, which neither theory nor a relation explains; of an earlier "
+        "version at levels full and partial alone",
     )
     baselines: tuple[ConditionBaseline, ...] = Field(
         default=(), description="level none: one for all conditions, or one for each speed where they differ"

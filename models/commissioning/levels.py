@@ -223,7 +223,8 @@ def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progre
     EstimationError
         If there is none that the pieces determine.
     """
-    groups = [list(pieces)]
+    pieces = [replace(piece, window=piece.window.without_lines) for piece in pieces]
+    groups = [pieces]
     baselines = [_baseline(groups[0])]
     agreement = check_recordings(disagreements(baselines[0]), _speeds(pieces))
     if agreement is not None and agreement.verdict == "limited":

@@ -17,6 +17,8 @@ from models.signals.block import FloatArray
 _LOBE = 2  # a Hann window spreads a line over two bins on either side
 _BESIDE = range(_LOBE + 1, _LOBE + 4)  # bins away, that are the surroundings
 _STANDS_OUT = 4.0  # power of the motion that does so most, over that of its surroundings; of noise up to 2.5
+_SMOOTH = 3  # segments to either side over which the phase of a line that is taken out is a mean
+_HANN_POWER, _AT_ONE = 0.375, 1e-6  # power of a lobe over the square of the amplitudes in it, added up
 _CHANCE = 1e-4  # of one bin that stands out
 _FEWEST_SEGMENTS = 6
 _ORDERS = range(2, 13)
@@ -34,11 +36,19 @@ class ExcludedLine(NamedTuple):
 
     frequency_hz: float
     reach_hz: float
+    # (n, n): R_ij(τ) = Re{power e^{-j2π centre τ}} of it alone, where its phase is sure to be no resonance's, as that
+    # of hum and of multiples of the speed is; and its frequency between the bins
+    power: ComplexArray | None = None
+    centre_hz: float = 0.0
 
     def known(self, speed_rad_s: float) -> KnownLine:
         """What is kept of it, to three digits: of a line that is found in every window one is kept, or few."""
         order = self.frequency_hz * 2 * np.pi / abs(speed_rad_s)
         return float(f"{self.frequency_hz:.3g}"), float(f"{order:.3g}")
+
+    def turned(self, turn: FloatArray) -> "ExcludedLine":
+        """The line in other channels, ``turn @ channels``."""
+        return self if self.power is None else self._replace(power=turn @ self.power @ turn.T)
 
 
 def excluded_lines(
@@ -77,10 +87,14 @@ def excluded_lines(
         peaks[at + _LOBE] = strength
         highest = peaks[at + np.arange(2 * _LOBE + 1)[:, np.newaxis]].max(axis=0)
         healthy = _near_known(frequencies_hz, speed_hz, known)
+        hum = _wanted(frequencies_hz, slowest_hz, fastest_hz, ())
         for n in np.flatnonzero((strength > _STANDS_OUT) & (strength == highest)):
             own = segments[at[n]] @ motions[n]
             if _keeps_course(own) and (healthy[at[n]] or _share(segments, int(at[n]), own) <= _HUM):
-                found.append(ExcludedLine(float(frequencies_hz[at[n]]), step_hz * _skirt(strength[n])))
+                line = ExcludedLine(float(frequencies_hz[at[n]]), step_hz * _skirt(strength[n]))
+                found.append(
+                    _with_power(line, segments, frequencies_hz, *_course(own, line, step_hz)) if hum[at[n]] else line
+                )
         if turning is None:
             return tuple(found)
         rotation = _unit(turning[:, np.abs(frequencies_hz - speed_hz).argmin()])
@@ -93,7 +107,10 @@ def excluded_lines(
                 # The phase in the middle of a segment is that of all bins of a lobe, with a sign that alternates.
                 own = ((-1.0) ** at[:, np.newaxis] * (segments[at] @ motions[strength.argmax()])).sum(axis=0)
                 if had or (strength.max() > _STANDS_OUT and _goes_with(own, rotation, order)):
-                    found.append(ExcludedLine(order * speed_hz, half_hz + step_hz * _skirt(strength.max())))
+                    line = ExcludedLine(order * speed_hz, half_hz + step_hz * _skirt(strength.max()))
+                    found.append(
+                        _with_power(line, segments, frequencies_hz, rotation**order, order * speed_hz, half_hz)
+                    )
     except np.linalg.LinAlgError:  # a dead channel, or one that is there twice
         return ()
     return tuple(found)
@@ -139,6 +156,46 @@ def _share(segments: ComplexArray, at: int, own: ComplexArray) -> float:
     line = np.abs(_unit(own).conj() @ segments[lobe] / own.size) ** 2
     noise = (np.abs(segments[lobe]) ** 2).mean(axis=1) / own.size
     return float((line - noise).sum() / (np.abs(segments) ** 2).mean(axis=1).sum())
+
+
+def _course(own: ComplexArray, line: ExcludedLine, step_hz: float) -> tuple[ComplexArray, float]:
+    """Phases of a line that goes on by one angle from segment to segment, shape (n_segments,), and its frequency.
+
+    They may wander, more slowly than a few segments: what follows every segment follows a resonance as well.
+    """
+    unit = _unit(own)
+    advance = np.angle(np.mean(unit[1:] * unit[:-1].conj()))
+    steady = np.exp(1j * advance * np.arange(own.size))
+    wandering = np.convolve(np.pad(unit * steady.conj(), _SMOOTH, mode="edge"), np.ones(2 * _SMOOTH + 1), mode="valid")
+    # Segments are half a segment apart: in that time a line between the bins turns by up to half a turn more or less.
+    every_s = 1 / (2 * step_hz)
+    off = np.angle(np.exp(1j * (advance - 2 * np.pi * line.frequency_hz * every_s))) / (2 * np.pi * every_s)
+    return _unit(steady * wandering), float(line.frequency_hz + off)
+
+
+def _with_power(
+    line: ExcludedLine,
+    segments: ComplexArray,
+    frequencies_hz: FloatArray,
+    phases: ComplexArray,
+    centre_hz: float,
+    half_hz: float = 0.0,
+) -> ExcludedLine:
+    """The line with what goes with its phases in all channels; `half_hz` is how far it wanders to either side."""
+    step_hz = frequencies_hz[1] - frequencies_hz[0]
+    lobe = np.flatnonzero(np.abs(frequencies_hz - centre_hz) <= half_hz + (_LOBE + 0.5) * step_hz)
+    if not lobe.size:
+        return line
+    off = np.abs(frequencies_hz[lobe] - centre_hz) / step_hz
+    hann = np.sinc(off) / np.where(np.abs(off - 1) < _AT_ONE, 2.0, 2 * (1 - off**2))
+    hann = np.where(np.abs(off - 1) < _AT_ONE, 0.25, hann)
+    # The amplitude in the middle of a segment is that of all bins of a lobe, with a sign that alternates: as the taper
+    # has them, or of a line that goes through them one as the other.
+    weights = hann / (hann @ hann) if half_hz < step_hz else np.ones(lobe.size)
+    middle = np.tensordot((-1.0) ** lobe * weights, segments[lobe], axes=1)
+    amplitudes = phases.conj() @ middle / phases.size
+    power = 2 * step_hz * _HANN_POWER * np.outer(amplitudes, amplitudes.conj())
+    return line._replace(power=power, centre_hz=centre_hz)
 
 
 def _outstanding(

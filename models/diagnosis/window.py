@@ -125,6 +125,26 @@ class WindowStatistics:
         return np.asarray(np.add.reduceat(self.spectrum, pair_bands(self.frequencies_hz.size)), dtype=np.complex128)
 
     @cached_property
+    def without_lines(self) -> "WindowStatistics":
+        """The same window without `lines` in its correlations and spectra.
+
+        A line is as strong at all lags, and neither goes with the motion at a bearing nor is forgotten by any force.
+        """
+        lines = [line for line in self.lines if line.power is not None]
+        if not lines:
+            return self
+        turns = np.exp(-2j * np.pi * self.lags_s[:, None] * [line.centre_hz for line in lines])
+        gone = np.tensordot(turns, np.stack([line.power for line in lines if line.power is not None]), axes=1).real
+        spectrum = replace(self, lines=tuple(lines)).spectrum_without_lines
+        return replace(
+            self,
+            correlation=self.correlation - gone,
+            hop_correlation=self.hop_correlation - gone,
+            spectrum=spectrum,
+            lines=(),
+        )
+
+    @cached_property
     def hop_waveform(self) -> Waveform:
         """The waveforms hop by hop, shape (n_hops, n)."""
         return stacked_waveform(self.waveforms)
@@ -279,6 +299,7 @@ def _turned(window: WindowStatistics, states: tuple[str, ...], turn: FloatArray)
         synchronous=vectors(window.synchronous),
         hop_synchronous=vectors(window.hop_synchronous),
         relative_synchronous=None if relative is None else relative_vectors(relative),
+        lines=tuple(line.turned(turn) for line in window.lines),
         mounted=window.as_mounted,
     )
 

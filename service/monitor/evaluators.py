@@ -65,6 +65,7 @@ class BaselineEvaluator(WindowEvaluator):
         self._conditions = commissioned.conditions
         self._naming = Naming(machine.sensors)
         self._diagnosed = states_of(machine) != ()
+        self._lines = commissioned.lines != ()  # without any, relations were learned with all that the windows held
         self._shape = commissioned.shape
         self._length_s = machine.window_data_s
         self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate
@@ -80,7 +81,8 @@ class BaselineEvaluator(WindowEvaluator):
             raise EstimationError(f"{self._place}: {here}: {outside}")
         speed = float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else None
         if self._baselines:
-            deciding = determined(self._baseline_for(window).diagnose(window), window, self._length_s)
+            clear = window.without_lines if self._lines else window
+            deciding = determined(self._baseline_for(window).diagnose(clear), window, self._length_s)
         else:
             nothing = tuple(no_reading(name, _SHAPE, _NO_EQUATION) for name in PARAMETERS)
             deciding = Diagnosis(_SHAPE, nothing, covariance=np.zeros((0, 0)))

@@ -40,6 +40,19 @@ def test_mains_hum_is_found_though_no_channel_alone_shows_it(hz: float) -> None:
     assert lines_of(found) == [round(float(FREQUENCIES_HZ[at]), 1)]
 
 
+@pytest.mark.parametrize("hz", [50.04, 100.1, 149.97])
+def test_hum_is_measured_between_the_bins_and_at_the_end_of_the_band(hz: float) -> None:
+    # Of segments that begin at their first sample, neighbouring bins of a line have opposite signs.
+    found = with_line(hz, 2.0, wander_hz=0.005) * (-1.0) ** np.arange(BINS)[:, None, None]
+    (line,) = excluded_lines(found, summed(found), FREQUENCIES_HZ, (2 * np.pi * 22.0,) * 2, None)
+    assert line.power is not None
+    assert line.centre_hz == pytest.approx(hz, abs=0.02)
+    # The amplitudes of a lobe add up to twice that of its middle, and have 0.375 of the power of that sum.
+    apart = np.exp(1j * np.array([0.0, 2.0, 4.0, 5.0]))
+    true = 2 * STEP_HZ * 0.375 * 4.0**2 * np.outer(apart, apart.conj())
+    assert np.abs(line.power - true).max() < 0.15 * np.abs(true).max()
+
+
 def test_other_lines_are_left_out_where_the_healthy_machine_had_them() -> None:
     found = with_line(37.3)
     assert not lines_of(found)

@@ -1,0 +1,67 @@
+"""Steady lines of the healthy machine, such as hum, are taken out of what relations are learned on and read in."""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+
+from models.commissioning.commissioned import Commissioned
+from models.commissioning.levels import pieces_of
+from models.diagnosis.window import WindowStatistics, window_statistics
+from models.signals.block import SampleBlock
+from service.monitor.evaluators import BaselineEvaluator
+from tests.commissioning.rotor_kit import NOTHING, commissioned, recording, stream, with_lines
+from tests.sure import sure
+
+HUM = {50.02: 0.03, 100.04: 0.02, 150.06: 0.02}
+
+
+@cache
+def recorded(*, lines: bool) -> Sequence[SampleBlock]:
+    clean = stream(130.0, 5_270_041)
+    return with_lines(clean, HUM, order=2) if lines else clean
+
+
+@cache
+def healthy(*, lines: bool) -> tuple[WindowStatistics, ...]:
+    pieces = pieces_of([recording(NOTHING, recorded(lines=lines))])
+    return tuple(piece.window for piece in pieces)
+
+
+@cache
+def made(*, lines: bool) -> Commissioned:
+    return sure(commissioned(NOTHING, recording(NOTHING, recorded(lines=lines))).commissioned)
+
+
+def test_lines_are_taken_out_of_correlations_at_all_lags_once() -> None:
+    for clean, window in zip(healthy(lines=False), healthy(lines=True), strict=True):
+        spread = np.sqrt(np.diag(clean.correlation[0]))
+        there, left = (
+            (one.correlation - clean.correlation) / np.outer(spread, spread) for one in (window, window.without_lines)
+        )
+        assert np.sqrt((left**2).mean()) < 0.35 * np.sqrt((there**2).mean())
+        again = window.without_lines
+        assert again.without_lines is again
+        np.testing.assert_allclose(again.hop_correlation.mean(axis=0), again.correlation, atol=1e-6 * spread.max() ** 2)
+
+
+def test_a_rotor_is_learned_as_if_there_were_none() -> None:
+    assert {round(line_hz) for line_hz, _ in made(lines=True).lines} == {44, 50, 100, 150}
+    assert made(lines=False).lines == ()
+    own, seen = (made(lines=lines).baselines[0].baseline.baseline().relations for lines in (False, True))
+    for one, other in zip(map(sure, own), map(sure, seen), strict=True):
+        errors = np.sqrt(np.diag(one.covariance))
+        assert np.all(np.abs(other.coefficients - one.coefficients) < 0.2 * errors)  # 1.8 with the lines
+
+
+def test_later_windows_are_read_without_them_where_the_relations_were_learned_so() -> None:
+    hops = recording(NOTHING, recorded(lines=True))
+    window = window_statistics(hops.plan, hops.hops[: hops.plan.hops], lines=made(lines=True).lines)
+    before = made(lines=True).model_copy(update={"lines": ()})  # of a version that learned on all that there was
+    with_them, without = (
+        BaselineEvaluator(NOTHING, one).evaluate(seen)
+        for one, seen in ((before, window), (before, window.without_lines))
+    )
+    now = BaselineEvaluator(NOTHING, made(lines=True)).evaluate(window)
+    assert now.deciding.parameters == without.deciding.parameters
+    assert now.deciding.parameters != with_them.deciding.parameters
