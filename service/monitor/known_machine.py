@@ -1,5 +1,6 @@
 """Evaluation of a machine whose parameters are known, given or identified: its windows are compared with theory."""
 
+import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -90,7 +91,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         if self._elsewhere(deciding):
             self.directed, window = False, replace(window, directed=False)
             deciding = self._explained(window)
-        deciding = self._within(deciding)
+        deciding = self._judged(window, self._within(deciding))
         short = {} if newest is None else self._newest(window, *newest, deciding)
         if not deciding.unexplained:
             self._explained_ns = window.end_ns
@@ -165,6 +166,31 @@ class KnownMachineEvaluator(WindowEvaluator):
         why = f"{self._machine.title}: it would take {times:.1f} times the unbalance of the machine file, the limit is"
         return replace(decided, unexplained=f"{why} {_HEAVIEST:g} times: check the units of the channels and e_m")
 
+    def _judged(self, window: WindowStatistics, decided: Diagnosis) -> Diagnosis:
+        """The diagnosis without its misfit where the speed changed faster than the rotation can be taken out.
+
+        A shaft that is switched off, or changes its speed at once, leaves a part of its rotation in a hop or two.
+
+        Raises
+        ------
+        EstimationError
+            Where nothing is explained for it.
+        """
+        steps = np.abs(np.diff(window.hop_speed_rad_s)) / self._machine.operation.speed_rad_s
+        fastest = float(np.max(steps, initial=0.0))
+        limit = (
+            math.floor(1000 * _STEADY / max(1, self._machine.window.hops - 1)) / 1000
+        )  # of a ramp as long as a window
+        if not fastest > limit:
+            return decided
+        if decided.unexplained:
+            told, most = beyond(100 * fastest, 100 * limit)
+            raise EstimationError(
+                f"{self._machine.title}: the speed changed by {told} % of nominal from one hop to the next, evaluation "
+                f"limit {most} %"
+            )
+        return replace(decided, misfit_z=None, suspect="")
+
     def _newest(
         self, window: WindowStatistics, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis
     ) -> dict[int, Diagnosis]:
@@ -183,7 +209,7 @@ class KnownMachineEvaluator(WindowEvaluator):
                 if (statistics := sliding.statistics(hops)) is not None:
                     statistics = replace(statistics, directed=self.directed, lines=window.lines)
                     decided = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
-                    evaluated[hops] = self._within(decided)
+                    evaluated[hops] = self._judged(statistics, self._within(decided))
         return evaluated
 
     def checkpoint(self) -> dict[str, np.ndarray]:

@@ -1,0 +1,50 @@
+"""A known machine whose speed changes faster than its rotation can be taken out of the window: healthy all the same."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from models.alarm_names import LEVEL
+from models.commissioning.commissioned import Installed
+from models.machine import load_machine
+from rotorwatch.records.health import HealthState, Report
+from service.monitor.monitor import MachineMonitor
+from simulator.scenario import Event, Scenario, Sensors
+from simulator.stream import blocks
+from tests.diagnosis.sensors.test_sensor_checks import sources_along
+from tests.service.monitor.test_monitor import feed
+
+LAB = load_machine("lab")
+RPM = LAB.operation.speed_rpm
+
+
+def watched(duration_s: float, change: Event) -> Sequence[Report]:
+    """Full windows of a machine that one force shakes, which shows most of what is left of the rotation."""
+    direction = np.array([[0.5, 0.7, 0.0, -0.4, 0.6, 0.0]])
+    scenario = Scenario(
+        machine="lab",
+        seed=5_280_031,
+        duration_s=duration_s,
+        sources=sources_along(direction, 70.0, 0.3),
+        sensors=Sensors(noise_relative=0.01, noise_corner_hz=300.0),
+        events=(change,),
+    )
+    windows, events = feed(MachineMonitor(Installed(LAB, None)), [block for block, _ in blocks(scenario, LAB)])
+    assert not [event for event in events if not event.alarm.name.startswith(LEVEL)]
+    return [window for window in windows if window.filled == 1.0]
+
+
+def test_a_machine_that_is_switched_off_raises_nothing_that_nobody_could_clear() -> None:
+    last = watched(79.0, Event(at_s=65.0, speed_rpm=0.65 * RPM, ramp_s=14.0))[-2:]
+    assert {window.state for window in last} == {HealthState.NOT_EVALUABLE}
+
+
+@pytest.mark.parametrize("to", [1.04, 0.95])
+def test_a_step_of_the_speed_is_no_misfit_and_parameters_are_read(to: float) -> None:
+    last = watched(75.0, Event(at_s=66.0, speed_rpm=to * RPM))[-1]
+    assert last.misfit_z is None
+    assert last.state is HealthState.HEALTHY
+    changes = [one.relative_change for one in last.parameters if one.relative_change is not None]
+    assert len(changes) == 6
+    assert max(map(abs, changes)) < 0.03
