@@ -46,9 +46,9 @@ class ExcludedLine(NamedTuple):
         order = self.frequency_hz * 2 * np.pi / abs(speed_rad_s)
         return float(f"{self.frequency_hz:.3g}"), float(f"{order:.3g}")
 
-    def turned(self, turn: FloatArray) -> "ExcludedLine":
+    def turned(self, turn: FloatArray | ComplexArray) -> "ExcludedLine":
         """The line in other channels, ``turn @ channels``."""
-        return self if self.power is None else self._replace(power=turn @ self.power @ turn.T)
+        return self if self.power is None else self._replace(power=turn @ self.power @ turn.conj().T)
 
 
 def excluded_lines(

@@ -269,6 +269,7 @@ def _equalised(window: WindowStatistics, equaliser: Equaliser, by_bin: ComplexAr
         synchronous=None if window.synchronous is None else window.synchronous / at_speed,
         hop_synchronous=None if window.hop_synchronous is None else window.hop_synchronous / at_speeds,
         relative_synchronous=None if relative is None else relative_vectors(relative / at_speeds),
+        lines=tuple(line.turned(np.diag(1 / equaliser.response(np.array(line.centre_hz)))) for line in window.lines),
     )
 
 

@@ -1,6 +1,5 @@
 """Evaluation of a machine whose parameters are known, given or identified: its windows are compared with theory."""
 
-import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -167,29 +166,26 @@ class KnownMachineEvaluator(WindowEvaluator):
         return replace(decided, unexplained=f"{why} {_HEAVIEST:g} times: check the units of the channels and e_m")
 
     def _judged(self, window: WindowStatistics, decided: Diagnosis) -> Diagnosis:
-        """The diagnosis without its misfit where the speed changed faster than the rotation can be taken out.
+        """The diagnosis, unless it does not fit where the speed changed faster than the rotation can be taken out.
 
-        A shaft that is switched off, or changes its speed at once, leaves a part of its rotation in a hop or two.
+        A shaft that is switched off, or changes its speed at once, leaves a part of its rotation in a hop or two. What
+        fits all the same does so for the machine's own sake.
 
         Raises
         ------
         EstimationError
-            Where nothing is explained for it.
+            If it does not fit.
         """
         steps = np.abs(np.diff(window.hop_speed_rad_s)) / self._machine.operation.speed_rad_s
         fastest = float(np.max(steps, initial=0.0))
-        limit = (
-            math.floor(1000 * _STEADY / max(1, self._machine.window.hops - 1)) / 1000
-        )  # of a ramp as long as a window
-        if not fastest > limit:
+        limit = round(_STEADY / max(1, self._machine.window.hops - 1), 3)  # of a ramp as long as a window
+        if fastest <= limit or (not decided.unexplained and (decided.misfit_z or 0.0) <= _INSIDE):
             return decided
-        if decided.unexplained:
-            told, most = beyond(100 * fastest, 100 * limit)
-            raise EstimationError(
-                f"{self._machine.title}: the speed changed by {told} % of nominal from one hop to the next, evaluation "
-                f"limit {most} %"
-            )
-        return replace(decided, misfit_z=None, suspect="")
+        told, most = beyond(100 * fastest, 100 * limit)
+        raise EstimationError(
+            f"{self._machine.title}: the speed changed by {told} % of nominal from one hop to the next, evaluation "
+            f"limit {most} %"
+        )
 
     def _newest(
         self, window: WindowStatistics, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis

@@ -41,10 +41,7 @@ def test_a_machine_that_is_switched_off_raises_nothing_that_nobody_could_clear()
 
 
 @pytest.mark.parametrize("to", [1.04, 0.95])
-def test_a_step_of_the_speed_is_no_misfit_and_parameters_are_read(to: float) -> None:
+def test_a_step_of_the_speed_is_no_misfit(to: float) -> None:
     last = watched(75.0, Event(at_s=66.0, speed_rpm=to * RPM))[-1]
-    assert last.misfit_z is None
-    assert last.state is HealthState.HEALTHY
-    changes = [one.relative_change for one in last.parameters if one.relative_change is not None]
-    assert len(changes) == 6
-    assert max(map(abs, changes)) < 0.03
+    assert last.state is HealthState.NOT_EVALUABLE
+    assert "% of nominal from one hop to the next, evaluation limit 1.4 %" in last.reason
