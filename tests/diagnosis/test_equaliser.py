@@ -132,3 +132,17 @@ def test_what_is_no_signal_of_a_sensor_is_refused(name: str, signal: dict[str, A
     fields["sensors"] = [one | (signal if one["name"] == name else {}) for one in fields["sensors"]]
     with pytest.raises(ValidationError, match=says):
         MachineFile.model_validate(fields)
+
+
+def test_a_line_of_hum_is_taken_out_as_the_sensors_show_it() -> None:
+    true_machine, declared = (machine(declared=one) for one in (False, True))
+    hummed = simulated().copy()
+    t_s = np.arange(len(hummed)) / true_machine.rate_hz
+    for column, sensor in enumerate(true_machine.sensors):
+        if sensor.quantity != "shaft_angle":
+            hummed[:, column] += 0.3 * hummed[:, column].std() * np.cos(2 * np.pi * 50.0 * t_s + column)
+    clean, true = statistics(true_machine, simulated()), statistics(true_machine, hummed)
+    found = statistics(declared, behind_sensors(hummed))
+    assert true.without_lines is not true
+    for one in (true, found):
+        assert apart(one.without_lines, clean)[1] < 0.005 < apart(one, clean)[1]
