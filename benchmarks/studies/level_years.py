@@ -118,8 +118,8 @@ class Drawing:
             vectors = self.orders + gain * np.sqrt(self.order_noise / 2) * (both[:, 0] + 1j * both[:, 1])
             hops = []
             for number in range(gain.size):
-                sums = np.ones((10, bands.shape[2]))
-                sums[0], sums[4:6], sums[7] = 0.0, np.nan, self.in_band @ bands[number]
+                sums = np.ones((11, bands.shape[2]))
+                sums[[0, 6]], sums[4:6], sums[8] = 0.0, np.nan, self.in_band @ bands[number]
                 hops.append(
                     HopLevels(self.n_samples, sums, vectors[number], bands[number, :-1], np.empty((0, bands.shape[2])))
                 )
