@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -148,7 +149,7 @@ def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browse
                     scrub = page.get_by_role("slider", name="Window")
                     scrub.focus()
                     page.mouse.wheel(0, 3000)
-                    page.wait_for_function("scrollY > 1500")
+                    until(partial(page.evaluate, "scrollY > 1500"), "the page to scroll")
                     tall = page.locator(".replay-banner").evaluate("one => one.getBoundingClientRect().bottom")
                     # What is scrubbed stays in sight below the banner, however many lines that has.
                     assert scrub.evaluate("one => one.getBoundingClientRect().top") >= tall > 0
