@@ -31,6 +31,7 @@ _SHIPPED = Path(__file__).parent / "machines"
 
 
 _BINS = 20
+_MOST_OF_SEGMENT = 0.02  # delay over the length of a segment: what came before it is missing in it
 _MOST_OF_BAND = 2.0  # corner of a high-pass over the beginning of the band: one of first order halves it there
 _LONGEST_HOP_S = 600.0
 
@@ -269,10 +270,19 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
 
     @model_validator(mode="after")
     def _high_passes(self) -> Self:
-        begin_hz = self.window.band_hz[0]
-        for sensor in self.sensors if self.holds_band else ():
+        begin_hz, most_us = self.window.band_hz[0], 1e6 * _MOST_OF_SEGMENT * self.window.segment_s
+        for sensor in self.sensors:
             corner_hz = sensor.high_pass_hz or 0.0
-            if corner_hz > _MOST_OF_BAND * begin_hz and not state_name(sensor).startswith("@"):
+            if corner_hz >= self.rate_hz / 2:
+                raise ValueError(
+                    f"channel {sensor.name}: high_pass_hz is {corner_hz:g}, expected below half of rate_hz"
+                )
+            if abs(sensor.delay_us or 0.0) > most_us:
+                raise ValueError(
+                    f"channel {sensor.name}: delay_us is {sensor.delay_us:g}, expected at most {most_us:g}, a fiftieth "
+                    "of window.segment_s"
+                )
+            if self.holds_band and corner_hz > _MOST_OF_BAND * begin_hz and not state_name(sensor).startswith("@"):
                 raise ValueError(
                     f"channel {sensor.name}: high_pass_hz is {corner_hz:g}, expected at most twice the lowest "
                     f"frequency of window.band_hz, {begin_hz:g} Hz: what a high-pass takes far below its corner is "

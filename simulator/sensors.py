@@ -33,6 +33,8 @@ class SimulatedSensor:
     ----------
     rms_SI : float
         What ``noise_relative`` refers to: the channel's own theoretical rms, one revolution for a shaft angle.
+    late_s : float
+        How much later its signal comes than that of the machine's first.
     rng : numpy.random.Generator
         Of this sensor alone. One number per sample is drawn whatever the settings are, so that a noise level can
         change without changing the noise.
@@ -46,6 +48,7 @@ class SimulatedSensor:
         rate_hz: float,
         rng: np.random.Generator,
         longest_delay_s: float = 0.0,
+        late_s: float = 0.0,
     ) -> None:
         self.channel = channel
         self._settings = settings
@@ -58,7 +61,9 @@ class SimulatedSensor:
         self._held: float | None = None
         self._rate_hz, self._reach = rate_hz, round(longest_delay_s * rate_hz)
         self._past: FloatArray | None = None
-        self._filter = _sections(channel, rate_hz)
+        angle = channel.quantity is Quantity.SHAFT_ANGLE
+        self._filter = None if angle else _sections(channel, rate_hz, late_s)
+        self.late = late_s * rate_hz  # samples
         self._filtered: FloatArray | None = None  # its state
 
     def noise(self, n_samples: int) -> FloatArray:
@@ -141,6 +146,7 @@ class SensorBank:
         rngs: Sequence[np.random.Generator],
     ) -> None:
         self._dtype = np.dtype(machine.dtype)
+        first_us = min(0.0, *(one.delay_us or 0.0 for one in machine.sensors))
         self._faults = faults
         self._sensors = [
             SimulatedSensor(
@@ -150,6 +156,7 @@ class SensorBank:
                 machine.rate_hz,
                 rng,
                 max((_value(kinds, "delay", 0.0) for _, kinds in faults.get(channel.name, ())), default=0.0),
+                ((channel.delay_us or 0.0) - first_us) * 1e-6,
             )
             for channel, rng in zip(machine.sensors, rngs, strict=True)
         ]
@@ -160,7 +167,7 @@ class SensorBank:
         samples = np.empty((n_samples, len(self._sensors)), dtype=self._dtype)
         for column, sensor in enumerate(self._sensors):
             angle = sensor.channel.quantity is Quantity.SHAFT_ANGLE
-            value = plant.theta_rad if angle else _seen(sensor.channel, plant.states)
+            value = _ago(plant.theta_rad, sensor.late) if angle else _seen(sensor.channel, plant.states)
             noise = sensor.noise(n_samples)
             for begin, end, faults in self._stretches(sensor.channel.name, first, n_samples):
                 samples[begin:end, column] = sensor.measure(value[begin:end], noise[begin:end], faults)
@@ -194,7 +201,14 @@ class SensorBank:
         return [(begin, end, _in_force(states, first + begin)) for begin, end in pairwise(cuts)]
 
 
-def _sections(sensor: Sensor, rate_hz: float) -> FloatArray | None:
+def _ago(angle_rad: FloatArray, late: float) -> FloatArray:
+    """Shaft angle some samples ago, at the speed of now."""
+    if not late or angle_rad.size < 2:
+        return angle_rad
+    return np.asarray(angle_rad - late * np.gradient(np.unwrap(angle_rad)))
+
+
+def _sections(sensor: Sensor, rate_hz: float, late_s: float) -> FloatArray | None:
     """Second-order sections of a sensor's high-pass and delay; None without either.
 
     The part of a delay below a sample is a Thiran all-pass of first order (Laakso et al., IEEE Signal Processing
@@ -206,7 +220,7 @@ def _sections(sensor: Sensor, rate_hz: float) -> FloatArray | None:
         found.append(
             scipy.signal.butter(sensor.high_pass_order or 1, sensor.high_pass_hz, "high", fs=rate_hz, output="sos")
         )
-    late = (sensor.delay_us or 0.0) * 1e-6 * rate_hz
+    late = late_s * rate_hz
     if late > 0:
         whole = max(0, round(late - 1))
         part = (1 - (late - whole)) / (1 + (late - whole))

@@ -77,6 +77,8 @@ def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistic
     window = window.as_mounted
     states = plan.mounted
     every = np.concatenate([hop.segments for hop in hops], dtype=np.complex128)
+    if plan.equaliser is not None:
+        every[:, :, : len(states)] /= plan.equaliser.response(plan.frequencies_hz)
     segments = every[:, :, : len(states)]
     if segments.shape[0] < _FEWEST_SEGMENTS:
         return ()

@@ -168,6 +168,8 @@ class HealthyMisfit(BaseModel, extra="forbid", frozen=True):
         root = math.sqrt(part)
         alternatives = []
         for one in window.alternatives:
+            if one.quantity == DELAY and one.tried not in self.scores:
+                continue  # of an earlier version, which did not try them: what healthy windows had of it is not known
             left = one.z - root * self.scores.get(one.tried, 0.0)
             change = one.change * left / one.z if one.z else 0.0
             error = root * math.hypot(self.error, self.spreads.get(one.tried, 0.0))
@@ -176,6 +178,7 @@ class HealthyMisfit(BaseModel, extra="forbid", frozen=True):
         return replace(
             window,
             excess_z=excess / math.hypot(1.0, part * self.excess_error, part * self.excess_spread),
+            excess=window.excess * excess / window.excess_z if window.excess_z else 0.0,
             alternatives=tuple(alternatives),
         )
 

@@ -87,7 +87,7 @@ class WindowStatistics:
 
     @property
     def as_mounted(self) -> "WindowStatistics":
-        """Statistics of the sensors themselves: for whatever judges a sensor."""
+        """Statistics of the sensors as mounted, high-pass and delay divided out: for whatever judges a sensor."""
         return self if self.mounted is None else self.mounted
 
     @property

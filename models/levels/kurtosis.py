@@ -20,23 +20,26 @@ _PIECES, _APART = 20, 2
 """Pieces of a hop whose levels are compared, each with the next but one: in between, what a knock makes ring dies."""
 
 
-def swell(square: FloatArray) -> FloatArray:
+def swell(rest: FloatArray) -> FloatArray:
     """What a level that rises and falls within a hop, as with a load that cycles, adds to the fourth moment; (n,).
 
     Three times the variance of the level, by the covariance of pieces that are apart: unlike the variance of the
-    pieces it is nothing, in the mean, where their levels differ by chance or for single knocks. It may be negative.
+    pieces it is next to nothing, in the mean, where their levels differ by chance or for single knocks. It may be
+    negative.
 
     Parameters
     ----------
-    square : ndarray, shape (n, n_samples)
-        Squares of the deviations from the mean.
+    rest : ndarray, shape (n, n_samples)
+        Deviations from the mean without the orders of running speed, with which a line beside them beats: that is no
+        level that swells.
     """
-    n, size = square.shape[0], square.shape[1] // _PIECES
+    n, size = rest.shape[0], rest.shape[1] // _PIECES
     if not size:
         return np.zeros(n)
-    pieces = square[:, : size * _PIECES].reshape(n, _PIECES, size).mean(axis=2)
-    pieces -= pieces.mean(axis=1, keepdims=True)
-    return np.asarray(3 * np.vecdot(pieces[:, :-_APART], pieces[:, _APART:]) / (_PIECES - _APART), dtype=np.float64)
+    pieces = rest[:, : size * _PIECES].reshape(n, _PIECES, size)
+    levels = np.vecdot(pieces, pieces) / size
+    levels -= levels.mean(axis=1, keepdims=True)
+    return np.asarray(3 * np.vecdot(levels[:, :-_APART], levels[:, _APART:]) / (_PIECES - _APART), dtype=np.float64)
 
 
 def random_kurtosis(square: FloatArray, fourth: FloatArray, lines: npt.NDArray[np.complex128]) -> FloatArray:

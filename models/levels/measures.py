@@ -40,7 +40,7 @@ import scipy  # its sub-packages are loaded when they are first used
 from models.checkpoint import checked
 from models.levels.bands import BandLevels, band_edges
 from models.levels.kurtosis import random_kurtosis, swell
-from models.levels.orders import ORDERS, Spectrum, hann_taper, order_vectors
+from models.levels.orders import ORDERS, Spectrum, hann_taper, order_vectors, without_orders
 from models.signals.block import FloatArray
 from models.signals.channels import LEAST_APART_DEG, Channel, Quantity, apart_deg
 from models.signals.waveform import Waveform
@@ -255,7 +255,6 @@ def hop_levels(
 
     Parameters
     ----------
-    plan : LevelPlan
     waveform : Waveform
         Of the plan's columns first; others may follow.
     deviations : ndarray, shape (n, n_samples)
@@ -272,7 +271,7 @@ def hop_levels(
     square, peak = x * x, np.maximum(high - mean, mean - low)
     sums = np.full((len(_SUMS), n), np.nan)
     sums[:4] = mean, peak, high - low, np.vecdot(square, square) / n_samples
-    sums[6:8] = swell(square), rms**2
+    sums[6], sums[7] = 0.0, rms**2
     # Strong lines must not leak into the low end of a band, where integration would magnify them.
     taper, scale = hann_taper(n_samples)
     # In parts of the peak single precision is enough, and quicker.
@@ -300,6 +299,8 @@ def hop_levels(
             distance -= 2 * skew * x[y] * x[z]
         sums[4, y] = np.sqrt(distance.max() / (1 - skew**2))
     orders = unit * order_vectors(x, unit, spectrum, amplitude, angle_rad)
+    if angle_rad is not None:
+        sums[6] = swell(without_orders(x, orders, angle_rad))
     lines = np.empty((n, 0))
     if plan.lines:
         bins = parts[:, : 2 * cuts[-1] : 2] + parts[:, 1 : 2 * cuts[-1] : 2]
@@ -400,7 +401,6 @@ def window_levels(
 
     Parameters
     ----------
-    plan : LevelPlan
     hops : sequence of HopLevels
         At least one.
     speeds_rad_s : ndarray, shape (n_hops,)

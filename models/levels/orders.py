@@ -84,6 +84,14 @@ def order_vectors(
     return np.asarray(solved[1::2] - 1j * solved[2::2], dtype=np.complex128)
 
 
+def without_orders(x: FloatArray, vectors: ComplexArray, angle_rad: FloatArray) -> FloatArray:
+    """What is left of samples, shape (n, n_samples), without the whole orders among the vectors of `order_vectors`."""
+    turn = np.exp(1j * angle_rad.astype(np.float32)).astype(np.complex64)
+    turning = np.stack([turn, turn * turn, turn * turn * turn])
+    vectors = np.nan_to_num(vectors[1:]).T  # of a shaft that stands still
+    return np.asarray(x - (vectors.real @ turning.real - vectors.imag @ turning.imag), dtype=np.float64)
+
+
 @lru_cache(maxsize=8)
 def hann_taper(size: int) -> tuple[_SingleArray, float]:
     """Hann's, of so many samples, and what makes mean squares of the squares of its bins."""

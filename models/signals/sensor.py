@@ -25,7 +25,11 @@ class Sensor(Channel):
         default=None, exclude_if=not_given, description="1: AC coupling; 2: a geophone damped at 0.7, Butterworth"
     )
     delay_us: float | None = Field(
-        default=None, ge=0, le=2e4, exclude_if=not_given, description="how much later it is sampled than stated"
+        default=None,
+        ge=-2e4,
+        le=2e4,
+        exclude_if=not_given,
+        description="how much later the signal comes than its times say; negative where it is sampled later than that",
     )
 
     @model_validator(mode="before")

@@ -10,6 +10,7 @@ import numpy as np
 from models.checkpoint import checked, prefixed, unprefixed
 from models.commissioning.commissioned import Commissioned, in_sense
 from models.diagnosis.likelihood.lengths import LengthFits
+from models.diagnosis.moments import STEADY
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
@@ -163,7 +164,9 @@ class KnownMachineEvaluator(WindowEvaluator):
         if times - _SURELY * vector.magnitude_error < _HEAVIEST:
             return decided
         why = f"{self._machine.title}: it would take {times:.1f} times the unbalance of the machine file, the limit is"
-        return replace(decided, unexplained=f"{why} {_HEAVIEST:g} times: check the units of the channels and e_m")
+        return replace(
+            decided, suspect="", unexplained=f"{why} {_HEAVIEST:g} times: check the units of the channels and e_m"
+        )
 
     def _judged(self, window: WindowStatistics, decided: Diagnosis) -> Diagnosis:
         """The diagnosis, unless it does not fit where the speed changed faster than the rotation can be taken out.
@@ -176,9 +179,10 @@ class KnownMachineEvaluator(WindowEvaluator):
         EstimationError
             If it does not fit.
         """
-        steps = np.abs(np.diff(window.hop_speed_rad_s)) / self._machine.operation.speed_rad_s
+        adjoin = np.isfinite(window.hop_jump_rad[1:])  # and the shaft angle is measured
+        steps = np.abs(np.diff(window.hop_speed_rad_s))[adjoin] / self._machine.operation.speed_rad_s
         fastest = float(np.max(steps, initial=0.0))
-        limit = round(_STEADY / max(1, self._machine.window.hops - 1), 3)  # of a ramp as long as a window
+        limit = max(STEADY, round(_STEADY / max(1, self._machine.window.hops - 1), 3))  # of a ramp as long as a window
         if fastest <= limit or (not decided.unexplained and (decided.misfit_z or 0.0) <= _INSIDE):
             return decided
         told, most = beyond(100 * fastest, 100 * limit)

@@ -54,6 +54,8 @@ def portrait(number: int, recording: HealthyRecording) -> Portrait | None:
     statistics = window_statistics(recording.plan, hops, lagged=False).as_mounted
     n = len(recording.plan.states)
     every = np.concatenate([hop.segments[:, :, :n] for hop in hops], dtype=np.complex128)
+    if recording.plan.equaliser is not None:
+        every /= recording.plan.equaliser.response(recording.plan.frequencies_hz)
     power = np.mean(np.abs(every) ** 2, axis=0)
     starts = np.array([hop.start_ns for hop in hops], dtype=np.int64)
     first = [len(stretch) for stretch in recording.stretches]

@@ -22,7 +22,7 @@ SIGNAL: dict[str, dict[str, Any]] = {
     "y1_dot": {"high_pass_hz": 2.0},
     "z1_dot": {"high_pass_hz": 4.5, "high_pass_order": 2},
     "y2": {"delay_us": 250.0},
-    "z2": {"high_pass_hz": 0.5, "delay_us": 400.0},
+    "z2": {"high_pass_hz": 0.5, "delay_us": -400.0},
 }
 
 
@@ -101,7 +101,7 @@ def test_sensors_whose_signal_is_declared_do_not_contradict_each_other() -> None
     seen = behind_sensors(simulated())
     assert sensor_findings(statistics(declared, seen), None, declared.sensors) == ()
     findings = sensor_findings(statistics(undeclared, seen), None, undeclared.sensors)
-    assert any("state the corner as high_pass_hz of its sensor" in one.text for one in findings)
+    assert any("state corner and order of its data sheet as high_pass_hz" in one.text for one in findings)
 
 
 def test_the_stream_and_what_identifies_a_machine_are_the_same_without() -> None:
@@ -119,6 +119,8 @@ def test_the_stream_and_what_identifies_a_machine_are_the_same_without() -> None
         ("y1", {"high_pass_hz": 2.0, "high_pass_order": 3}, "high_pass_order"),
         ("theta", {"high_pass_hz": 2.0}, "theta: high_pass_hz is given, but this measures shaft_angle"),
         ("theta", {"delay_us": 20.0}, "theta: delay_us is given, but this measures shaft_angle"),
+        ("y1", {"high_pass_hz": 1000.0}, "y1: high_pass_hz is 1000, expected below half of rate_hz"),
+        ("y1", {"delay_us": -30_000.0}, "delay_us"),
         (
             "y1_dot",
             {"high_pass_hz": 10.0},

@@ -118,9 +118,18 @@ def cycling(samples: FloatArray) -> FloatArray:
 
 
 def test_a_load_that_cycles_is_no_impact_and_impacts_beside_it_are_told() -> None:
-    """Within a hop such a force makes a kurtosis of 3.6, which healthy recordings of a steady load never have."""
+    """Over a cycle such a force makes a kurtosis of 3.6, which healthy recordings of a steady load never have."""
     assert suspects((0.0,) * 4, 0.0, cycling) == [""] * 4
     assert all("with impacts" in one for one in suspects((0.0,) * 4, 0.0, lambda samples: knocking(cycling(samples))))
+
+
+def test_a_line_beside_the_rotation_beats_and_is_no_level_that_swells() -> None:
+    """Otherwise kurtosis would go with how fast it beats, which goes with the slip of a motor."""
+    found = []
+    for number, beside_hz in enumerate((0.3, 0.6, 1.0, 1.3)):
+        lines = 2 * np.cos(THETA) + 1.5 * np.cos(THETA + 2 * np.pi * beside_hz * T)
+        found.append(kurtosis(np.asarray(0.5 * noise(400 + number) + lines, dtype=np.float64)).mean())
+    assert np.ptp(found) < 0.1
 
 
 def test_a_machine_commissioned_under_a_load_that_cycles_is_no_rub_once_the_load_is_steady() -> None:

@@ -228,6 +228,6 @@ def test_levels_are_the_same_by_the_spectrum_that_the_moments_have() -> None:
     moments = sure(hop_moments(plan, np.column_stack([seen, theta % (2 * np.pi)]), 0.9 * gap, 0).levels)
     alone = hop_levels(sure(plan.levels), *waveform_of(seen[-plan.hop :]), theta[-plan.hop :])
     alone.sums[CONTACT] = moments.sums[CONTACT]  # which only the moments look for
-    assert moments.sums == pytest.approx(alone.sums, rel=1e-5, abs=0, nan_ok=True)
+    assert moments.sums == pytest.approx(alone.sums, rel=1e-3, abs=0, nan_ok=True)
     assert moments.bands == pytest.approx(alone.bands, rel=1e-4, abs=0)
     assert moments.orders[1:] == pytest.approx(alone.orders[1:], rel=1e-4, abs=1e-8)

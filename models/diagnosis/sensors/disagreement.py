@@ -163,7 +163,7 @@ def _delay(
         f"{1e3 * late / departure.delay_z:.2g} ms) after {naming.name(window.states[other])}, expected {expected}"
     )
     if not departure.known:
-        text += "; if that is how it is sampled, state it as delay_us of its sensor"
+        text += "; if its signal comes late by that, or the other is sampled later, state it as delay_us"
     return SensorFault(states=(state,), kind=FaultKind.DELAY, text=text, value=late, z=departure.delay_z)
 
 
@@ -173,9 +173,10 @@ def _ahead(window: WindowStatistics, reading: PairReading, bands: Banded, naming
     guilty, other = (pair.second, pair.first) if reading.lead_rad_s > 0 else (pair.first, pair.second)
     state, lead_rad_s = window.states[guilty], abs(reading.lead_rad_s)
     text = (
-        f"{naming.name(state)}: runs ahead of {naming.name(window.states[other])} as behind a high-pass at "
+        f"{naming.name(state)}: runs ahead of {naming.name(window.states[other])} as behind a first-order high-pass at "
         f"{lead_rad_s / (2 * np.pi):.2g} Hz (AC coupling), expected at most {MOST_LEAD_RAD_S / (2 * np.pi):.2g} Hz: "
-        "state the corner as high_pass_hz of its sensor, couple both alike, or leave one of them out"
+        "state corner and order of its data sheet as high_pass_hz and high_pass_order, couple both alike, or leave "
+        "one of them out"
     )
     value = lead_rad_s * float(power @ bands.w**-2.0 / power.sum())
     return SensorFault(states=(state,), kind=FaultKind.DELAY, text=text, value=value)

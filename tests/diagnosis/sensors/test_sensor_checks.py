@@ -315,7 +315,7 @@ def test_a_corner_that_is_too_high_is_told_as_one(state: str) -> None:
     finding = only(found_in(coupled(recorded("lab", 1), (state,), 2.0)))
     assert (finding.kind, finding.states) == ("delay", (state,))
     assert f"{state}: runs ahead of" in finding.text
-    assert "as behind a high-pass at 2 Hz (AC coupling), expected at most 1.1 Hz" in finding.text
+    assert "as behind a first-order high-pass at 2 Hz (AC coupling), expected at most 1.1 Hz" in finding.text
 
 
 def test_run_out_a_quarter_turn_off_is_no_delay() -> None:

@@ -369,7 +369,7 @@ def test_a_converter_that_samples_one_channel_after_the_other_is_told_where_noth
     kit = rotor_kit.LAB
     sensors = [one for one in kit.sensors if not one.name.endswith("_dot")]
     late = [
-        one if one.name == "theta" else one.model_copy(update={"delay_us": 60.0 * number})
+        one if one.name == "theta" else one.model_copy(update={"delay_us": -60.0 * number})
         for number, one in enumerate(sensors)
     ]
     file, simulated = (kit.model_copy(update={"sensors": tuple(those)}) for those in (sensors, late))
@@ -379,7 +379,7 @@ def test_a_converter_that_samples_one_channel_after_the_other_is_told_where_noth
         MachineMonitor(install(file, None)), [block for block, _ in blocks(scenario, simulated, 1.0)]
     )
     assert "the theory does not explain this window" in windows[-1].reason
-    assert "delay of each channel after the one before (+" in windows[-1].suspect
+    assert "delay of each channel after the one before (-" in windows[-1].suspect
     (event,) = events
     assert event.alarm.name == MODEL
     assert event.alarm.note.endswith(windows[-1].suspect)
