@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import plan_for
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sliding_window import SlidingWindow
@@ -60,11 +61,15 @@ def behind_sensors(samples: FloatArray) -> FloatArray:
     return seen
 
 
-def statistics(of: Machine, samples: FloatArray) -> WindowStatistics:
+def fed(of: Machine, samples: FloatArray) -> SlidingWindow:
     window = SlidingWindow(plan_for(of))
     for _ in window.feed(window.plan.to_si(samples), 0):
         pass
-    return sure(window.statistics())
+    return window
+
+
+def statistics(of: Machine, samples: FloatArray) -> WindowStatistics:
+    return sure(fed(of, samples).statistics())
 
 
 def apart(found: WindowStatistics, true: WindowStatistics) -> tuple[float, float, float]:
@@ -88,6 +93,18 @@ def test_a_window_is_that_of_the_vibration(without_angle: bool, speed_rpm: float
     assert all(one < 0.06 for one in apart(statistics(declared, seen), true))
     # What is not declared is far away.
     assert all(one > 0.1 for one in apart(statistics(true_machine, seen), true))
+
+
+def test_the_latest_hops_say_behind_declared_sensors_what_they_say() -> None:
+    scenario, _ = load_scenario("healthy")
+    scenario = scenario.overridden(duration_s=64.0, seed=31_302)
+    samples = np.concatenate([block.samples for block, _ in blocks(scenario, machine(declared=False), 1.0)])
+    for of, seen in ((machine(declared=False), samples), (machine(declared=True), behind_sensors(samples))):
+        sliding, fits = fed(of, seen), LengthFits(of)
+        window = sure(sliding.statistics())
+        fits.window(window)
+        # By chance four hops may say something; what the sensors do not show as it is would, in all of them.
+        assert [fits.has_news(sliding, window, (hops,)) for hops in (2, 4, 6)] == [False, True, False]
 
 
 def test_simulated_sensors_are_those_of_the_file() -> None:

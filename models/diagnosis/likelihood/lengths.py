@@ -67,18 +67,21 @@ class LengthFits:
         """Whether the latest hops, of any of these lengths, may say more than that the machine is as the window says.
 
         The window is the latest of the sliding one. Its rotation is taken out of them, not their own: less work, and
-        hardly another spectrum away from it. Where no one rotation is that of all hops, accelerations are measured, or
-        sensors do not show the vibration as it is, they may.
+        hardly another spectrum away from it. Where no one rotation is that of all hops, or accelerations are measured,
+        they may.
         """
         rotation, by_hop, plan = window.as_mounted.synchronous, window.hop_synchronous, sliding.plan
         if rotation is None or by_hop is None or window.removed_by_hop or integrated(window) is not window:
             return True
-        if plan.equaliser is not None:
-            return True
         n, hops = len(plan.states), sliding.hops[-max(lengths, default=1) :]
         segments = np.concatenate([hop.segments.swapaxes(0, 1) for hop in hops], axis=1, dtype=np.complex128)
+        if plan.equaliser is not None:  # as the sensors give it
+            rotation = rotation * plan.equaliser.response(np.array(window.speed_rad_s / (2 * np.pi)))
         remove, each = np.column_stack([np.eye(n), np.zeros(n), -rotation.real, rotation.imag]), len(hops[0].segments)
-        by_bin = through(remove if plan.turn is None else plan.turn @ remove, segments)
+        by_bin = through(remove, segments)
+        if plan.equaliser is not None:
+            by_bin /= plan.equaliser.response(plan.frequencies_hz)[:, np.newaxis]
+        by_bin = by_bin if plan.turn is None else through(plan.turn, by_bin)
         return any(
             self._window.may_be_news(by_bin[:, -length * each :], by_hop[-length:].mean(axis=0)) for length in lengths
         )
