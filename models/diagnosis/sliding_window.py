@@ -81,8 +81,8 @@ class SlidingWindow:
 
         Parameters
         ----------
-        samples : ndarray, shape (n_samples, n_states [+ 1])
-            Finite SI samples as `Plan.to_si` gives them, or as received, shape (n_samples, n_channels).
+        samples : ndarray, shape (n_samples, width or channels)
+            Finite, in SI units as `Plan.to_si` gives them; as received where the window was told of how many channels.
 
         Yields
         ------

@@ -79,7 +79,8 @@ class WindowStatistics:
     # (n_pairs, n_bands, 3): powers of the motions that are measured twice, of each hop (`models.diagnosis.motion`)
     pair_powers: tuple[ComplexArray, ...]
     # The same window of the sensors as they are mounted, run-out included, where some of them are at an angle or have a
-    # slow-roll vector. `waveforms` and `pair_powers` are those of mounted sensors in either.
+    # slow-roll vector. `waveforms` and `pair_powers` are those of mounted sensors in either, and what the file states
+    # of a sensor's high-pass and delay is divided out of all but the waveforms.
     mounted: "WindowStatistics | None" = None
     lines: tuple[ExcludedLine, ...] = ()  # that say nothing of the machine
     time_scale: float = 1.0  # how much slower the machine moves than usual (`models.stream_settings.time_scale`)

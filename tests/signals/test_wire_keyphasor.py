@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.moments import plan_for
 from models.diagnosis.sensors.check import sensor_findings
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
-from models.machine import Machine, load_machine
+from models.machine import load_machine
 from models.signals.block import FloatArray
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
+from tests.diagnosis.test_equaliser import statistics
 from tests.signals.test_wire import page_blocks
 from tests.sure import sure
 
@@ -35,13 +33,6 @@ def keyphasor(theta: FloatArray, rate_hz: float, edge_s: float) -> FloatArray:
     turns = np.unwrap(theta) / (2 * np.pi)
     since_s = ((turns + 0.5) % 1 - 0.5) / (np.gradient(turns) * rate_hz)
     return np.asarray(LEVEL_V + PULSE_V * np.clip(since_s / edge_s + 0.5, 0, 1) * (since_s < PULSE_S))
-
-
-def statistics(machine: Machine, samples: FloatArray) -> WindowStatistics:
-    window = SlidingWindow(plan_for(machine))
-    for _ in window.feed(window.plan.to_si(samples), 0):
-        pass
-    return sure(window.statistics())
 
 
 @pytest.mark.parametrize(("edge_s", "most_deg"), [(1e-3, 1.0), (1e-5, 6.0)])
