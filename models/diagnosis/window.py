@@ -35,7 +35,7 @@ _BESIDE = 3  # bins beside a line whose mean is where the spectra go over it
 _SMOOTH = 0.5  # squares of a drift's steps from hop to hop over those about its mean, at most; of chance 2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class WindowStatistics:
     """Everything the diagnosis looks at, for one window."""
 

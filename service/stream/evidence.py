@@ -20,13 +20,13 @@ _log = logger(part="evidence")
 
 
 class EvidenceCollector:
-    """Keeps pictures of one machine; for one thread."""
+    """Keeps pictures of one machine, in its history alone, for they are large; for one thread."""
 
     def __init__(self, worker: MachineWorker) -> None:
         self._worker = worker
         self._looked_ns: int | None = None
-        self._before: Picture | None = None
-        self._standing: dict[tuple[str, int], AlarmEvidence] = {}
+        self._calm_ns: int | None = None  # end of the latest window kept while nothing was wrong
+        self._settled: dict[tuple[str, int], bool] = {}  # alarms that stand and are kept: settled, too?
         self._limiter = Limiter()
 
     def look(self, health: Health) -> None:
@@ -35,44 +35,49 @@ class EvidenceCollector:
         if report is None or report.end_ns == self._looked_ns:
             return
         try:
-            if self._looked_ns is None and (text := self._worker.history.evidence(_BEFORE)):
-                self._before = Picture.model_validate_json(text)
+            if self._looked_ns is None and (before := self._before()) is not None:
+                self._calm_ns = before.report.end_ns
             raised = {(one.name, one.occurrence): one for one in health.alarms if _rests_on_a_window(one)}
-            self._standing = {key: kept for key, kept in self._standing.items() if key in raised}
-            for (name, occurrence), alarm in raised.items():
-                self._keep(name, occurrence, alarm, report)
-            if _is_calm(health, report) and (
-                self._before is None or abs(report.end_ns - self._before.report.end_ns) >= _CALM_NS
-            ):
-                self._before = self._picture(report)
-                self._worker.history.keep_evidence(_BEFORE, 0, self._before.model_dump_json())
+            self._settled = {key: settled for key, settled in self._settled.items() if key in raised}
+            for key, alarm in raised.items():
+                settled = _is_settled(alarm, report)
+                if key not in self._settled or (settled and not self._settled[key]):
+                    self._settled[key] = self._keep(alarm, report, settled=settled)
+            is_new = self._calm_ns is None or abs(report.end_ns - self._calm_ns) >= _CALM_NS
+            if is_new and _is_calm(health, report):
+                self._worker.history.keep_evidence(_BEFORE, 0, self._picture(report).model_dump_json())
+                self._calm_ns = report.end_ns
             self._looked_ns = report.end_ns
         except RotorwatchError as error:  # tried again at the next look
             place = f"{health.site}/{health.machine}"
             self._limiter.say("", _log.warning, "evidence is not kept yet", machine=place, why=str(error))
 
-    def _keep(self, name: str, occurrence: int, alarm: Alarm, report: Report) -> None:
-        kept = self._standing.get((name, occurrence))
-        if kept is None and (text := self._worker.history.evidence(name, occurrence)):  # from before a restart
-            kept = AlarmEvidence.model_validate_json(text)
-        settled = None
-        if (kept is None or kept.settled is None) and _is_settled(alarm, report):
-            settled = self._picture(report)
+    def _before(self) -> Picture | None:
+        text = self._worker.history.evidence(_BEFORE)
+        return Picture.model_validate_json(text) if text else None
+
+    def _keep(self, alarm: Alarm, report: Report, *, settled: bool) -> bool:
+        """Keep what is not kept yet; whether the settled window is."""
+        history = self._worker.history
+        text = history.evidence(alarm.name, alarm.occurrence)  # from before a restart, or before it was settled
+        kept = AlarmEvidence.model_validate_json(text) if text else None
+        if kept is not None and (kept.settled is not None or not settled):
+            return kept.settled is not None
+        now = self._picture(report)
         if kept is None:
             kept = AlarmEvidence(
                 site=report.site,
                 machine=report.machine,
-                name=name,
-                occurrence=occurrence,
-                before=self._before,
-                raised=settled or self._picture(report),
-                settled=settled,
+                name=alarm.name,
+                occurrence=alarm.occurrence,
+                before=self._before(),
+                raised=now,
+                settled=now if settled else None,
             )
-        elif settled is not None:
-            kept = kept.model_copy(update={"settled": settled})
-        if self._standing.get((name, occurrence)) is not kept:
-            self._worker.history.keep_evidence(name, occurrence, kept.model_dump_json())
-            self._standing[name, occurrence] = kept
+        else:
+            kept = kept.model_copy(update={"settled": now})
+        history.keep_evidence(alarm.name, alarm.occurrence, kept.model_dump_json())
+        return settled
 
     def _picture(self, report: Report) -> Picture:
         latest, snapshots = self._worker.latest, self._worker.snapshots

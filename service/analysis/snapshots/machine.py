@@ -6,6 +6,7 @@ What makes them is imported when somebody asks: a process that only evaluates ma
 import threading
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 from models.commissioning.commissioned import Installed
 from models.diagnosis.window import WindowStatistics
@@ -22,15 +23,14 @@ _NO_WINDOW = "there is no window yet"
 class MachineSnapshots:
     """Makes snapshots of one machine; any thread may ask.
 
-    The theory of a window takes longer than all the rest, and is kept until another window comes.
+    The theory of a window takes longer than all the rest, and is kept as long as somebody keeps the window.
     """
 
     def __init__(self, installed: Installed, identity: Identity) -> None:
         self.installed = installed
         self._subject = Subject(identity, installed.machine, installed.known)
         self._lock = threading.Lock()
-        self._of: WindowStatistics | None = None
-        self._prediction: Prediction | None = None
+        self._predictions: WeakKeyDictionary[WindowStatistics, Prediction] = WeakKeyDictionary()
 
     def correlations(
         self, data: LatestData, first: Sequence[str] = (), second: Sequence[str] = (), units: Units = "channel"
@@ -68,7 +68,8 @@ class MachineSnapshots:
             reason = NO_PARAMETERS if known is None else _NO_WINDOW
             return Prediction(known, None, {}, reason, reason)
         with self._lock:
-            if self._prediction is None or self._of is not data.window:
-                self._prediction = predict(self._subject.known, data.window, data.parameters, data.why_not)
-                self._of = data.window
-            return self._prediction
+            found = self._predictions.get(data.window)
+            if found is None:
+                found = predict(self._subject.known, data.window, data.parameters, data.why_not)
+                self._predictions[data.window] = found
+            return found
