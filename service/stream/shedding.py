@@ -1,8 +1,31 @@
-"""When a machine's worker evaluates less often, because the computer cannot keep up."""
+"""When a machine's worker evaluates: in its turn, and less often where the computer cannot keep up."""
 
 import math
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 _LASTING_S = 30.0
+_LONGEST_TURN_S = 1.0
+_turn = threading.Lock()
+
+
+@contextmanager
+def in_turn(*, completes_hop: bool) -> Iterator[None]:
+    """Take the blocks that complete a hop one machine of the process after the other.
+
+    Python computes in one thread at a time anyway. Workers that evaluate side by side only take it from each other, in
+    the middle of their arithmetic: each holds its intermediate results meanwhile, and finds the processor's caches
+    filled with those of the others.
+
+    A machine that waits for longer than `_LONGEST_TURN_S` goes on beside the others, lest one that never ends stops all.
+    """
+    taken = completes_hop and _turn.acquire(timeout=_LONGEST_TURN_S)
+    try:
+        yield
+    finally:
+        if taken:
+            _turn.release()
 
 
 class LoadShedding:

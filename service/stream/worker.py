@@ -36,7 +36,7 @@ from service.stream.checkpoints import StepWriter, recorded_after, recorded_sinc
 from service.stream.inbox import Inbox, RawBlock
 from service.stream.liveness import COMPUTER, Clocks, Pulse
 from service.stream.monitored import MachineStatus
-from service.stream.shedding import LoadShedding
+from service.stream.shedding import LoadShedding, in_turn
 from service.terminal.logs import Limiter, logger
 
 _OPERATION_S = 10.0
@@ -375,10 +375,11 @@ class MachineWorker:
             self._failed(error)
 
     def _take(self, block: RawBlock) -> None:
-        begin_s = self._clocks.monotonic_s()
-        reports = self._monitor.step_payload(block.payload, block.attachment, block.encoding, block.dropped_before)
-        tally = self.tally
-        self.tally = replace(tally, blocks=tally.blocks + 1, step_s=tally.step_s + self._clocks.monotonic_s() - begin_s)
+        with in_turn(completes_hop=self._monitor.blocks_to_hop == 1):
+            begin_s = self._clocks.monotonic_s()
+            reports = self._monitor.step_payload(block.payload, block.attachment, block.encoding, block.dropped_before)
+            step_s = self._clocks.monotonic_s() - begin_s
+        self.tally = replace(self.tally, blocks=self.tally.blocks + 1, step_s=self.tally.step_s + step_s)
         if self._monitor.used:
             self.inbox.follow(block)
         self._conclude_reports(reports)

@@ -27,7 +27,7 @@ from service.recordings.replay.source import RecordingSource
 from service.settings.service import RecordingSettings
 from service.stream import shedding
 from service.stream.inbox import Inbox, RawBlock
-from service.stream.shedding import LoadShedding
+from service.stream.shedding import LoadShedding, in_turn
 from service.stream.worker import MachineWorker
 from simulator.scenario import parse_fault
 from tests.service.rig.live import QUICK, START_NS, Feed, fed_service, machine_file, scenario_blocks, until
@@ -258,6 +258,26 @@ def test_blocks_of_others_and_bursts_for_an_idle_worker_are_no_reason_to_skip() 
     burst.join()
     assert inbox.behind == 0
     assert inbox.behind == 39  # until all are taken again
+
+
+# Whose turn it is
+
+
+@pytest.mark.parametrize(("patience_s", "waits"), [(60.0, True), (0.05, False)])
+def test_a_hop_is_computed_when_that_of_another_machine_is_or_has_taken_too_long(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, patience_s: float, *, waits: bool
+) -> None:
+    monkeypatch.setattr(shedding, "_LONGEST_TURN_S", patience_s)
+    with fed_service(short_machine(tmp_path)) as (_, worker, feed):
+        with in_turn(completes_hop=True):  # another machine's
+            for block in scenario_blocks(10.0):
+                feed.put(block)
+            until(lambda: worker.tally.blocks >= 74, "the blocks before the last one of the first hop, of 7.5 s")
+            if not waits:
+                until(lambda: worker.tally.blocks == 100, "all blocks")
+            time.sleep(0.3)
+            assert worker.tally.blocks == (74 if waits else 100)
+        until(lambda: worker.tally.blocks == 100, "all blocks")
 
 
 # A running service
