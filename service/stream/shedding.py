@@ -18,7 +18,7 @@ def in_turn(*, completes_hop: bool) -> Iterator[None]:
     the middle of their arithmetic: each holds its intermediate results meanwhile, and finds the processor's caches
     filled with those of the others.
 
-    A machine that waits for longer than `_LONGEST_TURN_S` goes on beside the others, lest one that never ends stops all.
+    A machine that waits for longer than `_LONGEST_TURN_S` goes on beside the others: one that never ends stops none.
     """
     taken = completes_hop and _turn.acquire(timeout=_LONGEST_TURN_S)
     try:
