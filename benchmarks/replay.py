@@ -35,7 +35,7 @@ def main() -> None:
             path = Path(place) / f"{length:g}.mcap"
             record(machine, blocks(scenario.overridden(seed=1, duration_s=60 * length), machine), path)
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
-            command = ["-m", "service.rotorwatch", "replay", str(path), "--offline", "--machine", str(file)]
+            command = ["-m", "service", "replay", str(path), "--offline", "--machine", str(file)]
             # A process of its own each: the largest of all children so far is what the system remembers.
             subprocess.run(
                 [sys.executable, *command, "--out", str(path.with_suffix(".jsonl"))],

@@ -59,7 +59,7 @@ def serving(
 ) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
     """The service (``run`` without arguments) until the block is left, its output in the folder; and its address."""
     out, log = folder / "out", folder / "log"
-    process = started(["service.rotorwatch", *(arguments or ("run",))], out, log, environment)
+    process = started(["service", *(arguments or ("run",))], out, log, environment)
     try:
         yield process, url_of(process, out, log)
     finally:
@@ -73,7 +73,7 @@ def monitor(folder: Path, files: int, settings: dict[str, str], *publish: str) -
     environment, endpoint = on_loopback(folder)
     send = ["simulator.rotorsim", "publish", "--connect", endpoint, "--wait-for-subscriber", "120", *publish]
     out, log, published = folder / "out", folder / "log", folder / "published"
-    process = started(["service.rotorwatch", "run"], out, log, environment | settings)
+    process = started(["service", "run"], out, log, environment | settings)
     resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (files, files))
     publisher = started(send, published, Path(os.devnull), dict(os.environ))
     try:

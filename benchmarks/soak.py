@@ -154,7 +154,7 @@ class Plant:
     def start(self) -> None:
         """Start the monitor and wait until it listens; what it says goes into files of this start."""
         out, log = (self.folder / f"{name}-{self.kills}" for name in ("out", "log"))
-        self.process = started(["service.rotorwatch", "run"], out, log, self.environment)
+        self.process = started(["service", "run"], out, log, self.environment)
         self.url = url_of(self.process, out, log)
 
     def kill(self) -> None:

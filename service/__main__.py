@@ -6,7 +6,7 @@ import sys
 def main() -> None:
     """Load the commands, and run the one of the command line."""
     try:
-        from service.rotorwatch import app  # noqa: PLC0415  # takes a while
+        from service.commands.rotorwatch import app  # noqa: PLC0415  # takes a while
 
         app()
     except KeyboardInterrupt:

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from models.errors import MachineFileError
 from models.machine import load_machine, load_machine_file
-from service.rotorwatch import app as rotorwatch
+from service.commands.rotorwatch import app as rotorwatch
 from service.settings.service import load_settings
 from simulator.rotorsim import app as rotorsim
 from simulator.rotortrain import app as rotortrain

@@ -17,7 +17,11 @@ import rotorwatch
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("models", "rotorwatch", "service", "simulator")
 SHIPPED = {".py", ".toml", ".json", ".safetensors", ".jinja", ".mako", ".typed", ".dictionary", ".js", ".css", ".html"}
-PROGRAMS = {"rotorsim": "simulator.rotorsim", "rotortrain": "simulator.rotortrain", "rotorwatch": "service.rotorwatch"}
+PROGRAMS = {
+    "rotorsim": "simulator.rotorsim",
+    "rotortrain": "simulator.rotortrain",
+    "rotorwatch": "service.commands.rotorwatch",
+}
 HEAVY = {"scipy", "torch", "zenoh", "fastapi", "pyarrow", "mcap"}
 
 

@@ -51,7 +51,7 @@ import signal, sys
 from service.__main__ import main
 
 def interrupt(frame, event, argument):
-    if frame.f_code.co_filename.endswith("service/rotorwatch.py"):
+    if frame.f_code.co_filename.endswith("service/commands/rotorwatch.py"):
         signal.raise_signal(signal.SIGINT)
 
 sys.settrace(interrupt)

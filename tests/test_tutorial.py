@@ -16,7 +16,7 @@ from tests.service.rig.preloaded import ran
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
 _COMMANDS = [line for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for line in block.splitlines() if line]
-_PROGRAMS = {"rotorwatch": "service.rotorwatch", "rotortrain": "simulator.rotortrain"}
+_PROGRAMS = {"rotorwatch": "service", "rotortrain": "simulator.rotortrain"}
 
 
 @pytest.fixture(scope="module")

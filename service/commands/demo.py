@@ -204,7 +204,7 @@ class _Show:
         """Start both programs and show what comes, to the end; whether exactly what was injected was named."""
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="rotorwatch-demo-", ignore_cleanup_errors=True))
         monitor = stack.enter_context(
-            _program("monitor", "service.rotorwatch", "run", "--listen", self._endpoint,
+            _program("monitor", "service", "run", "--listen", self._endpoint,
                      "--http-port", self._url.rpartition(":")[2], recordings=folder)
         )  # fmt: skip
         _wait_until_ready(self._url, monitor)
@@ -409,7 +409,7 @@ def _command() -> str:
     if shutil.which("rotorwatch"):
         return "rotorwatch"
     script = Path(sys.executable).parent / "rotorwatch"
-    return os.path.relpath(script) if script.is_file() else f"{sys.executable} -m service.rotorwatch"
+    return os.path.relpath(script) if script.is_file() else f"{sys.executable} -m service"
 
 
 def _port(usual: int | None) -> int:

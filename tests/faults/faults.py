@@ -162,7 +162,7 @@ def second_monitor(plant: Plant) -> None:
     plant.flowing()
     plant.broken()
     with program(
-        plant.folder, "service.rotorwatch", "run", "--machine", "lab", "--listen", endpoint(), "--http-port", "0",
+        plant.folder, "service", "run", "--machine", "lab", "--listen", endpoint(), "--http-port", "0",
         ROTORWATCH_HISTORY__URL=f"sqlite:///{plant.history}",
     ) as second:  # fmt: skip
         assert second.process.wait(180) == 1

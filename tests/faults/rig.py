@@ -128,7 +128,7 @@ class Plant:
         mount = _DISK.format(self.folder / "history", self.disk)
         started = self.undo.enter_context(
             program(
-                self.folder, "service.rotorwatch", "run", "--config", str(file),
+                self.folder, "service", "run", "--config", str(file),
                 within=("unshare", "-rm", "sh", "-c", f'{mount} "$0" "$@"') if self.disk else (),
                 ROTORWATCH_HISTORY__URL=f"sqlite:///{self.folder}/history/h.sqlite",
                 ROTORWATCH_QUEUE__WHEN_FULL="drop",
@@ -154,9 +154,7 @@ class Plant:
 
     def start_router(self) -> None:
         """Start a router between publisher and monitor."""
-        self.router = self.undo.enter_context(
-            program(self.folder, "service.rotorwatch", "router", "--listen", self.address)
-        )
+        self.router = self.undo.enter_context(program(self.folder, "service", "router", "--listen", self.address))
         self.router.wait_for("router listening")
 
     def end(self, number: signal.Signals = signal.SIGKILL) -> int:

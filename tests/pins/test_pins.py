@@ -19,6 +19,6 @@ def test_a_scenario_is_reported_as_it_was(change: str, tmp_path: Path) -> None:
     recording, lines = tmp_path / "stream.mcap", tmp_path / "lines.jsonl"
     made = ran("simulator.rotorsim", "record", "healthy", recording, "--duration", "85", "--seed", "881", *fault)
     assert made.returncode == 0, made.stderr
-    found = ran("service.rotorwatch", "replay", recording, "--offline", "--machine", "lab@lab", "--out", lines)
+    found = ran("service", "replay", recording, "--offline", "--machine", "lab@lab", "--out", lines)
     assert found.returncode == 0, found.stderr
     assert differences(name, lines.read_text(encoding="utf-8").splitlines()) == []

@@ -197,7 +197,7 @@ class RunningJob:
         self._thread.join()
 
     def _command(self, plan: JobPlan, nice: int) -> Sequence[str]:
-        command = [sys.executable, "-m", "service.rotorwatch", "replay", *plan.arguments]
+        command = [sys.executable, "-m", "service", "replay", *plan.arguments]
         command += ["--progress", "json", "--control", "--nice", str(nice)]
         if self.machine_file is not None:
             command += ["--machine", self.machine_file]

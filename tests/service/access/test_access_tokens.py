@@ -19,8 +19,8 @@ from service.access.rates import MovingWindow
 from service.access.scopes import Scope
 from service.access.tls import lapses, server_arguments, tls_context
 from service.access.tokens import masked, new_token, parse_token, token_is_valid
+from service.commands.rotorwatch import app
 from service.history.records import TokenRecord
-from service.rotorwatch import app
 from service.settings.access import AccessSettings, HttpTlsSettings, check_access
 from service.settings.service import ServiceSettings
 from tests.service.rig.guarded import guarded

@@ -408,7 +408,7 @@ def test_the_shipped_examples_work_together(tmp_path: Path, level: str, request:
     try:
         with (
             program(
-                tmp_path, "service.rotorwatch", "record", "--machine", "lab", "--out", str(tmp_path / "recorded"),
+                tmp_path, "service", "record", "--machine", "lab", "--out", str(tmp_path / "recorded"),
                 "--link", str(folder / "monitor.toml"),
             ) as recorder,
             started(recorder, plan) as service,

@@ -14,8 +14,8 @@ from service.analysis.orbit import recorded_pairs
 from service.analysis.past import Past
 from service.analysis.runup import read_centreline, read_run_up
 from service.analysis.trend import past_trend
+from service.commands.rotorwatch import app
 from service.history.records import Step, StoredReport
-from service.rotorwatch import app
 from tests.service.rig.postgres import opened
 
 START_NS, S = 1_767_225_600 * 10**9, 10**9

@@ -241,7 +241,7 @@ def test_the_monitor_may_open_as_many_files_as_the_system_allows(tmp_path: Path)
         undo.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
         resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
         plan = ("--http-port", "0", "--listen", endpoint())
-        started = undo.enter_context(program(tmp_path, "service.rotorwatch", "run", *plan))
+        started = undo.enter_context(program(tmp_path, "service", "run", *plan))
         text = httpx.get(f"{started.url()}/metrics", trust_env=False, timeout=180.0).text
     found = next(line for line in text.splitlines() if line.startswith("process_max_fds "))
     assert float(found.split()[1]) == min(hard, 65_536)

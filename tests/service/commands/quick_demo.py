@@ -3,7 +3,7 @@
 import sys
 
 from service.commands import demo
-from service.rotorwatch import app
+from service.commands.rotorwatch import app
 
 if __name__ == "__main__":
     demo._HEALTHY_S, demo._BROKEN_S, demo._REPAIRED_S = 65.0, 45.0, 45.0

@@ -158,7 +158,7 @@ def test_the_command_that_a_monitor_prints_creates_a_token_that_it_takes(tmp_pat
     plain |= {"PYTHONPATH": str(ROOT), "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     plain |= {"HOME": str(tmp_path)}
     alone = plain | {"ROTORWATCH_HISTORY__URL": "sqlite:///its own.sqlite"}
-    with program(tmp_path, "service.rotorwatch", "run", *arguments, cwd=folder, alone=alone) as monitor:
+    with program(tmp_path, "service", "run", *arguments, cwd=folder, alone=alone) as monitor:
         url = monitor.url()
         monitor.wait_for("token create")
         hint = next(line for line in monitor.output().splitlines() if "token create" in line)
@@ -191,7 +191,7 @@ def test_status_says_why_a_token_is_refused(tmp_path: Path) -> None:
         wrong = "rw_000000000000_" + 43 * "0"
         plain = {name: value for name, value in os.environ.items() if name != "ROTORWATCH_TOKEN"}
         without, mistaken = (
-            ran("service.rotorwatch", "status", "--url", monitor.url, environment=plain | more)
+            ran("service", "status", "--url", monitor.url, environment=plain | more)
             for more in ({}, {"ROTORWATCH_TOKEN": wrong})
         )
     assert (without.returncode, mistaken.returncode) == (4, 4)

@@ -16,14 +16,14 @@ import yaml
 
 from models.errors import MachineFileError
 from models.signals.link import LinkSettings
-from service.rotorwatch import app as rotorwatch
+from service.commands.rotorwatch import app as rotorwatch
 from service.settings.service import load_settings
 from simulator.rotorsim import app as rotorsim
 from tests.service.rig.live import ROOT, endpoint, program, until
 
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text(encoding="utf-8"))
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
-MODULES = {"rotorwatch": "service.rotorwatch", "rotorsim": "simulator.rotorsim"}
+MODULES = {"rotorwatch": "service", "rotorsim": "simulator.rotorsim"}
 PROGRAMS = {"rotorwatch": rotorwatch, "rotorsim": rotorsim}
 
 
@@ -206,7 +206,7 @@ OPEN_API = '[http]\nhost = "{}"\nport = {}\n[access]\nopen_on_loopback = true'
 def test_a_monitor_open_to_others_does_not_start(tmp_path: Path, text: str, cure: str) -> None:
     file = tmp_path / "plant.toml"
     file.write_text(text.format(EVERYWHERE, endpoint().rpartition(":")[2]), encoding="utf-8")
-    with program(tmp_path, "service.rotorwatch", "run", "--config", str(file)) as started:
+    with program(tmp_path, "service", "run", "--config", str(file)) as started:
         assert started.process.wait(180) == 2
         (said,) = started.errors().splitlines()
         assert cure in said
@@ -216,7 +216,7 @@ def test_a_monitor_open_to_others_does_not_start(tmp_path: Path, text: str, cure
 @pytest.mark.parametrize("name", ["run", "router"])
 def test_what_the_command_line_opens_is_refused_as_well(tmp_path: Path, name: str) -> None:
     where = endpoint().replace("127.0.0.1", EVERYWHERE)
-    with program(tmp_path, "service.rotorwatch", name, "--listen", where) as started:
+    with program(tmp_path, "service", name, "--listen", where) as started:
         assert started.process.wait(180) == 2
         (said,) = started.errors().splitlines()
         assert where in said
@@ -226,12 +226,12 @@ def test_what_the_command_line_opens_is_refused_as_well(tmp_path: Path, name: st
 @pytest.mark.slow
 def test_settings_that_say_so_in_so_many_words_are_obeyed(tmp_path: Path) -> None:
     where = endpoint().replace("127.0.0.1", EVERYWHERE)
-    with program(tmp_path, "service.rotorwatch", "router", "--listen", where, "--without-grants") as router:
+    with program(tmp_path, "service", "router", "--listen", where, "--without-grants") as router:
         router.wait_for("listening")
         assert router.stop() == 0
     file = tmp_path / "plant.toml"
     file.write_text(f'[link]\nlisten = ["{where}"]\nwithout_grants = true\n', encoding="utf-8")
-    with program(tmp_path, "service.rotorwatch", "run", "--config", str(file), "--http-port", "0") as monitor:
+    with program(tmp_path, "service", "run", "--config", str(file), "--http-port", "0") as monitor:
         monitor.url()
         assert monitor.health().quality.accepted_blocks == 0  # it runs
         assert monitor.stop() == 0

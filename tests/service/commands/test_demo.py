@@ -17,7 +17,7 @@ from simulator.scenario import load_scenario
 from tests.service.rig.live import ROOT, Program, program, until
 from tests.service.rig.preloaded import ran
 
-WHOLE, QUICK = ("service.rotorwatch", "demo"), ("tests.service.commands.quick_demo",)
+WHOLE, QUICK = ("service", "demo"), ("tests.service.commands.quick_demo",)
 
 
 def children_of(pid: int) -> list[int]:
@@ -87,9 +87,9 @@ def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path:
         lines = one.output().splitlines()
         printed = [line.split()[1:] for line in lines if re.match(r"  \S*rotorwatch.* (watch|status) --", line)]
         assert [command[0] for command in printed] == ["watch", "status"]
-        with program(tmp_path, "service.rotorwatch", *printed[0]) as watch:
+        with program(tmp_path, "service", *printed[0]) as watch:
             one.wait_for("c_bz raised")
-            status = ran("service.rotorwatch", *printed[1], "--json")
+            status = ran("service", *printed[1], "--json")
             alarms = {one["name"]: one["raised"] for one in json.loads(status.stdout)["machines"][0]["alarms"]}
             assert "c_bz" in alarms
             # The demo goes on meanwhile: on a busy computer the machine is repaired before the answer comes.
@@ -132,7 +132,7 @@ def test_however_the_demo_ends_it_leaves_nothing_behind(
 
 def test_the_first_line_comes_before_anything_heavy_is_imported() -> None:
     code = (
-        "import sys\nfrom service.rotorwatch import app\n"
+        "import sys\nfrom service.commands.rotorwatch import app\n"
         "class Told:\n"
         "    def write(self, text):\n"
         "        if not text.strip():\n            return\n"

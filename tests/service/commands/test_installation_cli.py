@@ -174,7 +174,7 @@ def test_init_asks_until_a_channel_is_empty_and_again_for_what_cannot_be_used(tm
     wrong = "two thousand", "DE-H acceleration g DE", "DE-H acceleration furlong DE horizontal"
     typed = ("plant", "fan", wrong[0], "2560", *wrong[1:], FAN[10], FAN[12], "")
     os.write(keyboard, "".join(f"{line}\n" for line in typed).encode())
-    command = [sys.executable, "-m", "service.rotorwatch", "init", "--folder", str(tmp_path)]
+    command = [sys.executable, "-m", "service", "init", "--folder", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, stdin=terminal, capture_output=True, text=True, timeout=60, check=False)
     for end in (keyboard, terminal):
         os.close(end)

@@ -10,7 +10,7 @@ from matplotlib import get_cachedir
 from typer.testing import CliRunner
 
 from models.signals.recording import RecordedMessage, read_recording
-from service.rotorwatch import app
+from service.commands.rotorwatch import app
 from simulator.scenario import Event, parse_fault
 from tests.service.rig import replaying
 from tests.service.rig.live import LAB, START_NS, scenario_blocks
@@ -85,7 +85,7 @@ def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path) -> No
     environment = {"PATH": "/usr/bin:/bin", "MATPLOTLIBRC": str(tmp_path), "TZ": "Asia/Tokyo"}
     environment["MPLCONFIGDIR"] = get_cachedir()  # where the list of fonts is, which takes seconds to make
     for out in theirs:
-        assert ran("service.rotorwatch", "plot", *arguments, out, environment=environment).returncode == 0
+        assert ran("service", "plot", *arguments, out, environment=environment).returncode == 0
     for out, other in zip(ours, theirs, strict=True):
         assert Path(out).read_bytes() == Path(other).read_bytes()
 

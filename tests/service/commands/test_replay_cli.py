@@ -45,7 +45,7 @@ def test_lines_go_to_a_file_or_to_the_terminal_and_are_the_same(faulty: Path, tm
 
 def test_interrupted_offline_replay_is_no_success_and_says_what_it_leaves(faulty: Path, tmp_path: Path) -> None:
     out = tmp_path / "reports.jsonl"
-    command = ("service.rotorwatch", "replay", str(faulty), "--offline", "--progress", "json", "--out", str(out))
+    command = ("service", "replay", str(faulty), "--offline", "--progress", "json", "--out", str(out))
     with program(tmp_path, *command) as started:
         started.wait_for('"progress"')
         assert started.stop(signal.SIGINT) == 130
@@ -97,7 +97,7 @@ def test_channels_that_do_not_fit_are_said(faulty: Path, tmp_path: Path) -> None
 def test_options_that_cannot_be_used(faulty: Path, arguments: tuple[str, ...], message: str) -> None:
     from typer.testing import CliRunner  # noqa: PLC0415  # in this process: a dozen starts would take a minute
 
-    from service.rotorwatch import app  # noqa: PLC0415
+    from service.commands.rotorwatch import app  # noqa: PLC0415
 
     found = CliRunner().invoke(app, ["replay", str(faulty), *arguments])
     assert found.exit_code == 2, found.output
@@ -121,7 +121,7 @@ def test_a_monitor_in_the_namespace_of_a_replay(faulty: Path, tmp_path: Path) ->
     text = '[recording]\ndirectory = "recordings"\n\n[queue]\nwhen_full = "wait"\n'
     (tmp_path / "plant.toml").write_text(text, encoding="utf-8")
     arguments = ("--config", str(tmp_path / "plant.toml"), "--listen", address, "--http-port", "0")
-    with program(tmp_path, "service.rotorwatch", "run", *arguments, "--namespace", "replay/x") as monitor:
+    with program(tmp_path, "service", "run", *arguments, "--namespace", "replay/x") as monitor:
         monitor.wait_for("HTTP API")
         assert "Zenoh namespace replay/x" in monitor.output()
         options = ("--prefix", "replay/x", "--pace", "max", "--connect", address, "--wait-for-subscriber", "20")

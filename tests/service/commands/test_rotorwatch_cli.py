@@ -75,7 +75,7 @@ def test_the_help_has_all_exit_codes_of_status() -> None:
 def test_run_says_where_it_is_needs_no_torch_and_stops_cleanly(tmp_path: Path, number: signal.Signals) -> None:
     address = endpoint()
     with program(
-        tmp_path, "service.rotorwatch", "run", "--listen", address, "--http-port", "0", ROTORWATCH_LOG__FORMAT="json"
+        tmp_path, "service", "run", "--listen", address, "--http-port", "0", ROTORWATCH_LOG__FORMAT="json"
     ) as started:
         url = started.url()
         assert f"Zenoh listening on {address}" in started.output()
@@ -92,7 +92,7 @@ def test_run_says_where_it_is_needs_no_torch_and_stops_cleanly(tmp_path: Path, n
 @pytest.mark.parametrize("command", ["run", "router"])
 def test_signal_that_another_thread_receives_stops_the_program_too(tmp_path: Path, command: str) -> None:
     more = ("--machine", "lab", "--http-port", "0") if command == "run" else ()
-    with program(tmp_path, "service.rotorwatch", command, "--listen", endpoint(), *more) as started:
+    with program(tmp_path, "service", command, "--listen", endpoint(), *more) as started:
         started.wait_for("HTTP API" if command == "run" else "router listening")
         number = started.process.pid
         other = next(int(task.name) for task in Path(f"/proc/{number}/task").iterdir() if int(task.name) != number)
@@ -138,7 +138,7 @@ def test_status_names_a_certificate_it_cannot_use(tmp_path: Path) -> None:
 def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
     address = endpoint()
     file = machine_file(tmp_path, *QUICK)
-    watching = ("service.rotorwatch", "watch", "--connect", address, "--windows")
+    watching = ("service", "watch", "--connect", address, "--windows")
     with (
         service(address, file, when_full="wait") as (runtime, worker),
         program(tmp_path, *watching, "--machine", "demo/*") as text,
@@ -155,7 +155,7 @@ def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
         assert "00:00:22  demo/lab  " in text.output()
         assert not [line for line in text.output().splitlines() if "healthy" in line and "changed: " in line]
 
-        late = program(tmp_path, "service.rotorwatch", "watch", "--connect", address)
+        late = program(tmp_path, "service", "watch", "--connect", address)
         with late as joined:
             joined.wait_for("ALERT (unacknowledged): bearing stiffness, vertical")
             assert joined.stop() == 0
@@ -179,7 +179,7 @@ def test_watch_notices_a_monitor_that_goes_and_comes_back(tmp_path: Path) -> Non
     address = endpoint()
     with ExitStack() as started:
         with service(address):
-            watcher = started.enter_context(program(tmp_path, "service.rotorwatch", "watch", "--connect", address))
+            watcher = started.enter_context(program(tmp_path, "service", "watch", "--connect", address))
             watcher.wait_for("state is ")
         until(lambda: "connection lost, trying again" in watcher.errors(), "loss noticed")
         with service(address):
@@ -190,7 +190,7 @@ def test_watch_notices_a_monitor_that_goes_and_comes_back(tmp_path: Path) -> Non
 @pytest.mark.parametrize("form", [(), ("--json",)])
 def test_watch_ends_when_nobody_reads_any_more(form: tuple[str, ...]) -> None:
     address = endpoint()
-    command = [sys.executable, "-m", "service.rotorwatch", "watch", "--connect", address, *form]
+    command = [sys.executable, "-m", "service", "watch", "--connect", address, *form]
     with (
         service(address),
         subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as watcher,
@@ -205,7 +205,7 @@ def test_watch_ends_when_nobody_reads_any_more(form: tuple[str, ...]) -> None:
 
 def test_router_runs_until_it_is_told_to_stop(tmp_path: Path) -> None:
     address = endpoint()
-    with program(tmp_path, "service.rotorwatch", "router", "--listen", address) as router:
+    with program(tmp_path, "service", "router", "--listen", address) as router:
         router.wait_for(f"router listening on {address}")
         second = run("router", "--listen", address)
         assert second.returncode == 1

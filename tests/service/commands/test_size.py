@@ -5,8 +5,8 @@ import json
 import pytest
 from typer.testing import CliRunner
 
+from service.commands.rotorwatch import app
 from service.history.records import Retention
-from service.rotorwatch import app
 from service.runtime.sizing import Costs, Kind, Measured, RecordingCost, Size, load_costs, sized
 from service.settings.service import RecordingSettings
 

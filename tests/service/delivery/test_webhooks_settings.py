@@ -226,7 +226,7 @@ def test_a_monitor_logs_what_is_not_delivered_and_no_secret(tmp_path: Path) -> N
             f'url = "{receiver.url}/{path}"\nsecret_file = "hook.secret"\nlongest_pause_s = 1.0\n',
         )
         plan = ("--config", str(tmp_path / "plant.toml"), "--listen", address, "--http-port", "0")
-        with program(tmp_path, "service.rotorwatch", "run", *plan) as monitor:
+        with program(tmp_path, "service", "run", *plan) as monitor:
             monitor.url()
             with open_session(address) as session:
                 feed = Feed(session)

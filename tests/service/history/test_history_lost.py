@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from models.alarm_names import FAULT
+from service.commands.rotorwatch import app
 from service.history.records import StoredEvent, StoreError, TokenRecord
-from service.rotorwatch import app
 from service.runtime.runtime import running as running_here
 from tests.service.history.test_store import AUDIT, T0, alarm_event
 from tests.service.monitor.test_alarm_trouble import Bench, bench, block

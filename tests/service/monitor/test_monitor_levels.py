@@ -20,12 +20,12 @@ from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, HealthState, Report
 from rotorwatch.records.levels import ChannelLevels, LevelGrowth
 from service.commands import watching
+from service.commands.rotorwatch import app
 from service.history.records import Checkpoint
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.levels import LevelWatch
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import identity_of
-from service.rotorwatch import app
 from service.stream.checkpoints import checkpoint_step, restored
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import NOTHING, commissioned, elsewhere, healthy, stream

@@ -103,7 +103,7 @@ def test_everything_under_the_keys_is_recorded_as_it_was(tmp_path: Path) -> None
 def test_a_descriptor_announced_before_the_recorder_came_is_asked_for(tmp_path: Path) -> None:
     listen = endpoint()
     announced = b'{"announced": "by query"}'
-    command = ("service.rotorwatch", "record", "--machine", "lab", "--out", str(tmp_path / "o"), "--connect", listen)
+    command = ("service", "record", "--machine", "lab", "--out", str(tmp_path / "o"), "--connect", listen)
     with session_of(LinkSettings(listen=(listen,))) as session, program(tmp_path, *command) as recorder:
 
         def answer(query: zenoh.Query) -> None:
@@ -239,7 +239,7 @@ def test_a_folder_that_vanishes_is_noticed_and_made_again(tmp_path: Path) -> Non
 def test_a_write_error_is_told_and_recording_resumes_without_loss(tmp_path: Path) -> None:
     """The system refuses to let the program's files grow; then it lets them again."""
     listen, place = endpoint(), str(tmp_path / "kept")
-    command = ("service.rotorwatch", "record", "--machine", "lab", "--json", "--out", place, "--listen", listen)
+    command = ("service", "record", "--machine", "lab", "--json", "--out", place, "--listen", listen)
     with program(tmp_path, *command) as recorder:
         recorder.wait_for("idle")  # it listens and has subscribed
         with open_session(listen, "client") as session:

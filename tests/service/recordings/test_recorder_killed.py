@@ -28,7 +28,7 @@ NS = 1_000_000_000
 
 
 def recover(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return ran("service.rotorwatch", "recover", *arguments)
+    return ran("service", "recover", *arguments)
 
 
 class Sender:
@@ -96,9 +96,7 @@ def test_nothing_that_was_safe_is_lost_when_the_recorder_is_killed_again_and_aga
                     place = tmp_path / f"{number}-{folder.parents[1].name}"
                     place.mkdir()
                     options = ["--machine", "lab", "--out", str(folder.parents[1]), "--rotate-mb", "0.7", "--json"]
-                    recorder = stack.enter_context(
-                        program(place, "service.rotorwatch", "record", *options, "--connect", listen)
-                    )
+                    recorder = stack.enter_context(program(place, "service", "record", *options, "--connect", listen))
                     victims.append(Victim(folder, recorder, int(moments.integers(5, 600))))
                 for victim in victims:
                     victim.recorder.wait_for('"state"')

@@ -274,7 +274,7 @@ def test_a_recorder_beside_a_monitor_keeps_recordings_for_what_is_in_its_history
 
         def record(kind: str) -> dict[str, str]:
             """Record until an alarm event has come by; what is kept afterwards."""
-            command = ("service.rotorwatch", "record", *plan, "--json")
+            command = ("service", "record", *plan, "--json")
             with (
                 program(tmp_path, *command, ROTORWATCH_HISTORY__URL=history) as recorder,
                 open_session(address, "client") as session,

@@ -22,7 +22,7 @@ from tests.sure import sure
 _ROOT = Path(__file__).parents[3]
 
 PROGRAMS = [
-    *("service.runtime.runtime", "service.rotorwatch", "simulator.rotorsim", "simulator.publisher"),
+    *("service.runtime.runtime", "service.commands.rotorwatch", "simulator.rotorsim", "simulator.publisher"),
     *("models.signals.recording", "service.recordings.replay.offline", "service.terminal.stopping"),
     *("service.history.migrations", "pydantic.v1", "uvicorn.loops.asyncio", "uvicorn.lifespan.off", __name__),
 ]
@@ -125,7 +125,7 @@ def ran(
 def rotorwatch(*arguments: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run the command to its end, in an environment of little else."""
     clean = {"PATH": "/usr/bin:/bin", "COLUMNS": "200", **environment}
-    return ran("service.rotorwatch", *arguments, environment=clean)
+    return ran("service", *arguments, environment=clean)
 
 
 def _run(

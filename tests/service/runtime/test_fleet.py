@@ -13,7 +13,7 @@ from models.machine import load_machine
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from rotorwatch.records.health import HealthState
-from service.rotorwatch import app
+from service.commands.rotorwatch import app
 from service.runtime.fleet import better_place, fleet_count
 from service.runtime.runtime import Runtime, running
 from service.runtime.shards import Shards

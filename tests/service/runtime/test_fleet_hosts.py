@@ -150,7 +150,7 @@ def test_a_cut_cable_and_a_lost_host_leave_the_alarm_logs_of_a_fleet_as_they_wou
         # The path of a socket may have a hundred letters.
         rays = Path(running.enter_context(tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True)))
         listening = ("--listen", "tcp/0.0.0.0:7447", "--without-grants")
-        router = program(tmp_path, "service.rotorwatch", "router", *listening, network=net.network(MIDDLE))
+        router = program(tmp_path, "service", "router", *listening, network=net.network(MIDDLE))
         running.enter_context(router).wait_for("router listening")
 
         def node(host: str, *options: str) -> Group:
@@ -166,7 +166,7 @@ def test_a_cut_cable_and_a_lost_host_leave_the_alarm_logs_of_a_fleet_as_they_wou
         worker("left")
         right = worker("right")
         where = ("--address", f"{net.address('first')}:6379", "--config", str(settings))
-        command = ("service.rotorwatch", "fleet", *where)
+        command = ("service", "fleet", *where)
         alone = {key: value for key, value in os.environ.items() if not key.startswith("ROTORWATCH_")} | _VARIABLES
         served = running.enter_context(program(tmp_path, *command, network=net.network("first"), alone=alone))
         url = served.url()

@@ -83,10 +83,9 @@ def test_what_a_cut_cable_and_a_lost_host_cost_is_stated_and_the_alarm_log_arriv
             return BLOCK_S * quality.accepted_blocks + quality.missing_s
 
         listening = ("--listen", "tcp/0.0.0.0:7447", "--without-grants")
-        started(MIDDLE, "service.rotorwatch", "router", *listening).wait_for("router listening")
+        started(MIDDLE, "service", "router", *listening).wait_for("router listening")
         monitor = started(
-            "monitor",
-            *("service.rotorwatch", "run", "--machine", machine, "--connect", router("monitor"), "--http-port", "0"),
+            "monitor", *("service", "run", "--machine", machine, "--connect", router("monitor"), "--http-port", "0")
         )
         follow = [*net.within("operator"), sys.executable, "-c", FOLLOW, router("operator")]
         with told.open("wb") as out:

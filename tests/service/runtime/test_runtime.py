@@ -267,7 +267,7 @@ def test_threads_keep_no_memory_of_their_own() -> None:
 
 
 LIMITED = ["sh", "-c", 'ulimit -v "$1"; shift; exec "$@"', "sh"]
-MONITOR = ["-m", "service.rotorwatch", "run", "--http-port", "0", "--listen"]
+MONITOR = ["-m", "service", "run", "--http-port", "0", "--listen"]
 PROGRAM = """
 import threading
 import typer

@@ -207,7 +207,7 @@ def test_processes_end_with_the_monitor_that_started_them(tmp_path: Path) -> Non
     machines = "[" + ",".join(one.model_dump_json() for one in plan.machines) + "]"
     with program(
         tmp_path,
-        *("service.rotorwatch", "run"),
+        *("service", "run"),
         ROTORWATCH_MACHINES=machines,
         ROTORWATCH_SHARDS__COUNT="2",
         ROTORWATCH_HTTP__PORT="0",

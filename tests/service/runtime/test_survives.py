@@ -21,7 +21,7 @@ def monitor(folder: Path, address: str, file: str) -> tuple[str, ...]:
         f'[history]\nurl = "sqlite:///history.sqlite"\n[[machines]]\nfile = "{file}"\n',
         encoding="utf-8",
     )
-    return ("service.rotorwatch", "run", "--config", str(settings))
+    return ("service", "run", "--config", str(settings))
 
 
 def running(folder: Path, address: str, file: str) -> Any:

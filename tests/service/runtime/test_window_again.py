@@ -66,7 +66,7 @@ class Plant:
 
     @contextmanager
     def monitor(self) -> Iterator[Program]:
-        command = ("service.rotorwatch", "run", "--config", str(self._settings))
+        command = ("service", "run", "--config", str(self._settings))
         with program(self.folder, *command, ROTORWATCH_HISTORY__URL=self.url) as running:
             running.wait_for("HTTP API")
             until_subscribed(self.session, self.machine.keys.stream)

@@ -312,7 +312,3 @@ for module in (installation, size, watching, access, record, replay, interchange
     app.add_typer(module.commands)
 for group in (access.tokens, webhook.commands, history.commands, plot.commands):
     app.add_typer(group)
-
-
-if __name__ == "__main__":
-    app()
