@@ -40,6 +40,8 @@ COMPUTERS, CORES = 3, 2
 EVERY = 4
 BETWEEN_S = 30.0
 PATIENCE_S = 120.0
+CHECKS = {"health_check_period_ms": 1000, "health_check_timeout_ms": 2000, "health_check_failure_threshold": 5}
+"""Ray's health checks as ``docs/service.md`` starts it."""
 WARM_S = 80.0
 
 
@@ -66,7 +68,8 @@ def fleet_files(folder: Path, machines: Sequence[MachineFile], database: str, li
 @contextmanager
 def cluster_of() -> Iterator[Any]:
     """A Ray cluster of these computers, beside one without cores."""
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    head = {"num_cpus": 0, "include_dashboard": False, "_system_config": CHECKS}
+    cluster = Cluster(initialize_head=True, head_node_args=head)
     try:
         for _ in range(COMPUTERS):
             cluster.add_node(num_cpus=CORES)

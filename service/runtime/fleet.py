@@ -15,6 +15,7 @@ import secrets
 import socket
 import tempfile
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from multiprocessing import Pipe
@@ -37,6 +38,8 @@ _MB_OF_A_PROCESS, _MB_OF_A_MACHINE = 150, 45
 _USER = "shard"
 _ANSWER_S = 5.0
 _BALANCE_S = 5.0
+_SETTLED_S = 60.0
+"""Since its latest start, before a shard is moved: one that is moved while it catches up is out of service twice."""
 _VARIABLES = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """As in a monitor of one process: results do not depend on the number of cores."""
 
@@ -137,7 +140,8 @@ class Fleet:
                 _log.warning("the cluster does not report its computers", why=str(error))
                 continue
             placed = [one for one in self._processes if one.computer]
-            if len(placed) < len(self._processes):
+            now_s = time.monotonic()
+            if len(placed) < len(self._processes) or any(now_s - one.placed_s < _SETTLED_S for one in placed):
                 continue  # a shard is on its way, and its cores are taken soon
             move = better_place([(one.computer, one.cores) for one in placed], cores)
             if move is not None:
@@ -251,6 +255,7 @@ class _Actor:
         machines = len(settings.machines)
         self.cores = machines * _CORES_OF_A_MACHINE
         self.computer = ""  # where it runs; empty while it does not
+        self.placed_s = 0.0  # since when, monotonic
         self._ray = ray
         self._arguments = (settings, inner)
         self._options = {
@@ -294,7 +299,7 @@ class _Actor:
             return None
         said, computer = found
         if self._next == 0 and "\n" not in said:
-            self.computer, self._life = computer, self._actor.wait.remote()
+            self.computer, self._life, self.placed_s = computer, self._actor.wait.remote(), time.monotonic()
         self._next += 1
         return said
 

@@ -1,8 +1,9 @@
 """Shards on the computers of a Ray cluster: one that is lost, one that comes, and settings that are none of a fleet."""
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from typer.testing import CliRunner
@@ -14,6 +15,7 @@ from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from rotorwatch.records.health import HealthState
 from service.commands.rotorwatch import app
+from service.runtime import fleet
 from service.runtime.fleet import better_place, fleet_count
 from service.runtime.runtime import Runtime, running
 from service.runtime.shards import Shards
@@ -23,7 +25,10 @@ from simulator.scenario import parse_fault
 from tests.service.rig.live import Feed, endpoint, open_session, scenario_blocks, until
 from tests.service.rig.postgres import postgres_server
 from tests.service.rig.replaying import recording
+from tests.service.runtime.test_fleet_hosts import CHECKS
 from tests.service.runtime.test_shards import SECONDS, plan_for
+
+SETTLED_S = 20.0
 
 if TYPE_CHECKING:
     from ray.cluster_utils import Cluster
@@ -42,7 +47,7 @@ def cluster() -> Iterator["Cluster"]:
     """A Ray cluster of two computers with a core each, beside one without any; all are this computer."""
     from ray.cluster_utils import Cluster  # noqa: PLC0415  # half a second, and every worker reads this module
 
-    head = {"num_cpus": 0, "include_dashboard": False, "_system_config": {"worker_niceness": 0}}
+    head = {"num_cpus": 0, "include_dashboard": False, "_system_config": {"worker_niceness": 0} | json.loads(CHECKS)}
     made = Cluster(initialize_head=True, head_node_args=head)
     try:
         for _ in range(2):
@@ -52,13 +57,21 @@ def cluster() -> Iterator["Cluster"]:
         made.shutdown()  # type: ignore[no-untyped-call]
 
 
+def actors_of(runtime: Runtime) -> list[Any]:
+    """What Ray runs for the shards."""
+    assert isinstance(runtime._machines, Shards)
+    return [shard.process for shard in runtime._machines._shards]
+
+
 def computers_of(runtime: Runtime) -> list[str]:
     """Where the shards run; empty for one that does not."""
-    assert isinstance(runtime._machines, Shards)
-    return [shard.process.computer for shard in runtime._machines._shards]  # type: ignore[attr-defined]  # actors
+    return [one.computer for one in actors_of(runtime)]
 
 
-def test_a_computer_that_is_lost_and_one_that_comes(cluster: "Cluster", tmp_path: Path) -> None:
+def test_a_computer_that_is_lost_and_one_that_comes(
+    cluster: "Cluster", tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet, "_SETTLED_S", SETTLED_S)
     blocks = scenario_blocks(SECONDS, parse_fault("k_by=-0.33@10"))
     with postgres_server() as server:
         plan = fleet_plan(tmp_path, server.new_database("fleet"))
@@ -96,8 +109,10 @@ def test_a_computer_that_is_lost_and_one_that_comes(cluster: "Cluster", tmp_path
             assert computers_of(runtime) == [there[0], there[0]]
             assert "00:42" not in machines[0].health().restart
             assert machines[1].health().restart.startswith("went on where it stood at 2026-01-01T00:00:42")
+            again_s = max(one.placed_s for one in actors_of(runtime))
             cluster.add_node(num_cpus=1)
             until(lambda: len(set(computers_of(runtime)) - {""}) == 2 and runtime.readiness().ready, "a move")
+            assert max(one.placed_s for one in actors_of(runtime)) - again_s > SETTLED_S  # not while one catches up
             fed(blocks[440:], lambda count: count >= 10)
             for one, log in zip(machines, before, strict=True):
                 after = one.history.events(after=-1)
