@@ -2,30 +2,44 @@
 
 import math
 import threading
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 _LASTING_S = 30.0
-_LONGEST_TURN_S = 1.0
-_turn = threading.Lock()
+_LONGEST_TURN_S = 3.0
+_lock = threading.Lock()
+_turns: deque[threading.Lock] = deque()
+"""Of the machine whose turn it is, and of those that wait for theirs."""
 
 
 @contextmanager
 def in_turn(*, completes_hop: bool) -> Iterator[None]:
-    """Take the blocks that complete a hop one machine of the process after the other.
+    """Take the blocks that complete a hop one machine of the process after the other, in the order in which they came.
 
     Python computes in one thread at a time anyway. Workers that evaluate side by side only take it from each other, in
     the middle of their arithmetic: each holds its intermediate results meanwhile, and finds the processor's caches
-    filled with those of the others.
+    filled with those of the others. After a stall, all machines have their next window before any has its last one.
 
     A machine that waits for longer than `_LONGEST_TURN_S` goes on beside the others: one that never ends stops none.
     """
-    taken = completes_hop and _turn.acquire(timeout=_LONGEST_TURN_S)
+    if not completes_hop:
+        yield
+        return
+    mine = threading.Lock()
+    with _lock:
+        _turns.append(mine)
+        if _turns[0] is not mine:
+            mine.acquire()
+    mine.acquire(timeout=_LONGEST_TURN_S)
     try:
         yield
     finally:
-        if taken:
-            _turn.release()
+        with _lock:
+            had_turn = _turns[0] is mine
+            _turns.remove(mine)
+            if had_turn and _turns:
+                _turns[0].release()
 
 
 class LoadShedding:

@@ -280,6 +280,33 @@ def test_a_hop_is_computed_when_that_of_another_machine_is_or_has_taken_too_long
         until(lambda: worker.tally.blocks == 100, "all blocks")
 
 
+def test_turns_come_in_the_order_in_which_they_were_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One who went on beside the others has had his turn."""
+    monkeypatch.setattr(shedding, "_LONGEST_TURN_S", 60.0)
+    began: list[int] = []
+    ended = [threading.Event() for _ in range(6)]
+
+    def take(number: int) -> None:
+        with in_turn(completes_hop=True):
+            began.append(number)
+            ended[number].wait(60.0)
+
+    threads = [threading.Thread(target=take, args=(number,)) for number in range(6)]
+    for number, thread in enumerate(threads):
+        if number == 3:
+            monkeypatch.setattr(shedding, "_LONGEST_TURN_S", 0.0)
+        thread.start()
+        monkeypatch.setattr(shedding, "_LONGEST_TURN_S", 60.0)
+        until(lambda number=number: len(shedding._turns) == number + 1, "its place among those who wait")  # type: ignore[misc]  # bound now
+    until(lambda: began == [0, 3], "one beside the first")
+    for number in (3, 0, 1, 2, 4, 5):
+        until(lambda number=number: number in began, "its turn")  # type: ignore[misc]  # bound now
+        ended[number].set()
+        threads[number].join()
+    assert began == [0, 3, 1, 2, 4, 5]
+    assert not shedding._turns
+
+
 # A running service
 
 
