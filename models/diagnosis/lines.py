@@ -3,7 +3,8 @@
 A line has the same strength in every segment, noise has not: of a steady line the mean fourth power of the Fourier
 coefficient is the square of the mean second power, of noise twice that. And it turns by the same angle from each
 segment to the next, where a resonance has forgotten its phase: their coherence is 1 of a line, and of n segments of
-noise c or more with the probability (1 - c²)ⁿ⁻¹.
+noise c or more with the probability (1 - c²)ⁿ⁻¹. A line too faint to be certain of in one window is certain when two
+that do not overlap have it: no resonance is remembered from one to the other, so that their chances multiply.
 
 Beside a multiple of the speed a line beats with it. Seen from the turning shaft that multiple stands still, and the
 line turns: of what is left without the mean, one rotation holds nearly all, where of n segments of noise it holds a
@@ -12,20 +13,22 @@ alike, and one that drifts does not get round. What rings from one segment to th
 has to keep its phase besides.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
 
+from models.checkpoint import checked
 from models.diagnosis.excluded import KnownLine
 from models.diagnosis.moments import ComplexArray, HopMoments, Plan
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
 _STEADY = 1.35  # fourth power over the square of the second: 2 for noise, 1 for a line; between them with little data
-_STANDS_OUT = 8.0
+_STANDS_OUT, _FAINT = 8.0, 4.0  # power over that of its surroundings: seen in one window alone, and in two
 _NEIGHBOURHOOD_HZ = 4.0
 _LOBE = 2  # a Hann window spreads a line over two bins on either side
 _FEWEST_SEGMENTS = 6
@@ -51,6 +54,8 @@ class Line:
         Whether no noise is coherent like that.
     beside : int
         The multiple of the speed it is next to, within three bins of the spectra; 0 if next to none.
+    likely : bool
+        Whether noise is coherent like that by so small a chance that it is not in two windows.
     """
 
     state: str
@@ -58,6 +63,7 @@ class Line:
     share: float
     certain: bool
     beside: int = 0
+    likely: bool = False
 
     def known(self, speed_rad_s: float) -> KnownLine:
         """What is kept of it."""
@@ -92,16 +98,20 @@ def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistic
     speed_hz = abs(window.speed_rad_s) / (2 * np.pi)
     rotation = _near_rotation(frequencies_hz, speed_hz, step_hz)
     found: dict[int, Line] = {}
-    for at, column in np.argwhere((mean > _STANDS_OUT * floor) & ~rotation[:, None]):
+    for at, column in np.argwhere((mean > _FAINT * floor) & ~rotation[:, None]):
         lobe = slice(max(0, at - _LOBE), at + _LOBE + 1)
-        own = power[:, at, column]
-        unsteady = (own**2).mean() >= _STEADY * mean[at, column] ** 2
-        if unsteady or mean[at, column] < mean[lobe, column].max():
+        if mean[at, column] < mean[lobe, column].max():
             continue
-        share = float(2 * step_hz * mean[lobe, column].sum() / total[column])
-        if at not in found or share > found[at].share:
-            certain = _coherent(segments[:, at, column])
-            found[at] = Line(states[column], float(frequencies_hz[at]), min(1.0, share), certain)
+        clear = mean[at, column] > _STANDS_OUT * floor[at, column]
+        clear &= (power[:, at, column] ** 2).mean() < _STEADY * mean[at, column] ** 2
+        chance = _chance(segments[:, at, column])
+        likely = chance < math.sqrt(_CHANCE)
+        if clear or likely:
+            share = min(1.0, float(2 * step_hz * mean[lobe, column].sum() / total[column]))
+            certain = bool(clear and chance < _CHANCE)
+            line = Line(states[column], float(frequencies_hz[at]), share, certain, likely=likely)
+            # A channel that is sure of it goes before one that it is louder in.
+            found[at] = max(found.get(at, line), line, key=lambda one: (one.certain, one.likely, one.share))
     lines = [*found.values(), *_beside_multiples(plan, window, every, floor, total)]
     return tuple(sorted(lines, key=lambda line: -line.share))
 
@@ -157,19 +167,58 @@ def new_line(
     for line in lines:
         if line.beside and not beside:
             continue
-        own = line.known(speed_rad_s)
-        seen = any(abs(now - then) <= _SAME * then for one in known for now, then in zip(own, one, strict=True))
-        if line.certain and line.share > _LOUD and not seen:
+        if line.certain and line.share > _LOUD and not _among(line, known, speed_rad_s):
             return line
     return None
 
 
-def _coherent(own: ComplexArray) -> bool:
-    """Whether segments keep their phase as no noise does; those that overlap are no evidence, one of two is left."""
+class LatestLines:
+    """The lines of the latest windows, to be sure of those that are too faint for one."""
+
+    def __init__(self) -> None:
+        self._seen: list[tuple[int, KnownLine]] = []  # by the end of the window
+
+    def take(self, lines: Sequence[Line], window: WindowStatistics) -> tuple[Line, ...]:
+        """Go on with a window: its lines, those certain too that one had which ended before it began."""
+        oldest_ns = 2 * window.start_ns - window.end_ns
+        self._seen = [(end_ns, line) for end_ns, line in self._seen if end_ns >= oldest_ns]
+        before = [line for end_ns, line in self._seen if end_ns <= window.start_ns]
+        self._seen += [(window.end_ns, line.known(window.speed_rad_s)) for line in lines if line.likely]
+        return tuple(
+            replace(line, certain=True) if line.likely and _among(line, before, window.speed_rad_s) else line
+            for line in lines
+        )
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything as named arrays."""
+        ends = np.array([end_ns for end_ns, _ in self._seen], dtype=np.int64)
+        return {"lines_end_ns": ends, "lines": np.array([line for _, line in self._seen]).reshape(-1, 2)}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called.
+
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form.
+        """
+        ends = checked(arrays, "lines_end_ns", np.int64, (None,)).tolist()
+        lines = checked(arrays, "lines", np.float64, (len(ends), 2)).tolist()
+        self._seen = [(end_ns, (hz, order)) for end_ns, (hz, order) in zip(ends, lines, strict=True)]
+
+
+def _among(line: Line, known: Sequence[KnownLine], speed_rad_s: float) -> bool:
+    """Whether a line is one of these, at its frequency or order."""
+    own = line.known(speed_rad_s)
+    return any(abs(now - then) <= _SAME * then for one in known for now, then in zip(own, one, strict=True))
+
+
+def _chance(own: ComplexArray) -> float:
+    """How seldom noise keeps its phase as segments do; those that overlap are no evidence, one of two is left."""
     earlier, later = own[:-2], own[2:]
     norms = np.linalg.norm(earlier) * np.linalg.norm(later)
     coherence = min(1.0, float(abs(np.vdot(earlier, later)) / norms))
-    return bool((1 - coherence**2) ** (earlier.size / 2 - 1) < _CHANCE)
+    return float((1 - coherence**2) ** (earlier.size / 2 - 1))
 
 
 def _turning(left: ComplexArray, at: int, every_s: float, near_hz: float) -> tuple[float, bool]:
@@ -187,7 +236,7 @@ def _turning(left: ComplexArray, at: int, every_s: float, near_hz: float) -> tup
     there, back = rotations[[most, -most]].sum(axis=1)
     one_way &= bool(back < _OTHER_WAY * there) and min(most, size - most) * n_segments >= _TURNS * size
     # A resonance that rings from one segment to the next turns one way for a while.
-    return found_hz + round((near_hz - found_hz) * every_s) / every_s, one_way and _coherent(own)
+    return found_hz + round((near_hz - found_hz) * every_s) / every_s, one_way and _chance(own) < _CHANCE
 
 
 def _near_rotation(frequencies_hz: FloatArray, speed_hz: float, step_hz: float) -> npt.NDArray[np.bool_]:

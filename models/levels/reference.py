@@ -74,6 +74,8 @@ class LevelReference(BaseModel):
     lines: tuple[tuple[_Level, _Level], ...] | None = Field(default=None, exclude_if=lambda found: found is None)
     # Whether they were looked for next to multiples of the speed as well.
     beside: bool = Field(default=False, exclude_if=lambda found: not found)
+    # Whether those were kept that are too faint to be certain of in one window.
+    faint: bool = Field(default=False, exclude_if=lambda found: not found)
 
     @model_validator(mode="after")
     def _known(self) -> Self:
@@ -124,7 +126,8 @@ def learn_levels(
         else:
             groups.append([levels])
     states = tuple(_state(channels, group) for group in groups)
-    return LevelReference(source=source, states=states, gains=gains, lines=lines, beside=lines is not None)
+    looked = lines is not None
+    return LevelReference(source=source, states=states, gains=gains, lines=lines, beside=looked, faint=looked)
 
 
 def expected_levels(

@@ -10,7 +10,7 @@ import numpy as np
 from models.alarm_names import LEVEL
 from models.commissioning.commissioned import Installed
 from models.diagnosis.likelihood.motions import natural_frequencies
-from models.diagnosis.lines import new_line, steady_lines
+from models.diagnosis.lines import LatestLines, new_line, steady_lines
 from models.diagnosis.moments import Plan
 from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.window import WindowStatistics
@@ -73,6 +73,7 @@ class LevelWatch:
             of=hashlib.sha256(machine.model_dump_json(include=_DEPENDS_ON).encode()).hexdigest()[:16],
         )
         self._contact = LatestContact(_WINDOWS_OF_CONTACT * plan.hops)
+        self._lines = LatestLines()
         self.latest: tuple[ChannelLevels, ...] = ()
         self._found: WindowLevels | None = None
         self._states = [state_name(channel) for channel in channels]
@@ -106,6 +107,8 @@ class LevelWatch:
         healthy, speed_rad_s = self.reference, statistics.speed_rad_s
         if healthy is not None and healthy.lines is not None and math.isfinite(speed_rad_s) and speed_rad_s:
             lines = steady_lines(window.plan, window.hops, statistics)
+            if healthy.faint:
+                lines = self._lines.take(lines, statistics)
             line = new_line(lines, healthy.lines, speed_rad_s, beside=healthy.beside)
             if line is not None:
                 order = f"{line.known(speed_rad_s)[1]:.{3 if line.beside else 2}f}"
@@ -134,8 +137,8 @@ class LevelWatch:
         return expected_levels(names, levels, (slowest, fastest), tuple(modes))
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """What is remembered, as named arrays: the first windows, and what the latest hops had of a contact."""
-        return {**self._first.checkpoint(), **self._contact.checkpoint()}
+        """What is remembered, as named arrays: the first windows, and what the latest had of a contact and of lines."""
+        return {**self._first.checkpoint(), **self._contact.checkpoint(), **self._lines.checkpoint()}
 
     def restore(self, arrays: Mapping[str, np.ndarray], *, first_alone: bool) -> None:
         """Go on where `checkpoint` was called.
@@ -153,6 +156,7 @@ class LevelWatch:
         self._first.restore(arrays)
         if not first_alone:
             self._contact.restore(arrays)
+            self._lines.restore(arrays)
 
     def tell(
         self,

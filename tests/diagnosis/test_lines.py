@@ -1,5 +1,6 @@
 """Lines beside the rotation against noise, resonances and bursts, and which of them are new."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -8,7 +9,7 @@ from scipy.signal import lfilter
 
 from models.commissioning.checks import check_lines
 from models.commissioning.healthy import HealthyRecording, healthy_from_blocks, known_lines
-from models.diagnosis.lines import Line, new_line, steady_lines
+from models.diagnosis.lines import LatestLines, Line, new_line, steady_lines
 from models.diagnosis.window import window_statistics
 from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
@@ -85,6 +86,23 @@ def test_neither_a_multiple_of_the_speed_nor_a_narrow_resonance_is_one() -> None
     root = np.exp(2 * np.pi * (-0.003 + 1j) * 40 / RATE_HZ)  # damped by 0.3 %
     resonance = lfilter([1.0], [1, -2 * root.real, abs(root) ** 2], noise(20))
     assert not any(one.certain for one in lines(resonance / resonance.std()))
+
+
+@pytest.mark.parametrize(("apart", "second_hz", "certain"), [(1.0, 30.0, True), (0.9, 30.0, False), (1.0, 33.0, False)])
+def test_a_line_too_faint_for_one_window_is_certain_in_two(apart: float, second_hz: float, certain: bool) -> None:
+    latest, found = LatestLines(), []
+    for number, hz in enumerate((30.0, second_hz)):
+        made = recording(noise(30 + number) + line(hz, 0.09))
+        window = window_statistics(made.plan, made.hops, lagged=False)
+        later_ns = round(number * apart * (window.end_ns - window.start_ns))
+        window = replace(window, start_ns=window.start_ns + later_ns, end_ns=window.end_ns + later_ns)
+        found = [one for one in latest.take(steady_lines(made.plan, made.hops, window), window) if one.state == "y1"]
+        assert [one.likely for one in found] == [True]
+        assert number or not found[0].certain
+        restored = LatestLines()
+        restored.restore(latest.checkpoint())
+        latest = restored
+    assert found[0].certain is certain
 
 
 def test_a_burst_is_none() -> None:
