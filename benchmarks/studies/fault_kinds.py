@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.finite_elements.assembly import ComplexArray
+from models.levels.measures import NYQUIST_PART
 from models.signals.block import FloatArray
 
 MOTIONS = (("bearing", "y"), ("disc", "y"), ("bearing", "z"), ("disc", "z"))
@@ -83,8 +84,12 @@ def _looseness(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
 
 
 def _gear(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
-    """Mesh of 13 to 23 teeth with a sideband at either side; the bearing's velocity is compared with that at 1x."""
-    teeth = float(rng.integers(13, 24))
+    """Mesh of 13 to 23 teeth with a sideband at either side; the bearing's velocity is compared with that at 1x.
+
+    Of fewer teeth where it would lie above 0.4 of the sampling rate, where levels are not measured.
+    """
+    most = int(NYQUIST_PART * rotor.rate_hz / 2 / rotor.speed_hz) - 1
+    teeth = float(min(int(rng.integers(13, 24)), most))
     return _lines(
         rotor, seen, rng, {teeth: 1 / teeth, teeth - 1: 0.3 / teeth, teeth + 1: 0.3 / teeth}, _size(rng, 0.5, 2.0)
     )
