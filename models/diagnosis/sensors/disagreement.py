@@ -89,17 +89,19 @@ def _departure(
     )  # fmt: skip
 
 
-def _largest_part(course: FloatArray, error: float) -> tuple[float, float]:
+def _largest_part(course: FloatArray, error: FloatArray) -> tuple[float, float]:
     """Largest difference between the hops before and after a moment, and its size in standard errors."""
     n = course.size
     if n < 4:
         return 0.0, 0.0
     if n > 5:
-        error = max(error, 1.4826 * float(np.median(np.abs(np.diff(course)))) / np.sqrt(2))
-    before = np.arange(1, n)
-    sums = np.cumsum(course)
-    changes = (sums[-1] - sums[:-1]) / (n - before) - sums[:-1] / before
-    z = np.abs(changes) / (error * np.sqrt(1 / before + 1 / (n - before)))
+        steps = np.abs(np.diff(course)) / np.hypot(error[1:], error[:-1])
+        error = error * max(1.0, 1.4826 * float(np.median(steps)))
+    weight = error**-2.0
+    before, sums = np.cumsum(weight)[:-1], np.cumsum(weight * course)
+    after = weight.sum() - before
+    changes = (sums[-1] - sums[:-1]) / after - sums[:-1] / before
+    z = np.abs(changes) / np.sqrt(1 / before + 1 / after)
     best = int(np.argmax(z))
     return float(changes[best]), float(z[best])
 

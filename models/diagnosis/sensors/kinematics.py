@@ -301,16 +301,25 @@ def _transfer(bands: Banded, incoherent: FloatArray) -> tuple[ComplexArray, Floa
     return h, variance / explained, left
 
 
-def gain_course(window: WindowStatistics, reading: PairReading, bands: Banded) -> tuple[FloatArray, float]:
-    """Relative deviation of the pair's gain from its mean, hop by hop, and the standard error of one hop."""
+def gain_course(window: WindowStatistics, reading: PairReading, bands: Banded) -> tuple[FloatArray, FloatArray]:
+    """Relative deviation of the pair's gain from its mean, hop by hop, and the standard error of each hop.
+
+    The noise of the sensors stays as it is while the motion comes and goes: where a machine runs down it is more and
+    more of what they show, and makes the ratio of a hop smaller, and less certain.
+    """
     number = motion_pairs(window.states).index(reading.pair)
     z, v = bands.total[:, 0, 0].real, bands.total[:, 1, 1].real
     incoherent = np.maximum(1 - np.abs(bands.total[:, 1, 0]) ** 2 / (z * v), _FLOOR)
-    variance = incoherent / np.maximum(1 - incoherent, 1e-6) / (bands.averages / len(window.pair_powers))
     aligned = reading.transfer(bands.w).conj() / np.exp(reading.log_gain)
     powers = np.stack([hop[number] for hop in window.pair_powers])
-    ratio = np.real(aligned * powers[:, :, 1]) / np.maximum(powers[:, :, 0].real, np.finfo(float).tiny)
-    # Each band about its own mean: what noise takes from the ratio is the same in all hops.
+    own = np.maximum(powers[:, :, 0].real, np.finfo(float).tiny)
+    ratio = np.real(aligned * powers[:, :, 1]) / own
+    # Each band about its own mean: what noise takes from the ratio is the same in all hops that are as loud.
     course = ratio / np.median(ratio, axis=0) - 1
+    noise = np.minimum(incoherent * own.mean(axis=0) / own, 1.0)
+    variance = noise / np.maximum(1 - noise, 1e-6) / (bands.averages / len(powers))
     weight = 1 / variance
-    return np.asarray(course @ weight / weight.sum(), dtype=np.float64), float(np.sqrt(1 / (2 * weight.sum())))
+    total = weight.sum(axis=1)
+    taken = np.sum(weight * noise, axis=1) / total
+    error = np.sqrt(1 / (2 * total) + np.maximum(taken - np.median(taken), 0.0) ** 2)
+    return np.asarray(np.sum(course * weight, axis=1) / total, dtype=np.float64), np.asarray(error, dtype=np.float64)

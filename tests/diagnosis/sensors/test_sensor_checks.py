@@ -389,6 +389,17 @@ def test_with_displacements_alone_a_gain_that_jumps_in_one_channel_is_found() ->
     np.testing.assert_allclose(found, -0.3, atol=0.1)
 
 
+def test_a_machine_that_sinks_into_the_noise_of_its_sensors_has_no_gain_that_drifts() -> None:
+    plan, samples = plan_of("lab"), recorded("lab", 31).copy()
+    moving = samples[:, : len(plan.states)]
+    mean, rms = moving.mean(axis=0), moving.std(axis=0)
+    fades = np.interp(np.arange(len(samples)) / plan.rate_hz, [40.0, 55.0], [1.0, 0.03])[:, np.newaxis]
+    noise = 0.02 * rms * np.random.default_rng([31, 8]).standard_normal(moving.shape)
+    moving[:] = mean + (moving - mean) * fades + noise
+    assert found_in(samples) == ()
+    assert found_in(samples, reference_of("lab")) == ()
+
+
 def test_a_machine_that_moves_more_is_no_sensors_fault() -> None:
     plan, columns = displacements_only()
     samples = recorded("lab", 23)[:, columns].copy()
