@@ -89,8 +89,8 @@ def relative_limits(
                 overall = state.levels[channel.name].get("overall")
                 if name in {"x1", "x2"} and one.mean < ERRORS * one.error and overall is not None:
                     danger = max(danger, _LEAST_DANGER * overall.mean)
-            fall = None
-            if name in {"overall", "velocity"} and given.fall_ratio:
+            fall = None  # nor is it a fault to be quieter there, as while it runs down
+            if seen and name in {"overall", "velocity"} and given.fall_ratio:
                 quietest = one.low * min(1 / BEYOND_RANGE, 1 - _filling(one, shorter))
                 fall = min(given.fall_ratio * one.mean, quietest, one.mean - spread)
             shown = [None if edge is None else shown_level(channel, name, edge) for edge in (alert, danger, fall)]

@@ -193,6 +193,12 @@ def test_every_operating_state_has_levels_of_its_own() -> None:
     assert limits(between)["overall"].state == "alert"
 
 
+def test_a_machine_that_runs_down_through_speeds_nobody_knows_has_not_fallen_silent() -> None:
+    healthy = reference(*(window(speed_rad_s=SPEED, overall=value) for value in (1e-3, 1.1e-3)))
+    quiet = (limits(judged(CASING, window(speed_rad_s=speed, overall=1e-4), healthy)) for speed in (SPEED, SPEED / 2))
+    assert [one["overall"].state for one in quiet] == ["alert", "normal"]
+
+
 def test_every_kind_of_limit_is_told_where_there_are_several() -> None:
     own = [{"channel": "DE-H", "alert": 3.0}, {"channel": "DE-H", "measure": "crest", "alert": 6.0}]
     healthy = reference(*(window(overall=1e-3) for _ in range(3)))
