@@ -132,7 +132,6 @@ def parameter_summaries(
     window_s: float,
     *,
     wished: float,
-    short: bool,
     identified: Mapping[str, float],
 ) -> tuple[ParameterSummary, ...]:
     """Sum up what healthy windows say of each parameter.
@@ -145,12 +144,10 @@ def parameter_summaries(
         The same windows read against what was learned without them.
     healthy_s, window_s : float
         Data learned from; length of each window in `diagnoses`.
-    short : bool
-        Whether stretches shorter than a window are looked at, too: they share the declared rate.
     identified : mapping of str to float
         Identified values, SI.
     """
-    settings = SequentialSettings.for_machine(machine, short=short)
+    settings = SequentialSettings.for_machine(machine)
     threshold = settings.thresholds(settings.window_hops).first + float(ndtri(_POWER))
     found = []
     for name in PARAMETERS:
@@ -368,7 +365,6 @@ def _report(
             healthy_s,
             float(np.median([piece.window.duration_s for piece in pieces])),
             wished=machine.alarms.limits.raise_above if wished is None else wished,
-            short=learned.machine is not None,
             identified={} if rotor is None else {name: getattr(rotor, FAULT_FIELDS[name]) for name in PARAMETERS},
         )
         if learned.diagnoses

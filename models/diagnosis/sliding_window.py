@@ -270,18 +270,21 @@ class SlidingWindow:
         """Levels of the hops that are there, however few; None without any."""
         return levels_of(self.plan, tuple(self._hops), errors=errors) if self._hops else None
 
-    def statistics(self, hops: int | None = None) -> WindowStatistics | None:
+    def statistics(self, hops: int | None = None, *, lagged: bool = False) -> WindowStatistics | None:
         """Statistics of the window, or of its latest hops, or None while there are not so many.
 
         Parameters
         ----------
         hops : int, optional
-            How many of the latest hops, with correlations at lag zero alone; all hops of a full window without it.
+            How many of the latest hops; all hops of a full window without it.
+        lagged : bool
+            Whether the latest hops have correlations at all lags, as a full window has, or at lag zero alone.
         """
         count = self.plan.hops if hops is None else hops
         if not 0 < count <= len(self._hops):
             return None
-        return window_statistics(self.plan, tuple(self._hops)[-count:], lagged=hops is None, lines=self._lines)
+        lagged = lagged or hops is None
+        return window_statistics(self.plan, tuple(self._hops)[-count:], lagged=lagged, lines=self._lines)
 
     def again(self) -> Callable[[], WindowStatistics] | None:
         """What makes the statistics of the window as it is now when they are asked for; None before it is full.

@@ -32,6 +32,7 @@ class Evaluation:
     opinions: tuple[Opinion, ...]  # what the others say
     speed_rad_s: float | None
     shapes: tuple[Shape, ...] = ()  # where no equation can be evaluated: whether each channel's vibration is as it was
+    alone: bool = False  # whether only later windows can say that this one is astride a change
 
     def calm(self, *, outside: bool) -> HealthState:
         """State without raised alarms: healthy only if something was read that could have said otherwise."""

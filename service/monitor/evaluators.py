@@ -5,6 +5,9 @@ which only healthy recordings are known is compared with its baseline (`Baseline
 no equation, each channel with its own healthy form.
 """
 
+from contextlib import suppress
+from dataclasses import replace
+
 import numpy as np
 
 from models.commissioning.commissioned import Commissioned, Installed
@@ -13,7 +16,8 @@ from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.moments import states_of
 from models.diagnosis.readings import Diagnosis, no_reading
 from models.diagnosis.sensors.reference import Naming
-from models.diagnosis.verdict.sequential import SequentialSettings
+from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.stretch import determined
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
@@ -24,6 +28,10 @@ from service.monitor.evaluation import Evaluation, Newest, WindowEvaluator
 from service.monitor.known_machine import KnownMachineEvaluator
 
 _SHAPE = "shape"
+# Standard deviations of the misfit: up to which a window holds no change and a shorter stretch is explained, and by how
+# many one must leave less than its share of what the window does, to be of another machine than the rest.
+_INSIDE, _LESS = 2.0, 3.0
+_ASTRIDE = "the machine changed within the window: its latest data fit for themselves, all of it together does not"
 _NO_EQUATION = "no equation can be evaluated on this machine; see the result for each channel"
 
 
@@ -71,23 +79,59 @@ class BaselineEvaluator(WindowEvaluator):
         self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate
         self._baselines = tuple((one.conditions, one.baseline.diagnostician()) for one in commissioned.baselines)
         self.by = self._baselines[0][1].by if self._baselines else _SHAPE
+        self.takes_short = self._baselines != ()
 
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`; outside the commissioned conditions it is not evaluable."""
-        _ = newest
         outside = self._conditions.outside(window, self._naming)
         if outside:
             here = "not evaluable here" if self._diagnosed else "levels are judged as at the nearest commissioned speed"
             raise EstimationError(f"{self._place}: {here}: {outside}")
         speed = float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else None
+        short: dict[int, Diagnosis] = {}
         if self._baselines:
-            clear = window.without_lines if self._lines else window
-            deciding = determined(self._baseline_for(window).diagnose(clear), window, self._length_s)
+            deciding = self._read(window)
+            if newest is not None:
+                deciding, short = self._newest(*newest, deciding)
         else:
             nothing = tuple(no_reading(name, _SHAPE, _NO_EQUATION) for name in PARAMETERS)
             deciding = Diagnosis(_SHAPE, nothing, covariance=np.zeros((0, 0)))
         shapes = () if self._shape is None or deciding.evaluable else self._shape.judge(window, self._shape_rate)
-        return Evaluation(deciding, {}, _row_readings(deciding, window), (), speed, shapes)
+        return Evaluation(deciding, short, _row_readings(deciding, window), (), speed, shapes, alone=not short)
+
+    def _read(self, window: WindowStatistics) -> Diagnosis:
+        clear = window.without_lines if self._lines else window
+        return determined(self._baseline_for(window).diagnose(clear), window, self._length_s)
+
+    def _newest(
+        self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis
+    ) -> tuple[Diagnosis, dict[int, Diagnosis]]:
+        """What the window and its latest hops say, by how many, where it may be astride a change.
+
+        A short stretch has little power: of a machine that no parameter describes it leaves as much less as it is
+        shorter, and is then no witness for a change of parameters. So it is heard only where it is well inside and
+        leaves clearly less than its share of what the window does, some of which has been explained before. The window
+        is of two machines then.
+        """
+        found: dict[int, Diagnosis] = {}
+        whole, misfit_z = test.settings.window_hops, deciding.misfit_z or 0.0
+        if misfit_z <= _INSIDE and test.wanted() == test.settings.short_hops:
+            return deciding, found
+        limit, start_ns = test.thresholds(whole).outside, sliding.hops[0].start_ns
+        outside = misfit_z > limit
+        before = [one for one in test.state.sums.get(1, ()) if one.end_ns > start_ns and not one.unexplained]
+        if outside and not any((one.misfit_z or 0.0) <= limit for one in before):
+            return deciding, found
+        for hops in test.wanted():
+            with suppress(EstimationError):  # too little data for itself, or outside the commissioned conditions
+                if (statistics := sliding.statistics(hops, lagged=True)) is not None:
+                    read = self._read(statistics)
+                    most = min(_INSIDE, misfit_z * (hops / whole) ** 0.5 - _LESS) if outside else _INSIDE
+                    if not read.unexplained and (read.misfit_z or 0.0) < most:
+                        found[hops] = read
+        if found and outside and not deciding.unexplained:
+            deciding = replace(deciding, unexplained=_ASTRIDE)
+        return deciding, found
 
     def _baseline_for(self, window: WindowStatistics) -> BaselineDiagnostician:
         """The baseline of these conditions."""

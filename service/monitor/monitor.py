@@ -453,7 +453,7 @@ class MachineMonitor:
         verdict = self._test.update(looks, foreign=foreign.text != "")
         unexplained = evaluation.deciding.unexplained
         suspect = evaluation.deciding.suspect
-        astride_s = 0.0 if foreign.text else self._test.astride_s
+        astride_s = self._test.astride_s if evaluation.alone and not foreign.text else 0.0
         self._alarms.found(verdict, self._test.unexplained, suspect, end_ns, hidden=foreign.hides, astride_s=astride_s)
         explained = bool(verdict.changed) and not verdict.outside_model
         self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=explained)

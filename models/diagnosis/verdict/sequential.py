@@ -145,9 +145,9 @@ class SequentialTest:
 
     @property
     def astride_s(self) -> float:
-        """For how long windows that are outside the model may be astride a change, where no shorter stretch says; s."""
+        """For how long windows that are outside the model may be astride a change, s."""
         began_ns, windows = self.state.outside_ns, self.state.sums.get(1)
-        if self.settings.short_hops or began_ns is None or not windows:
+        if began_ns is None or not windows:
             return 0.0
         lasts_ns = round(self.settings.window_hops * self.settings.hop_s * 1e9)
         return max(0, lasts_ns - (windows[-1].end_ns - began_ns)) / 1e9

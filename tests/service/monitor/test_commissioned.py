@@ -71,6 +71,18 @@ def test_a_change_is_named_alone(name: str, change: float) -> None:
     assert low - 0.05 < change < high + 0.05
 
 
+def test_a_change_within_the_window_is_named_and_is_not_outside_the_model() -> None:
+    """Windows astride it fit neither the machine as it was nor as it is; their latest data fit."""
+    begins_s = 63.0
+    change = Event(at_s=begins_s, parameter="k_by", relative_change=-0.35)
+    blocks = stream(97.0, SEED + 5, change)
+    _, events = feed(MachineMonitor(installed()), blocks)
+    told = [event for event in events if not event.alarm.name.startswith(LEVEL)]
+    assert [event.alarm.name for event in told] == ["k_by"]
+    assert not told[0].alarm.low_confidence
+    assert (told[0].time_ns - blocks[0].start_ns) / 1e9 < begins_s + 25.0
+
+
 def test_another_speed_is_not_evaluable_here_and_raises_nothing_but_levels() -> None:
     faster = Event(at_s=0.0, speed_rpm=1.15 * LAB.operation.speed_rpm)
     windows, events = feed(MachineMonitor(installed()), stream(65.0, SEED + 3, faster))
