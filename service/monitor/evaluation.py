@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from models.diagnosis.readings import Diagnosis, no_reading
+from models.diagnosis.sensors.level import at_range_end
+from models.diagnosis.sensors.reference import Naming
 from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.verdict.calibration import agreements
 from models.diagnosis.verdict.sequential import SequentialTest
@@ -16,6 +18,8 @@ from models.signals.channels import Channel, with_channel_names
 from rotorwatch.records.health import HealthState
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import Equation, Opinion, Parameter, SensorFault, Shape
+
+_INSIDE = 2.0  # standard deviations of the misfit within which nothing has to be explained
 
 Newest = tuple[SlidingWindow, SequentialTest]
 """Where the window is the latest, and what wants its latest hops evaluated."""
@@ -58,6 +62,10 @@ class Evaluation:
         )
 
     @property
+    def _doubtful(self) -> bool:
+        return self.deciding.unexplained != "" or (self.deciding.misfit_z or 0.0) > _INSIDE
+
+    @property
     def unlike_healthy(self) -> str:
         """What has been seen, where no equation can be evaluated."""
         return "; ".join(filter(None, (self.deciding.suspect, *self._changed)))
@@ -79,15 +87,19 @@ class Evaluation:
         reasons = (one.reason for one in self.deciding.parameters if one.reason)
         return "; ".join(dict.fromkeys([*self._changed, *reasons]))
 
-    def named(self, channels: Sequence[Channel], foreign: str) -> "Evaluation":
+    def named(self, channels: Sequence[Channel], window: WindowStatistics, foreign: str) -> "Evaluation":
         """The same with sentences in the names of a machine's channels.
 
         Parameters
         ----------
+        window : WindowStatistics
+            What is evaluated: channels that reach the end of their range explain what does not fit.
         foreign : str
             What was seen that no change of a parameter makes: the first suspect. Empty if nothing.
         """
-        suspect = foreign or with_channel_names(self.deciding.suspect, channels)
+        limited = [] if foreign or self.shapes or not self._doubtful else at_range_end([window], Naming(channels))
+        ends = f"{'; '.join(limited)}, the end of its range" if limited else ""
+        suspect = foreign or ends or with_channel_names(self.deciding.suspect, channels)
         return replace(
             self,
             deciding=replace(self.deciding, suspect=suspect),

@@ -446,7 +446,7 @@ class MachineMonitor:
         except EstimationError as error:
             return unread(HealthState.WATCHING if self._watching else HealthState.NOT_EVALUABLE, str(error))
         foreign = self._levels.foreign(self._window, statistics, named=bool(self._test.state.findings))
-        evaluation = evaluation.named(self.machine.sensors, foreign.text)
+        evaluation = evaluation.named(self.machine.sensors, statistics, foreign.text)
         looks = {n: stretch_of(one, self._window.hops[-n].start_ns, end_ns) for n, one in evaluation.short.items()}
         whole = self._test.settings.window_hops
         looks[whole] = stretch_of(evaluation.deciding, start_ns, end_ns)

@@ -11,11 +11,13 @@ import pytest
 
 from models.alarm_names import MODEL
 from models.commissioning.commissioned import install
+from models.diagnosis.readings import Diagnosis
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.alarms.alarm import AlarmEvent
+from service.monitor.evaluation import Evaluation
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
@@ -339,6 +341,22 @@ def test_a_report_says_what_would_have_been_noticed_and_who_agrees() -> None:
     (relation,) = (opinion for opinion in window.opinions if opinion.by == "relation")
     assert {one.verdict for one in relation.agreement if one.name != "EI"} == {"agree"}
     assert {one.verdict for one in relation.agreement if one.name == "EI"} == {"only-one"}
+
+
+def test_where_peaks_are_cut_off_now_and_then_the_range_is_what_is_told() -> None:
+    """Too few samples lie there to be called clipped, and enough to bend the spectra."""
+    blocks = healthy(63.0)
+    samples = rotor_kit.samples_of(blocks)
+    measured = samples[:, [channel.quantity != "shaft_angle" for channel in rotor_kit.LAB.sensors]]
+    low, high = np.quantile(measured, [0.0015, 0.9985], axis=0)
+    samples[:, : measured.shape[1]] = np.clip(measured, low, high)
+    target = monitor()
+    windows, _ = feed(target, rotor_kit.with_samples(blocks, samples))
+    assert not windows[-1].sensors
+    for misfit_z, told in ((9.0, "y2 is at exactly"), (0.0, "a mass")):
+        evaluation = Evaluation(Diagnosis("", misfit_z=misfit_z, suspect="a mass"), {}, (), (), None)
+        found = evaluation.named(target.machine.sensors, sure(target.window)(), "").deciding.suspect
+        assert told in found
 
 
 def test_without_a_bundle_the_equations_say_so() -> None:
