@@ -32,6 +32,7 @@ from running_monitor import on_loopback, serving
 
 from models.machine import MachineFile, load_machine
 from models.signals.link import LinkSettings
+from service.runtime.fleet import HEALTH_CHECKS
 from service.stream.transport import route
 from simulator.scenario import load_scenario, parse_fault
 from simulator.stream import blocks
@@ -40,8 +41,6 @@ COMPUTERS, CORES = 3, 2
 EVERY = 4
 BETWEEN_S = 30.0
 PATIENCE_S = 120.0
-CHECKS = {"health_check_period_ms": 1000, "health_check_timeout_ms": 2000, "health_check_failure_threshold": 5}
-"""Ray's health checks as ``docs/service.md`` starts it."""
 WARM_S = 80.0
 
 
@@ -68,7 +67,7 @@ def fleet_files(folder: Path, machines: Sequence[MachineFile], database: str, li
 @contextmanager
 def cluster_of() -> Iterator[Any]:
     """A Ray cluster of these computers, beside one without cores."""
-    head = {"num_cpus": 0, "include_dashboard": False, "_system_config": CHECKS}
+    head = {"num_cpus": 0, "include_dashboard": False, "_system_config": json.loads(HEALTH_CHECKS)}
     cluster = Cluster(initialize_head=True, head_node_args=head)
     try:
         for _ in range(COMPUTERS):

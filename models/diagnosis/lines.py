@@ -28,6 +28,8 @@ from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
 _STEADY = 1.35  # fourth power over the square of the second: 2 for noise, 1 for a line; between them with little data
+_NO_BURST = 1.8
+"""The same: 1.2 to 1.4 for a faint line, over 2.2 for what rings in a few segments and keeps its phase there."""
 _STANDS_OUT, _FAINT = 8.0, 4.0  # power over that of its surroundings: seen in one window alone, and in two
 _NEIGHBOURHOOD_HZ = 4.0
 _LOBE = 2  # a Hann window spreads a line over two bins on either side
@@ -102,10 +104,10 @@ def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistic
         lobe = slice(max(0, at - _LOBE), at + _LOBE + 1)
         if mean[at, column] < mean[lobe, column].max():
             continue
-        clear = mean[at, column] > _STANDS_OUT * floor[at, column]
-        clear &= (power[:, at, column] ** 2).mean() < _STEADY * mean[at, column] ** 2
+        spread = float((power[:, at, column] ** 2).mean() / mean[at, column] ** 2)
+        clear = mean[at, column] > _STANDS_OUT * floor[at, column] and spread < _STEADY
         chance = _chance(segments[:, at, column])
-        likely = chance < math.sqrt(_CHANCE)
+        likely = spread < _NO_BURST and chance < math.sqrt(_CHANCE)
         if clear or likely:
             share = min(1.0, float(2 * step_hz * mean[lobe, column].sum() / total[column]))
             certain = bool(clear and chance < _CHANCE)
@@ -180,9 +182,10 @@ class LatestLines:
 
     def take(self, lines: Sequence[Line], window: WindowStatistics) -> tuple[Line, ...]:
         """Go on with a window: its lines, those certain too that one had which ended before it began."""
-        oldest_ns = 2 * window.start_ns - window.end_ns
-        self._seen = [(end_ns, line) for end_ns, line in self._seen if end_ns >= oldest_ns]
-        before = [line for end_ns, line in self._seen if end_ns <= window.start_ns]
+        length_ns = window.end_ns - window.start_ns
+        # What is later is of a clock that was set back. Where clocks run apart, a window begins a little early.
+        self._seen = [one for one in self._seen if window.start_ns - length_ns <= one[0] < window.end_ns]
+        before = [line for end_ns, line in self._seen if end_ns <= window.start_ns + length_ns // 100]
         self._seen += [(window.end_ns, line.known(window.speed_rad_s)) for line in lines if line.likely]
         return tuple(
             replace(line, certain=True) if line.likely and _among(line, before, window.speed_rad_s) else line

@@ -125,15 +125,17 @@ class WindowStatistics:
         """Sums of the spectra over the bins of `pair_bands`, shape (n_bands, n, n)."""
         return np.asarray(np.add.reduceat(self.spectrum, pair_bands(self.frequencies_hz.size)), dtype=np.complex128)
 
-    @cached_property
+    @property
     def without_lines(self) -> "WindowStatistics":
         """The same window without `lines` in its correlations and spectra.
 
         A line is as strong at all lags, and neither goes with the motion at a bearing nor is forgotten by any force.
         """
+        return self if all(line.power is None for line in self.lines) else self._cleared
+
+    @cached_property
+    def _cleared(self) -> "WindowStatistics":
         lines = [line for line in self.lines if line.power is not None]
-        if not lines:
-            return self
         turns = np.exp(-2j * np.pi * self.lags_s[:, None] * [line.centre_hz for line in lines])
         gone = np.tensordot(turns, np.stack([line.power for line in lines if line.power is not None]), axes=1).real
         spectrum = replace(self, lines=tuple(lines)).spectrum_without_lines

@@ -131,7 +131,8 @@ def fleet(
 
     Ray gives each group of machines a computer with room, and another one when that is lost; this process serves HTTP,
     the page, metrics and webhooks for all of them. It needs a history in PostgreSQL, Zenoh routers that sensors and
-    computers connect to, and an endpoint of its own: see "Fleets" in docs/service.md.
+    computers connect to, and an endpoint of its own: see "Fleets" in docs/service.md, also for the health checks with
+    which Ray notices sooner that a computer is lost.
 
     [bold]Example[/bold]
 

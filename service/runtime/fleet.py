@@ -40,6 +40,8 @@ _ANSWER_S = 5.0
 _BALANCE_S = 5.0
 _SETTLED_S = 60.0
 """Since its latest start, before a shard is moved: one that is moved while it catches up is out of service twice."""
+HEALTH_CHECKS = '{"health_check_period_ms": 1000, "health_check_timeout_ms": 2000, "health_check_failure_threshold": 5}'
+"""Of Ray, to notice after some 5 s that a computer is lost; it takes 13 to 15 s without them."""
 _VARIABLES = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """As in a monitor of one process: results do not depend on the number of cores."""
 
@@ -140,14 +142,16 @@ class Fleet:
                 _log.warning("the cluster does not report its computers", why=str(error))
                 continue
             placed = [one for one in self._processes if one.computer]
-            now_s = time.monotonic()
-            if len(placed) < len(self._processes) or any(now_s - one.placed_s < _SETTLED_S for one in placed):
+            if len(placed) < len(self._processes):
                 continue  # a shard is on its way, and its cores are taken soon
-            move = better_place([(one.computer, one.cores) for one in placed], cores)
-            if move is not None:
-                number, computer = move
-                _log.info("a shard moves to a less busy computer", shard=number + 1)
-                placed[number].move_to(computer)
+            shards = [(one.computer, one.cores) for one in placed]
+            move = better_place(shards, cores)
+            settled_s = time.monotonic() - _SETTLED_S
+            for number, shard in enumerate(placed):
+                if move is not None and shards[number] == shards[move[0]] and shard.placed_s < settled_s:
+                    _log.info("a shard moves to a less busy computer", shard=number + 1)
+                    shard.move_to(move[1])
+                    break
 
 
 def better_place(shards: Sequence[tuple[str, float]], cores: Mapping[str, float]) -> tuple[int, str] | None:
@@ -202,7 +206,8 @@ def join_cluster(address: str, undo: ExitStack) -> None:
         ray.init(address=address, namespace="rotorwatch", logging_level="warning", runtime_env={"env_vars": _VARIABLES})
     except (OSError, RuntimeError, ValueError) as error:
         raise RotorwatchError(
-            f"no Ray cluster at {address}: {error}; start one with: RAY_worker_niceness=0 ray start --head"
+            f"no Ray cluster at {address}: {error}; start one with: RAY_worker_niceness=0 ray start --head "
+            f"--system-config '{HEALTH_CHECKS}'"
         ) from error
     undo.callback(ray.shutdown)
 
@@ -299,7 +304,8 @@ class _Actor:
             return None
         said, computer = found
         if self._next == 0 and "\n" not in said:
-            self.computer, self._life, self.placed_s = computer, self._actor.wait.remote(), time.monotonic()
+            self.placed_s = time.monotonic()
+            self.computer, self._life = computer, self._actor.wait.remote()
         self._next += 1
         return said
 

@@ -20,13 +20,15 @@ _log = logger(part="evidence")
 
 
 class EvidenceCollector:
-    """Keeps pictures of one machine, in its history alone, for they are large; for one thread."""
+    """Keeps pictures of one machine, in its history, for they are large; for one thread."""
 
     def __init__(self, worker: MachineWorker) -> None:
         self._worker = worker
         self._looked_ns: int | None = None
         self._calm_ns: int | None = None  # end of the latest window kept while nothing was wrong
-        self._settled: dict[tuple[str, int], bool] = {}  # alarms that stand and are kept: settled, too?
+        # What alarms that are raised rest on, until it is whole.
+        self._standing: dict[tuple[str, int], AlarmEvidence | None] = {}
+        self._generation = worker.history.generation
         self._limiter = Limiter()
 
     def look(self, health: Health) -> None:
@@ -35,14 +37,15 @@ class EvidenceCollector:
         if report is None or report.end_ns == self._looked_ns:
             return
         try:
-            if self._looked_ns is None and (before := self._before()) is not None:
+            if self._generation != self._worker.history.generation:  # begun anew, without what was kept
+                self._generation, self._calm_ns = self._worker.history.generation, None
+            elif self._looked_ns is None and (before := self._before()) is not None:
                 self._calm_ns = before.report.end_ns
             raised = {(one.name, one.occurrence): one for one in health.alarms if _rests_on_a_window(one)}
-            self._settled = {key: settled for key, settled in self._settled.items() if key in raised}
+            self._standing = {key: kept for key, kept in self._standing.items() if key in raised}
             for key, alarm in raised.items():
-                settled = _is_settled(alarm, report)
-                if key not in self._settled or (settled and not self._settled[key]):
-                    self._settled[key] = self._keep(alarm, report, settled=settled)
+                if key not in self._standing or self._standing[key] is not None:
+                    self._standing[key] = self._keep(self._standing.get(key), alarm, report)
             is_new = self._calm_ns is None or abs(report.end_ns - self._calm_ns) >= _CALM_NS
             if is_new and _is_calm(health, report):
                 self._worker.history.keep_evidence(_BEFORE, 0, self._picture(report).model_dump_json())
@@ -56,28 +59,27 @@ class EvidenceCollector:
         text = self._worker.history.evidence(_BEFORE)
         return Picture.model_validate_json(text) if text else None
 
-    def _keep(self, alarm: Alarm, report: Report, *, settled: bool) -> bool:
-        """Keep what is not kept yet; whether the settled window is."""
-        history = self._worker.history
-        text = history.evidence(alarm.name, alarm.occurrence)  # from before a restart, or before it was settled
-        kept = AlarmEvidence.model_validate_json(text) if text else None
-        if kept is not None and (kept.settled is not None or not settled):
-            return kept.settled is not None
-        now = self._picture(report)
-        if kept is None:
-            kept = AlarmEvidence(
-                site=report.site,
-                machine=report.machine,
-                name=alarm.name,
-                occurrence=alarm.occurrence,
-                before=self._before(),
-                raised=now,
-                settled=now if settled else None,
-            )
-        else:
-            kept = kept.model_copy(update={"settled": now})
-        history.keep_evidence(alarm.name, alarm.occurrence, kept.model_dump_json())
-        return settled
+    def _keep(self, kept: AlarmEvidence | None, alarm: Alarm, report: Report) -> AlarmEvidence | None:
+        """Keep what is not kept yet; returns it until it is whole."""
+        history, settled = self._worker.history, _is_settled(alarm, report)
+        if kept is None and (text := history.evidence(alarm.name, alarm.occurrence)):  # from before a restart
+            kept = AlarmEvidence.model_validate_json(text)
+        if kept is None or (settled and kept.settled is None):
+            now = self._picture(report)
+            if kept is None:
+                kept = AlarmEvidence(
+                    site=report.site,
+                    machine=report.machine,
+                    name=alarm.name,
+                    occurrence=alarm.occurrence,
+                    before=self._before(),
+                    raised=now,
+                    settled=now if settled else None,
+                )
+            else:
+                kept = kept.model_copy(update={"settled": now})
+            history.keep_evidence(alarm.name, alarm.occurrence, kept.model_dump_json())
+        return kept if kept.settled is None else None
 
     def _picture(self, report: Report) -> Picture:
         latest, snapshots = self._worker.latest, self._worker.snapshots

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 _LASTING_S = 30.0
 _LONGEST_TURN_S = 3.0
 _lock = threading.Lock()
-_turns: deque[threading.Lock] = deque()
-"""Of the machine whose turn it is, and of those that wait for theirs."""
+_turns: deque[threading.Event] = deque()
+"""Of the machine whose turn it is, and of those that wait for theirs; set for whose has come."""
 
 
 @contextmanager
@@ -21,25 +21,33 @@ def in_turn(*, completes_hop: bool) -> Iterator[None]:
     the middle of their arithmetic: each holds its intermediate results meanwhile, and finds the processor's caches
     filled with those of the others. After a stall, all machines have their next window before any has its last one.
 
-    A machine that waits for longer than `_LONGEST_TURN_S` goes on beside the others: one that never ends stops none.
+    A turn that lasts longer than `_LONGEST_TURN_S` is over for the others: one that never ends stops none.
     """
     if not completes_hop:
         yield
         return
-    mine = threading.Lock()
+    mine = threading.Event()
     with _lock:
         _turns.append(mine)
-        if _turns[0] is not mine:
-            mine.acquire()
-    mine.acquire(timeout=_LONGEST_TURN_S)
+        _turns[0].set()
+    while not mine.is_set():
+        with _lock:
+            first = _turns[0]
+        if not mine.wait(_LONGEST_TURN_S):
+            _end(first)
     try:
         yield
     finally:
-        with _lock:
-            had_turn = _turns[0] is mine
-            _turns.remove(mine)
-            if had_turn and _turns:
-                _turns[0].release()
+        _end(mine)
+
+
+def _end(turn: threading.Event) -> None:
+    """Let the next one begin, if this turn has not been ended before."""
+    with _lock:
+        if turn in _turns:
+            _turns.remove(turn)
+            if _turns:
+                _turns[0].set()
 
 
 class LoadShedding:

@@ -88,21 +88,49 @@ def test_neither_a_multiple_of_the_speed_nor_a_narrow_resonance_is_one() -> None
     assert not any(one.certain for one in lines(resonance / resonance.std()))
 
 
-@pytest.mark.parametrize(("apart", "second_hz", "certain"), [(1.0, 30.0, True), (0.9, 30.0, False), (1.0, 33.0, False)])
+def taken(latest: LatestLines, made: HealthyRecording, after: float) -> tuple[Line, ...]:
+    """Its window, moved to so many windows later."""
+    window = window_statistics(made.plan, made.hops, lagged=False)
+    later_ns = round(after * (window.end_ns - window.start_ns))
+    window = replace(window, start_ns=window.start_ns + later_ns, end_ns=window.end_ns + later_ns)
+    return latest.take(steady_lines(made.plan, made.hops, window), window)
+
+
+@pytest.mark.parametrize(
+    ("apart", "second_hz", "certain"),
+    [(1.0, 30.0, True), (0.9999, 30.0, True), (0.9, 30.0, False), (1.0, 33.0, False), (2.1, 30.0, False)],
+)
 def test_a_line_too_faint_for_one_window_is_certain_in_two(apart: float, second_hz: float, certain: bool) -> None:
-    latest, found = LatestLines(), []
+    latest, found = LatestLines(), tuple[Line, ...]()
     for number, hz in enumerate((30.0, second_hz)):
         made = recording(noise(30 + number) + line(hz, 0.09))
-        window = window_statistics(made.plan, made.hops, lagged=False)
-        later_ns = round(number * apart * (window.end_ns - window.start_ns))
-        window = replace(window, start_ns=window.start_ns + later_ns, end_ns=window.end_ns + later_ns)
-        found = [one for one in latest.take(steady_lines(made.plan, made.hops, window), window) if one.state == "y1"]
+        found = tuple(one for one in taken(latest, made, number * apart) if one.state == "y1")
         assert [one.likely for one in found] == [True]
         assert number or not found[0].certain
         restored = LatestLines()
         restored.restore(latest.checkpoint())
         latest = restored
     assert found[0].certain is certain
+
+
+def test_lines_from_before_a_clock_was_set_back_are_forgotten() -> None:
+    latest, made = LatestLines(), recording(noise(30) + line(30.0, 0.09))
+    for _ in range(3):  # a recording that is sent again and again
+        for after in (0.0, 0.1, 0.2):
+            taken(latest, made, after)
+    assert len(latest.checkpoint()["lines"]) == 3
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.003])
+def test_one_impact_or_burst_in_each_window_is_none(damping: float) -> None:
+    """It is in phase as long as it lasts, and what lasts for a few segments only is no line."""
+    machine, latest = with_segments(2.0), LatestLines()
+    for number, at_s in enumerate((20.3, 41.7)):
+        since = np.clip(T - at_s, 0.0, None)
+        rings = 10 * np.exp(-2 * np.pi * 12.0 * damping * since) * np.sin(2 * np.pi * 12.0 * since)
+        made = recording(rings if damping else rings * (since < 5.0), machine=machine)
+        assert new_line(taken(latest, made, number), (), 2 * np.pi * SPEED_HZ) is None
+        assert check_lines(machine, [made]).verdict == "passed"
 
 
 def test_a_burst_is_none() -> None:

@@ -9,7 +9,7 @@ from structlog.testing import capture_logs
 
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, HealthState
-from rotorwatch.records.history import AlarmEvidence
+from rotorwatch.records.history import AlarmEvidence, Picture
 from service.history.records import StoreError
 from service.runtime.runtime import running
 from service.stream.evidence import EvidenceCollector
@@ -89,6 +89,39 @@ def test_a_database_that_is_away_does_not_fill_the_log() -> None:
         for _ in range(40):  # looks of ten seconds
             collector.look(Health.model_validate(example(Health)))
     assert [one["why"] for one in logged] == ["the database is away"]
+
+
+def test_a_history_that_begins_anew_gets_what_an_alarm_rests_on_when_the_change_is_all_there_is() -> None:
+    """And another picture of the machine while nothing is wrong."""
+    kept: dict[tuple[str, int], str] = {}
+    worker = Mock()
+    worker.history.evidence.side_effect = lambda name, occurrence=0: kept.get((name, occurrence))
+    worker.history.keep_evidence.side_effect = lambda name, occurrence, text: kept.update({(name, occurrence): text})
+    worker.history.generation = 0
+    collector, picture = EvidenceCollector(worker), Picture.model_validate(example(Picture))
+    alarming = Health.model_validate(example(Health))
+    report, (alarm, *_) = sure(alarming.report), alarming.alarms
+    collector._picture = lambda report: picture.model_copy(update={"report": report})  # type: ignore[method-assign]  # of the window alone
+
+    def look(end_s: int, *, calm: bool = False, settled: bool = False) -> None:
+        verdict = sure(report.verdict).model_copy(update={"settled": settled})
+        state = HealthState.HEALTHY if calm else report.state
+        now = report.model_copy(update={"end_ns": end_s * 10**9, "state": state, "verdict": None if calm else verdict})
+        alarms = () if calm else (alarm.model_copy(update={"raised": True}),)
+        collector.look(alarming.model_copy(update={"report": now, "alarms": alarms}))
+
+    look(10, calm=True)
+    look(20)
+    kept.clear()
+    worker.history.generation = 1
+    look(30)
+    assert kept == {}
+    look(40, settled=True)
+    found = AlarmEvidence.model_validate_json(kept[alarm.name, alarm.occurrence])
+    ends = [sure(one).report.end_ns for one in (found.before, found.raised, found.settled)]
+    assert ends == [10 * 10**9, 20 * 10**9, 40 * 10**9]
+    look(50, calm=True)
+    assert Picture.model_validate_json(kept["", 0]).report.end_ns == 50 * 10**9
 
 
 def test_evidence_of_many_occurrences_does_not_grow_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,16 +16,15 @@ from models.signals.link import LinkSettings
 from rotorwatch.records.health import HealthState
 from service.commands.rotorwatch import app
 from service.runtime import fleet
-from service.runtime.fleet import better_place, fleet_count
+from service.runtime.fleet import HEALTH_CHECKS, better_place, fleet_count
 from service.runtime.runtime import Runtime, running
 from service.runtime.shards import Shards
 from service.settings.service import FleetSettings, HistorySettings, MachineEntry, ServiceSettings
 from service.stream.transport import route
 from simulator.scenario import parse_fault
-from tests.service.rig.live import Feed, endpoint, open_session, scenario_blocks, until
+from tests.service.rig.live import ROOT, Feed, endpoint, open_session, scenario_blocks, until
 from tests.service.rig.postgres import postgres_server
 from tests.service.rig.replaying import recording
-from tests.service.runtime.test_fleet_hosts import CHECKS
 from tests.service.runtime.test_shards import SECONDS, plan_for
 
 SETTLED_S = 20.0
@@ -47,7 +46,11 @@ def cluster() -> Iterator["Cluster"]:
     """A Ray cluster of two computers with a core each, beside one without any; all are this computer."""
     from ray.cluster_utils import Cluster  # noqa: PLC0415  # half a second, and every worker reads this module
 
-    head = {"num_cpus": 0, "include_dashboard": False, "_system_config": {"worker_niceness": 0} | json.loads(CHECKS)}
+    head = {
+        "num_cpus": 0,
+        "include_dashboard": False,
+        "_system_config": {"worker_niceness": 0} | json.loads(HEALTH_CHECKS),
+    }
     made = Cluster(initialize_head=True, head_node_args=head)
     try:
         for _ in range(2):
@@ -73,6 +76,7 @@ def test_a_computer_that_is_lost_and_one_that_comes(
 ) -> None:
     monkeypatch.setattr(fleet, "_SETTLED_S", SETTLED_S)
     blocks = scenario_blocks(SECONDS, parse_fault("k_by=-0.33@10"))
+    assert HEALTH_CHECKS in (ROOT / "docs" / "service.md").read_text(encoding="utf-8")
     with postgres_server() as server:
         plan = fleet_plan(tmp_path, server.new_database("fleet"))
         at = plan.link.connect[0]

@@ -20,6 +20,7 @@ from models.commissioning.commissioned import Installed
 from models.machine import load_machine
 from rotorwatch.records.health import Health, HealthState
 from service.monitor.monitor import MachineMonitor
+from service.runtime.fleet import HEALTH_CHECKS
 from simulator.scenario import load_scenario, parse_fault
 from simulator.stream import blocks
 from tests.service.rig.hosts import MIDDLE, Hosts, hosts, why_not
@@ -36,7 +37,6 @@ AGAIN_S = 60.0
 """PostgreSQL lets go of a silent host after 15 s, Ray notices it after about 5; a process starts, a hop comes."""
 FAULT = "k_by=-0.33@30"
 START_NS = 1_767_225_600 * 10**9
-CHECKS = '{"health_check_period_ms":1000,"health_check_timeout_ms":2000,"health_check_failure_threshold":5}'
 _VARIABLES = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_worker_niceness": "0",
@@ -162,7 +162,7 @@ def test_a_cut_cable_and_a_lost_host_leave_the_alarm_logs_of_a_fleet_as_they_wou
             return node(host, "--address", f"{net.address('first')}:6379", "--num-cpus", "2")
 
         head = ("--head", "--port", "6379", "--num-cpus", "0", "--include-dashboard", "false", "--temp-dir", str(rays))
-        node("first", *head, "--system-config", CHECKS)
+        node("first", *head, "--system-config", HEALTH_CHECKS)
         worker("left")
         right = worker("right")
         where = ("--address", f"{net.address('first')}:6379", "--config", str(settings))

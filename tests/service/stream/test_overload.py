@@ -4,7 +4,9 @@ import json
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -263,47 +265,53 @@ def test_blocks_of_others_and_bursts_for_an_idle_worker_are_no_reason_to_skip() 
 # Whose turn it is
 
 
-@pytest.mark.parametrize(("patience_s", "waits"), [(60.0, True), (0.05, False)])
-def test_a_hop_is_computed_when_that_of_another_machine_is_or_has_taken_too_long(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, patience_s: float, *, waits: bool
-) -> None:
-    monkeypatch.setattr(shedding, "_LONGEST_TURN_S", patience_s)
+def test_the_last_block_of_a_hop_waits_for_its_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shedding, "_LONGEST_TURN_S", 60.0)
     with fed_service(short_machine(tmp_path)) as (_, worker, feed):
+        first, *others = scenario_blocks(10.0)
+        feed.put(first)  # nobody knows yet how many blocks a hop has
+        until(lambda: worker.tally.blocks == 1, "the first block")
         with in_turn(completes_hop=True):  # another machine's
-            for block in scenario_blocks(10.0):
+            for block in others:
                 feed.put(block)
             until(lambda: worker.tally.blocks >= 74, "the blocks before the last one of the first hop, of 7.5 s")
-            if not waits:
-                until(lambda: worker.tally.blocks == 100, "all blocks")
             time.sleep(0.3)
-            assert worker.tally.blocks == (74 if waits else 100)
+            assert worker.tally.blocks == 74
         until(lambda: worker.tally.blocks == 100, "all blocks")
 
 
-def test_turns_come_in_the_order_in_which_they_were_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One who went on beside the others has had his turn."""
-    monkeypatch.setattr(shedding, "_LONGEST_TURN_S", 60.0)
-    began: list[int] = []
-    ended = [threading.Event() for _ in range(6)]
+def test_turns_come_one_by_one_in_the_order_in_which_they_were_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However long they take together; one that never ends is waited for once."""
+    asked, began, beside, ends = list[int](), list[int](), list[int](), threading.Event()
 
-    def take(number: int) -> None:
+    class Turns(deque[threading.Event]):
+        def append(self, turn: threading.Event) -> None:
+            asked.append(threading.get_ident())
+            super().append(turn)
+
+    def take(first: bool = False) -> None:
         with in_turn(completes_hop=True):
-            began.append(number)
-            ended[number].wait(60.0)
+            began.append(threading.get_ident())
+            if first:
+                ends.wait(60.0)
+                return
+            beside.append(1)
+            time.sleep(0.05)
+            assert beside.pop() == 1
+            assert not beside
 
-    threads = [threading.Thread(target=take, args=(number,)) for number in range(6)]
-    for number, thread in enumerate(threads):
-        if number == 3:
-            monkeypatch.setattr(shedding, "_LONGEST_TURN_S", 0.0)
-        thread.start()
-        monkeypatch.setattr(shedding, "_LONGEST_TURN_S", 60.0)
-        until(lambda number=number: len(shedding._turns) == number + 1, "its place among those who wait")  # type: ignore[misc]  # bound now
-    until(lambda: began == [0, 3], "one beside the first")
-    for number in (3, 0, 1, 2, 4, 5):
-        until(lambda number=number: number in began, "its turn")  # type: ignore[misc]  # bound now
-        ended[number].set()
-        threads[number].join()
-    assert began == [0, 3, 1, 2, 4, 5]
+    monkeypatch.setattr(shedding, "_LONGEST_TURN_S", 0.5)
+    monkeypatch.setattr(shedding, "_turns", Turns())
+    with ThreadPoolExecutor(31) as threads:
+        endless = threads.submit(take, True)
+        until(lambda: len(began) == 1, "the turn that never ends")
+        others = [threads.submit(take) for _ in range(30)]  # 1.5 s in all
+        for turn in others:
+            turn.result()
+        assert began == asked
+        assert not endless.done()
+        ends.set()
+        endless.result()
     assert not shedding._turns
 
 
