@@ -8,6 +8,7 @@ import importlib
 import os
 import select
 import socket
+import sqlite3
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from sqlalchemy.dialects import postgresql, sqlite
     from sqlalchemy.sql.schema import Table
 
+_BUSY_S = 0.02
 _ANSWER_S = 60.0  # at least; a query over a long time may take a while
 _FINISH_S = 2.0  # for what others have asked for when the history is closed
 _JOIN_S = 10.0
@@ -321,7 +323,15 @@ class Database:
                     self._bring_up_to_date(connection)
             if self.is_sqlite:  # kept in the file, so not before that is known to be ours
                 with closing(engine.raw_connection()) as raw, closing(raw.cursor()) as cursor:
-                    cursor.execute("PRAGMA journal_mode = WAL")
+                    end_s = time.monotonic() + self.timeout_s
+                    while True:  # SQLite does not wait here for others who open the file at the same time
+                        try:
+                            cursor.execute("PRAGMA journal_mode = WAL")
+                            break
+                        except sqlite3.OperationalError as error:
+                            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > end_s:
+                                raise
+                            time.sleep(_BUSY_S)
                     cursor.execute("PRAGMA schema_version")  # the log is made by whoever reads
             if self.file is not None:
                 self.file.opened()

@@ -38,7 +38,7 @@ from tests.sure import sure
 
 def test_numpy_computes_in_one_thread() -> None:
     code = (
-        "import os, sys\nfrom service import rotorwatch\n"
+        "import os, sys\nfrom service.commands import rotorwatch\n"
         "assert not {'numpy', 'pydantic', 'sqlalchemy', 'zenoh'} & set(sys.modules)  # --help does not wait for them\n"
         "rotorwatch.prepare_numerics()\nimport numpy as np\n"
         "a = np.ones((800, 800))\na @ a\nprint(len(os.listdir('/proc/self/task')))"
