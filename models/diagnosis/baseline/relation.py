@@ -413,20 +413,28 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
         If the window does not determine them: it is explained as it is, and by nearly any change as well.
     """
     usual_s = LAG_FROM_S * window.window.time_scale
-    first = change_of(row, relation, window.beyond(max(usual_s, relation.lag_from_s)))
+    first = change_of(row, relation, window.beyond(max(usual_s, relation.lag_from_s)), stretched=False)
     lag_s = max(relation.lag_from_s, lag_beyond_memory(window, first.combination))
-    change = change_of(row, relation, window.beyond(lag_s))
-    longest = first if lag_s < usual_s else change
+    believed = change = change_of(row, relation, window.beyond(lag_s))
     # An estimate that the window does not determine wanders, to where the misfit is anything: no change counts as well.
-    believed = longest if (longest.fits or longest.unchanged) and not change.fits else change
+    unchanged = change.unchanged
+    if lag_s < usual_s:
+        unchanged |= first.unchanged
+        if (first.fits or first.unchanged) and not change.fits:
+            believed = change_of(row, relation, first.moments)
     errors = zip(row.own, believed.error(relation), strict=True)
-    if (change.unchanged or longest.unchanged) and any(error > LOST for own, error in errors if 0 in own.terms):
+    if unchanged and any(error > LOST for own, error in errors if 0 in own.terms):
         raise EstimationError(f"{row.title}: this window does not determine it at lags beyond the memory of its force")
     return believed
 
 
-def change_of(row: Row, relation: Relation, moments: LagMoments) -> RowChange:
+def change_of(row: Row, relation: Relation, moments: LagMoments, *, stretched: bool = True) -> RowChange:
     """Read the change from given moments.
+
+    Parameters
+    ----------
+    stretched : bool
+        Whether errors are stretched to what the window objects to (`stretching`), which takes most of the time.
 
     Raises
     ------
@@ -469,9 +477,10 @@ def change_of(row: Row, relation: Relation, moments: LagMoments) -> RowChange:
     chi2, freedom = float(left @ W @ left), max(1, rank - d.size)
     # What is left beyond chance was not expected by any of these errors: it is in the change as well.
     beyond = 1.0 if _by_chance(chi2, freedom) else chi2 / freedom
+    stretch = stretching(criterion, d, covariance) if stretched else np.eye(d.size)
     return RowChange(
         change=d,
-        projection=np.sqrt(beyond) * stretching(criterion, d, covariance) @ projection,
+        projection=np.sqrt(beyond) * stretch @ projection,
         sensitivity=-projection @ X,
         moments=moments,
         combination=combination,

@@ -66,14 +66,15 @@ class ForceRow:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SynchronousState:
-    """All that the unbalance depends on."""
+class RelativeForce:
+    """Unbalance force over the healthy one, less one: real parts row by row, then imaginary parts; and its slopes."""
 
-    coefficients: FloatArray  # of all relations
-    change: FloatArray  # of all their own parameters
-    # (2 n,): synchronous vectors
-    now: FloatArray
-    healthy: FloatArray
+    value: FloatArray  # (2 n_rows,)
+    to_coefficients: FloatArray  # (2 n_rows, n_coefficients), of all relations
+    to_change: FloatArray  # (2 n_rows, n_own), of all their own parameters
+    # (2 n_rows, 2 n_coordinates): to real parts of the synchronous vectors, then to their imaginary parts
+    to_now: FloatArray
+    to_healthy: FloatArray
 
 
 def rotation_of(window: WindowStatistics, coordinates: tuple[str, ...]) -> SynchronousVectors | None:
@@ -141,66 +142,67 @@ def rotations_by_speed(found: Sequence[SynchronousVectors]) -> tuple[Synchronous
 
 
 def relative_force(
-    rows: Sequence[ForceRow], state: SynchronousState, now: SynchronousVectors, healthy: SynchronousVectors
-) -> FloatArray:
-    """Unbalance force over the healthy one, less one: real parts row by row, then imaginary parts."""
-    speeds = now.speed_rad_s, healthy.speed_rad_s
-    forces = _forces(rows, state.coefficients, state.change, now.coordinates, state.now, speeds[0])
-    before = _forces(
-        rows, state.coefficients, np.zeros_like(state.change), healthy.coordinates, state.healthy, speeds[1]
+    rows: Sequence[ForceRow],
+    coefficients: FloatArray,
+    change: FloatArray,
+    now: SynchronousVectors,
+    healthy: SynchronousVectors,
+) -> RelativeForce:
+    """Compare what the rows leave of synchronous vectors with what they leave of the healthy ones.
+
+    Parameters
+    ----------
+    coefficients : ndarray, shape (n_coefficients,)
+        Of all relations.
+    change : ndarray, shape (n_own,)
+        Of all their own parameters, relative; the healthy machine has none.
+    """
+    n, n_coordinates = len(rows), len(now.coordinates)
+    ratio = np.zeros(n, dtype=np.complex128)
+    to_coefficients, to_change, to_now, to_healthy = (
+        np.zeros((n, size), dtype=np.complex128)
+        for size in (coefficients.size, change.size, 2 * n_coordinates, 2 * n_coordinates)
     )
-    ratio = forces / before * (speeds[1] / speeds[0]) ** 2 - 1
-    return np.concatenate([ratio.real, ratio.imag])
+    for number, one in enumerate(rows):
+        combination = np.concatenate([[1.0], -coefficients[one.coefficients]])
+        factors = np.ones((len(one.row.own), combination.size))
+        for factor, own, value in zip(factors, one.row.own, change[one.own], strict=True):
+            factor[list(own.terms)] = 1 + value
+        terms, before = _terms(one.row, now), _terms(one.row, healthy)
+        moved, moved_before = terms @ _phasors(now), before @ _phasors(healthy)
+        per_force = (healthy.speed_rad_s / now.speed_rad_s) ** 2 / (combination @ moved_before)
+        scaled = combination * factors.prod(axis=0)
+        ratio[number] = per_force * (scaled @ moved)
+        lost = ratio[number] / (combination @ moved_before)
+        to_coefficients[number, one.coefficients] = (lost * moved_before - per_force * factors.prod(axis=0) * moved)[1:]
+        to_change[number, one.own] = [
+            per_force * (combination * np.delete(factors, at, axis=0).prod(axis=0) * moved)[list(own.terms)].sum()
+            for at, own in enumerate(one.row.own)
+        ]
+        to_now[number] = np.kron([1, 1j], per_force * (scaled @ terms))
+        to_healthy[number] = np.kron([1, 1j], -lost * (combination @ before))
+    parts = (ratio - 1, to_coefficients, to_change, to_now, to_healthy)
+    return RelativeForce(*(np.concatenate([part.real, part.imag]) for part in parts))
+
+
+def _phasors(vectors: SynchronousVectors) -> ComplexArray:
+    n = len(vectors.coordinates)
+    return np.asarray(vectors.vectors[:n] + 1j * vectors.vectors[n:], dtype=np.complex128)
+
+
+def _terms(row: Row, vectors: SynchronousVectors) -> ComplexArray:
+    """A row's terms as combinations of the coordinates' displacements, shape (n_terms, n_coordinates)."""
+    speed = vectors.speed_rad_s
+    terms = np.zeros((len(row.terms), len(vectors.coordinates)), dtype=np.complex128)
+    for found, term in zip(terms, row.terms, strict=True):
+        for motion in term.motions:
+            factor = motion.factor * (speed if term.times_speed else 1.0)
+            found[vectors.coordinates.index(motion.coordinate)] += factor * (1j * speed) ** motion.order
+    return terms
 
 
 class ForeignRotationError(EstimationError):
     """What turns with the shaft is not what an unbalance makes."""
-
-
-def _forces(
-    rows: Sequence[ForceRow],
-    coefficients: FloatArray,
-    change: FloatArray,
-    coordinates: tuple[str, ...],
-    vectors: FloatArray,
-    speed_rad_s: float,
-) -> ComplexArray:
-    n = len(coordinates)
-    q = dict(zip(coordinates, vectors[:n] + 1j * vectors[n:], strict=True))
-    forces = np.empty(len(rows), dtype=np.complex128)
-    for number, one in enumerate(rows):
-        combination = np.concatenate([[1.0], -coefficients[one.coefficients]])
-        scale = np.ones(combination.size)
-        for own, value in zip(one.row.own, change[one.own], strict=True):
-            scale[list(own.terms)] *= 1 + value
-        forces[number] = sum(
-            weight
-            * (speed_rad_s if term.times_speed else 1.0)
-            * sum(motion.factor * (1j * speed_rad_s) ** motion.order * q[motion.coordinate] for motion in term.motions)
-            for weight, term in zip(combination * scale, one.row.terms, strict=True)
-        )
-    return forces
-
-
-def slopes(
-    rows: Sequence[ForceRow], state: SynchronousState, now: SynchronousVectors, healthy: SynchronousVectors
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Derivatives of `relative_force` to coefficients, change, now and healthy, by central differences."""
-    parts = [state.coefficients, state.change, state.now, state.healthy]
-    derivatives = []
-    for number, part in enumerate(parts):
-        columns = []
-        floor = 1e-3 if number == 1 else 0.0
-        largest = 1e-3 * float(np.max(np.abs(part), initial=0.0))
-        for position, step in enumerate(1e-4 * np.maximum(np.abs(part), max(floor, largest))):
-            ends = []
-            for sign in (1, -1):
-                moved = [other.copy() for other in parts]
-                moved[number][position] += sign * step
-                ends.append(relative_force(rows, SynchronousState(*moved), now, healthy))
-            columns.append((ends[0] - ends[1]) / (2 * step))
-        derivatives.append(np.stack(columns, axis=1))
-    return derivatives[0], derivatives[1], derivatives[2], derivatives[3]
 
 
 def combination(design: FloatArray, covariance: FloatArray) -> FloatArray:
