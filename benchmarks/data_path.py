@@ -14,6 +14,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from studies.subjects import without_parameters
+from studies.watched import commissioned
 
 from models.commissioning.commissioned import Installed
 from models.diagnosis.likelihood.fit import LikelihoodFit
@@ -86,14 +88,18 @@ def main() -> None:
     def often(work: Callable[[], object]) -> float:
         return median_s(lambda: [work() for _ in range(100)], 100)
 
-    def whole_s() -> float:
+    def whole_s(installed: Installed) -> float:
         """Time for a hop once the window is full."""
-        monitor = MachineMonitor(Installed(machine, bundle))
+        monitor = MachineMonitor(installed)
         for block in stream[: len(stream) // 2]:
             monitor.step(block)
         return median_s(lambda: [monitor.step(block) for block in stream[len(stream) // 2 :]], hops, repetitions=1)
 
     hops = round(DATA_S / 2 / machine.window.hop_s)
+    known = Installed(machine, bundle)
+    unknown = commissioned(without_parameters(machine), stream)
+    if isinstance(unknown, str):
+        raise SystemExit(unknown)
     costs = {
         "Fourier transforms alone (yardstick)": median_s(yardstick, 1),
         "moments of a hop": median_s(lambda: hop_moments(plan, piece, level, 0), 1),
@@ -107,7 +113,8 @@ def main() -> None:
         "likelihood, followed": median_s(lambda: [following.diagnose(one) for one in windows], len(windows)),
         "amortised networks, all four": median_s(lambda: [amortised.diagnose(one) for one in windows], len(windows)),
         "relation networks 28, 29, 31": median_s(lambda: [relation.diagnose(one) for one in windows], len(windows)),
-        "whole data path, per hop": statistics.median(whole_s() for _ in range(REPETITIONS)),
+        "whole data path, per hop": statistics.median(whole_s(known) for _ in range(REPETITIONS)),
+        "  without parameters, commissioned": statistics.median(whole_s(unknown) for _ in range(REPETITIONS)),
     }
     base = costs["Fourier transforms alone (yardstick)"]
     print(f"{machine.name}: {machine.rate_hz:g} Hz, {len(machine.sensors)} channels, hop {machine.window.hop_s:g} s")

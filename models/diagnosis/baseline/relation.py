@@ -27,6 +27,7 @@ from models.diagnosis.baseline.lag_moments import (
     LagMoments,
     RowWindow,
     inverse,
+    telling,
 )
 from models.diagnosis.baseline.rows import Row
 from models.diagnosis.window import WindowStatistics
@@ -454,27 +455,29 @@ def change_of(row: Row, relation: Relation, moments: LagMoments, *, stretched: b
     for _ in range(_ITERATIONS // 2):
         combination = signatures @ np.concatenate([[1.0], -d])
         own_covariance = moments.covariance(combination)
-        W_own, own_rank = inverse(own_covariance)
-        widening = max(1.0, moments.scatter(combination, W_own, own_rank)) * relation.allowance
-        W, rank = inverse(own_covariance * widening + uncertain)
-        Q = Z.T @ W @ Z
-        C = signatures.T @ moments.noise(W) @ signatures * widening
+        kept = telling(own_covariance)
+        used, grid = moments.only(kept), np.ix_(kept, kept)
+        scatter = used.scatter(combination, np.linalg.inv(own_covariance[grid]), kept.size)
+        widening = max(1.0, scatter) * relation.allowance
+        W = np.linalg.inv(own_covariance[grid] * widening + uncertain[grid])
+        Q = Z[kept].T @ W @ Z[kept]
+        C = signatures.T @ used.noise(W) @ signatures * widening
         before = d
         d, covariance = _least_squares(Q, C, np.zeros((d.size, d.size)))
         if np.all(np.abs(d - before) <= _CONVERGED * np.sqrt(np.abs(np.diag(covariance)))):
             break
     if not np.all(np.diag(covariance) > 0):
         raise EstimationError(f"{row.title}: the bearing hardly moves in this window")
-    projection = covariance @ Z[:, 1:].T @ W
-    left = Z[:, 0] - Z[:, 1:] @ d
+    projection = np.zeros((d.size, len(Z)))
+    projection[:, kept] = covariance @ Z[kept, 1:].T @ W
+    left = Z[kept, 0] - Z[kept, 1:] @ d
 
     def criterion(trial: FloatArray) -> float:
         force = signatures @ np.concatenate([[1.0], -trial])
-        weight, kept = inverse(moments.covariance(force) * widening + uncertain)
-        rest = Z[:, 0] - Z[:, 1:] @ trial
-        return float(rest @ weight @ rest) - kept
+        rest = used.values @ force
+        return float(rest @ np.linalg.solve(used.covariance(force) * widening + uncertain[grid], rest))
 
-    chi2, freedom = float(left @ W @ left), max(1, rank - d.size)
+    chi2, freedom = float(left @ W @ left), max(1, kept.size - d.size)
     # What is left beyond chance was not expected by any of these errors: it is in the change as well.
     beyond = 1.0 if _by_chance(chi2, freedom) else chi2 / freedom
     stretch = stretching(criterion, d, covariance) if stretched else np.eye(d.size)
@@ -487,8 +490,7 @@ def change_of(row: Row, relation: Relation, moments: LagMoments, *, stretched: b
         widening=widening,
         chi2=chi2,
         degrees_of_freedom=freedom,
-        unchanged=bool(criterion(np.zeros(d.size)) <= _FITS * np.sqrt(2 * rank))
-        and not _cancels_nothing(relation, moments),
+        unchanged=_by_chance(criterion(np.zeros(d.size)), kept.size) and not _cancels_nothing(relation, moments),
     )
 
 
