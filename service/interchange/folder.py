@@ -13,10 +13,10 @@ from models.machine import MachineFile
 from models.signals.block import FloatArray
 from service.interchange.angle import pulse_times
 from service.interchange.clock import Clock, clock_for
-from service.interchange.formats import format_of, open_source
+from service.interchange.formats import DATED, format_of, open_source
 from service.interchange.mapping import Keyphasor, Mapping
 from service.interchange.samples import Gap, Piece, Read, pieces, signals_of
-from service.interchange.source import SourceError
+from service.interchange.source import Reference, Source, SourceError
 
 _DATE = re.compile(
     r"(?<!\d)(\d{4})[-_. ]?(\d{2})[-_. ]?(\d{2})"  # day
@@ -64,8 +64,8 @@ def time_in_name(name: str) -> int | None:
 def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tuple[SnapshotFile, ...]:
     """Files of a folder in the order of their times, or of the numbers in their names.
 
-    Their times are counted from ``time.start`` of the mapping by the machine's schedule, or are in their names, or in
-    the files. Files of formats that are not known are left out, unless the mapping says the format.
+    Their times are in the files, or are counted from ``time.start`` of the mapping by the machine's schedule, or are in
+    their names. Files of formats that are not known are left out, unless the mapping says the format.
 
     Raises
     ------
@@ -77,8 +77,8 @@ def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tupl
     if not paths:
         raise SourceError(f"{folder}: no file of a known format in it; say format = ... in the mapping")
     base, schedule = mapping.time, machine.schedule
-    if base.is_datetime or base.start == "unix":
-        return tuple(SnapshotFile(path, None) for path in paths)
+    if base.is_datetime or base.start == "unix" or (base.start is None and format_of(paths[0], mapping) in DATED):
+        return _by_their_own_times(paths, mapping, machine)
     if base.start_ns is not None:
         if schedule is None:
             raise SourceError(
@@ -89,6 +89,23 @@ def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tupl
         return tuple(SnapshotFile(path, base.start_ns + number * period_ns) for number, path in enumerate(paths))
     files = [SnapshotFile(path, time_in_name(path.name)) for path in paths]
     return tuple(sorted(files, key=lambda one: one.start_ns or 0))  # those without a time keep their order
+
+
+def _by_their_own_times(paths: Sequence[Path], mapping: Mapping, machine: MachineFile) -> tuple[SnapshotFile, ...]:
+    """Files that say themselves when they begin, in that order; of one that does not, its name counts."""
+    begun = []
+    for path in paths:
+        with open_source(path, mapping) as source:
+            columns = [one.reference for one in signals_of(source, mapping, machine)]
+            named_ns = time_in_name(path.name) if _has_no_time(source, columns, mapping) else None
+            clock = clock_for(source, columns, mapping.time, machine, named_ns)
+            begun.append((clock.origin_ns, SnapshotFile(path, named_ns)))
+    return tuple(file for _, file in sorted(begun, key=lambda one: one[0]))
+
+
+def _has_no_time(source: Source, columns: list[Reference], mapping: Mapping) -> bool:
+    base = mapping.time
+    return not base.is_datetime and base.start is None and source.timing(columns).start_ns is None
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -18,6 +18,9 @@ _SOURCES: dict[Format, tuple[str, tuple[str, ...]]] = {
 }
 """Class in this package, imported when it is needed with the library that only it needs, and how files are named."""
 
+DATED: tuple[Format, ...] = ("tdms", "mf4")
+"""Formats whose files say when they were recorded."""
+
 
 def format_of(path: Path, mapping: Mapping) -> Format | None:
     """Format that the mapping or the end of a file's name says; None if neither does."""

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import nptdms
 import numpy as np
 import pytest
 
@@ -80,6 +81,32 @@ def test_pulses_of_a_keyphasor_give_the_angle_in_every_file(tmp_path: Path, mapp
     apart = np.abs(np.angle(np.exp(1j * (angle - _COLUMNS[2]))))
     assert apart.max() < 0.01
     assert done.unknown_angle == 0
+
+
+def test_files_that_say_when_they_begin_are_joined_in_that_order_whatever_their_names(tmp_path: Path) -> None:
+    _, recording = imported(
+        tmp_path, write(tmp_path / "files", lambda number: f"{'dcba'[number]}.npz", range(4)), DATED, KIT
+    )
+    begun = [one.start_ns for one in stretches(recording, KIT)]
+    assert begun == [START_NS + round(number * EVERY_S * 1e9) for number in range(4)]
+
+
+@pytest.mark.parametrize("dated", [True, False])
+def test_the_time_in_a_waveform_counts_more_than_the_one_in_the_name_of_its_file(tmp_path: Path, dated: bool) -> None:
+    folder = tmp_path / "files"
+    folder.mkdir()
+    for number in range(3):  # names in local time, an hour ahead
+        start = np.datetime64(BEGIN.replace(tzinfo=None), "us") + np.timedelta64(round(number * EVERY_S), "s")
+        told = {"wf_increment": 1 / RATE_HZ} | ({"wf_start_time": start} if dated else {})
+        columns = zip("xva", _COLUMNS, strict=True)
+        with nptdms.TdmsWriter(
+            folder / f"{BEGIN + timedelta(hours=1, seconds=number * EVERY_S):%Y%m%d_%H%M%S}.tdms"
+        ) as writer:
+            writer.write_segment([nptdms.ChannelObject("g", name, x[:COUNT], told) for name, x in columns])
+    _, recording = imported(tmp_path, folder, CHANNELS, KIT)
+    begin_ns = START_NS + (0 if dated else 3600 * 10**9)
+    begun = [one.start_ns for one in stretches(recording, KIT)]
+    assert begun == [begin_ns + round(number * EVERY_S * 1e9) for number in range(3)]
 
 
 def test_a_snapshot_that_is_missing_is_told(tmp_path: Path) -> None:
