@@ -4,7 +4,10 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import pairwise
+from math import gcd
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 
@@ -86,7 +89,10 @@ def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tupl
                 "from which the times of the others follow"
             )
         period_ns = round(schedule.every_s * 1e9)
-        return tuple(SnapshotFile(path, base.start_ns + number * period_ns) for number, path in enumerate(paths))
+        return tuple(
+            SnapshotFile(path, base.start_ns + place * period_ns)
+            for place, path in zip(_places(paths), paths, strict=True)
+        )
     files = [SnapshotFile(path, time_in_name(path.name)) for path in paths]
     return tuple(sorted(files, key=lambda one: one.start_ns or 0))  # those without a time keep their order
 
@@ -108,9 +114,25 @@ def _has_no_time(source: Source, columns: list[Reference], mapping: Mapping) -> 
     return not base.is_datetime and base.start is None and source.timing(columns).start_ns is None
 
 
+def _places(paths: Sequence[Path]) -> list[int]:
+    """Places of files in a schedule, from 0: a number that is missing among those in their names leaves one empty.
+
+    If they do not differ in one number that counts in equal steps, they follow each other.
+    """
+    parts = [re.split(r"(\d+)", path.name) for path in paths]
+    columns = list(zip(*parts, strict=False))
+    differing = [place for place, column in enumerate(columns) if len(set(column)) > 1]
+    if len(differing) == 1 and differing[0] % 2 and len({len(row) for row in parts}) == 1:
+        numbers = [int(part) for part in columns[differing[0]]]
+        steps = [after - before for before, after in pairwise(numbers)]
+        if (step := gcd(*steps)) and median(steps) == step:
+            return [(number - numbers[0]) // step for number in numbers]
+    return list(range(len(paths)))
+
+
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Key that sorts 2 before 10."""
-    return [(int(part) if part.isdigit() else -1, part) for part in re.split(r"(\d+)", path.name)]
+    return [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"(\d+)", path.name)]
 
 
 def runs_of_pulses(

@@ -34,6 +34,10 @@ def by_number(number: int) -> str:
     return f"acc_{number + 1}.npz"  # acc_10 comes before acc_2 in the alphabet
 
 
+def by_tens(number: int) -> str:
+    return f"run2_{10 * number:04d}.npz"
+
+
 def write(folder: Path, name: Callable[[int], str], numbers: range = range(FILES), every_s: float = EVERY_S) -> Path:
     """Snapshots of one motion, the newest written first."""
     folder.mkdir()
@@ -109,13 +113,27 @@ def test_the_time_in_a_waveform_counts_more_than_the_one_in_the_name_of_its_file
     assert begun == [begin_ns + round(number * EVERY_S * 1e9) for number in range(3)]
 
 
-def test_a_snapshot_that_is_missing_is_told(tmp_path: Path) -> None:
-    folder = write(tmp_path / "files", by_date)
-    (folder / by_date(5)).unlink()
-    done, _ = imported(tmp_path, folder, NAMED, KIT)
+@pytest.mark.parametrize(("name", "mapping"), [(by_date, NAMED), (by_number, NUMBERED), (by_tens, NUMBERED)])
+def test_a_snapshot_that_is_missing_is_told_and_the_others_keep_their_times(
+    tmp_path: Path, name: Callable[[int], str], mapping: str
+) -> None:
+    folder = write(tmp_path / "files", name)
+    (folder / name(5)).unlink()
+    done, recording = imported(tmp_path, folder, mapping, KIT)
     told = "\n".join(summary_lines(done))
     assert "gaps: 1, 38 s in all" in told
-    assert f"\n  before row 1 of {by_date(6)}: 38 s from " in told
+    assert f"\n  before row 1 of {name(6)}: 38 s from " in told
+    begun = [one.start_ns for one in stretches(recording, KIT)]
+    assert begun == [START_NS + round(n * EVERY_S * 1e9) for n in range(FILES) if n != 5]
+
+
+def test_numbers_that_are_no_count_give_the_order_alone(tmp_path: Path) -> None:
+    numbers = [100, 119, 140, 160]
+    _, recording = imported(
+        tmp_path, write(tmp_path / "files", lambda n: f"after {numbers[n]} s.npz", range(4)), NUMBERED, KIT
+    )
+    begun = [one.start_ns for one in stretches(recording, KIT)]
+    assert begun == [START_NS + round(n * EVERY_S * 1e9) for n in range(4)]
 
 
 def test_files_that_follow_each_other_are_one_stretch(tmp_path: Path) -> None:
