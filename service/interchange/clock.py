@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -45,6 +45,17 @@ class Clock:
         if entries is None:
             return np.asarray((first_row + np.arange(count)) * (1e9 / self.rate_hz))
         return _since(entries, self.first, self.unit_ns)
+
+    def after(self, first: "Clock") -> "Clock":
+        """Return the clock of a later file of a folder: what a time column has that runs on counts once.
+
+        It has already passed what the files' names, or their places in a schedule, say has passed.
+        """
+        if self.column is None or first.first.dtype.kind == "M":
+            return self
+        ran_ns = _nanoseconds(self.first[0], self.unit_ns) - _nanoseconds(first.first[0], self.unit_ns)
+        told_ns = self.origin_ns - first.origin_ns - ran_ns
+        return replace(self, origin_ns=first.origin_ns + ran_ns) if 2 * ran_ns > told_ns > 0 else self
 
     def pulse_times(self, entries: Array, unit_ns: float) -> FloatArray:
         """Times of pulses, which are counted from the same zero as the rows."""

@@ -83,6 +83,8 @@ def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tupl
     if base.is_datetime or base.start == "unix" or (base.start is None and format_of(paths[0], mapping) in DATED):
         return _by_their_own_times(paths, mapping, machine)
     if base.start_ns is not None:
+        if schedule is None and base.column is not None:  # the files' column may run on from one to the next
+            return tuple(SnapshotFile(path, base.start_ns) for path in paths)
         if schedule is None:
             raise SourceError(
                 f"{folder}: time.start is that of the first file; expected [schedule] every_s in the machine file, "
@@ -154,7 +156,7 @@ def runs_of_pulses(
     for file in files:
         with open_source(file.path, mapping) as source:
             columns = [one.reference for one in signals_of(source, mapping, machine)]
-            clock = clock_for(source, columns, mapping.time, machine, file.start_ns)
+            clock = _clock_after(first, file, source, columns, mapping, machine)
             own = pulse_times(source, keyphasor, clock, mapping) + float(clock.origin_ns - first.origin_ns)
         before = runs[-1]
         if before.size > 1 and own.size and own[0] - before[-1] < 1.5 * float(np.median(np.diff(before[-9:]))):
@@ -162,6 +164,13 @@ def runs_of_pulses(
         else:
             runs.append(own)
     return runs
+
+
+def _clock_after(
+    first: Clock, file: SnapshotFile, source: Source, columns: list[Reference], mapping: Mapping, machine: MachineFile
+) -> Clock:
+    clock = clock_for(source, columns, mapping.time, machine, file.start_ns)
+    return clock if file.start_ns is None else clock.after(first)
 
 
 def joined(
@@ -192,7 +201,8 @@ def joined(
         own = Read()
         with open_source(file.path, mapping) as source:
             signals = signals_of(source, mapping, machine)
-            clock = clock_for(source, [one.reference for one in signals], mapping.time, machine, file.start_ns)
+            columns = [one.reference for one in signals]
+            clock = _clock_after(first, file, source, columns, mapping, machine)
             if clock.ratio != first.ratio:
                 raise SourceError(
                     f"{file.path}: has {clock.rate_hz:.9g} samples per second, {first.path.name} has "

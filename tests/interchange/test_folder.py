@@ -127,6 +127,34 @@ def test_a_snapshot_that_is_missing_is_told_and_the_others_keep_their_times(
     assert begun == [START_NS + round(n * EVERY_S * 1e9) for n in range(FILES) if n != 5]
 
 
+@pytest.mark.parametrize("name", [by_date, by_number])
+@pytest.mark.parametrize("runs_on", [True, False])
+def test_a_time_column_that_runs_on_from_file_to_file_counts_once(
+    tmp_path: Path, name: Callable[[int], str], runs_on: bool
+) -> None:
+    folder = write(tmp_path / "files", name)
+    for number in range(FILES):
+        arrays = dict(np.load(folder / name(number)))
+        arrays["t"] = arrays["t"] - (START_NS if runs_on else arrays["t"][0])
+        np.savez(folder / name(number), **arrays)
+    mapping = NAMED if name is by_date else NUMBERED
+    _, recording = imported(tmp_path, folder, mapping.replace("rate_hz = 2000.0", 'column = "t"\nunit = "ns"'), KIT)
+    begun = [one.start_ns for one in stretches(recording, KIT)]
+    assert begun == [START_NS + round(n * EVERY_S * 1e9) for n in range(FILES)]
+
+
+def test_a_start_alone_is_enough_where_the_time_column_runs_on(tmp_path: Path) -> None:
+    folder = write(tmp_path / "files", by_number, range(4), ON_S)
+    mapping = NUMBERED.replace("rate_hz = 2000.0", 'column = "t"\nunit = "ns"')
+    for number in range(4):
+        arrays = dict(np.load(folder / by_number(number)))
+        np.savez(folder / by_number(number), **arrays | {"t": arrays["t"] - START_NS})
+    _, recording = imported(tmp_path, folder, mapping)
+    (found,) = stretches(recording)
+    assert found.start_ns == START_NS
+    np.testing.assert_allclose(found.samples[:, 0], _COLUMNS[0][: 4 * COUNT], atol=1e-9)
+
+
 def test_numbers_that_are_no_count_give_the_order_alone(tmp_path: Path) -> None:
     numbers = [100, 119, 140, 160]
     _, recording = imported(
