@@ -1,7 +1,7 @@
 """Pieces of samples to the messages of a recording."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,7 +22,7 @@ class Written:
 
     blocks: int = 0
     samples: int = 0
-    stretches: int = 0  # contiguous stretches
+    lengths: list[int] = field(default_factory=list)  # samples of each contiguous stretch
     too_short: int = 0  # samples in stretches too short for a block, left out
     # Time of the first sample, and of the one after the last.
     start_ns: int = 0
@@ -102,7 +102,7 @@ class BlockMaker:
         elif self._new:
             self._sequence += self._missing((since_ns - self._expected_ns) / 1e9)
         if self._new:
-            self.written.stretches += 1
+            self.written.lengths.append(0)
         self._expected_ns = since_ns + time_ns.size * 1e9 / rate_hz
         columns = samples.astype(np.dtype(self._machine.dtype))
         for number in self._angles:  # rounding may reach 2π, which is 0
@@ -113,4 +113,5 @@ class BlockMaker:
         self._sequence, self._new = self._sequence + 1, False
         self.written.blocks += 1
         self.written.samples += time_ns.size
+        self.written.lengths[-1] += time_ns.size
         self.written.end_ns = block.end_ns

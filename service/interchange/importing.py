@@ -10,6 +10,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
+from math import floor
 from pathlib import Path
 
 import numpy as np
@@ -148,6 +149,7 @@ def summary_lines(done: Imported) -> list[str]:
         lines.append(f"rows left out for an empty cell, NaN, infinity or a number beyond the dtype: {read.left_out}")
     if written.too_short:
         lines.append(f"samples left out in stretches shorter than a block: {written.too_short}")
+    lines += _snapshot_lines(machine, written)
     length_s = written.samples / machine.rate_hz
     if length_s < machine.window_data_s:
         lines.append(
@@ -177,6 +179,21 @@ def _gap_lines(done: Imported) -> list[str]:
             f"{done.read.filled}"
         )
     return lines
+
+
+def _snapshot_lines(machine: MachineFile, written: Written) -> list[str]:
+    """Snapshots that the monitor will leave out, because what the file or the filters left of them is too short."""
+    if machine.schedule is None:
+        return []
+    least = floor(machine.hop_data_s * machine.rate_hz + 1e-6)
+    short = [length for length in written.lengths if length < least]
+    if not short:
+        return []
+    return [
+        f"note: {len(short)} of {len(written.lengths)} snapshots are shorter than [schedule] on_s = "
+        f"{machine.schedule.on_s:g} in the machine file and will not be evaluated; the shortest has "
+        f"{min(short) / machine.rate_hz:.6g} s, the longest of them {max(short) / machine.rate_hz:.6g} s"
+    ]
 
 
 def _filter_lines(done: Imported) -> list[str]:

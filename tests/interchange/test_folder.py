@@ -127,6 +127,17 @@ def test_a_snapshot_that_is_missing_is_told_and_the_others_keep_their_times(
     assert begun == [START_NS + round(n * EVERY_S * 1e9) for n in range(FILES) if n != 5]
 
 
+@pytest.mark.parametrize(("rate_hz", "short"), [(RATE_HZ, False), (1000.0, True)])
+def test_snapshots_that_filters_leave_too_short_are_told(tmp_path: Path, rate_hz: float, short: bool) -> None:
+    kit = machine(schedule={"on_s": ON_S, "every_s": EVERY_S}, window={}, ingest={}, rate_hz=rate_hz)
+    mapping = NAMED.replace("rate_hz", "resample = true\nrate_hz")
+    done, _ = imported(tmp_path, write(tmp_path / "files", by_date), mapping, kit)
+    told = "\n".join(summary_lines(done))
+    note = f"note: {FILES} of {FILES} snapshots are shorter than [schedule] on_s = 2 in the machine file"
+    assert (note in told) == short
+    assert ("the shortest has 1.978 s, the longest of them 1.978 s" in told) == short
+
+
 @pytest.mark.parametrize("name", [by_date, by_number])
 @pytest.mark.parametrize("runs_on", [True, False])
 def test_a_time_column_that_runs_on_from_file_to_file_counts_once(
