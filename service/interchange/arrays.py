@@ -74,7 +74,8 @@ class NumpySource(_Arrays):
 class MatlabSource(_Arrays):
     """A MATLAB .mat file: version 4 to 7 read whole, version 7.3 (HDF5) column by column.
 
-    Fields of structs are named ``struct.field``.
+    Fields of structs are named ``struct.field``, those of the third of several ``struct(3).field``, and what is in the
+    third cell ``cell{3}``.
     """
 
     kind, package = "MATLAB", "h5py"
@@ -94,7 +95,7 @@ class MatlabSource(_Arrays):
             else:
                 from scipy.io import loadmat  # noqa: PLC0415  # slow to import; only for these files
 
-                content = loadmat(path, simplify_cells=True)
+                content = loadmat(path, squeeze_me=True)
                 super().__init__(path, dict(_flattened(content)))
 
     def close(self) -> None:
@@ -168,21 +169,44 @@ def _over_full_scale(column: Array) -> Array:
     return column
 
 
-def _flattened(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Array]]:
-    """Numeric arrays of nested structs."""
+def _flattened(content: Mapping[str, Any]) -> Iterator[tuple[str, Array]]:
+    """Numeric arrays of a file, also those in structs and cells, by the names that MATLAB has for them."""
     for name, value in content.items():
-        if name.startswith("__"):
-            continue
-        if isinstance(value, dict):
-            yield from _flattened(value, f"{prefix}{name}.")
-        else:
-            array = np.asarray(value)
-            if array.dtype.kind in "fiub":
-                yield f"{prefix}{name}", np.atleast_1d(array)
+        if not name.startswith("__"):
+            yield from _arrays_in(name, value)
+
+
+def _arrays_in(name: str, value: Any) -> Iterator[tuple[str, Array]]:
+    array = np.asarray(value)
+    if array.dtype.names is not None:  # structs
+        for number, struct in enumerate(array.ravel(order="F")):
+            place = name if array.size == 1 else f"{name}({number + 1})"
+            for field in array.dtype.names:
+                yield from _arrays_in(f"{place}.{field}", struct[field])
+    elif array.dtype == object:
+        for number, inner in enumerate(array.ravel(order="F")):
+            yield from _arrays_in(f"{name}{{{number + 1}}}", inner)
+    elif array.dtype.kind in "fiub":
+        yield name, np.atleast_1d(array)
 
 
 def _collect_hdf5(found: dict[str, Any], name: str, item: Any) -> None:
-    """Take numeric data sets; MATLAB's table (n, m) is stored as (m, n), which the longer side settles."""
-    is_array = hasattr(item, "shape") and item.ndim in (1, 2) and item.size > 0 and item.dtype.kind in "fiu"
-    if is_array and item.attrs.get("MATLAB_class", b"") != b"char" and not name.startswith("#"):
+    """Take numeric data sets; MATLAB's table (n, m) is stored as (m, n), which the longer side settles.
+
+    Cells, and fields of several structs, are references to what is stored elsewhere in the file.
+    """
+    if name.startswith("#") or not hasattr(item, "shape"):
+        return
+    if item.dtype.kind == "O" and item.dtype.metadata and "ref" in item.dtype.metadata:
+        parent, _, field = name.rpartition("/")
+        is_cell = not parent or item.attrs.get("MATLAB_class", b"") == b"cell"
+        for number, reference in enumerate(np.ravel(item[()])):
+            place = f"{name}{{{number + 1}}}" if is_cell else f"{parent}({number + 1})/{field}"
+            inner = item.file[reference]
+            _collect_hdf5(found, place, inner)
+            if hasattr(inner, "visititems"):
+                inner.visititems(lambda of_it, it, place=place: _collect_hdf5(found, f"{place}/{of_it}", it))
+        return
+    is_array = item.ndim in (1, 2) and item.size > 0 and item.dtype.kind in "fiu"
+    if is_array and item.attrs.get("MATLAB_class", b"") != b"char":
         found[name.replace("/", ".")] = item

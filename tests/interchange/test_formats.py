@@ -54,8 +54,37 @@ def write_npz_table(path: Path, columns: Columns) -> None:
     np.savez(path, table=np.vstack([columns["x"], columns["v"], columns["a"]]))
 
 
+OF_STRUCTS = CHANNELS.replace('"x"', '"run.Y(1).Data"').replace('"v"', '"run.Y(2).Data"').replace('"a"', '"more{2}.a"')
+
+
 def write_mat(path: Path, columns: Columns) -> None:
     savemat(path, {"run": {"x": columns["x"], "v": columns["v"]}, "a": columns["a"][:, None], "fs": RATE_HZ})
+
+
+def write_mat_of_structs(path: Path, columns: Columns) -> None:
+    """As public data sets of bearings have it: Y(2).Data; and cells."""
+    several = np.zeros((1, 2), dtype=[("Name", "O"), ("Data", "O")])
+    for number, name in enumerate("xv"):
+        several[0, number] = (name, columns[name])
+    cells = np.empty((1, 2), dtype=object)
+    cells[0, :] = ["angle", {"a": columns["a"]}]
+    savemat(path, {"run": {"Info": "bearing 3", "Y": several}, "more": cells, "fs": RATE_HZ})
+
+
+def write_mat73_of_structs(path: Path, columns: Columns) -> None:
+    """The same as MATLAB stores it in HDF5: references to what is in a group of its own."""
+    with h5py.File(path, "w") as file:
+        stored = file.create_group("#refs#")
+        for name in "xv":
+            stored[name] = columns[name][None, :]
+        stored.create_group("s")["a"] = columns["a"][:, None]
+        stored["t"] = np.array([97], dtype=np.uint16)
+        stored["t"].attrs["MATLAB_class"] = np.bytes_("char")
+        data = file.create_dataset("run/Y/Data", (2, 1), dtype=h5py.ref_dtype)
+        cells = file.create_dataset("more", (2, 1), dtype=h5py.ref_dtype)
+        cells.attrs["MATLAB_class"] = np.bytes_("cell")
+        data[:, 0] = [stored["x"].ref, stored["v"].ref]
+        cells[:, 0] = [stored["t"].ref, stored["s"].ref]
 
 
 def write_mat73(path: Path, columns: Columns) -> None:
@@ -165,6 +194,8 @@ CASES: dict[str, tuple[str, Callable[[Path, Columns], None], str]] = {
         write_mat,
         f'[time]\nrate_from = "fs"\nstart = "{START}"\n' + CHANNELS.replace('"x"', '"run.x"').replace('"v"', '"run.v"'),
     ),
+    "mat-5-structs": ("run.mat", write_mat_of_structs, RATE + OF_STRUCTS),
+    "mat-7.3-structs": ("run.mat", write_mat73_of_structs, RATE + OF_STRUCTS),
     "mat-7.3": ("run.mat", write_mat73, RATE + CHANNELS.replace('"x"', '"run.x"').replace('"v"', '"run.v"')),
     "wav": (
         "run.wav",
