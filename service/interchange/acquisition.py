@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from service.interchange.source import CHUNK_ROWS, Array, Reference, Source, SourceError, Timing, equally_long, readable
+from service.monitor.alarm_conversion import rfc3339
 
 _SAME_TIME_S = 1e-9
 _TIME_RESPONSE = 1
@@ -48,8 +49,8 @@ class TdmsSource(Source):
             timing = Timing(_tdms_rate_hz(properties), _tdms_start_ns(properties))
             if found is not None and timing != found:
                 raise SourceError(
-                    f"{self.path}: channel {reference} starts or is sampled otherwise than {columns[0]}: {timing} "
-                    f"and {found}"
+                    f"{self.path}: channel {reference} has {_told(timing)}, channel {columns[0]} has {_told(found)}; "
+                    "expected the same (wf_increment, wf_start_time, wf_start_offset)"
                 )
             found = timing
         return found or Timing()
@@ -67,6 +68,11 @@ class TdmsSource(Source):
     def _rows(self, reference: Reference) -> tuple[int, Callable[[slice], Any]]:
         channel = self._column(reference)
         return len(channel), lambda rows: channel.read_data(rows.start, rows.stop - rows.start)
+
+
+def _told(timing: Timing) -> str:
+    rate = "no rate" if timing.rate_hz is None else f"{timing.rate_hz:.12g} samples per second"
+    return f"{rate} from {'no time' if timing.start_ns is None else rfc3339(timing.start_ns)} on"
 
 
 def _tdms_rate_hz(properties: Any) -> float | None:

@@ -91,6 +91,11 @@ def clock_for(
     else:
         entries = _first_times(source, column, columns)
         first = entries[:1]
+        if base.is_datetime and first.dtype.kind != "M":
+            raise SourceError(
+                f"{path}: column {column} holds numbers ({first.dtype}) such as {first[0]}, expected dates (time.unit "
+                'is "datetime"); for numbers, give s, ms, d, ... as time.unit and when they are 0 as time.start'
+            )
         measured, tolerance = _measured_rate(path, column, _since(entries, first, unit_ns))
         if first.dtype.kind == "M":
             origin_ns = int(first.astype("datetime64[ns]").astype(np.int64)[0])

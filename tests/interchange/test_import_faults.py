@@ -424,3 +424,25 @@ def test_a_record_shorter_than_the_filter_settles_and_a_velocity_are_refused(tmp
     ):
         with pytest.raises(MachineFileError, match=said):
             imported(tmp_path, tmp_path / "run.npz", mapping)
+
+
+def test_numbers_where_dates_are_told_are_named(tmp_path: Path) -> None:
+    time, x, v, a = signals(1000)
+    np.savez(tmp_path / "run.npz", t=time + 3.0, x=x, v=v, a=a)
+    mapping = f'[time]\ncolumn = "t"\nunit = "datetime"\n{CHANNELS}'
+    with pytest.raises(MachineFileError, match=r"column t holds numbers \(float64\) such as 3\.0, expected dates"):
+        imported(tmp_path, tmp_path / "run.npz", mapping)
+
+
+def test_channels_of_a_tdms_file_that_differ_in_time_are_told_in_words(tmp_path: Path) -> None:
+    columns = dict(zip("xva", signals(1000)[1:], strict=True))
+    told = {"wf_increment": 1 / 2000, "wf_start_time": np.datetime64("2026-01-31T12:00:00")}
+    with nptdms.TdmsWriter(tmp_path / "run.tdms") as writer:
+        for name, column in columns.items():
+            writer.write_segment([nptdms.ChannelObject("g", name, column, {} if name == "a" else told)])
+    says = (
+        "run.tdms: channel a has no rate from no time on, "
+        "channel x has 2000 samples per second from 2026-01-31T12:00:00.000000Z on; expected the same"
+    )
+    with pytest.raises(MachineFileError, match=re.escape(says)):
+        imported(tmp_path, tmp_path / "run.tdms", CHANNELS)
