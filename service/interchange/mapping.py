@@ -36,6 +36,7 @@ class CsvFormat(BaseModel, extra="forbid", frozen=True):
     skip_lines: int = Field(default=0, ge=0, description="lines before the table")
     skip_lines_after_header: int = Field(default=0, ge=0, description="lines between names and numbers, such as units")
     encoding: str = Field(default="utf-8", description="such as latin-1 for a µ from an old program")
+    missing: tuple[str, ...] = Field(default=(), description="cells without a number, such as OVL or ---")
 
     @model_validator(mode="after")
     def _distinct(self) -> Self:

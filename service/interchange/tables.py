@@ -117,7 +117,7 @@ class CsvSource(_Table):
                 column_types=types,
                 include_columns=list(types) or None,
                 decimal_point=form.decimal,
-                null_values=["", "NaN", "nan", "NA", "N/A", "null"],
+                null_values=["", "NaN", "nan", "NA", "N/A", "null", *form.missing],
                 strings_can_be_null=True,
             ),
         )
@@ -148,6 +148,8 @@ class CsvSource(_Table):
                                     what += ', or ISO 8601 times with time.unit = "datetime" in the mapping'
                                 if self._form.decimal == "." and re.fullmatch(r"[-+]?\d+,\d+", cell.strip()):
                                     what += ", or decimal commas with csv.decimal in the mapping"
+                                elif name != self._time_column:
+                                    what += ", or csv.missing in the mapping has what stands where there is none"
                                 return (
                                     f"{self.path}: row {row + offset + 1}, column {name!r}: found {cell!r}, "
                                     f"expected {what}"

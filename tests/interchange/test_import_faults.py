@@ -446,3 +446,16 @@ def test_channels_of_a_tdms_file_that_differ_in_time_are_told_in_words(tmp_path:
     )
     with pytest.raises(MachineFileError, match=re.escape(says)):
         imported(tmp_path, tmp_path / "run.tdms", CHANNELS)
+
+
+def test_texts_for_missing_numbers_count_as_empty_cells(tmp_path: Path) -> None:
+    told = fault(tmp_path, with_cell("OVL"))
+    assert "row 737, column 'v': found 'OVL', expected a number, or csv.missing in the mapping" in told
+    named = f'[csv]\nmissing = ["OVL", "---"]\n{TEXT}'
+    assert "row 737, column v: found nan, expected a finite number (time.not_finite" in fault(
+        tmp_path, with_cell("OVL"), named
+    )
+    source = table(tmp_path / "run.csv", with_cell("---"))
+    done, recording = imported(tmp_path, source, named.replace("[time]", '[time]\nnot_finite = "gap"'))
+    assert (done.read.left_out, done.written.samples) == (1, 999)
+    assert [one.samples.shape[0] for one in stretches(recording)] == [736, 263]
