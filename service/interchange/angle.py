@@ -81,6 +81,14 @@ class AngleColumn:
     pulses: PulseTrain | None
     reverse: bool  # whether the shaft turns from z to y
     unknown: int = 0  # rows left out
+    # How far a column of angles turned, rad, and in which time, ns.
+    turned: float = 0.0
+    passed_ns: float = 0.0
+
+    @property
+    def speed_rpm(self) -> float | None:
+        """Mean speed of a column of angles, negative from z to y; None without one."""
+        return 60e9 * self.turned / (_TURN * self.passed_ns) if self.passed_ns else None
 
     def feed(self, parts: Iterator[Piece]) -> Iterator[Piece]:
         """Complete a file's pieces."""
@@ -94,6 +102,8 @@ class AngleColumn:
             if self.pulses is None:
                 samples = piece.samples.copy()
                 samples[:, column] = np.mod(samples[:, column], _TURN)
+                self.turned += float((np.mod(np.diff(samples[:, column]) + np.pi, _TURN) - np.pi).sum())
+                self.passed_ns += float(piece.time_ns[-1] - piece.time_ns[0])
                 yield Piece(piece.begins, piece.time_ns, samples)
                 continue
             angle = shaft_angle(self.pulses, piece.time_ns, reverse=self.reverse)

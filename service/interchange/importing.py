@@ -36,6 +36,8 @@ _NOTED = 0.01
 _MOST_ALONE = 0.1
 """Part of the rows that may have a gap on either side."""
 _LISTED = 10
+_FEW_SAMPLES = 4.0
+"""Samples for each pulse of the keyphasor below which it may be one that comes faster."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +54,7 @@ class Imported:
     pulses: PulseTrain | None
     cut_rows: int  # rows at the ends of stretches where filters are not settled
     unknown_angle: int  # rows left out because the shaft angle is not known
+    angle_rpm: float | None  # mean speed of a column of angles, if there is one
 
 
 def import_file(
@@ -121,7 +124,8 @@ def import_file(
             writer.part.unlink(missing_ok=True)
             raise
     cut_rows = sum(overlap.cut_rows for overlap in overlaps)
-    return Imported(path, recording, machine, mapping, clock, read, maker.written, pulses, cut_rows, angle.unknown)
+    written, unknown = maker.written, angle.unknown
+    return Imported(path, recording, machine, mapping, clock, read, written, pulses, cut_rows, unknown, angle.speed_rpm)
 
 
 def _nothing(path: Path, machine: MachineFile, read: Read, cut_rows: int) -> str:
@@ -143,7 +147,7 @@ def summary_lines(done: Imported) -> list[str]:
         f"{rfc3339(written.end_ns)}",
         *_gap_lines(done),
         *_filter_lines(done),
-        *_pulse_lines(done),
+        *_angle_lines(done),
     ]
     if read.left_out:
         lines.append(f"rows left out for an empty cell, NaN, infinity or a number beyond the dtype: {read.left_out}")
@@ -224,10 +228,24 @@ def _filter_lines(done: Imported) -> list[str]:
     return lines
 
 
-def _pulse_lines(done: Imported) -> list[str]:
-    train = done.pulses
-    if train is None:
+def _angle_lines(done: Imported) -> list[str]:
+    if done.pulses is not None:
+        lines, speed_rpm = _pulse_lines(done, done.pulses)
+    elif done.angle_rpm is not None:
+        speed_rpm = abs(done.angle_rpm)
+        way = ", from z to y" if done.angle_rpm < 0 else ""
+        lines = [f"shaft angle: {speed_rpm:.6g} rpm on average{way}"]
+    else:
         return []
+    operation = done.machine.operation
+    if operation is not None and abs(speed_rpm / operation.speed_rpm - 1) > operation.speed_tolerance:
+        lines.append(
+            f"note: the machine file says speed_rpm = {operation.speed_rpm:g}; at this speed nothing is evaluated"
+        )
+    return lines
+
+
+def _pulse_lines(done: Imported, train: PulseTrain) -> tuple[list[str], float]:
     passed_ns = float(np.diff(train.times)[train.known].sum())
     turns = float(np.diff(train.counts)[train.known].sum()) / train.pulses_per_turn
     speed_rpm = turns / passed_ns * 60e9 if turns else float("nan")
@@ -243,9 +261,18 @@ def _pulse_lines(done: Imported) -> list[str]:
                 f"note: that is {share:.0%} of the file, in which the keyphasor gives no pulses or uneven ones; look "
                 "at its signal and threshold, or leave the shaft angle out of the machine file"
             )
-    operation = done.machine.operation
-    if operation is not None and abs(speed_rpm / operation.speed_rpm - 1) > operation.speed_tolerance:
+    keyphasor = done.mapping.keyphasor
+    samples = done.clock.rate_hz * passed_ns / 1e9 / (turns * train.pulses_per_turn) if turns else np.inf
+    if keyphasor is not None and keyphasor.column is not None and samples < _FEW_SAMPLES:
         lines.append(
-            f"note: the machine file says speed_rpm = {operation.speed_rpm:g}; at this speed nothing is evaluated"
+            f"note: {samples:.3g} samples for each pulse; pulses that come faster than half the samples look like "
+            "slower ones: is this speed right?"
         )
-    return lines
+    end_ns = done.written.end_ns - done.clock.origin_ns
+    outside = int(np.count_nonzero((train.times < 0) | (train.times > end_ns)))
+    if outside > train.times.size / 2:
+        lines.append(
+            f"note: {outside} of {train.times.size} pulses are outside of the {lasting(end_ns / 1e9)} of the rows; are "
+            "they on the time base of the rows, in keyphasor.unit?"
+        )
+    return lines, speed_rpm

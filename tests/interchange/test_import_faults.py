@@ -459,3 +459,39 @@ def test_texts_for_missing_numbers_count_as_empty_cells(tmp_path: Path) -> None:
     done, recording = imported(tmp_path, source, named.replace("[time]", '[time]\nnot_finite = "gap"'))
     assert (done.read.left_out, done.written.samples) == (1, 999)
     assert [one.samples.shape[0] for one in stretches(recording)] == [736, 263]
+
+
+@pytest.mark.parametrize(
+    ("unit", "says"), [("rad", "shaft angle: 1320 rpm on average"), ("deg", "shaft angle: 23.0383 rpm on average")]
+)
+def test_the_speed_of_a_column_of_angles_is_told(tmp_path: Path, unit: str, says: str) -> None:
+    mapping = TEXT.replace('column = "a", unit = "rad"', f'column = "a", unit = "{unit}"')
+    time, x, v, _ = signals(1000)
+    rows = zip(time, x, v, 2 * np.pi * 22.0 * time, strict=True)
+    source = table(tmp_path / "run.csv", [",".join(repr(float(one)) for one in row) for row in rows])
+    told = summary_lines(imported(tmp_path, source, mapping)[0])
+    assert says in told
+    assert any(line.startswith("note: the machine file says speed_rpm = 1320") for line in told) == (unit == "deg")
+
+
+@pytest.mark.parametrize(("marks", "doubted"), [(16, False), (60, True)])
+def test_pulses_that_come_faster_than_the_samples_tell_are_doubted(tmp_path: Path, marks: int, doubted: bool) -> None:
+    time, x, v, _ = signals(4000)
+    np.savez(tmp_path / "run.npz", x=x, v=v, k=np.mod(22.0 * marks * time, 1.0) < 0.5)
+    mapping = TEXT.replace('column = "t"', "rate_hz = 2000.0").replace("theta =", "# theta =")
+    mapping += f'[keyphasor]\ncolumn = "k"\nthreshold = 0.5\npulses_per_revolution = {marks}\n'
+    told = "\n".join(summary_lines(imported(tmp_path, tmp_path / "run.npz", mapping)[0]))
+    assert ("samples for each pulse; pulses that come faster than half" in told) == doubted
+    speed = re.search(r"pulses, ([\d.]+) rpm on average", told)
+    assert speed is not None
+    assert (float(speed[1]) == pytest.approx(1320, rel=1e-3)) != doubted
+
+
+@pytest.mark.parametrize(("unit", "doubted"), [("ms", False), ("s", True)])
+def test_pulses_outside_of_the_rows_are_doubted(tmp_path: Path, unit: str, doubted: bool) -> None:
+    x, v = signals(4000)[1:3]
+    np.savez(tmp_path / "run.npz", x=x, v=v, p=np.arange(45) / 22.0 * 1e3)
+    mapping = TEXT.replace('column = "t"', "rate_hz = 2000.0").replace("theta =", "# theta =")
+    mapping += f'[keyphasor]\npulse_times = "p"\nunit = "{unit}"\n'
+    told = "\n".join(summary_lines(imported(tmp_path, tmp_path / "run.npz", mapping)[0]))
+    assert ("note: 44 of 45 pulses are outside of the 2 s of the rows" in told) == doubted
