@@ -77,9 +77,12 @@ class CsvSource(_Table):
         super().__init__(path, names)
 
     def unit(self, column: Reference) -> str:
-        """Unit in brackets at the end of a column's name, as in ``y1 [um]``."""
+        """Unit in brackets at the end of a column's name, as in ``y1 [um]`` or ``y1 (um)``."""
         name = column.column
-        return name[name.rindex("[") + 1 : -1].strip() if name.endswith("]") and "[" in name else ""
+        for opening, closing in ("[]", "()"):
+            if name.endswith(closing) and opening in name:
+                return name[name.rindex(opening) + 1 : -1].strip()
+        return ""
 
     def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
         """Rows, some megabytes of text at a time."""

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from models.errors import MachineFileError
 from models.ingest import Gate
 from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import FloatArray
@@ -23,6 +25,9 @@ y1 = { column = "x", unit = "um" }
 y1_dot = { column = "v", unit = "mm/s" }
 theta = { column = "a", unit = "rad" }
 """
+TIME = f'[time]\ncolumn = "t"\nstart = "{START}"\n'
+TEXT = TIME + CHANNELS
+HEADER = "t,x,v,a"
 
 
 @dataclass(frozen=True)
@@ -76,3 +81,29 @@ def stretches(recording: Path, described: MachineFile | None = None) -> list[Str
             found.append((block.start_ns, []))
         found[-1][1].append(np.asarray(block.samples, dtype=np.float64))
     return [Stretch(start_ns, np.concatenate(blocks)) for start_ns, blocks in found]
+
+
+def table(path: Path, rows: list[str], header: str = HEADER) -> Path:
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+def good_rows(count: int = 1000, rate_hz: float = 2000.0) -> list[str]:
+    return [",".join(repr(float(value)) for value in row) for row in zip(*signals(count, rate_hz), strict=True)]
+
+
+GOOD = good_rows()
+
+
+def with_cell(cell: str) -> list[str]:
+    """Good rows, but for one cell of the velocity."""
+    t, x, _, a = GOOD[736].split(",")
+    return [*GOOD[:736], f"{t},{x},{cell},{a}", *GOOD[737:]]
+
+
+def fault(folder: Path, rows: list[str], mapping: str = TEXT, header: str = HEADER) -> str:
+    source = table(folder / "run.csv", rows, header)
+    with pytest.raises(MachineFileError) as raised:
+        imported(folder, source, mapping)
+    assert not list(folder.glob("*.mcap*")), "a failed import leaves nothing behind"
+    return str(raised.value)

@@ -15,40 +15,27 @@ from models.machine import load_machine_file
 from models.signals.block import integrated, lowest_valid_hz, settling_s
 from models.signals.channels import unit_factor
 from service.interchange.importing import summary_lines
-from tests.interchange.material import CHANNELS, START, START_NS, imported, machine, signals, stretches
+from tests.interchange.material import (
+    CHANNELS,
+    GOOD,
+    HEADER,
+    START,
+    START_NS,
+    TEXT,
+    TIME,
+    fault,
+    good_rows,
+    imported,
+    machine,
+    signals,
+    stretches,
+    table,
+    with_cell,
+)
 from tests.service.rig.preloaded import rotorwatch as run
 
-TIME = f'[time]\ncolumn = "t"\nstart = "{START}"\n'
-TEXT = TIME + CHANNELS
-HEADER = "t,x,v,a"
 IN_ORDER = CHANNELS.replace('"x"', "1").replace('"v"', "2").replace('"a"', "3")
 """Channels by their number, of files without names."""
-
-
-def table(path: Path, rows: list[str], header: str = HEADER) -> Path:
-    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
-    return path
-
-
-def good_rows(count: int = 1000, rate_hz: float = 2000.0) -> list[str]:
-    return [",".join(repr(float(value)) for value in row) for row in zip(*signals(count, rate_hz), strict=True)]
-
-
-GOOD = good_rows()
-
-
-def with_cell(cell: str) -> list[str]:
-    """Good rows, but for one cell of the velocity."""
-    t, x, _, a = GOOD[736].split(",")
-    return [*GOOD[:736], f"{t},{x},{cell},{a}", *GOOD[737:]]
-
-
-def fault(folder: Path, rows: list[str], mapping: str = TEXT, header: str = HEADER) -> str:
-    source = table(folder / "run.csv", rows, header)
-    with pytest.raises(MachineFileError) as raised:
-        imported(folder, source, mapping)
-    assert not list(folder.glob("*.mcap*")), "a failed import leaves nothing behind"
-    return str(raised.value)
 
 
 def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
@@ -424,74 +411,3 @@ def test_a_record_shorter_than_the_filter_settles_and_a_velocity_are_refused(tmp
     ):
         with pytest.raises(MachineFileError, match=said):
             imported(tmp_path, tmp_path / "run.npz", mapping)
-
-
-def test_numbers_where_dates_are_told_are_named(tmp_path: Path) -> None:
-    time, x, v, a = signals(1000)
-    np.savez(tmp_path / "run.npz", t=time + 3.0, x=x, v=v, a=a)
-    mapping = f'[time]\ncolumn = "t"\nunit = "datetime"\n{CHANNELS}'
-    with pytest.raises(MachineFileError, match=r"column t holds numbers \(float64\) such as 3\.0, expected dates"):
-        imported(tmp_path, tmp_path / "run.npz", mapping)
-
-
-def test_channels_of_a_tdms_file_that_differ_in_time_are_told_in_words(tmp_path: Path) -> None:
-    columns = dict(zip("xva", signals(1000)[1:], strict=True))
-    told = {"wf_increment": 1 / 2000, "wf_start_time": np.datetime64("2026-01-31T12:00:00")}
-    with nptdms.TdmsWriter(tmp_path / "run.tdms") as writer:
-        for name, column in columns.items():
-            writer.write_segment([nptdms.ChannelObject("g", name, column, {} if name == "a" else told)])
-    says = (
-        "run.tdms: channel a has no rate from no time on, "
-        "channel x has 2000 samples per second from 2026-01-31T12:00:00.000000Z on; expected the same"
-    )
-    with pytest.raises(MachineFileError, match=re.escape(says)):
-        imported(tmp_path, tmp_path / "run.tdms", CHANNELS)
-
-
-def test_texts_for_missing_numbers_count_as_empty_cells(tmp_path: Path) -> None:
-    told = fault(tmp_path, with_cell("OVL"))
-    assert "row 737, column 'v': found 'OVL', expected a number, or csv.missing in the mapping" in told
-    named = f'[csv]\nmissing = ["OVL", "---"]\n{TEXT}'
-    assert "row 737, column v: found nan, expected a finite number (time.not_finite" in fault(
-        tmp_path, with_cell("OVL"), named
-    )
-    source = table(tmp_path / "run.csv", with_cell("---"))
-    done, recording = imported(tmp_path, source, named.replace("[time]", '[time]\nnot_finite = "gap"'))
-    assert (done.read.left_out, done.written.samples) == (1, 999)
-    assert [one.samples.shape[0] for one in stretches(recording)] == [736, 263]
-
-
-@pytest.mark.parametrize(
-    ("unit", "says"), [("rad", "shaft angle: 1320 rpm on average"), ("deg", "shaft angle: 23.0383 rpm on average")]
-)
-def test_the_speed_of_a_column_of_angles_is_told(tmp_path: Path, unit: str, says: str) -> None:
-    mapping = TEXT.replace('column = "a", unit = "rad"', f'column = "a", unit = "{unit}"')
-    time, x, v, _ = signals(1000)
-    rows = zip(time, x, v, 2 * np.pi * 22.0 * time, strict=True)
-    source = table(tmp_path / "run.csv", [",".join(repr(float(one)) for one in row) for row in rows])
-    told = summary_lines(imported(tmp_path, source, mapping)[0])
-    assert says in told
-    assert any(line.startswith("note: the machine file says speed_rpm = 1320") for line in told) == (unit == "deg")
-
-
-@pytest.mark.parametrize(("marks", "doubted"), [(16, False), (60, True)])
-def test_pulses_that_come_faster_than_the_samples_tell_are_doubted(tmp_path: Path, marks: int, doubted: bool) -> None:
-    time, x, v, _ = signals(4000)
-    np.savez(tmp_path / "run.npz", x=x, v=v, k=np.mod(22.0 * marks * time, 1.0) < 0.5)
-    mapping = TEXT.replace('column = "t"', "rate_hz = 2000.0").replace("theta =", "# theta =")
-    mapping += f'[keyphasor]\ncolumn = "k"\nthreshold = 0.5\npulses_per_revolution = {marks}\n'
-    told = "\n".join(summary_lines(imported(tmp_path, tmp_path / "run.npz", mapping)[0]))
-    assert ("samples for each pulse; pulses that come faster than half" in told) == doubted
-    speed = re.search(r"pulses, ([\d.]+) rpm on average", told)
-    assert speed is not None
-    assert (float(speed[1]) == pytest.approx(1320, rel=1e-3)) != doubted
-
-
-@pytest.mark.parametrize(("unit", "doubted"), [("ms", False), ("s", True)])
-def test_pulses_outside_of_the_rows_are_doubted(tmp_path: Path, unit: str, doubted: bool) -> None:
-    x, v = signals(4000)[1:3]
-    np.savez(tmp_path / "run.npz", x=x, v=v, p=np.arange(45) / 22.0 * 1e3)
-    mapping = TEXT.replace('column = "t"', "rate_hz = 2000.0").replace("theta =", "# theta =")
-    mapping += f'[keyphasor]\npulse_times = "p"\nunit = "{unit}"\n'
-    told = "\n".join(summary_lines(imported(tmp_path, tmp_path / "run.npz", mapping)[0]))
-    assert ("note: 44 of 45 pulses are outside of the 2 s of the rows" in told) == doubted
