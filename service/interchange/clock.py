@@ -141,7 +141,7 @@ def _start_ns(path: Path, base: TimeBase, timing: Timing, known_ns: int | None) 
     if start_ns is None:
         raise SourceError(
             f"{path}: the time of the first row is not known; give time.start in the mapping, such as "
-            'start = "2026-01-31T12:00:00Z"'
+            'start = "2026-01-31T12:00:00Z"; files of a folder may have it in their names, such as 20260131T120000'
         )
     return start_ns
 

@@ -36,6 +36,7 @@ _NOTED = 0.01
 _MOST_ALONE = 0.1
 """Part of the rows that may have a gap on either side."""
 _LISTED = 10
+_NAMED = 5
 _FEW_SAMPLES = 4.0
 """Samples for each pulse of the keyphasor below which it may be one that comes faster."""
 
@@ -55,6 +56,7 @@ class Imported:
     cut_rows: int  # rows at the ends of stretches where filters are not settled
     unknown_angle: int  # rows left out because the shaft angle is not known
     angle_rpm: float | None  # mean speed of a column of angles, if there is one
+    left_out: list[str]  # names in a folder that were not read: other formats, folders, links to nothing
 
 
 def import_file(
@@ -79,6 +81,7 @@ def import_file(
     files = snapshot_files(path, mapping, machine) if path.is_dir() else (SnapshotFile(path, None),)
     if any(recording.exists() and file.path.exists() and recording.samefile(file.path) for file in files):
         raise SourceError(f"{recording}: is what is imported, expected another name for the recording")
+    left_out = _left_out(path, files)
     with open_source(files[0].path, mapping) as source:
         signals = signals_of(source, mapping, machine)
         columns = [signal.reference for signal in signals]
@@ -123,9 +126,28 @@ def import_file(
         except BaseException:
             writer.part.unlink(missing_ok=True)
             raise
-    cut_rows = sum(overlap.cut_rows for overlap in overlaps)
-    written, unknown = maker.written, angle.unknown
-    return Imported(path, recording, machine, mapping, clock, read, written, pulses, cut_rows, unknown, angle.speed_rpm)
+    cut_rows, unknown = sum(overlap.cut_rows for overlap in overlaps), angle.unknown
+    return Imported(
+        path,
+        recording,
+        machine,
+        mapping,
+        clock,
+        read,
+        maker.written,
+        pulses,
+        cut_rows,
+        unknown,
+        angle.speed_rpm,
+        left_out,
+    )
+
+
+def _left_out(path: Path, files: tuple[SnapshotFile, ...]) -> list[str]:
+    if not path.is_dir():
+        return []
+    names = {one.path.name for one in files}
+    return sorted(one.name for one in path.iterdir() if one.name not in names and not one.name.startswith("."))
 
 
 def _nothing(path: Path, machine: MachineFile, read: Read, cut_rows: int) -> str:
@@ -145,6 +167,7 @@ def summary_lines(done: Imported) -> list[str]:
         f"{len(machine.sensors)} channels of {machine.title}",
         f"{done.recording}: {written.samples} samples in {written.blocks} blocks, {rfc3339(written.start_ns)} to "
         f"{rfc3339(written.end_ns)}",
+        *_folder_lines(done),
         *_gap_lines(done),
         *_filter_lines(done),
         *_angle_lines(done),
@@ -161,6 +184,14 @@ def summary_lines(done: Imported) -> list[str]:
             "few or none"
         )
     return lines
+
+
+def _folder_lines(done: Imported) -> list[str]:
+    names = done.left_out
+    if not names:
+        return []
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return [f"not read in the folder, as no files of a known format: {', '.join(names[:_NAMED])}{more}"]
 
 
 def _gap_lines(done: Imported) -> list[str]:

@@ -66,6 +66,7 @@ def test_snapshots_come_in_with_their_times_and_none_is_lost(
     assert (done.read.files, done.read.rows) == (FILES, FILES * COUNT)
     told = "\n".join(summary_lines(done))
     assert f"files: {FILES} files, {FILES * COUNT} rows at 2000 Hz" in told
+    assert "\nnot read in the folder, as no files of a known format: notes.docx\n" in told
     assert "gaps: none" in told
 
 
@@ -185,7 +186,7 @@ def test_files_that_follow_each_other_are_one_stretch(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("mapping", "every_s", "says"),
     [
-        (NAMED, EVERY_S, "acc_1.npz: the time of the first row is not known"),
+        (NAMED, EVERY_S, "acc_1.npz: the time of the first row is not known.* in their names, such as 20260131T120000"),
         (DATED, 1.0, "acc_2.npz: begins 1 s before the end of acc_1.npz"),
         (
             PULSES.replace("= 0.5", "= 5").replace("rate_hz", START),
