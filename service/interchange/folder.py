@@ -80,7 +80,7 @@ def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tupl
     if not paths:
         raise SourceError(f"{folder}: no file of a known format in it; say format = ... in the mapping")
     base, schedule = mapping.time, machine.schedule
-    if base.is_datetime or base.start == "unix" or (base.start is None and format_of(paths[0], mapping) in DATED):
+    if base.is_absolute or (base.start is None and format_of(paths[0], mapping) in DATED):
         return _by_their_own_times(paths, mapping, machine)
     if base.start_ns is not None:
         if schedule is None and base.column is not None:  # the files' column may run on from one to the next

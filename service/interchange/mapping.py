@@ -17,6 +17,8 @@ from models.signals.sensor import Sensor
 
 Format = Literal["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"]
 _DATETIME = "datetime"
+_ZEROS_NS = {"unix": 0, "datenum": -719_529 * 86_400 * 10**9}
+"""Where counts of time begin, nanoseconds since 1970; MATLAB counts days from a year 0."""
 
 
 def _text(value: object) -> object:
@@ -51,8 +53,10 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
     column: _Name | None = Field(default=None, description="column with the time of each row")
     index: int | None = Field(default=None, ge=0, description="its column, in a table within an array file")
     unit: str = Field(default="s", description="of that column: s, ms, us, ns, min, h, d; datetime for dates and times")
-    start: datetime | Literal["unix"] | None = Field(
-        default=None, description="time of the first row, or of 0 in the time column; unix if that counts from 1970"
+    start: datetime | Literal["unix", "datenum"] | None = Field(
+        default=None,
+        description="time of the first row, or of 0 in the time column; unix if that counts from 1970, datenum if that "
+        "counts the days of MATLAB",
     )
     rate_hz: float | None = Field(default=None, gt=0, le=1e6, description="samples per second where no column says so")
     rate_from: _Name | None = Field(default=None, description="array of the file with the rate, Hz")
@@ -86,12 +90,17 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
         return self.column is not None and self.unit == _DATETIME
 
     @property
+    def is_absolute(self) -> bool:
+        """Whether the time column says by itself when its rows were, as dates or as a count from a known zero."""
+        return self.is_datetime or isinstance(self.start, str)
+
+    @property
     def start_ns(self) -> int | None:
         """Start in nanoseconds since 1970, if it is given."""
         if self.start is None:
             return None
-        if self.start == "unix":
-            return 0
+        if not isinstance(self.start, datetime):
+            return _ZEROS_NS[self.start]
         since = self.start - datetime(1970, 1, 1, tzinfo=UTC)
         return ((since.days * 86400 + since.seconds) * 1_000_000 + since.microseconds) * 1000
 

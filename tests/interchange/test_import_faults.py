@@ -43,6 +43,14 @@ def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
     assert done.written.samples == 1000
 
 
+def test_days_of_matlab_are_times(tmp_path: Path) -> None:
+    rows = [f"{740013.5 + number / 2000 / 86_400:.12f},{row.partition(',')[2]}" for number, row in enumerate(GOOD)]
+    mapping = TEXT.replace(f'start = "{START}"', 'unit = "d"\nstart = "datenum"')
+    done, _ = imported(tmp_path, table(tmp_path / "run.csv", rows), mapping)
+    assert abs(done.written.start_ns - START_NS) < 20_000  # 740013.5 has no more digits as a float
+    assert done.clock.rate_hz == pytest.approx(2000, rel=1e-4)
+
+
 def test_days_of_a_spreadsheet_are_times(tmp_path: Path) -> None:
     rows = [f"{46053.5 + number / 2000 / 86_400:.12f},{row.partition(',')[2]}" for number, row in enumerate(GOOD)]
     days = '[time]\ncolumn = "t"\nunit = "d"\nstart = "1899-12-30T00:00:00Z"\n' + CHANNELS
