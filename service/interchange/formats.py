@@ -10,7 +10,7 @@ _SOURCES: dict[Format, tuple[str, tuple[str, ...]]] = {
     "csv": ("tables.CsvSource", (".csv", ".txt", ".tsv")),
     "parquet": ("tables.ParquetSource", (".parquet", ".pq")),
     "npz": ("arrays.NumpySource", (".npz",)),
-    "mat": ("arrays.MatlabSource", (".mat",)),
+    "mat": ("arrays.MatlabSource", (".mat", ".h5", ".hdf5")),
     "wav": ("arrays.WavSource", (".wav",)),
     "uff": ("acquisition.UniversalSource", (".uff", ".unv")),
     "tdms": ("acquisition.TdmsSource", (".tdms",)),

@@ -196,6 +196,7 @@ CASES: dict[str, tuple[str, Callable[[Path, Columns], None], str]] = {
     ),
     "mat-5-structs": ("run.mat", write_mat_of_structs, RATE + OF_STRUCTS),
     "mat-7.3-structs": ("run.mat", write_mat73_of_structs, RATE + OF_STRUCTS),
+    "hdf5": ("run.h5", write_mat73, RATE + CHANNELS.replace('"x"', '"run.x"').replace('"v"', '"run.v"')),
     "mat-7.3": ("run.mat", write_mat73, RATE + CHANNELS.replace('"x"', '"run.x"').replace('"v"', '"run.v"')),
     "wav": (
         "run.wav",
