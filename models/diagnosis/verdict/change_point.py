@@ -6,9 +6,12 @@ are tried, and what is said is the mean over them by their probability, with the
 
 A window that holds the new state for a share of its time reads about that share of the change. One window cannot tell
 a small change from a late one; the windows before, which overlap it, show the share growing. Given the moment, the
-values before and after it are linear in what the windows read.
+values before and after it are linear in what the windows read. Moments are tried so close to each other that being
+between two of them is less than the windows' errors: a growth that is seen far more sharply would otherwise fit another
+moment, another power and another size better than the true ones.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -18,7 +21,8 @@ import numpy as np
 from models.diagnosis.verdict.stretch import Stretch
 from models.signals.block import FloatArray
 
-_STEPS = 2  # moments that are tried in every hop
+_STEPS, _MOST_STEPS = 2, 20  # moments that are tried in every hop, at least and at most
+_APART = 2.0  # standard errors by which a window may read otherwise from one of these moments to the next
 # How much a second of the new state weighs beside one of the old one: as much as it vibrates.
 _POWERS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
 # Variance that every window has for itself, over that of a window: its maximum is followed to a fraction of an error.
@@ -66,11 +70,13 @@ def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, 
     shared = np.zeros_like(own) if last.common is None else last.common[np.ix_(known, known)]
     whiten = np.linalg.inv(np.linalg.cholesky(own + shared))
     seen = values @ whiten.T
+    steps, coarse = _resolution(seen)
+    whiten, seen = whiten / coarse, seen / coarse
     bent = _BENT**2 * float(np.sum((seen[-1] - seen[0]) ** 2)) + 1e-12
     starts, ends = (np.array([getattr(one, at) for one in windows], dtype=np.float64) for at in ("start_ns", "end_ns"))
     # The first one stands for all before the data. It is as probable as the others together, and much more so where
     # the data have only just begun: few machines change in their first minute.
-    moments = np.append(starts[0] - hop_ns, np.arange(starts[0], min(by_ns, ends[-1]), hop_ns / _STEPS))
+    moments = np.append(starts[0] - hop_ns, np.arange(starts[0], min(by_ns, ends[-1]), hop_ns / steps))
     watched = ends[0] <= starts[-1] + hop_ns / 2
     odds = max(1, moments.size - 1) * (1.0 if watched else _BEFORE)
     before = np.log(np.where(moments < starts[0], odds, 1.0))
@@ -103,7 +109,7 @@ def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, 
         fit, best, variance = _fitted(gram, right[:, :, None] @ basis, prior[:, None, None])
         weights.append(before[:, None] + fit + count * np.log(_ODDS))
         means.append((best[..., None, :] @ np.swapaxes(back, -1, -2))[..., 0, : len(first)])
-        variances.append(variance[..., None] * errors[:, : len(first)] + common[:, : len(first)])
+        variances.append(variance[..., None] * coarse**2 * errors[:, : len(first)] + common[:, : len(first)])
     log_weight, every = np.concatenate(weights, axis=-1)[..., None], np.concatenate(means, axis=-2)
     weight = np.exp(log_weight - np.max(log_weight))
     weight /= weight.sum()
@@ -113,6 +119,13 @@ def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, 
     at = np.minimum(np.searchsorted(passed, _QUANTILES), moments.size - 1)
     middle, low, high = (round(moment) for moment in (moments[at] + np.array([0, -0.5, 0.5]) * hop_ns).tolist())
     return Changes(mean, np.sqrt(variance), None if middle < starts[0] else (middle, low, high))
+
+
+def _resolution(seen: FloatArray) -> tuple[int, float]:
+    """How many moments are tried in a hop, and where those are not close enough, how much larger errors count."""
+    moved = float(np.max(np.linalg.norm(np.diff(seen, axis=0), axis=1), initial=0.0))
+    steps = min(max(_STEPS, math.ceil(moved / _APART)), _MOST_STEPS)
+    return steps, max(1.0, moved / (_APART * steps))
 
 
 def _fitted(gram: FloatArray, right: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

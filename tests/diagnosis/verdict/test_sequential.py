@@ -224,6 +224,21 @@ def test_a_window_astride_a_change_says_how_much_it_does_not_know() -> None:
     assert sum(dates) >= 34
 
 
+@pytest.mark.parametrize("error", [0.002, 0.0002])
+def test_a_change_that_is_seen_sharply_is_not_taken_for_another_one_at_another_moment(error: float) -> None:
+    """It came within a hop, at any moment: one to eight hops later its size is read within its errors."""
+    inside = []
+    for trial in range(8):
+        rng = np.random.default_rng(SEED + 500 + trial)
+        hops, share = GaussianHops(SETTINGS, np.diag(np.where(true(e=1.0) > 0, error, ERRORS) ** 2), rng), rng.uniform()
+        looks = [hops.looks(true(e=0.5 * np.clip(number - 16 + share, 0.0, 1.0))) for number in range(25)]
+        for number in range(18, 25, 2):
+            windows = [found[12] for found in looks[: number + 1] if found]
+            found = read_changes(windows, [PARAMETERS.index("e")], 5 * 10**9, windows[-1].end_ns)
+            inside.append(abs(found.values[0] - 0.5) <= Z95 * found.errors[0])
+    assert np.mean(inside) > 0.9
+
+
 @pytest.mark.parametrize("gap", [10, 25])
 def test_a_gap_changes_nothing_but_the_date_of_what_came_after_it(gap: int) -> None:
     """Older windows span the gap, the latest one does not."""
