@@ -143,15 +143,26 @@ def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> Flo
             near = np.abs(speed / np.median(speed) - 1) < _NEIGHBOUR * len(lines)
             return speed if np.all(strength > _STRONG) and np.all(near) else None
         expected = (sweep[1:] + sweep[:-1]) / 2 * hop_s
-        together = np.abs(np.diff(speed) - expected) < np.maximum(_NEIGHBOUR * speed[1:], _RESOLVED * 2 * np.pi / hop_s)
+        near = np.maximum(_NEIGHBOUR * speed, _RESOLVED * 2 * np.pi / hop_s)
+        together = np.abs(np.diff(speed) - expected) < near[1:]
     followed = np.append(together, False) | np.insert(together, 0, False)
     if followed.sum() > 1:
         number = np.flatnonzero(followed)
-        slope, start = scipy.stats.theilslopes(speed[followed], number)[:2]
-        followed[number] = np.abs(speed[followed] / (start + slope * number) - 1) < _COURSE
+        followed[number] = np.abs(speed[number] / _course(speed, number)[number] - 1) < _COURSE
+    if (number := np.flatnonzero(np.isfinite(speed))).size > 1:
+        # The sweep of a line that noise surrounds is uncertain by more than a steady shaft has. A line left in a window
+        # is worse than one taken out of noise, and noise does not keep to a straight course.
+        steady = np.abs(speed - _course(speed, number)) < near
+        followed |= steady & (steady.mean() >= _FOLLOWED_PART)
     if followed.mean() < _FOLLOWED_PART:
         return None
     return np.where(followed, speed, np.nan)
+
+
+def _course(speed: FloatArray, number: npt.NDArray[np.intp]) -> FloatArray:
+    """Straight course of the speed through most of the hops of these numbers, at every hop."""
+    slope, start = scipy.stats.theilslopes(speed[number], number)[:2]
+    return np.asarray(start + slope * np.arange(speed.size), dtype=np.float64)
 
 
 def relative_vectors(vectors: _ComplexArray) -> _ComplexArray:
