@@ -1,9 +1,9 @@
 """What a diagnostician says about a window: readings of parameters and of equations, or why there are none."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.special import chdtri
@@ -17,6 +17,7 @@ from rotorwatch.records.windows import Equation, Parameter
 from rotorwatch.records.windows import UnbalanceVector as VectorRecord
 
 _DIGITS, _MOST_DIGITS = 3, 15
+_MOST_LOSS = -0.95  # of which the logarithm is taken
 
 
 def beyond(value: float, limit: float) -> tuple[str, str]:
@@ -268,6 +269,15 @@ def _stated(vector: UnbalanceVector) -> VectorRecord:
     )
 
 
+class Left(NamedTuple):
+    """What simpler explanations leave of several parameters' changes, in squared standard errors."""
+
+    single: float  # the best of them alone
+    common: float  # one factor on all of them, as of a wrong gain
+    factor: float  # its logarithm
+    z: float  # that in standard errors
+
+
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
     """One diagnostician's opinion of one window."""
@@ -317,6 +327,21 @@ class Diagnosis:
             return self.covariance
         errors = [one.standard_error for one in self.evaluable]
         return np.diag(np.square(np.array(errors, dtype=np.float64)))
+
+    def left_by(self, names: Sequence[str]) -> "Left | None":
+        """What simpler explanations leave of some parameters' changes; None where one of them was not read."""
+        known = [one.name for one in self.evaluable]
+        if not names or not set(names) <= set(known):
+            return None
+        at = [known.index(name) for name in names]
+        changes = np.array([max(_MOST_LOSS, self.evaluable[i].relative_change or 0.0) for i in at])
+        x = np.log1p(changes)
+        J = np.linalg.inv(self.full_covariance[np.ix_(at, at)] / np.outer(1 + changes, 1 + changes))
+        b, everything, ones = J @ x, float(x @ J @ x), np.ones(x.size)
+        weight = float(ones @ J @ ones)
+        factor = float(ones @ b) / weight
+        single = float(np.min(everything - b**2 / np.diag(J)))
+        return Left(single, everything - factor**2 * weight, factor, factor * math.sqrt(weight))
 
 
 class Diagnostician(Protocol):

@@ -7,6 +7,7 @@ other places', and compared with that of each recording of the healthy machine. 
 these, no factor fits, and nothing is said.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -106,6 +107,27 @@ def wrong_gain(levels: BandLevels, places: Sequence[str], reference: GainReferen
     if not abs(factor) > _LEAST or not left < min(_FITS, _EXPLAINED * without):
         return None
     return place, float(np.exp(factor))
+
+
+def left_of_1x(logs: FloatArray, errors: FloatArray, places: Sequence[str], place: str, factor: float) -> float:
+    """What a wrong gain of a place leaves of the change of 1x beyond what chance does, in squared standard errors.
+
+    A gain changes 1x of its own place by its factor and that of no other, but for what they all share: an unbalance. A
+    bearing that has changed moves the other places, too.
+
+    Parameters
+    ----------
+    logs, errors : ndarray, shape (n_channels,)
+        Logarithm of 1x over that of the healthy machine, and its standard error.
+    places : sequence of str
+        Of the channels.
+    """
+    names = tuple(dict.fromkeys(places))
+    own = np.array([[one == name for one in places] for name in names]) / [[places.count(name)] for name in names]
+    left = own @ logs - math.log(factor) * np.array([name == place for name in names])
+    weight = (own @ errors) ** -2.0
+    squares = float(weight @ (left - weight @ left / weight.sum()) ** 2)
+    return max(0.0, squares - len(names) + 1) if math.isfinite(squares) else 0.0
 
 
 def _contrast(levels: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from models.levels.bands import Growth, band_in_words, growth
 from models.levels.contact import LatestContact
-from models.levels.gains import place_of, wrong_gain
+from models.levels.gains import left_of_1x, place_of, wrong_gain
 from models.levels.kurtosis import GAUSSIAN, departure, fallen_by_lines, without_lines
 from models.levels.limits import (
     BEYOND_RANGE,
@@ -31,6 +31,7 @@ from models.levels.measures import LevelPlan, WindowLevels
 from models.levels.reference import LevelReference, OperatingState
 from models.levels.settings import LevelSettings
 from models.levels.zones import ZONES, zone_of
+from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity, unit_in_text
 from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth, LevelLimits
 
@@ -38,6 +39,8 @@ _ERRORS_OF_CONTACT = 5.0
 """A contact is on one side alone, and Gaussian in theory: five are seldom enough."""
 _STILL = 0.3
 """Part of what several windows show that the newest one has to show, or the contact is over."""
+_SPREAD = 4.0
+"""Standard deviations from the smallest to the largest of the windows of a healthy machine."""
 _ERRORS_OF_DOUBT = 4.0
 """Where it decides whether to believe what else has been found, not whether anything has happened."""
 _TURNED_OUT = "1x vector"
@@ -75,6 +78,8 @@ class Foreign(NamedTuple):
 
     text: str = ""  # empty if there is nothing
     hides: bool = False  # whether nothing that is read of parameters beside it can be believed
+    direction: str = ""  # of a wrong gain of all sensors of a place: theirs
+    unlike: float = 0.0  # what that leaves of the change of 1x, see `left_of_1x`
 
 
 class LevelJudge:
@@ -153,11 +158,14 @@ class LevelJudge:
             by_theory = {} if state.levels else {"unlike": "no rotor of the machine file makes"}
             found = found or new_line(levels, names, state.lines, state.bands, **by_theory)
         if not found and reference.gains is not None and levels.bands is not None:
-            wrong = wrong_gain(levels.bands, [place_of(one) for one in self._channels], reference.gains)
+            places = [place_of(one) for one in self._channels]
+            wrong = wrong_gain(levels.bands, places, reference.gains)
             if wrong is not None:
-                own = " and ".join(one.name for one in self._channels if place_of(one) == wrong[0])
+                own = [one for one in self._channels if place_of(one) == wrong[0]]
                 more = f"{wrong[1]:.2f} times its healthy value at all frequencies, compared with the other places"
-                return Foreign(f"gain of {own}: {more}", hides=True)
+                text = f"gain of {' and '.join(one.name for one in own)}: {more}"
+                unlike = left_of_1x(*self._turned_up(levels, state), places, *wrong) if seen else 0.0
+                return Foreign(text, hides=True, direction=own[0].direction, unlike=unlike)
         if found or not seen:  # at another speed much is otherwise
             return Foreign(found)
         kurtosis, twice = levels.random_kurtosis, [one.limit("x2") for one in judged]
@@ -179,6 +187,15 @@ class LevelJudge:
             f"a vibration at {channel.name} ({channel.location} {channel.direction}) that is {how}: kurtosis of its "
             f"random part {healthy + most:.2f}, {healthy:.2f} on the healthy machine"
         )
+
+    def _turned_up(self, levels: WindowLevels, state: OperatingState) -> tuple[FloatArray, FloatArray]:
+        """Logarithm of each channel's 1x over that of the healthy machine, and its error; nan where it is not known."""
+        healthy = [state.levels.get(one.name, {}).get("x1") for one in self._channels]
+        mean, low, high, error = np.array(
+            [(np.nan,) * 4 if one is None else (one.mean, one.low, one.high, one.error) for one in healthy]
+        ).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.log(levels.values["x1"] / mean), np.hypot(error, (high - low) / _SPREAD) / mean
 
     def _contact(self, levels: WindowLevels, state: OperatingState, latest: LatestContact, number: int) -> str:
         """Where the shaft is pushed back far out, as it was not on the healthy machine; empty if nowhere."""

@@ -14,6 +14,7 @@ from models.diagnosis.verdict.calibration import agreements
 from models.diagnosis.verdict.sequential import SequentialTest
 from models.diagnosis.window import WindowStatistics
 from models.errors import CheckpointError
+from models.levels.judgement import Foreign
 from models.signals.channels import Channel, with_channel_names
 from rotorwatch.records.health import HealthState
 from rotorwatch.records.sensor_faults import FaultKind
@@ -64,6 +65,16 @@ class Evaluation:
     @property
     def _doubtful(self) -> bool:
         return self.deciding.unexplained != "" or (self.deciding.misfit_z or 0.0) > _INSIDE
+
+    def rivals(self, foreign: Foreign) -> tuple[str, ...]:
+        """Parameters one of which explains the window as well as a wrong gain of a place does.
+
+        A gain changes stiffness and damping as they are read by one factor, and 1x as `left_of_1x` says. Below its
+        resonance a bearing looks like that, too, where its damping is not known well.
+        """
+        names = tuple(f"{of}_b{foreign.direction}" for of in "kc")
+        left = self.deciding.left_by(names) if foreign.direction else None
+        return names if left is not None and left.single <= left.common + foreign.unlike else ()
 
     @property
     def unlike_healthy(self) -> str:

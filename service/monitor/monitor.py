@@ -450,7 +450,7 @@ class MachineMonitor:
         looks = {n: stretch_of(one, self._window.hops[-n].start_ns, end_ns) for n, one in evaluation.short.items()}
         whole = self._test.settings.window_hops
         looks[whole] = stretch_of(evaluation.deciding, start_ns, end_ns)
-        verdict = self._test.update(looks, foreign=foreign.text != "")
+        verdict = self._test.update(looks, foreign=foreign.text != "", rivals=evaluation.rivals(foreign))
         unexplained = evaluation.deciding.unexplained
         suspect = evaluation.deciding.suspect
         astride_s = self._test.astride_s if evaluation.alone and not foreign.text else 0.0
@@ -472,7 +472,7 @@ class MachineMonitor:
             equations=evaluation.equations,
             opinions=evaluation.opinions,
             misfit_z=evaluation.deciding.misfit_z,
-            suspect=suspect if verdict.outside_model else "",
+            suspect=suspect if verdict.outside_model or foreign.hides else "",
             verdict=verdict,
             sensors=findings,
             detectable=() if unexplained else detectable_changes(look, self._test.thresholds(whole), length_s),

@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 from models.levels.bands import BandLevels
-from models.levels.gains import GainReference, learn_gains, wrong_gain
+from models.levels.gains import GainReference, learn_gains, left_of_1x, wrong_gain
 from models.levels.measures import level_plan
 from models.signals.channels import Channel
 from tests.levels.test_measures import taken
@@ -75,6 +75,27 @@ def test_nor_a_channel_that_is_dead_or_other_places_or_hops(reference: GainRefer
     assert wrong_gain(dead, PLACES, reference) is None
     assert wrong_gain(now, ("bearing z", "disc y", "disc z"), reference) is None
     assert wrong_gain(replace(now, edges_hz=1.1 * now.edges_hz), PLACES, reference) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "fits"),
+    [
+        ((0.15, 0.0, 0.0), True),  # a gain
+        ((0.35, 0.2, 0.2), True),  # and a heavier unbalance
+        ((0.12, -0.04, 0.0), False),  # a bearing moves the disc, too
+        ((np.nan, 0.0, 0.0), True),  # nothing is known
+    ],
+)
+def test_what_turns_with_the_shaft_speaks_for_a_gain_or_against_it(changes: tuple[float, ...], *, fits: bool) -> None:
+    errors = np.array([0.01, 0.004, 0.004])
+    left = left_of_1x(np.array(changes), errors, PLACES, "bearing y", float(np.exp(0.15)))
+    assert left == 0 if fits else left > 20
+
+
+def test_two_sensors_of_a_place_count_once() -> None:
+    changes, errors, places = np.array([0.12, -0.04, 0.0]), np.full(3, 0.004), ("bearing y", "disc y", "disc z")
+    once = left_of_1x(changes, errors, places, "bearing y", 1.15)
+    assert left_of_1x(np.tile(changes, 2), np.tile(errors, 2), 2 * places, "bearing y", 1.15) == pytest.approx(once)
 
 
 def test_what_cannot_be_compared_is_not_learned() -> None:

@@ -68,29 +68,16 @@ def gain_suspicion(
 
 
 def _row_suspicion(diagnosis: Diagnosis, row: Row, relation: Relation, tested: int) -> GainSuspicion | None:
-    readings = diagnosis.evaluable
-    names = [reading.name for reading in readings]
-    if any(own.parameter not in names for own in row.own):
+    left = diagnosis.left_by([own.parameter for own in row.own])
+    if left is None or left.single <= _SINGLE**2 or left.common > _COMMON**2:
         return None
-    at = [names.index(own.parameter) for own in row.own]
-    changes = np.array([max(_MOST_LOSS, readings[i].relative_change or 0.0) for i in at])
-    x = np.log1p(changes)
-    J = np.linalg.inv(diagnosis.full_covariance[np.ix_(at, at)] / np.outer(1 + changes, 1 + changes))
-    b, everything = J @ x, float(x @ J @ x)
-    left_alone = everything - b**2 / np.diag(J)
-    ones = np.ones(x.size)
-    weight = float(ones @ J @ ones)
-    factor = float(ones @ b) / weight
-    left_common = everything - factor**2 * weight
-    if np.min(left_alone) <= _SINGLE**2 or left_common > _COMMON**2:
-        return None
-    tail = 2 * tested * float(ndtr(-abs(factor) * math.sqrt(weight)))
+    tail = 2 * tested * float(ndtr(-abs(left.z)))
     z = -float(ndtri(min(0.5, max(tail, 1e-300))))
     places = [
         " and ".join(name for name in relation.states if name == coordinate or name.startswith(f"{coordinate}_"))
         for coordinate in dict.fromkeys(motion.coordinate for motion in row.motions)
     ]
-    return GainSuspicion(f"gain of {' or of '.join(filter(None, places))}", math.expm1(factor), z)
+    return GainSuspicion(f"gain of {' or of '.join(filter(None, places))}", math.expm1(left.factor), z)
 
 
 _WORST_ERROR = 0.2

@@ -15,7 +15,7 @@ All times are those of the data.
 """
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
@@ -45,6 +45,7 @@ _PROBABLE = 0.05  # least probability of a parameter that is told as one that ma
 _CLEAR = 3.0
 # Standard deviations of the misfit below which a short stretch takes back that the machine is outside the model.
 _INSIDE = 2.0
+_EITHER = "; or all sensors of a place have a wrong gain, which explains the data as well"
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +153,7 @@ class SequentialTest:
         lasts_ns = round(self.settings.window_hops * self.settings.hop_s * 1e9)
         return max(0, lasts_ns - (windows[-1].end_ns - began_ns)) / 1e9
 
-    def update(self, looks: Mapping[int, Stretch], *, foreign: bool = False) -> Verdict:
+    def update(self, looks: Mapping[int, Stretch], *, foreign: bool = False, rivals: Collection[str] = ()) -> Verdict:
         """Judge one hop.
 
         Parameters
@@ -162,6 +163,8 @@ class SequentialTest:
             there. `wanted` says which suffice.
         foreign : bool
             Whether something was seen that no change of a parameter makes.
+        rivals : collection of str
+            Parameters whose change would explain it as well: if one of them alone has changed, that need not be so.
 
         Raises
         ------
@@ -193,18 +196,19 @@ class SequentialTest:
         else:
             self._note(isolation.changed, every, clean, verdicts)
         current = self._current(clean[deciding[-1]], isolation.changed) if deciding and not unexplained else ()
-        isolation = replace(isolation, outside=outside or foreign, outside_confidence=confidence)
         self.unexplained = unexplained
         findings = () if unexplained else self.state.findings
+        either = foreign and not outside and findings != () and {one.name for one in findings} <= set(rivals)
+        isolation = replace(isolation, outside=outside or (foreign and not either), outside_confidence=confidence)
         detected = bool(verdicts) and not unexplained
         return Verdict(
             changed=findings,
-            text=_in_words(findings, isolation, detected=detected, read=bool(current)),
+            text=_in_words(findings, isolation, detected=detected, read=bool(current)) + either * _EITHER,
             detected=detected,
             confidence=isolation.confidence,
             candidates=() if unexplained else _candidates(isolation),
             alternatives=() if unexplained else isolation.alternatives,
-            low_confidence=isolation.low_confidence,
+            low_confidence=isolation.low_confidence or either,
             outside_model=isolation.outside,
             outside_confidence=isolation.outside_confidence,
             decided_s=decided.duration_s,

@@ -20,7 +20,7 @@ from models.errors import CheckpointError
 from models.machine import AlarmSettings, SuppressRule
 from models.physics.rotor import PARAMETERS
 from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
-from rotorwatch.records.windows import Verdict
+from rotorwatch.records.windows import Candidate, Verdict
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.alarms.life_cycle import follow, owed_after
 from service.monitor.alarms.operation import (
@@ -112,7 +112,8 @@ class AlarmBook:
         suspect : str
             What explains data outside the model best; empty if nothing does.
         hidden : bool
-            Whether it hides what a parameter does: none is named then, and none that was named is taken back.
+            Whether it hides what a parameter does: none is named then, and none that was named is taken back. Where a
+            parameter explains the data as well, so that they are not outside the model, both may be.
         astride_s : float
             For how long the window may still hold the moment of a change, and be outside the model for that alone.
         """
@@ -133,7 +134,7 @@ class AlarmBook:
                     end_ns,
                     named=reading.name in sure,
                     taken_back=verdict.settled and not hidden and (another or reading.name not in held),
-                    low_confidence=verdict.outside_model,
+                    low_confidence=verdict.outside_model or hidden,
                     growth=None if reading.vector is None else reading.vector.magnitude_change,
                     evidence=evidence,
                     note="" if reading.vector is None else reading.vector.text,
@@ -147,6 +148,7 @@ class AlarmBook:
             # Outside the model no candidate need be right, and `model` says so; and one cause has one alarm.
             told = verdict.outside_model or any(self.present(name) for name in probability)
             unsure = [] if sure or told else named
+            rival = [suspect] if hidden and suspect else []
             changes = [
                 (abs(one.relative_change or 0.0), self._settings.for_parameter(one.name))
                 for one in verdict.current
@@ -156,7 +158,7 @@ class AlarmBook:
                 CHANGED,
                 any(change > limits.raise_above for change, limits in changes),
                 end_ns,
-                " or ".join(f"{one.text} ({one.name}) {one.probability:.0%}" for one in verdict.candidates),
+                " or ".join([*(_candidate(one, alone=not rival) for one in verdict.candidates), *rival]),
                 evidence=evidence,
                 danger=any(change > limits.danger_above for change, limits in changes),
             )
@@ -463,6 +465,11 @@ class AlarmBook:
         self._alarms[alarm.name] = alarm
         self._untold.append(event)
         return (event,)
+
+
+def _candidate(one: Candidate, *, alone: bool) -> str:
+    """A candidate, with its probability where there are none but parameters."""
+    return f"{one.text} ({one.name}) {one.probability:.0%}" if alone else f"{one.text} ({one.name})"
 
 
 def _since(since_ns: int | None, time_ns: int) -> int:

@@ -17,8 +17,10 @@ from models.diagnosis.verdict.calibration import agreements, beside, month_thres
 from models.diagnosis.verdict.isolation import Isolation, isolate, isolate_window, outside_confidence
 from models.diagnosis.verdict.stretch import added, from_scale, slope, stretch_of, to_scale
 from models.errors import EstimationError
+from models.levels.judgement import Foreign
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
+from service.monitor.evaluation import Evaluation
 from tests.sure import sure
 
 SEED = 88_100
@@ -274,3 +276,15 @@ def test_ninety_five_per_cent_is_one_number_everywhere() -> None:
         if re.search(r"(?<![\w, .])1\.96\d* ?\*|= ?1\.96|\b1\.9599", file.read_text(encoding="utf-8"))
     ]
     assert written == ["readings.py"]
+
+
+@pytest.mark.parametrize(("c_by", "rivals"), [(0.0, True), (-0.14, False)])
+def test_a_parameter_explains_what_a_gain_does_where_its_damping_or_1x_says_so(c_by: float, *, rivals: bool) -> None:
+    """A gain of a place changes stiffness and damping by one factor."""
+    readings = (parameter_reading("k_by", "baseline", -0.14, 0.004), parameter_reading("c_by", "baseline", c_by, 0.07))
+    evaluation = Evaluation(Diagnosis("baseline", readings, covariance=np.diag([0.004, 0.07]) ** 2), {}, (), (), None)
+    gain = Foreign("gain of y1: 1.16 times", hides=True, direction="y")
+    assert evaluation.rivals(gain) == (("k_by", "c_by") if rivals else ())
+    assert evaluation.rivals(gain._replace(unlike=30.0)) == ("k_by", "c_by")
+    assert evaluation.rivals(gain._replace(direction="z")) == ()
+    assert evaluation.rivals(Foreign("a line", hides=True)) == ()

@@ -288,6 +288,19 @@ def test_what_is_outside_the_model_is_said_of_clean_data() -> None:
                 assert test.update(looks).outside_model == outside
 
 
+def test_what_one_parameter_explains_as_well_is_not_outside_the_model() -> None:
+    test, hops = SequentialTest(SETTINGS), gaussian(SEED + 8)
+    for _ in range(20):
+        looks = hops.looks(true(k_bz=-0.15))
+    for rivals, misfit, outside in [(("k_bz", "c_bz"), 0.0, False), (("k_by",), 0.0, True), (("k_bz",), 8.0, True)]:
+        looks = {h: replace(look, misfit_z=misfit) for h, look in looks.items()}
+        verdict = test.update(looks, foreign=True, rivals=rivals)
+        assert [one.name for one in verdict.changed] == ["k_bz"]
+        assert verdict.outside_model == outside
+        assert verdict.low_confidence
+        assert ("a wrong gain, which explains the data as well" in verdict.text) != outside
+
+
 def test_how_long_a_window_that_is_outside_may_be_astride_a_change_is_known() -> None:
     alone = SequentialTest(replace(SETTINGS, short_hops=()))
     hops, left_s = gaussian(SEED + 48), []

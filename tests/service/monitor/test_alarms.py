@@ -207,6 +207,16 @@ def test_where_most_has_changed_outside_the_model_nothing_is_named() -> None:
     assert judged([most | {"k_by": 0.1}] * 3, outside=True) == half
 
 
+def test_where_a_wrong_gain_would_explain_it_as_well_both_are_told() -> None:
+    book = AlarmBook(SETTINGS)
+    for number in range(3):
+        book.found(verdict(SURE), "", "gain of z1: 1.16 times", number * 5_000_000_000, hidden=True)
+    (event,) = book.take()
+    assert event.alarm.name == "changed"
+    assert event.alarm.note == "c_by (c_by) or c_bz (c_bz) or gain of z1: 1.16 times"
+    assert judged([SURE] * 3, outside=True, hidden=True) == ["raised model"]
+
+
 def test_where_a_line_hides_the_machine_nothing_is_named() -> None:
     assert judged([SURE] * 3, outside=True) == ["raised c_bz", "raised model"]
     assert judged([SURE] * 9, outside=True, hidden=True) == ["raised model"]
