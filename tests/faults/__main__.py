@@ -11,7 +11,6 @@ from tests.faults.scenarios import ROWS, Row
 
 
 def main() -> int:
-    """Run it."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0], prog="python -m tests.faults")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--rows", nargs="+", default=[""], help="only rows in whose names one of these texts is")
@@ -37,7 +36,7 @@ def main() -> int:
     wrong = [f"{name}: {text}" for name, outcomes in found.items() for one in outcomes for text in one.wrong]
     sys.stdout.write("".join(f"{line}\n" for line in wrong) or "everything was as the table says\n")
     if given.write:
-        PAGE.write_text(written(found, given.seeds, loads), encoding="utf-8")
+        PAGE.write_text(written(PAGE.read_text(encoding="utf-8"), found, given.seeds, loads), encoding="utf-8")
     return 1 if wrong else 0
 
 

@@ -13,24 +13,6 @@ _SLACK_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What one run of a row came to.
-
-    Attributes
-    ----------
-    missing_s : float
-        Data that were not evaluated, as the monitor states it, in seconds of data.
-    unaccounted : int or None
-        Blocks that were published, and neither evaluated nor stated as missing; None if there is nothing to compare.
-    orders, lost_orders : int
-        What operators were told is done, and how much of it is not in the log.
-    doubled : int
-        Alarm events that are in the log twice.
-    stated_s, recovered_s : tuple of float
-        Until it was stated, and until it was over.
-    wrong : tuple of str
-        What is not as the row says.
-    """
-
     missing_s: float
     unaccounted: int | None
     orders: int
@@ -42,7 +24,6 @@ class Outcome:
 
 
 def carried_out(row: Row, seed: int) -> Outcome:
-    """Carry out a row."""
     # A short path: it becomes that of a mounted file system.
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
         try:
@@ -72,12 +53,7 @@ def _outcome(at: Plant) -> Outcome:
         f"{doubled} events are in the log twice": doubled,
     }
     return Outcome(
-        missing_s=round(at.missing_s / BLOCK_S) * BLOCK_S,
-        unaccounted=unaccounted,
-        orders=len(at.answered),
-        lost_orders=len(lost),
-        doubled=doubled,
-        stated_s=tuple(at.stated_s),
-        recovered_s=tuple(at.recovered_s),
+        missing_s=round(at.missing_s / BLOCK_S) * BLOCK_S, unaccounted=unaccounted, orders=len(at.answered),
+        lost_orders=len(lost), doubled=doubled, stated_s=tuple(at.stated_s), recovered_s=tuple(at.recovered_s),
         wrong=tuple(text for text, holds in faults.items() if holds),
-    )
+    )  # fmt: skip

@@ -49,17 +49,14 @@ class Seen:
     health: Health
 
     def raised(self, name: str) -> bool:
-        """Whether the condition of an alarm is there."""
         return any(one.name == name and one.present for one in self.health.alarms)
 
     @property
     def why_not(self) -> str:
-        """Reasons not to be ready."""
         return "; ".join(self.readiness.reasons)
 
     @property
     def flowing(self) -> bool:
-        """Whether data come in."""
         age_s = self.health.stream.data_age_s
         return age_s is not None and age_s < 1.0 and not self.health.stream.silent
 
@@ -72,8 +69,6 @@ class Seen:
 
 @dataclass(slots=True)
 class Plant:
-    """One run of a scenario."""
-
     folder: Path
     rng: np.random.Generator
     undo: ExitStack
@@ -111,13 +106,11 @@ class Plant:
 
     @property
     def running(self) -> Program:
-        """The monitor that runs."""
         return sure(self.monitor)
 
     # What runs
 
     def start(self) -> Program:
-        """Start a monitor, with what is in the history, and wait until it answers."""
         self.monitor = None
         (self.folder / "history").mkdir(exist_ok=True)
         link = f'connect = ["{self.address}"]\nmode = "client"' if self.connects else f'listen = ["{self.address}"]'
@@ -140,7 +133,6 @@ class Plant:
         return started
 
     def publish(self, *more: str, run: int = 1) -> Program:
-        """Start a publisher of a healthy machine."""
         role = ("--mode", "client") if self.connects else ()
         started = self.undo.enter_context(
             program(
@@ -153,7 +145,6 @@ class Plant:
         return started
 
     def start_router(self) -> None:
-        """Start a router between publisher and monitor."""
         self.router = self.undo.enter_context(program(self.folder, "service", "router", "--listen", self.address))
         self.router.wait_for("router listening")
 
@@ -167,7 +158,6 @@ class Plant:
     # What is seen
 
     def look(self) -> Seen | None:
-        """What the monitor says of itself now; None if it does not answer."""
         if self.monitor is None or self.monitor.process.poll() is not None:
             return None
         try:
@@ -180,7 +170,6 @@ class Plant:
         return Seen(answer.status_code == 200, Readiness.model_validate(fields), self._last)
 
     def wait(self, condition: Callable[[Seen], bool], what: str) -> None:
-        """Wait until something is seen."""
         deadline = time.monotonic() + _LONGEST_S
         seen = self.look()
         while seen is None or not condition(seen):
@@ -191,7 +180,6 @@ class Plant:
             seen = self.look()
 
     def flowing(self, blocks: int = 20) -> None:
-        """Wait until data have come in for a while, and operators have been answered."""
         self.wait(lambda s: s.flowing and s.health.quality.accepted_blocks >= blocks, "data")
 
     def at_work(self, *options: str) -> Program:
@@ -226,7 +214,6 @@ class Plant:
     mended = broken
 
     def stated(self, condition: Callable[[Seen], bool], what: str) -> None:
-        """Wait until the monitor says what is wrong."""
         self.wait(condition, f"statement: {what}")
         self.stated_now()
 
@@ -235,7 +222,6 @@ class Plant:
         self.stated_s.append(time.monotonic() - self._begin_s)
 
     def recovered(self, condition: Callable[[Seen], bool] = lambda seen: seen.well) -> None:
-        """Wait until everything is as it should be."""
         self.wait(condition, "recovery")
         self.recovered_s.append(time.monotonic() - self._begin_s)
 
@@ -281,12 +267,10 @@ class Plant:
                 action = "unshelve" if action == "shelve" else "shelve"
 
     def work(self) -> None:
-        """Let the operator begin."""
         self._threads.append(threading.Thread(target=self._operate))
         self._threads[0].start()
 
     def rest_from_work(self) -> None:
-        """Let the operator stop."""
         self._over.set()
         for one in self._threads:
             one.join()
@@ -314,7 +298,6 @@ class Plant:
         return published - found()
 
     def wait_for_orders(self, more: int = 2) -> None:
-        """Wait until operators were answered again."""
         before = len(self.answered)
         deadline = time.monotonic() + _LONGEST_S
         while len(self.answered) < before + more:
@@ -339,7 +322,6 @@ def _witness(address: str, heard: list[Event]) -> Iterator[None]:
 
 @contextmanager
 def plant(folder: Path, seed: int, prepare: Callable[[Plant], None]) -> Iterator[Plant]:
-    """A monitor at work with an operator, a witness and no publisher yet."""
     with ExitStack() as undo:
         made = Plant(folder, np.random.default_rng(seed), undo)
         prepare(made)
@@ -354,7 +336,6 @@ def plant(folder: Path, seed: int, prepare: Callable[[Plant], None]) -> Iterator
 
 @contextmanager
 def locked(history: Path) -> Iterator[None]:
-    """Another program that does not let go of the database."""
     blocker = sqlite3.connect(history, isolation_level=None)
     blocker.execute("BEGIN IMMEDIATE")
     try:
@@ -364,5 +345,4 @@ def locked(history: Path) -> Iterator[None]:
 
 
 def pause(one: Program) -> None:
-    """Let a program stand still."""
     os.kill(one.process.pid, signal.SIGSTOP)

@@ -1,5 +1,7 @@
 """The first row of the table of faults, so that none of it rots; ``python -m tests.faults`` carries out all of them."""
 
+import re
+
 import pytest
 
 from tests.faults.measure import carried_out
@@ -15,8 +17,6 @@ def test_a_killed_publisher_costs_no_more_than_the_table_says() -> None:
     assert outcome.recovered_s
 
 
-def test_the_page_has_every_row_as_the_table_has_it() -> None:
-    page = PAGE.read_text(encoding="utf-8")
-    for row in ROWS:
-        assert f"| {row.name} | {row.done} | {row.lost} | {row.stated} | {row.recovery} |" in page
-        assert page.count(f"| {row.name} |") == 2
+def test_the_page_has_every_row_in_both_tables() -> None:
+    named = re.findall(r"^\| ([^|]+) \|", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    assert [name for name in named if name != "what happens"] == 2 * [row.name for row in ROWS]
