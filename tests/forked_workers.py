@@ -41,12 +41,10 @@ class ForkedIO(Popen2IO):
             end.close()
 
     def wait(self) -> int | None:
-        """Wait for the end."""
         self.popen.join()
         return self.popen.exitcode
 
     def kill(self) -> None:
-        """End it at once."""
         self.popen.kill()
 
 

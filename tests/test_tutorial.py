@@ -83,8 +83,7 @@ def test_what_is_said_of_it_is_what_was_said(folder: Path, name: str) -> None:
 
 def test_what_the_commissioning_said_is_on_the_page(folder: Path) -> None:
     report = json.loads((folder / "bundle" / "report.json").read_text(encoding="utf-8"))
-    assert report["level"] == "none"
-    assert report["verdict"] == "limited"
+    assert (report["level"], report["verdict"]) == ("none", "limited")
     loss = {one["name"]: one["detectable_loss"] for one in report["parameters"]}
     assert loss["c_by"] is None
     assert f"{-loss['k_by']:.0%}".replace("%", " %") in PAGE

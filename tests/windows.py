@@ -10,7 +10,6 @@ from tests.sure import sure
 
 
 def full_windows(window: SlidingWindow, stream: Iterable[SampleBlock]) -> Iterator[WindowStatistics]:
-    """Each full one, at every hop."""
     for block in stream:
         for _ in window.feed(window.plan.to_si(block.samples), block.start_ns):
             full = window.statistics()
@@ -19,7 +18,6 @@ def full_windows(window: SlidingWindow, stream: Iterable[SampleBlock]) -> Iterat
 
 
 def last_window(plan: Plan, stream: Iterable[SampleBlock]) -> WindowStatistics:
-    """The one at the end."""
     window = SlidingWindow(plan)
     for block in stream:
         tuple(window.feed(plan.to_si(block.samples), block.start_ns))

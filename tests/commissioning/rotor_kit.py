@@ -61,12 +61,10 @@ def stream(duration_s: float, seed: int, *events: Event) -> tuple[SampleBlock, .
 
 
 def samples_of(stream_: Sequence[SampleBlock]) -> FloatArray:
-    """All samples, shape (n_samples, n_channels)."""
     return np.asarray(np.concatenate([block.samples for block in stream_]), dtype=np.float64)
 
 
 def with_samples(stream_: Sequence[SampleBlock], samples: FloatArray) -> list[SampleBlock]:
-    """The same blocks with other samples in them."""
     found, at = [], 0
     for block in stream_:
         n_samples = block.samples.shape[0]
@@ -100,7 +98,6 @@ def with_lines(stream_: Sequence[SampleBlock], parts: Mapping[float, float], ord
 
 
 def recording(machine: MachineFile, stream_: Sequence[SampleBlock], name: str = "healthy.mcap") -> HealthyRecording:
-    """What a recording of these blocks gives."""
     return healthy_from_blocks(name, machine, ((block, "") for block in stream_))
 
 
@@ -115,12 +112,10 @@ def windows_of(recorded: HealthyRecording) -> tuple[WindowStatistics, ...]:
 
 
 def healthy(machine: MachineFile, duration_s: float, seed: int, name: str = "healthy.mcap") -> HealthyRecording:
-    """A recording of the healthy rotor kit."""
     return recording(machine, stream(duration_s, seed), name)
 
 
 def commissioned(machine: MachineFile, *recordings: HealthyRecording, wished: float | None = None) -> Commissioning:
-    """Commission on recordings that are in no file."""
     entries = [
         HealthyEntry(
             name=one.name,

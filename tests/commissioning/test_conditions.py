@@ -25,7 +25,6 @@ def recorded(name: str, seed: int, *events: Event) -> HealthyRecording:
 
 
 def made_of(*conditions: tuple[str, int, tuple[Event, ...]]) -> Commissioning:
-    """Commission on recordings: name, seed, and what makes them differ."""
     return commissioned(NOTHING, *(recorded(name, seed, *events) for name, seed, events in conditions))
 
 

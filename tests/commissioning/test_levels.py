@@ -55,8 +55,7 @@ def made_at(level: str) -> Commissioning:
 
 
 def test_a_machine_file_says_how_much_is_known() -> None:
-    assert knowledge_of(LAB).level is KnowledgeLevel.FULL
-    assert knowledge_of(PARTIAL).level is KnowledgeLevel.PARTIAL
+    assert (knowledge_of(LAB).level, knowledge_of(PARTIAL).level) == (KnowledgeLevel.FULL, KnowledgeLevel.PARTIAL)
     assert "k_by_N_per_m, k_bz_N_per_m, c_by_N_s_per_m, c_bz_N_s_per_m, e_m" in knowledge_of(PARTIAL).text
     assert knowledge_of(NOTHING).level is KnowledgeLevel.NONE
     rotor = sure(PARTIAL.rotor).model_copy(update={"I2_kg_m2": None})

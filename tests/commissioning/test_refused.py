@@ -40,7 +40,6 @@ def verdict_of(made: Commissioning, check: str) -> tuple[str, str, str]:
 
 
 def made_of(blocks: Sequence[SampleBlock], machine: MachineFile = NOTHING) -> Commissioning:
-    """Commission on blocks."""
     return commissioned(machine, recording(machine, blocks))
 
 
@@ -317,13 +316,10 @@ def test_an_unbalance_that_is_elsewhere_differs_by_its_vector(turned_rad: float,
 @pytest.mark.parametrize(
     ("tried", "change", "verdict"),
     [
-        ("share of z1 in y1", 0.02, "limited"),
-        ("share of z1 in y1", 0.06, "refused"),
-        ("delay of y1", 4e-5, "limited"),
-        ("delay of y1", 3e-4, "refused"),
-        ("mass of the disc", 0.02, "refused"),
+        ("share of z1 in y1", 0.02, "limited"), ("share of z1 in y1", 0.06, "refused"),
+        ("delay of y1", 4e-5, "limited"), ("delay of y1", 3e-4, "refused"), ("mass of the disc", 0.02, "refused"),
     ],
-)
+)  # fmt: skip
 def test_a_sensor_that_is_a_degree_off_its_axis_or_a_little_late_makes_no_other_machine(
     tried: str, change: float, verdict: str
 ) -> None:

@@ -272,13 +272,9 @@ def stretches(draw: st.DrawFn) -> Stretch:
     lower = np.tril(draw(arrays_of.arrays(np.float64, (n, n), elements=numbers)))
     common = arrays_of.arrays(np.float64, (n, n), elements=numbers)
     return Stretch(
-        draw(times),
-        draw(times),
-        draw(arrays_of.arrays(np.float64, (n,), elements=numbers)),
-        lower + np.tril(lower, -1).T,
-        draw(st.none() | numbers),
-        draw(st.none() | common),
-    )
+        draw(times), draw(times), draw(arrays_of.arrays(np.float64, (n,), elements=numbers)),
+        lower + np.tril(lower, -1).T, draw(st.none() | numbers), draw(st.none() | common),
+    )  # fmt: skip
 
 
 limits = st.tuples(times, times).map(lambda both: (min(both), max(both)))
@@ -306,8 +302,7 @@ def test_the_state_of_the_sequential_test_is_restored_exactly(state: SequentialS
     again = SequentialState.restored(from_bytes(to_bytes(state.checkpoint())), hops)
     dates = [(one.change_ns, one.dated_ns, one.outside_ns) for one in (again, state)]
     assert dates[0] == dates[1]
-    assert repr(again.before) == repr(state.before)
-    assert repr(again.findings) == repr(state.findings)
+    assert (repr(again.before), repr(again.findings)) == (repr(state.before), repr(state.findings))
     assert again.sums.keys() == state.sums.keys()
     older = {name: array for name, array in state.checkpoint().items() if name not in {"dated_ns", "between_ns"}}
     without = SequentialState.restored(older, hops)  # as an earlier version stored it

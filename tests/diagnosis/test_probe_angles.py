@@ -182,8 +182,7 @@ def test_angles_of_the_planes_are_the_planes() -> None:
 def test_a_descriptor_says_the_angle_and_comes_back() -> None:
     announced = API_670.descriptor.model_dump_json()
     assert ChannelDescriptor.model_validate_json(announced) == API_670.descriptor
-    assert API_670.descriptor.channels[0].angle_deg == 45
-    assert API_670.descriptor.states == LAB.descriptor.states
+    assert (API_670.descriptor.channels[0].angle_deg, API_670.descriptor.states) == (45, LAB.descriptor.states)
 
 
 @pytest.mark.parametrize(

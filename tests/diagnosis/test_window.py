@@ -28,20 +28,10 @@ RATE = 200.0
 
 def small_plan(*, angle: bool = True, hops: int = 4) -> Plan:
     return Plan(
-        rate_hz=RATE,
-        states=("y1", "y1_dot"),
-        columns=np.array([0, 1]),
-        scales=np.array([1.0, 1.0]),
-        angle_column=2 if angle else None,
-        hop=100,
-        stride=100,
-        preamble=50,
-        segment=100,
-        lags=np.arange(0, 21, 2),
-        bins=np.arange(2, 40),
-        hops=hops,
-        max_span_ns=10**12,
-    )
+        rate_hz=RATE, states=("y1", "y1_dot"), columns=np.array([0, 1]), scales=np.array([1.0, 1.0]),
+        angle_column=2 if angle else None, hop=100, stride=100, preamble=50, segment=100, lags=np.arange(0, 21, 2),
+        bins=np.arange(2, 40), hops=hops, max_span_ns=10**12,
+    )  # fmt: skip
 
 
 def signal(n_samples: int, seed: int, *, offset: float = 0.0, angle: bool = True) -> FloatArray:
@@ -217,8 +207,7 @@ def test_a_gap_costs_the_hop_it_falls_into_and_no_more() -> None:
     assert_identical(now, before)
     feed(window, later[140:150], 1140)
     now = sure(window.statistics())
-    assert now.start_ns == before.start_ns + round(0.5e9)
-    assert now.end_ns == round(1150e9 / RATE)
+    assert (now.start_ns, now.end_ns) == (before.start_ns + round(0.5e9), round(1150e9 / RATE))
 
 
 def test_hops_too_old_leave_the_window() -> None:

@@ -32,14 +32,11 @@ HEADER = "t,x,v,a"
 
 @dataclass(frozen=True)
 class Stretch:
-    """A contiguous part of a recording."""
-
     start_ns: int
     samples: FloatArray
 
 
 def machine(**changes: object) -> Machine:
-    """Displacement and velocity of the bearing in y, and the shaft angle, as float64."""
     lab = load_machine("lab")
     kept = {"y1", "y1_dot", "theta"}
     sensors = tuple(channel for channel in lab.sensors if channel.name in kept)
@@ -59,7 +56,6 @@ def signals(count: int, rate_hz: float = RATE_HZ) -> tuple[FloatArray, FloatArra
 
 
 def imported(folder: Path, source: Path, mapping: str, described: MachineFile | None = None) -> tuple[Imported, Path]:
-    """Import a file with a mapping given as text."""
     described = described or machine()
     file = folder / "mapping.toml"
     file.write_text(mapping, encoding="utf-8")

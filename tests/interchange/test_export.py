@@ -73,9 +73,7 @@ SI = {"um": "m", "mm/s": "m/s", "rad": "rad"}
 
 
 @pytest.mark.parametrize(("kind", "si"), [("parquet", False), ("csv", True), ("mat", False)])
-def test_exported_files_are_read_by_others_and_come_back_unchanged(
-    tmp_path: Path, kind: ExportFormat, si: bool
-) -> None:
+def test_exported_files_are_read_by_others_and_come_back_same(tmp_path: Path, kind: ExportFormat, si: bool) -> None:
     samples = recording(tmp_path / "run.mcap")
     out = tmp_path / f"run.{kind}"
     table = export(Selection((tmp_path / "run.mcap",), si=si), "stream", kind, out)

@@ -56,9 +56,7 @@ def write(folder: Path, name: Callable[[int], str], numbers: range = range(FILES
 
 
 @pytest.mark.parametrize(("name", "mapping"), [(by_date, NAMED), (by_number, NUMBERED), (by_number, DATED)])
-def test_snapshots_come_in_with_their_times_and_none_is_lost(
-    tmp_path: Path, name: Callable[[int], str], mapping: str
-) -> None:
+def test_snapshots_come_in_with_their_times_and_all(tmp_path: Path, name: Callable[[int], str], mapping: str) -> None:
     done, recording = imported(tmp_path, write(tmp_path / "files", name), mapping, KIT)
     found = stretches(recording, KIT)
     assert [one.start_ns for one in found] == [START_NS + round(n * EVERY_S * 1e9) for n in range(FILES)]

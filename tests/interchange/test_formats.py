@@ -222,16 +222,13 @@ def test_a_file_of_the_formats_own_library_comes_in_unchanged(case: str, tmp_pat
     assert done.read.rows == done.written.samples == COUNT
     np.testing.assert_array_equal(found.samples, np.column_stack([x, v, angle]))
     first = next(read_recording(recording))
-    assert first.key == machine().keys.descriptor
-    assert first.payload.decode() == machine().descriptor.model_dump_json()
+    assert (first.key, first.payload.decode()) == (machine().keys.descriptor, machine().descriptor.model_dump_json())
 
 
 @pytest.mark.parametrize(
     ("dtype", "largest"), [(np.int16, 2.0**15), (np.int32, 2.0**31), (np.uint8, 2.0**7), (np.float32, 1.0)]
 )
-def test_whole_numbers_of_a_wav_file_are_fractions_of_full_scale(
-    tmp_path: Path, dtype: type[np.generic], largest: float
-) -> None:
+def test_integers_of_a_wav_file_are_of_full_scale(tmp_path: Path, dtype: type[np.generic], largest: float) -> None:
     fraction = np.sin(np.arange(4000) * 0.07) * 0.9
     offset = 128 if dtype is np.uint8 else 0
     whole = np.rint(fraction * largest) if largest > 1 else fraction

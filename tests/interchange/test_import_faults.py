@@ -182,9 +182,7 @@ def test_a_number_that_is_not_finite_is_refused_or_a_gap(tmp_path: Path, cell: s
         (19997, "resample = true", "19997 and 2000 samples per second are not in a ratio of whole numbers"),
     ],
 )
-def test_a_rate_of_the_header_that_cannot_be_used_is_refused(
-    tmp_path: Path, rate_hz: int, wish: str, said: str
-) -> None:
+def test_a_rate_of_the_header_that_is_none_is_refused(tmp_path: Path, rate_hz: int, wish: str, said: str) -> None:
     wavfile.write(tmp_path / "run.wav", rate_hz, np.zeros((1000, 3), dtype=np.float32))
     with pytest.raises(MachineFileError, match=said):
         imported(tmp_path, tmp_path / "run.wav", f'[time]\n{wish}\nstart = "{START}"\n{IN_ORDER}')

@@ -72,9 +72,7 @@ def test_gaps_stay_gaps_and_every_sample_keeps_its_time(
 
 @settings(max_examples=30)
 @given(rows=st.integers(3, 2000), data=st.data())
-def test_a_duplicated_time_is_named_by_its_row(
-    tmp_path_factory: pytest.TempPathFactory, rows: int, data: st.DataObject
-) -> None:
+def test_a_duplicated_time_is_named(tmp_path_factory: pytest.TempPathFactory, rows: int, data: st.DataObject) -> None:
     folder = tmp_path_factory.mktemp("duplicates")
     twice = data.draw(st.integers(1, rows - 1))
     time = START_NS + STEP_NS * np.arange(rows, dtype=np.int64)
@@ -87,13 +85,10 @@ def test_a_duplicated_time_is_named_by_its_row(
 @settings(max_examples=40)
 @given(
     displacement=st.sampled_from(["m", "mm", "um", "µm", "\u03bcm", "mil", "in"]),
-    velocity=st.sampled_from(["m/s", "mm/s", "in/s", "ips"]),
-    angle=st.sampled_from(["rad", "deg", "rev"]),
+    velocity=st.sampled_from(["m/s", "mm/s", "in/s", "ips"]), angle=st.sampled_from(["rad", "deg", "rev"]),
     kept=st.tuples(st.sampled_from(["m", "mm", "um", "mil"]), st.sampled_from(["m/s", "mm/s", "in/s"])),
-    scale=st.floats(1e-3, 1e3),
-    offset=st.floats(-50, 50),
-    sign=st.sampled_from([1, -1]),
-)
+    scale=st.floats(1e-3, 1e3), offset=st.floats(-50, 50), sign=st.sampled_from([1, -1]),
+)  # fmt: skip
 def test_any_mix_of_units_gives_the_same_motion(
     tmp_path_factory: pytest.TempPathFactory,
     displacement: str,
@@ -112,15 +107,12 @@ def test_any_mix_of_units_gives_the_same_motion(
     described: Machine = machine(sensors=sensors)
     numbers = (sign * x_SI / unit_factor("displacement", displacement) - offset) / scale
     pa.parquet.write_table(
-        pa.table(
-            {
-                "x": numbers,
-                "v": v_SI / unit_factor("velocity", velocity),
-                "a": a / unit_factor("shaft_angle", angle) + (1.0 if angle == "rev" else 0.0),
-            }
-        ),
+        pa.table({
+            "x": numbers, "v": v_SI / unit_factor("velocity", velocity),
+            "a": a / unit_factor("shaft_angle", angle) + (1.0 if angle == "rev" else 0.0),
+        }),
         folder / "run.parquet",
-    )
+    )  # fmt: skip
     mapping = (
         f'[time]\nrate_hz = 2000.0\nstart = "{START}"\n[channels]\n'
         f'y1 = {{ column = "x", unit = "{displacement}", scale = {scale!r}, offset = {offset!r}, sign = {sign} }}\n'
@@ -138,9 +130,7 @@ def test_any_mix_of_units_gives_the_same_motion(
 
 @settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), drift=st.floats(-5e-5, 5e-5))
-def test_jitter_and_a_drifting_clock_make_no_gaps(
-    tmp_path_factory: pytest.TempPathFactory, seed: int, drift: float
-) -> None:
+def test_jitter_and_drift_make_no_gaps(tmp_path_factory: pytest.TempPathFactory, seed: int, drift: float) -> None:
     folder = tmp_path_factory.mktemp("jitter")
     rng = np.random.default_rng(seed)
     rows = 20_000

@@ -58,8 +58,7 @@ def test_the_growth_that_is_stated_is_the_one_that_raises_an_alert(scales: tuple
             assert (limit.state == "normal") == (state == "normal")
         assert one.alert == pytest.approx(one.healthy * (1 + one.growth))
     units = {(one.channel.name, one.measure): one.unit for one in stated}
-    assert units["A", "velocity"] == "mm/s rms"
-    assert units["D", "x2"] == "um pp"
+    assert (units["A", "velocity"], units["D", "x2"]) == ("mm/s rms", "um pp")
     assert next(one for one in stated if one.channel.name == "D").healthy == pytest.approx(40 * mean)
 
 

@@ -78,8 +78,7 @@ def test_own_limits_are_in_the_unit_that_is_shown() -> None:
     own = [{"channel": "DE-A", "alert": 0.5, "danger": 0.8}, {"channel": "DE-A", "measure": "crest", "alert": 6.0}]
     found = judged(CASING_G, window(overall=0.6 * 9.80665, crest=5.0), limits=own)
     assert found.overall == pytest.approx(0.6)
-    assert limits(found)["overall"].state == "alert"
-    assert limits(found)["crest"].state == "normal"
+    assert (limits(found)["overall"].state, limits(found)["crest"].state) == ("alert", "normal")
 
 
 def limits(levels: ChannelLevels) -> dict[str, LevelLimits]:
@@ -103,8 +102,7 @@ def test_levels_relative_to_a_steady_reference(factor: float, state: str) -> Non
 def test_a_window_that_is_not_full_may_scatter_more() -> None:
     healthy = reference(*(replace(window(error=1e-4, overall=1e-3), hops=16) for _ in range(3)))
     full, first_hop = (judged(CASING, replace(window(overall=3e-3), hops=hops), healthy) for hops in (16, 1))
-    assert limits(full)["overall"].state == "danger"
-    assert limits(first_hop)["overall"].state == "normal"
+    assert (limits(full)["overall"].state, limits(first_hop)["overall"].state) == ("danger", "normal")
 
 
 def test_what_varied_in_the_healthy_windows_may_vary() -> None:
@@ -235,9 +233,7 @@ def test_the_first_windows_become_the_reference_and_survive_a_restart() -> None:
 
 
 @pytest.mark.parametrize(("times", "learned"), [(3.0, [True]), (5.0, [True, False])])
-def test_a_machine_that_stood_in_the_first_windows_is_learned_again_once_it_runs(
-    times: float, learned: list[bool]
-) -> None:
+def test_a_machine_that_stood_in_the_first_windows_is_learned_anew(times: float, learned: list[bool]) -> None:
     """But not one that has become louder, and turns visibly: it may have turned all the time."""
     first = FirstWindows(["DE-H"], 2, turns=True, since="May, new bearing")
     for number in range(8):

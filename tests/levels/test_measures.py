@@ -27,7 +27,6 @@ def plan(*quantities: str, rate_hz: float = RATE_HZ, band_hz: tuple[float, float
 def taken(
     sizes: LevelPlan, samples: FloatArray, hops: int = 1, angle_rad: FloatArray | None = None, *, phase: bool = False
 ) -> WindowLevels:
-    """Levels of a window of equal hops."""
     pieces = np.split(samples, hops)
     angles = [None] * hops if angle_rad is None else np.split(angle_rad, hops)
     found = [hop_levels(sizes, *waveform_of(piece), angle) for piece, angle in zip(pieces, angles, strict=True)]

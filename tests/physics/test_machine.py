@@ -119,8 +119,7 @@ def in_time(times: float, rate_hz: float, *more: str) -> str:
 
 def test_a_window_that_is_not_given_goes_with_the_natural_frequencies(tmp_path: Path) -> None:
     usual = load_machine(write(tmp_path, in_time(1, 2000.0)))
-    assert usual.window == WindowSettings()
-    assert usual.time_scale == 1
+    assert (usual.window, usual.time_scale) == (WindowSettings(), 1)
 
     fast = load_machine(write(tmp_path, in_time(15, 20000.0)))
     low_hz, high_hz = fast.window.band_hz
@@ -140,14 +139,10 @@ def test_a_window_that_is_not_given_goes_with_the_natural_frequencies(tmp_path: 
 
 
 def test_a_window_that_is_given_is_taken(tmp_path: Path) -> None:
-    given = load_machine(
-        write(
-            tmp_path,
-            in_time(
-                15, 20000.0, "[window]", "hop_s = 10.0", "length_s = 120.0", "max_span_s = 200.0", "lag_to_s = 0.05"
-            ),
-        )
-    )
+    given = load_machine(write(
+        tmp_path,
+        in_time(15, 20000.0, "[window]", "hop_s = 10.0", "length_s = 120.0", "max_span_s = 200.0", "lag_to_s = 0.05"),
+    ))  # fmt: skip
     assert (given.window.hop_s, given.window.length_s, given.window.segment_s) == (10, 120, 2)
     assert (given.window.lag_from_s, given.window.lag_to_s) == (0.01, 0.05)
     assert given.window.band_hz[1] > 1000
@@ -162,9 +157,7 @@ def test_a_slow_machine_whose_file_gives_one_length_has_the_usual_others(tmp_pat
 
 
 @pytest.mark.parametrize("lag_to_s", [0.1, 0.125])
-def test_lags_of_a_usual_machine_that_are_given_are_what_a_fast_one_is_evaluated_by(
-    tmp_path: Path, lag_to_s: float
-) -> None:
+def test_given_lags_of_a_usual_machine_are_what_a_fast_one_is_evaluated_by(tmp_path: Path, lag_to_s: float) -> None:
     """What was commissioned with such a file before goes on as it was."""
     text = SENSORS_ALONE.replace("2000", "25600") + "[operation]\nspeed_rpm = 6000\n"
     assert load_machine_file(write(tmp_path, text)).time_scale == 0.5
@@ -205,8 +198,7 @@ def test_where_the_rotor_is_not_known_a_fast_speed_says_so_and_a_slow_one_nothin
         for rpm in (60, 1500, 3000, 15000)
     }
     assert [one.time_scale for one in windows.values()] == [1, 1, 1, 0.2]
-    assert windows[60].window == windows[3000].window
-    assert windows[15000].window.band_hz == (15, 750)
+    assert (windows[60].window, windows[15000].window.band_hz) == (windows[3000].window, (15, 750))
     assert windows[15000].window.lag_to_s == pytest.approx(0.025)
 
 
@@ -224,5 +216,4 @@ def test_a_rate_that_shows_nothing_of_a_fast_machine_still_goes_with_the_usual_w
 ) -> None:
     text = SENSORS_ALONE.replace("2000.0", repr(rate_hz)) + "[operation]\nspeed_rpm = "
     machine = load_machine_file(write(tmp_path, f"{text}{rpm}\n"))
-    assert machine.window == load_machine_file(write(tmp_path, f"{text}1500\n")).window
-    assert machine.time_scale == 1
+    assert (machine.window, machine.time_scale) == (load_machine_file(write(tmp_path, f"{text}1500\n")).window, 1)

@@ -99,12 +99,9 @@ def test_of_missing_blocks_nothing_else_is_lost(late: list[int], again: list[tup
 @pytest.mark.slow
 @settings(max_examples=60)
 @given(
-    lateness(3 * N),
-    repetitions,
-    st.sampled_from([-3600, -50, -2, 0, 2, 900, 7200]),
-    st.integers(-20, 400),
+    lateness(3 * N), repetitions, st.sampled_from([-3600, -50, -2, 0, 2, 900, 7200]), st.integers(-20, 400),
     st.booleans(),
-)
+)  # fmt: skip
 def test_a_clock_that_is_set_and_a_restart_change_nothing(
     late: list[int], again: list[tuple[int, int]], clock_s: int, pause: int, has_run: bool
 ) -> None:
@@ -146,9 +143,7 @@ def test_any_block_may_be_repeated_anywhere() -> None:
 
 @settings(max_examples=100)
 @given(lateness(N), repetitions, st.lists(st.integers(0, N), max_size=3))
-def test_restarts_of_the_monitor_change_nothing(
-    late: list[int], again: list[tuple[int, int]], stops: list[int]
-) -> None:
+def test_restarts_of_a_monitor_change_nothing(late: list[int], again: list[tuple[int, int]], stops: list[int]) -> None:
     """What waited is lost with the monitor and comes again, with much else, from the publisher's cache."""
     stream = [block(number) for number in range(N)]
     arriving = delivered(stream, late, again)
@@ -226,8 +221,7 @@ def test_repetitions_of_a_waiting_block_follow_it() -> None:
 def test_a_stream_that_is_joined_late_begins_at_once_and_a_young_one_waits_for_its_beginning() -> None:
     late, young = Arrivals(3), Arrivals(3)
     assert len(late.take(block(36_000))) == 1
-    assert young.take(block(2)) == ()
-    assert young.take(block(1)) == ()
+    assert young.take(block(2)) == young.take(block(1)) == ()
     assert [arrived.block.sequence for arrived in young.take(block(0))] == [0, 1, 2]
 
 

@@ -149,19 +149,14 @@ def test_secrets_that_everybody_may_read_are_refused(tmp_path: Path, mode: int) 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "no users"),
-        ("lab", "line 1: expected name:password"),
-        (f"lab:{HIDDEN}\n\npump:x", "line 2: expected name:password"),
-        (f"lab:{HIDDEN}\n# pump:x", "line 2"),
-        (f"lab:{HIDDEN}\n:x", "line 2"),
-        (f"lab:{HIDDEN}\npump:", "line 2"),
+        ("", "no users"), ("lab", "line 1: expected name:password"),
+        (f"lab:{HIDDEN}\n\npump:x", "line 2: expected name:password"), (f"lab:{HIDDEN}\n# pump:x", "line 2"),
+        (f"lab:{HIDDEN}\n:x", "line 2"), (f"lab:{HIDDEN}\npump:", "line 2"),
         (f"lab:{HIDDEN}\nlab:{HIDDEN}", "line 2: the user lab already has a line"),
         (f"pump:{HIDDEN}", "who: lab has no line in"),
     ],
-)
-def test_a_file_of_passwords_that_cannot_be_used_is_refused_without_showing_one(
-    tmp_path: Path, text: str, said: str
-) -> None:
+)  # fmt: skip
+def test_a_file_of_passwords_that_is_none_is_refused_and_not_shown(tmp_path: Path, text: str, said: str) -> None:
     passwords = secret_file(tmp_path / "all", text)
     link = LinkSettings.model_validate({"listen": ENDPOINT, "passwords_file": passwords, "grants": [GRANT]})
     with pytest.raises(MachineFileError, match=said) as caught:

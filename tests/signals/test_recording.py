@@ -15,14 +15,11 @@ from models.signals.salvage import inspect_recording, salvage_recording
 from tests.sure import sure
 
 messages = st.builds(
-    RecordedMessage,
-    key=st.sampled_from(["a/stream", "a/truth", "b/stream"]),
-    payload=st.binary(max_size=300),
+    RecordedMessage, key=st.sampled_from(["a/stream", "a/truth", "b/stream"]), payload=st.binary(max_size=300),
     attachment=st.binary(max_size=40),
     encoding=st.sampled_from(["", "application/json", "application/x-rotorwatch-block;0123456789ab", "text/plain;µ"]),
-    log_time_ns=st.integers(0, 2**63 - 1),
-    publish_time_ns=st.integers(0, 2**63 - 1),
-)
+    log_time_ns=st.integers(0, 2**63 - 1), publish_time_ns=st.integers(0, 2**63 - 1),
+)  # fmt: skip
 
 
 def _some(count: int, size: int = 7200) -> list[RecordedMessage]:
@@ -42,9 +39,7 @@ def _write(path: Path, content: list[RecordedMessage]) -> None:
 
 @settings(max_examples=40)
 @given(content=st.lists(messages, max_size=30))
-def test_messages_come_back_verbatim_and_in_order(
-    tmp_path_factory: pytest.TempPathFactory, content: list[RecordedMessage]
-) -> None:
+def test_messages_come_back_the_same(tmp_path_factory: pytest.TempPathFactory, content: list[RecordedMessage]) -> None:
     path = tmp_path_factory.mktemp("recording") / "run.mcap"
     _write(path, content)
     assert list(read_recording(path)) == content
@@ -276,8 +271,7 @@ def test_a_flushed_message_is_safe_and_an_abandoned_file_keeps_it(tmp_path: Path
     assert (writer.messages, writer.flushed) == (1, 1)
     writer.write(content[1])
     writer.sync()
-    assert writer.flushed == 2
-    assert writer.size_bytes == writer.part.stat().st_size
+    assert (writer.flushed, writer.size_bytes) == (2, writer.part.stat().st_size)
     writer.write(content[2])
     writer.abandon()
     assert not writer.path.exists()

@@ -70,13 +70,9 @@ _samples = st.one_of(
 @pytest.mark.parametrize("encode", [encode_block, encode_arrow])
 @settings(max_examples=60)
 @given(
-    samples=_samples,
-    start_ns=st.integers(-(2**63), 2**63 - 1),
-    sequence=st.integers(0, 2**64 - 1),
-    run=st.integers(0, 2**16 - 1),
-    rate_hz=st.floats(1e-3, 1e6),
-    schema_hash=st.sampled_from(["", "0123456789ab"]),
-)
+    samples=_samples, start_ns=st.integers(-(2**63), 2**63 - 1), sequence=st.integers(0, 2**64 - 1),
+    run=st.integers(0, 2**16 - 1), rate_hz=st.floats(1e-3, 1e6), schema_hash=st.sampled_from(["", "0123456789ab"]),
+)  # fmt: skip
 def test_any_block_survives_the_round_trip(
     encode: Encoder, samples: npt.NDArray[Any], start_ns: int, sequence: int, run: int, rate_hz: float, schema_hash: str
 ) -> None:
@@ -390,13 +386,10 @@ def test_units_turn_into_si(quantity: str, unit: str, factor: float) -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"unit": "mm/s"}, "unit 'mm/s' is not one of"),
-        ({"name": ""}, "at least 1 character"),
-        ({"name": "a b"}, "pattern"),
-        ({"name": "x" * 65}, "at most 64"),
-        ({"gain": "1"}, "Extra inputs"),
+        ({"unit": "mm/s"}, "unit 'mm/s' is not one of"), ({"name": ""}, "at least 1 character"),
+        ({"name": "a b"}, "pattern"), ({"name": "x" * 65}, "at most 64"), ({"gain": "1"}, "Extra inputs"),
     ],
-)
+)  # fmt: skip
 def test_unusable_channels_are_refused(fields: dict[str, str], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         Channel.model_validate(_channel(**fields))
@@ -417,8 +410,7 @@ def test_the_hash_changes_with_whatever_shapes_the_stream() -> None:
     ]  # fmt: skip
     assert len({variant.schema_hash for variant in variants}) == len(variants)
     again = ChannelDescriptor.model_validate_json(variants[0].model_dump_json())
-    assert again.schema_hash == variants[0].schema_hash
-    assert again.states == ("y1", "z1")
+    assert (again.schema_hash, again.states) == (variants[0].schema_hash, ("y1", "z1"))
 
 
 def test_keys_lie_below_the_machine() -> None:
@@ -446,8 +438,7 @@ def test_plain_names_are_accepted(name: str) -> None:
 
 def test_a_link_stays_local_and_quiet_by_default() -> None:
     items = LinkSettings().zenoh_items()
-    assert json.loads(items["listen/endpoints"]) == []
-    assert json.loads(items["connect/endpoints"]) == []
+    assert json.loads(items["listen/endpoints"]) == json.loads(items["connect/endpoints"]) == []
     assert items["scouting/multicast/enabled"] == items["scouting/gossip/enabled"] == "false"
     assert items["transport/shared_memory/enabled"] == "false"
     with pytest.raises(ValidationError, match="Extra inputs"):

@@ -35,9 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def test_a_machine_without_parameters_is_commissioned_and_again_only_with_a_reason(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_machine_is_commissioned_and_again_only_with_a_reason(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = ("--machine", "machine.toml", "--healthy", "monday.mcap", "friday.mcap", "--out", "kit")
     variables = {**os.environ, "COLUMNS": "200"}
     found = ran("simulator.rotortrain", "commission", *arguments, cwd=folder, environment=variables)
@@ -66,9 +64,7 @@ def test_a_machine_without_parameters_is_commissioned_and_again_only_with_a_reas
     assert json.loads((folder / "kit" / "commissioned-1.json").read_text(encoding="utf-8"))["version"] == 1
 
 
-def test_a_recording_that_is_not_fit_is_refused_with_what_to_record(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unfit_recording_is_refused_with_what_to_record(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("simulator.commission.page.pictures_of", lambda *_: ())
     found = run(folder, "--machine", "machine.toml", "--healthy", "short.mcap", "--out", "never")
     assert found.exit_code == 3

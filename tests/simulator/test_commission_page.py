@@ -47,14 +47,9 @@ from tests.sure import sure
 
 VOID = {"meta", "br", "link", "img", "hr", "input"}
 MEASURES = (
-    "healthy_spread",
-    "window_error",
-    "commissioning_error",
-    "detectable_loss",
-    "detectable_gain",
-    "window_s_for_wished",
-    "healthy_s_for_wished",
-)
+    "healthy_spread", "window_error", "commissioning_error", "detectable_loss", "detectable_gain",
+    "window_s_for_wished", "healthy_s_for_wished",
+)  # fmt: skip
 RUDE = '<script>alert("1")</script> & co.mcap'
 
 Case = tuple[Commissioning, tuple[HealthyRecording, ...], MachineFile]
@@ -169,7 +164,6 @@ def written(folder: Path, name: str) -> tuple[str, CommissioningReport]:
 
 
 def section(text: str, name: str) -> str:
-    """What is seen of one section."""
     found = sure(re.search(rf'<section id="{name}">(.*?)</section>', text, re.DOTALL))
     return Page(found[1]).text
 
@@ -316,11 +310,8 @@ def pictures(text: str) -> dict[str, str]:
 
 def test_pictures(folder: Path) -> None:
     everything = [
-        "Healthy readings",
-        "What limits each reading",
-        "Spectra of the recordings",
-        "Speed and level over time",
-    ]
+        "Healthy readings", "What limits each reading", "Spectra of the recordings", "Speed and level over time",
+    ]  # fmt: skip
     for name in (*LEVELS, "no phase reference"):
         assert list(pictures(written(folder, name)[0])) == everything
     for name in ("too short", "second excitation", "no speed"):

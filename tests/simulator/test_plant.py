@@ -70,7 +70,7 @@ def _covariance(machine: Machine, condition: Condition) -> tuple[FloatArray, Flo
     return A, stationary_covariance(A, expanded_B(condition.sources))
 
 
-def test_covariances_are_those_of_the_lyapunov_equation(
+def test_covariances_are_those_of_lyapunov(
     machine: Machine, condition: Condition, stochastic: list[FloatArray]
 ) -> None:
     _, R = _covariance(machine, condition)
@@ -155,12 +155,9 @@ def _forced_equation(rotor: RotorParameters, W: float, theta: float) -> Callable
 def test_changes_give_the_motion_of_the_forced_equation(machine: Machine) -> None:
     """Without noise, through changes of unbalance, stiffness, damping and speed: an ODE solver says the same."""
     conditions = [
-        _condition(),
-        _condition(e=0.5),
-        _condition(e=0.5, k_by=-0.4),
-        _condition(speed_rpm=1700.0, k_by=-0.4, c_bz=0.8),
-        _condition(speed_rpm=1000.0, EI=-0.2),
-    ]
+        _condition(), _condition(e=0.5), _condition(e=0.5, k_by=-0.4),
+        _condition(speed_rpm=1700.0, k_by=-0.4, c_bz=0.8), _condition(speed_rpm=1000.0, EI=-0.2),
+    ]  # fmt: skip
     plant = Plant(machine, conditions[0], np.random.default_rng(0))
     pieces, angles, solution = [], [], []
     state, theta, n = None, 0.0, 150

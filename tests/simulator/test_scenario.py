@@ -72,8 +72,7 @@ def test_the_shipped_scenarios_are_what_they_are_called() -> None:
         assert (scenario.name, scenario.duration_s) == (name, 300.0)
         (event,) = scenario.events
         assert (event.parameter, event.relative_change, event.at_s, event.ramp_s) == (name, change, 140.0, 0.0)
-        assert scenario.sources == healthy.sources
-        assert scenario.sensors == healthy.sensors
+        assert (scenario.sources, scenario.sensors) == (healthy.sources, healthy.sensors)
         seeds.add(scenario.seed)
     assert len(seeds) == 6  # independent realisations
 
@@ -247,8 +246,7 @@ def test_without_events_one_condition_holds(machine: Machine) -> None:
     ((first, condition),) = timeline.conditions
     assert (first, condition.speed_rpm, condition.sources) == (0, 1320.0, (SOURCE,))
     assert set(condition.relative_changes.values()) == {0.0}
-    assert timeline.sensor_faults == {}
-    assert timeline.truth == ((0, ()),)
+    assert (timeline.sensor_faults, timeline.truth) == ({}, ((0, ()),))
 
 
 def test_a_step_acts_at_the_nearest_sample(machine: Machine) -> None:

@@ -101,19 +101,14 @@ VALUES = np.array([-3e-6, 1e-6, 5e-6])
 @pytest.mark.parametrize(
     ("faults", "expected"),
     [
-        ({}, [-3.0, 1.0, 5.0]),
-        ({"offset": 2e-6}, [-1.0, 3.0, 7.0]),
-        ({"gain": 0.5}, [-1.5, 0.5, 2.5]),
-        ({"offset": 2e-6, "gain": 0.5}, [0.5, 2.5, 4.5]),
-        ({"clip": 2e-6}, [-2.0, 1.0, 2.0]),
-        ({"clip": 0.0}, [0.0, 0.0, 0.0]),
-        ({"noise_relative": 0.1}, [-2.0, 0.0, 6.0]),
-        ({"stuck": None}, [7.0, 7.0, 7.0]),
-        ({"stuck": None, "dropout": None}, [np.nan, np.nan, np.nan]),
+        ({}, [-3.0, 1.0, 5.0]), ({"offset": 2e-6}, [-1.0, 3.0, 7.0]), ({"gain": 0.5}, [-1.5, 0.5, 2.5]),
+        ({"offset": 2e-6, "gain": 0.5}, [0.5, 2.5, 4.5]), ({"clip": 2e-6}, [-2.0, 1.0, 2.0]),
+        ({"clip": 0.0}, [0.0, 0.0, 0.0]), ({"noise_relative": 0.1}, [-2.0, 0.0, 6.0]),
+        ({"stuck": None}, [7.0, 7.0, 7.0]), ({"stuck": None, "dropout": None}, [np.nan, np.nan, np.nan]),
         ({"dropout": None}, [np.nan, np.nan, np.nan]),
     ],
     ids=lambda value: "+".join(value) or "healthy" if isinstance(value, dict) else "",
-)
+)  # fmt: skip
 def test_each_fault(faults: SensorFaults, expected: list[float]) -> None:
     sensor = _sensor(SensorSettings())
     sensor.measure(np.array([7e-6]), np.zeros(1), {})  # what a stuck sensor repeats
@@ -144,10 +139,8 @@ def test_faults_begin_and_end_at_their_samples() -> None:
     expected = np.zeros(40)
     expected[13:20], expected[20:30] = 1e6, np.nan
     np.testing.assert_array_equal(column, expected)
-    assert bank.faults_at(102) == {}
-    assert bank.faults_at(103) == {"XE": {"offset": 1.0}}
-    assert bank.faults_at(115) == {"XE": {"offset": 1.0, "dropout": None}}
-    assert bank.faults_at(120) == {}
+    assert (bank.faults_at(102), bank.faults_at(103)) == ({}, {"XE": {"offset": 1.0}})
+    assert (bank.faults_at(115), bank.faults_at(120)) == ({"XE": {"offset": 1.0, "dropout": None}}, {})
 
 
 def test_an_unused_noise_is_drawn_all_the_same() -> None:

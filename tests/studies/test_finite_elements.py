@@ -41,16 +41,10 @@ from tests.sure import sure
 from tests.windows import last_window
 
 BEAM = BeamRotor(
-    name="beam",
-    description="",
-    length_m=1.0,
-    diameter_m=0.02,
-    elements=12,
-    bearings=(Bearing(0, 1e12, 1e12, 0, 0), Bearing(12, 1e12, 1e12, 0, 0)),
-    discs=(),
-    speed_rad_s=0.0,
+    name="beam", description="", length_m=1.0, diameter_m=0.02, elements=12,
+    bearings=(Bearing(0, 1e12, 1e12, 0, 0), Bearing(12, 1e12, 1e12, 0, 0)), discs=(), speed_rad_s=0.0,
     shaft_damping_s=0.0,
-)
+)  # fmt: skip
 
 
 def forces(rotor: BeamRotor) -> tuple[Force, ...]:

@@ -64,9 +64,7 @@ def test_training_fits_its_own_windows_and_is_repeatable(
     assert np.mean([first.deviation(window) for window in training]) < 0.05
 
 
-def test_diagnostician_names_equations(
-    rig: Machine, networks: list[PaperNetwork], healthy: list[WindowStatistics]
-) -> None:
+def test_a_reading_names_equations(rig: Machine, networks: list[PaperNetwork], healthy: list[WindowStatistics]) -> None:
     paper = PaperDiagnostician.calibrated(networks, healthy, false_alarm_rate=0.2)
     # As calibrated: of the six windows exactly the largest score is at the limit, none above it.
     assert not any(paper.flagged(paper.deviations(window)) for window in healthy)
@@ -76,9 +74,7 @@ def test_diagnostician_names_equations(
     assert "28" in paper.flagged(deviations)
 
 
-def test_an_equation_without_its_channels_is_not_evaluated(
-    networks: list[PaperNetwork], healthy: list[WindowStatistics]
-) -> None:
+def test_equations_without_channels_are_not_read(networks: list[PaperNetwork], healthy: list[WindowStatistics]) -> None:
     paper = PaperDiagnostician.calibrated(networks, healthy, false_alarm_rate=0.2)
     window = simulate_window(Draw(load_machine("lab"), _SEED, Purpose.EVALUATION), 0)
     assert list(paper.deviations(window)) == ["28", "29", "31"]
@@ -86,8 +82,6 @@ def test_an_equation_without_its_channels_is_not_evaluated(
     assert list(paper.deviations(without_angle)) == ["28", "31"]
 
 
-def test_too_few_windows_for_the_declared_rate_are_refused(
-    networks: list[PaperNetwork], healthy: list[WindowStatistics]
-) -> None:
+def test_too_few_windows_for_a_rate_are_refused(networks: list[PaperNetwork], healthy: list[WindowStatistics]) -> None:
     with pytest.raises(EstimationError, match="expected at least 99"):
         PaperDiagnostician.calibrated(networks[:1], healthy, false_alarm_rate=0.01)

@@ -75,14 +75,10 @@ def toy(windows: int = 4, machine: str = "none") -> Study:
     """Under the name of a study that has words for its page."""
     columns = {"named": lambda rows: rate(row["named"] for row in rows)}
     return Study(
-        name="sensors",
-        cells=tuple(Cell({"changed": changed}, windows, _measure) for changed in ("healthy", "e +20%")),
-        tables=(Table("toy", ("changed", "method"), columns, page="Everything:"),),
-        goals=_goals,
-        charts=_charts,
-        learn=_learn,
-        made_with={"machine": machine},
-    )
+        name="sensors", cells=tuple(Cell({"changed": changed}, windows, _measure) for changed in ("healthy", "e +20%")),
+        tables=(Table("toy", ("changed", "method"), columns, page="Everything:"),), goals=_goals, charts=_charts,
+        learn=_learn, made_with={"machine": machine},
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("processes", [1, 2])

@@ -64,13 +64,9 @@ def recorded(
 
 
 def of_states(window: WindowStatistics, states: tuple[str, ...]) -> WindowStatistics:
-    """What is seen of some of the motions."""
     at = [window.states.index(name) for name in states]
     return replace(
-        window,
-        states=states,
-        correlation=window.correlation[:, at][:, :, at],
-        hop_correlation=window.hop_correlation[:, :, at][:, :, :, at],
-        spectrum=window.spectrum[:, at][:, :, at],
+        window, states=states, correlation=window.correlation[:, at][:, :, at],
+        hop_correlation=window.hop_correlation[:, :, at][:, :, :, at], spectrum=window.spectrum[:, at][:, :, at],
         synchronous=None if window.synchronous is None else window.synchronous[at],
-    )
+    )  # fmt: skip

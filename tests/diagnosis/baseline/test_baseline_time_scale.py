@@ -22,20 +22,13 @@ def faster(window: WindowStatistics) -> WindowStatistics:
     assert window.hop_synchronous is not None
     slowest, fastest = window.speed_range
     return replace(
-        window,
-        lags_s=window.lags_s / _TIMES,
-        correlation=window.correlation * both,
-        hop_correlation=window.hop_correlation * both,
-        spectrum=window.spectrum * both / _TIMES,
-        frequencies_hz=window.frequencies_hz * _TIMES,
-        synchronous=turning * rates,
-        hop_synchronous=window.hop_synchronous * rates,
-        speed_rad_s=window.speed_rad_s * _TIMES,
-        speed_range=(slowest * _TIMES, fastest * _TIMES),
-        hop_speed_rad_s=window.hop_speed_rad_s * _TIMES,
-        duration_s=window.duration_s / _TIMES,
-        time_scale=1 / _TIMES,
-    )
+        window, lags_s=window.lags_s / _TIMES, correlation=window.correlation * both,
+        hop_correlation=window.hop_correlation * both, spectrum=window.spectrum * both / _TIMES,
+        frequencies_hz=window.frequencies_hz * _TIMES, synchronous=turning * rates,
+        hop_synchronous=window.hop_synchronous * rates, speed_rad_s=window.speed_rad_s * _TIMES,
+        speed_range=(slowest * _TIMES, fastest * _TIMES), hop_speed_rad_s=window.hop_speed_rad_s * _TIMES,
+        duration_s=window.duration_s / _TIMES, time_scale=1 / _TIMES,
+    )  # fmt: skip
 
 
 def test_a_machine_five_times_as_fast_reads_the_same() -> None:

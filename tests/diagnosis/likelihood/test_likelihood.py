@@ -236,18 +236,10 @@ def test_the_bound_of_a_single_mass_on_a_spring() -> None:
     mass, f_hz, damping, length_s = 1.0, 50.0, 0.01, 600.0
     k = (2 * np.pi * f_hz) ** 2 * mass
     c = 2 * damping * np.sqrt(k * mass)
-    rotor = machine.rotor.model_copy(
-        update={
-            "m1_kg": mass - 1e-6,
-            "m2_kg": 1e-6,
-            "I2_kg_m2": 1e-9,
-            "I2p_kg_m2": 1e-12,
-            "k_by_N_per_m": k,
-            "k_bz_N_per_m": k,
-            "c_by_N_s_per_m": c,
-            "c_bz_N_s_per_m": c,
-        }
-    )
+    rotor = machine.rotor.model_copy(update={
+        "m1_kg": mass - 1e-6, "m2_kg": 1e-6, "I2_kg_m2": 1e-9, "I2p_kg_m2": 1e-12, "k_by_N_per_m": k, "k_bz_N_per_m": k,
+        "c_by_N_s_per_m": c, "c_bz_N_s_per_m": c,
+    })  # fmt: skip
     window = machine.window.model_copy(update={"segment_s": 20.0, "hop_s": 10.0, "band_hz": (20.0, 80.0)})
     sensors = tuple(one for one in machine.sensors if one.name in {"y1", "z1", "theta"})
     single = machine.model_copy(update={"rotor": rotor, "window": window, "sensors": sensors})
@@ -302,7 +294,6 @@ def late(machine: Machine, window: WindowStatistics, delays_s: list[float]) -> W
 
 
 def told(machine: Machine, window: WindowStatistics) -> tuple[str, float]:
-    """What explains a window best, and its delay, µs."""
     diagnosis = LikelihoodFit(machine).diagnose(window)
     assert sure(diagnosis.misfit_z) > 5
     name, _, size = diagnosis.suspect.partition(" (")

@@ -38,9 +38,7 @@ def linear_relation(equation: Equation | SynchronousEquation, machine: Machine) 
 
 @pytest.mark.parametrize("name", ["lab", "heavy"])
 @pytest.mark.parametrize("equation", EQUATIONS, ids=lambda equation: equation.number)
-def test_an_equation_reads_its_own_parameters_and_is_blind_to_the_rest(
-    equation: Equation | SynchronousEquation, name: str
-) -> None:
+def test_an_equation_reads_its_own_parameters_alone(equation: Equation | SynchronousEquation, name: str) -> None:
     machine = load_machine(name)
     weights = linear_relation(equation, machine)
     for changed_name in PARAMETERS:

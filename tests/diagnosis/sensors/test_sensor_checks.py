@@ -98,8 +98,7 @@ def only(findings: tuple[SensorFault, ...]) -> SensorFault:
 )
 def test_healthy_sensors_are_left_alone_under_any_excitation(name: str, one_source: bool) -> None:
     for window in windows_of(plan_of(name), recorded(name, 31, one_source=one_source)):
-        assert sensor_findings(window) == ()
-        assert sensor_findings(window, reference_of(name)) == ()
+        assert sensor_findings(window) == sensor_findings(window, reference_of(name)) == ()
 
 
 @pytest.mark.parametrize("state", ["y1", "z2_dot"])
@@ -189,14 +188,11 @@ def test_runs_of_equal_samples_that_are_no_break(kind: str) -> None:
 @pytest.mark.parametrize(
     ("bounds", "angle"),
     [
-        ("0.0 to 1.0", lambda theta: theta / (2 * np.pi)),
-        ("0.0 to 359.6", np.degrees),
-        ("-10.0 to -8.0", lambda theta: np.where(theta < 0.3, -8.0, -10.0)),
-        ("", lambda theta: theta - np.pi),
-        ("", np.unwrap),
-        ("", lambda theta: np.mod(np.unwrap(theta), 20 * np.pi)),
+        ("0.0 to 1.0", lambda theta: theta / (2 * np.pi)), ("0.0 to 359.6", np.degrees),
+        ("-10.0 to -8.0", lambda theta: np.where(theta < 0.3, -8.0, -10.0)), ("", lambda theta: theta - np.pi),
+        ("", np.unwrap), ("", lambda theta: np.mod(np.unwrap(theta), 20 * np.pi)),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_angle_in_radians_is_told(bounds: str, angle: Callable[[FloatArray], FloatArray]) -> None:
     samples = recorded("lab", 1).copy()
     samples[:, -1] = angle(samples[:, -1])
@@ -245,8 +241,7 @@ def test_a_wrong_gain_is_measured_and_the_pair_named(state: str, gain: float) ->
     samples[:, column(state)] *= gain
     place = state.partition("_")[0]
     finding = only(found_in(samples))
-    assert finding.kind == "gain"
-    assert set(finding.states) == {place, f"{place}_dot"}
+    assert (finding.kind, set(finding.states)) == ("gain", {place, f"{place}_dot"})
     seen = gain if state.endswith("_dot") else 1 / gain
     assert 1 + (finding.value or 0.0) == pytest.approx(seen, rel=0.005)
 
@@ -396,8 +391,7 @@ def test_a_machine_that_sinks_into_the_noise_of_its_sensors_has_no_gain_that_dri
     fades = np.interp(np.arange(len(samples)) / plan.rate_hz, [40.0, 55.0], [1.0, 0.03])[:, np.newaxis]
     noise = 0.02 * rms * np.random.default_rng([31, 8]).standard_normal(moving.shape)
     moving[:] = mean + (moving - mean) * fades + noise
-    assert found_in(samples) == ()
-    assert found_in(samples, reference_of("lab")) == ()
+    assert found_in(samples) == found_in(samples, reference_of("lab")) == ()
 
 
 def test_a_machine_that_moves_more_is_no_sensors_fault() -> None:

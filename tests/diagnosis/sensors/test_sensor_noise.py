@@ -43,13 +43,9 @@ def recorded(
     cutoff_hz = rng.uniform(*machine.condition.cutoff_hz)
     rows = np.eye(6)[[0, 1, 3, 4]] if directions == 4 else rng.standard_normal((1, 6)) * [1, 1, 0.05, 1, 1, 0.05]
     scenario = Scenario(
-        machine=name,
-        seed=seed,
-        duration_s=windows * WINDOW_S + MORE_S,
-        sources=sources_along(rows, cutoff_hz, force_N),
-        sensors=Sensors(noise_relative=noise),
-        events=events,
-    )
+        machine=name, seed=seed, duration_s=windows * WINDOW_S + MORE_S,
+        sources=sources_along(rows, cutoff_hz, force_N), sensors=Sensors(noise_relative=noise), events=events,
+    )  # fmt: skip
     return np.concatenate([plan_of(name).to_si(block.samples) for block, _ in blocks(scenario, machine, 1.0)])
 
 
@@ -76,7 +72,6 @@ def found_in(
 
 
 def with_noise(samples: FloatArray, state: str, part: float, seed: int = 0) -> FloatArray:
-    """White noise of a part of the channel's rms."""
     noisy, at = samples.copy(), column(state)
     noisy[:, at] += part * samples[:, at].std() * np.random.default_rng(seed).standard_normal(len(samples))
     return noisy
@@ -162,8 +157,7 @@ CHANGES = {"k_by": -0.25, "e": 1.0}
 def test_a_fault_of_the_machine_is_none_of_its_sensors(parameter: str, at_s: float) -> None:
     event = Event(at_s=at_s, parameter=parameter, relative_change=CHANGES[parameter])
     samples = recorded("lab", 925, events=(event,))
-    assert found_in(samples) == ()
-    assert found_in(samples, displacements=True) == ()
+    assert found_in(samples) == found_in(samples, displacements=True) == ()
 
 
 def test_without_a_reference_of_noise_none_is_found_and_an_old_reference_stays_as_it_was() -> None:
@@ -217,16 +211,12 @@ def jittering(theta: FloatArray) -> FloatArray:
 @pytest.mark.parametrize(
     ("spoilt", "kind", "value", "displacements"),
     [
-        (jumped, "offset", np.pi / 2, False),
-        (jumped, "offset", np.pi / 2, True),
-        (lost_a_turn, "incoherent", 1.0, False),
-        (slipping, "incoherent", 1.001, True),
-        (of_another_shaft, "incoherent", 0.8, False),
-        (jittering, "noise", 0.8, False),
-        (jittering, "noise", 0.8, True),
+        (jumped, "offset", np.pi / 2, False), (jumped, "offset", np.pi / 2, True),
+        (lost_a_turn, "incoherent", 1.0, False), (slipping, "incoherent", 1.001, True),
+        (of_another_shaft, "incoherent", 0.8, False), (jittering, "noise", 0.8, False), (jittering, "noise", 0.8, True),
     ],
-)
-def test_a_wrong_shaft_angle_is_named(
+)  # fmt: skip
+def test_a_wrong_angle_is_named(
     spoilt: Callable[[FloatArray], FloatArray], kind: str, value: float, displacements: bool
 ) -> None:
     samples = recorded("lab", 920).copy()
@@ -272,9 +262,7 @@ def test_a_shaft_that_changes_its_speed_has_a_sound_angle() -> None:
 
 @pytest.mark.parametrize(("wanders", "resonance"), [(0.0, 1.0), (0.0, 1.01), (0.01, 1.0), (0.01, 1.2)])
 @pytest.mark.parametrize("damping", [0.002, 0.01])
-def test_a_lightly_damped_shaft_near_its_resonance_has_a_sound_angle(
-    wanders: float, resonance: float, damping: float
-) -> None:
+def test_a_shaft_near_a_narrow_resonance_has_a_sound_angle(wanders: float, resonance: float, damping: float) -> None:
     rng, plan = np.random.default_rng([60120, round(1e4 * damping), round(100 * resonance)]), plan_of("lab")
     plan = replace(plan, states=("y1",), columns=plan.columns[:1], scales=plan.scales[:1])
     machine = load_machine("lab")

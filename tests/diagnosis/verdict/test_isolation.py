@@ -114,9 +114,7 @@ def test_changes_that_hide_each_other_in_single_tests_are_found_together() -> No
 
 
 @pytest.mark.parametrize(("first", "second", "found"), [(4.7, 4.7, True), (4.7, 4.0, False)])
-def test_two_that_chance_may_have_made_one_by_one_but_not_together_have_changed(
-    first: float, second: float, found: bool
-) -> None:
+def test_two_that_chance_makes_alone_but_not_together_have_changed(first: float, second: float, found: bool) -> None:
     thresholds = month_thresholds(1.0, 5.0, 12, len(PARAMETERS), 10)
     assert first < thresholds.first
     seen = window(1e-3 * np.array([0.0, first, 0.0, second, 0.0, 0.0]), np.diag(np.full(6, 1e-6)))
@@ -162,9 +160,7 @@ def test_parameters_without_a_reading_take_no_part() -> None:
         no_reading(one.name, one.by, "not measured") if one.name == "c_bz" else one for one in full.parameters
     )
     found = isolate_window(Diagnosis("network", missing, covariance=np.delete(np.delete(cov, 3, 0), 3, 1)), 0.01)
-    assert found.changed == ("k_by",)
-    assert found.readings[0].by == "network"
-    assert found.probability[3] == 0.0
+    assert (found.changed, found.readings[0].by, found.probability[3]) == (("k_by",), "network", 0.0)
     assert isolate_window(Diagnosis("network"), 0.01).changed == ()
 
 
@@ -189,8 +185,7 @@ def test_agreement_disagreement_and_only_one() -> None:
     first = diagnosis("likelihood", k_by=(-0.25, 0.01), c_by=(0.01, 0.01), EI=(0.0, 0.002))
     second = diagnosis("network", k_by=(-0.24, 0.02), c_by=(0.30, 0.02), e=(0.1, 0.02))
     found = {one.name: one for one in agreements(first, second)}
-    assert list(found) == ["k_by", "c_by", "e", "EI"]
-    assert found["k_by"].verdict == "agree"
+    assert (list(found), found["k_by"].verdict) == (["k_by", "c_by", "e", "EI"], "agree")
     assert found["k_by"].between == ("likelihood", "network")
     assert found["k_by"].difference_z == pytest.approx(0.01 / 5**0.5 / 0.01)
     assert found["c_by"].verdict == "disagree"

@@ -42,7 +42,6 @@ def true(**changes: float) -> FloatArray:
 
 
 def play(test: SequentialTest, hops: GaussianHops, *story: tuple[int, FloatArray]) -> list[tuple[int, Verdict]]:
-    """Feed hops with these true values; verdicts with the number of the hop."""
     verdicts, number = [], 0
     for count, values in story:
         for _ in range(count):
@@ -122,8 +121,7 @@ def test_delays_stay_within_twice_those_of_a_fixed_length(name: str, change: flo
     allowed_s = 2 * fixed_length_s(name, change)
     assert np.quantile(study.detected_s, 0.95) <= allowed_s
     assert np.quantile(study.named_s, 0.95) <= allowed_s
-    assert study.wrong == 0
-    assert study.early == 0
+    assert study.wrong == study.early == 0
 
 
 def test_a_small_change_accumulates_over_windows() -> None:

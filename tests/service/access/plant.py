@@ -31,7 +31,6 @@ def at_once(hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], No
 
 
 def kept(path: Path, text: str) -> Path:
-    """A file that only its owner may read."""
     path.write_text(text, encoding="utf-8")
     path.chmod(0o600)
     return path

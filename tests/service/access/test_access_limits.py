@@ -314,12 +314,8 @@ def test_a_websocket_is_refused(monitor: Guarded) -> None:
             sent.append(message)
 
         scope: dict[str, object] = {
-            "type": "websocket",
-            "path": "/health",
-            "headers": [],
-            "query_string": b"",
-            "client": None,
-        }
+            "type": "websocket", "path": "/health", "headers": [], "query_string": b"", "client": None,
+        }  # fmt: skip
         await monitor.app(scope, receive, send)
 
     asyncio.run(run())

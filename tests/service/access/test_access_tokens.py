@@ -119,8 +119,7 @@ def test_many_addresses_do_not_fill_the_memory() -> None:
     window = MovingWindow(1, clock=lambda: 0.0, keys=100)
     for number in range(1000):
         window.hit(str(number))
-    assert len(window) == 100
-    assert window.wait("999") == 60.0
+    assert (len(window), window.wait("999")) == (100, 60.0)
 
 
 def test_what_is_over_is_forgotten() -> None:
@@ -128,22 +127,16 @@ def test_what_is_over_is_forgotten() -> None:
     window = MovingWindow(1, clock=lambda: now_s)
     window.hit("a")
     now_s = 60.0
-    assert window.wait("a") == 0.0
-    assert len(window) == 0
+    assert (window.wait("a"), len(window)) == (0.0, 0)
 
 
 @pytest.mark.parametrize(
     ("address", "network"),
     [
-        ("10.0.0.1", "10.0.0.1"),
-        ("::ffff:10.0.0.1", "10.0.0.1"),
-        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
-        ("2001:db8:1:2::9", "2001:db8:1:2::/64"),
-        ("fe80::1%eth0", "fe80::/64"),
-        ("", ""),
-        ("unix", "unix"),
+        ("10.0.0.1", "10.0.0.1"), ("::ffff:10.0.0.1", "10.0.0.1"), ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
+        ("2001:db8:1:2::9", "2001:db8:1:2::/64"), ("fe80::1%eth0", "fe80::/64"), ("", ""), ("unix", "unix"),
     ],
-)
+)  # fmt: skip
 def test_what_counts_as_one_address(address: str, network: str) -> None:
     assert network_of(address) == network
 
@@ -215,9 +208,7 @@ def test_https_is_served_and_nothing_older_than_tls_1_2(tmp_path: Path, authorit
     assert tls_context(files(tmp_path, authority)).minimum_version == ssl.TLSVersion.TLSv1_2
 
 
-def test_a_client_without_a_certificate_is_refused_where_one_is_asked_for(
-    tmp_path: Path, authority: trustme.CA
-) -> None:
+def test_a_client_without_a_certificate_is_refused_where_it_needs_one(tmp_path: Path, authority: trustme.CA) -> None:
     with guarded(tmp_path, AccessSettings(tls=files(tmp_path, authority, client_ca=True))) as monitor:
         token = monitor.token(Scope.READ)
         known, stranger = trusting(authority), trusting(authority)
@@ -297,11 +288,7 @@ def test_a_key_with_a_password_is_refused_without_asking_for_it(tmp_path: Path, 
 
     tls = files(tmp_path, authority)
     key = serialization.load_pem_private_key(tls.key.read_bytes(), None)
-    tls.key.write_bytes(
-        key.private_bytes(
-            serialization.Encoding.PEM,
-            serialization.PrivateFormat.PKCS8,
-            serialization.BestAvailableEncryption(b"secret"),
-        )
-    )
+    tls.key.write_bytes(key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.BestAvailableEncryption(b"secret"),
+    ))  # fmt: skip
     assert "protected by a password" in refused(tls)

@@ -74,8 +74,6 @@ def test_only_the_right_password_opens(router: Plant, tmp_path: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Authority:
-    """Issues certificates into a folder."""
-
     folder: Path
     issuer: trustme.CA
 
@@ -142,21 +140,14 @@ def test_a_certificates_common_name_is_the_name_in_the_grants(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("who", "key", "owner"),
     [
-        ("lab", PUMP.stream, "pump"),
-        ("lab", PUMP.descriptor, "pump"),
-        ("lab", f"{PUMP.stream}/@adv/pub/1a/2/_", "pump"),
-        ("lab", LAB.keys.alarm_event, "monitor"),
-        ("lab", LAB.keys.alarm_state, "monitor"),
-        ("lab", LAB.keys.health, "monitor"),
-        ("monitor", LAB.keys.stream, "lab"),
-        ("all", LAB.keys.stream, "lab"),
-        ("all", LAB.keys.descriptor, "lab"),
-        ("all", LAB.keys.alarm_event, "monitor"),
-        ("all", LAB.keys.health, "monitor"),
-        ("all", LAB.keys.report, "monitor"),
-        ("one", PUMP.health, "monitor"),
+        ("lab", PUMP.stream, "pump"), ("lab", PUMP.descriptor, "pump"),
+        ("lab", f"{PUMP.stream}/@adv/pub/1a/2/_", "pump"), ("lab", LAB.keys.alarm_event, "monitor"),
+        ("lab", LAB.keys.alarm_state, "monitor"), ("lab", LAB.keys.health, "monitor"),
+        ("monitor", LAB.keys.stream, "lab"), ("all", LAB.keys.stream, "lab"), ("all", LAB.keys.descriptor, "lab"),
+        ("all", LAB.keys.alarm_event, "monitor"), ("all", LAB.keys.health, "monitor"),
+        ("all", LAB.keys.report, "monitor"), ("one", PUMP.health, "monitor"),
     ],
-)
+)  # fmt: skip
 def test_what_is_not_granted_is_dropped(router: Plant, who: str, key: str, owner: str) -> None:
     router.session.declare_queryable(LAB.keys.health, lambda query: query.reply(LAB.keys.health, "fine"))
     with router.client(who) as refused, router.client(owner) as granted:

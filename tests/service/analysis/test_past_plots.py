@@ -106,9 +106,7 @@ def test_pictures_of_the_history(settings: Path, tmp_path: Path, kind: str) -> N
         (("trend", "some.mcap", "--history"), "both recordings and --history are given, expected one of them"),
     ],
 )
-def test_what_a_history_does_not_have_is_said(
-    settings: Path, tmp_path: Path, arguments: tuple[str, ...], message: str
-) -> None:
+def test_what_a_history_lacks_is_said(settings: Path, tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
     code, said = run(*arguments, settings, "--out", tmp_path / "picture.png")
     assert (code, message in said) == (2, True), said
 

@@ -183,9 +183,7 @@ def test_what_cannot_be_answered_is_refused_or_explained(http: httpx.Client) -> 
     assert "are kept of 1x and 2x" in explained.reason
 
 
-def test_recordings_are_read_for_one_at_a_time_and_not_too_many(
-    http: httpx.Client, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recordings_are_read_for_one_at_a_time_and_few(http: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
     path = f"{PLACE}/waterfalls?recording=run-up.mcap"
     with monkeypatch.context() as patched:
         patched.setattr(samples, "_MOST_BYTES", 1000)

@@ -49,7 +49,6 @@ def lines(faulty: Path) -> list[dict[str, object]]:
 
 @pytest.fixture(scope="module")
 def computed(faulty: Path) -> TrendSeries:
-    """Its trend, computed from the samples."""
     source = RecordingSource([faulty])
     return read_trend(Recorded(source, LAB.keys, source.span().start_ns, source.span().end_ns + 1))
 
@@ -210,9 +209,7 @@ def test_a_speed_axis_needs_a_speed_that_changes(faulty: Path) -> None:
 
 
 @pytest.mark.parametrize("nth", [-1, 3])
-def test_correlation_panels_carry_the_figures_of_the_report(
-    faulty: Path, lines: list[dict[str, object]], nth: int
-) -> None:
+def test_correlation_panels_have_figures_of_the_report(faulty: Path, lines: list[dict[str, object]], nth: int) -> None:
     report = [one for one in reports_of(lines) if one.equations][nth]
     source = RecordingSource([faulty])
     window = latest_window(Recorded(source, LAB.keys, source.span().start_ns, report.end_ns + S), LAB)
@@ -256,8 +253,7 @@ def test_no_full_window_is_said(faulty: Path) -> None:
 def test_a_computed_trend_is_that_of_the_reports(computed: TrendSeries, lines: list[dict[str, object]]) -> None:
     found, reports = computed, reports_of(lines)
     assert found.end_ns.tolist() == [report.end_ns for report in reports]
-    assert found.states == tuple(report.state for report in reports)
-    assert found.limits == LAB.alarms
+    assert (found.states, found.limits) == (tuple(report.state for report in reports), LAB.alarms)
     for name, (field, _) in MEASURES.items():
         known = [getattr(report, field) for report in reports]
         np.testing.assert_array_equal(found.measures[name], np.array(known, dtype=np.float64))
@@ -278,9 +274,7 @@ def test_a_computed_trend_is_that_of_the_reports(computed: TrendSeries, lines: l
     assert last.low[-1] < 0.5 < last.high[-1]
 
 
-def test_a_trend_of_a_publisher_that_was_started_again_earlier_shows_the_later_run(
-    lines: list[dict[str, object]],
-) -> None:
+def test_a_trend_of_a_publisher_started_again_earlier_shows_the_later_run(lines: list[dict[str, object]]) -> None:
     reports = reports_of(lines)
     again = [one.model_copy(update={"end_ns": one.end_ns - 22 * S}) for one in reports]
     before = [one.end_ns for one in reports if one.end_ns < again[0].end_ns]

@@ -57,8 +57,7 @@ def test_orbits_are_turned_and_say_so() -> None:
         assert other.y.amplitude == pytest.approx(one.y.amplitude, rel=1e-3)
         assert other.y.phase_lag_deg == pytest.approx(one.y.phase_lag_deg, abs=0.1)
         assert numbers(sure(other.path).z) == pytest.approx(numbers(sure(one.path).z), abs=1e-2)
-    assert sure(turned.orbits[0].y).channel == "y of y1 and z1"
-    assert sure(turned.orbits[0].z).channel == "z of y1 and z1"
+    assert (sure(turned.orbits[0].y).channel, sure(turned.orbits[0].z).channel) == ("y of y1 and z1", "z of y1 and z1")
 
 
 def test_spectra_and_correlations_are_those_of_the_probes_and_so_is_the_theory() -> None:

@@ -80,8 +80,7 @@ def test_a_window_of_a_recording_is_that_of_the_monitor(folder: Path, file: str)
     for number in (0, whole[0], whole[-1]):
         report, window = held[number]
         found = recorded_window(source, installed.machine, "demo/lab", report.end_ns, report, lagged=False)
-        assert found.filled == report.filled
-        assert found.parameters == report.parameters
+        assert (found.filled, found.parameters) == (report.filled, report.parameters)
         assert (found.window is None) == (window is None)
         if window is not None and found.window is not None:
             assert abs(found.window.start_ns - window.start_ns) < 1000
@@ -166,8 +165,7 @@ def test_windows_of_recordings_alone_and_of_a_paced_replay(http: httpx.Client, r
 
     at = START_NS + 24 * S
     read = spectra(at)
-    assert read.end_ns == at
-    assert read.theory.nominal_reason == ""
+    assert (read.end_ns, read.theory.nominal_reason) == (at, "")
     assert "evaluated by an offline replay alone" in read.theory.estimated_reason
     assert answered(http.get(f"{PLACE}/spectra"), SpectrumSnapshot).start_ns is None  # nothing is live
     assert "is full yet" in spectra(START_NS + S).reason

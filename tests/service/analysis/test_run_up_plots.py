@@ -34,9 +34,7 @@ def turning(hz: float, sense: int = 1) -> Callable[[FloatArray], FloatArray]:
 
 @pytest.mark.parametrize("sense", [1, -1])
 @pytest.mark.parametrize("orders", [False, True])
-def test_a_circle_with_the_rotation_is_one_forward_line_and_an_ellipse_two(
-    tmp_path: Path, sense: int, orders: bool
-) -> None:
+def test_a_circle_with_the_rotation_is_one_line_and_an_ellipse_two(tmp_path: Path, sense: int, orders: bool) -> None:
     """A circle of radius 20 µm; an ellipse with half axes of 30 and 10 µm, the sum and difference of two circles."""
     angle = 2 * np.pi * 20.0
     signals: Signals = {
@@ -152,8 +150,7 @@ def test_a_run_up_shows_the_critical_speed_of_a_simple_rotor(run_up: tuple[int, 
     sense, data = run_up
     found = read_run_up(data, data.channels(["y2", "z2"]), 1, 4)
     hz = np.abs(found.speed_rad_s) / (2 * np.pi)
-    assert found.direction == sense
-    assert found.units == ("µm p-p", "µm p-p")
+    assert (found.direction, found.units) == (sense, ("µm p-p", "µm p-p"))
     top = found.amplitude.argmax(axis=0)
     assert hz[top] == pytest.approx(CRITICAL_HZ / np.sqrt(1 - 2 * DAMPING**2), rel=0.01)
     assert found.amplitude.max(axis=0) == pytest.approx(20 / (2 * DAMPING * np.sqrt(1 - DAMPING**2)), rel=0.03)

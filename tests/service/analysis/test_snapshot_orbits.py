@@ -69,8 +69,7 @@ def test_errors_of_an_orbit_are_the_scatter_of_many() -> None:
             hops = 1e6 * np.abs(sure(data.window.hop_synchronous)[:, data.window.states.index(vector.channel)])
             assert vector.amplitude_error == pytest.approx(hops.std(ddof=1) / np.sqrt(12), rel=0.2)
         assert sure(orbit.ellipse).semi_major == pytest.approx(sure(orbit.nominal).semi_major, rel=0.1)
-    assert snapshot.revolutions == 0
-    assert snapshot.path_reason == "none were asked for"
+    assert (snapshot.revolutions, snapshot.path_reason) == (0, "none were asked for")
     assert all(orbit.path is None for orbit in snapshot.orbits)
 
 
@@ -116,8 +115,7 @@ def test_without_a_phase_reference_size_and_sense_remain() -> None:
         assert one.ellipse.semi_major == pytest.approx(sure(other.ellipse).semi_major, rel=0.15)
         turns_s = 4 * 2 * np.pi / LAB.operation.speed_rad_s
         assert sure(one.path).times_s[-1] == pytest.approx(turns_s, abs=2 / LAB.rate_hz)
-    assert blind.revolutions == 4
-    assert blind.pulses_s == ()
+    assert (blind.revolutions, blind.pulses_s) == (4, ())
     assert blind.path_reason.startswith("the shaft angle is not measured")
     snapshot = snapshots_of(machine).correlations(data)
     assert all(pair.nominal_z is not None and pair.nominal_z < 2.5 for pair in snapshot.pairs)

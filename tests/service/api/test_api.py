@@ -58,23 +58,20 @@ def test_machines_are_listed(http: httpx.Client, seen: tuple[Runtime, MachineWor
     (machine,) = answered(http.get("/api/v1/machines"), MachineList).machines
     assert machine == answered(http.get(PLACE), MachineDescription)
     assert (machine.site, machine.machine, machine.state) == ("demo", "lab", "alert")
-    assert machine.keys["health"] == "rotorwatch/demo/lab/health"
-    assert len(machine.channels) == 9
+    assert (machine.keys["health"], len(machine.channels)) == ("rotorwatch/demo/lab/health", 9)
     assert machine.bundle == seen[1].identity["bundle"] is not None
 
 
 def test_configuration_is_the_machine_file(http: httpx.Client, seen: tuple[Runtime, MachineWorker]) -> None:
     found = answered(http.get(f"{PLACE}/configuration"), MachineConfiguration)
     assert (file := Machine.model_validate(found.file)) == seen[1].machine
-    assert file.alarms.on_delay_s == 10.0
-    assert file.rotor.k_by_N_per_m == load_machine("lab").rotor.k_by_N_per_m
+    assert (file.alarms.on_delay_s, file.rotor.k_by_N_per_m) == (10.0, load_machine("lab").rotor.k_by_N_per_m)
     assert found.machine_hash == seen[1].identity["machine_hash"]
 
 
 def test_health_names_the_fault_with_its_interval(http: httpx.Client) -> None:
     health = answered(http.get(f"{PLACE}/health"), Health)
-    assert health.state == "alert"
-    assert health.filled == 1.0
+    assert (health.state, health.filled) == ("alert", 1.0)
     report = sure(health.report)
     assert report == next(iter(answered(http.get(f"{PLACE}/reports?limit=1"), ReportList).reports))
     assert report.start_ns == report.end_ns - 12 * HOP_NS
@@ -99,8 +96,7 @@ def test_reports_are_cut_by_time_and_number(http: httpx.Client) -> None:
     ends = [report.end_ns for report in every.reports]
     assert ends == sorted(ends, reverse=True)
     # The first hop ends after its own history (half a segment) and its own five seconds.
-    assert ends[-1] == START_NS + 7_500_000_000
-    assert len(ends) == 15
+    assert (ends[-1], len(ends)) == (START_NS + 7_500_000_000, 15)
     assert every.next_before is None
     assert [report.state for report in reversed(every.reports)] == ["warming"] * 11 + ["healthy"] * 2 + ["alert"] * 2
     some = answered(http.get(f"{PLACE}/reports?since_ns={ends[10]}&until_ns={ends[3]}"), ReportList)
@@ -202,8 +198,7 @@ def test_alarms_and_their_events(http: httpx.Client) -> None:
     assert {*PARAMETERS} <= {alarm.name for alarm in everything} <= set(ALARMS)
     assert [alarm.name for alarm in everything if alarm.state != "normal"] == ["k_by"]
     (event,) = answered(http.get(f"{PLACE}/alarms/events"), AlarmEventList).events
-    assert event.type == "org.rotorwatch.alarm.raised"
-    assert event.source == "/rotorwatch/demo/lab"
+    assert (event.type, event.source) == ("org.rotorwatch.alarm.raised", "/rotorwatch/demo/lab")
     assert event.subject == event.data.name == "k_by"
     assert int(event.sequence) == event.data.sequence == 0
     assert event.data.time_ns == active.raised_ns == START_NS + 72_500_000_000
@@ -216,14 +211,10 @@ def test_alarms_and_their_events(http: httpx.Client) -> None:
 @pytest.mark.parametrize(
     ("query", "names"),
     [
-        ("state=unacknowledged", ["k_by"]),
-        ("state=normal&name=e", ["e"]),
-        ("state=shelved", []),
-        ("name=k_by&name=e", ["k_by", "e"]),
-        ("raised=true&all=true", ["k_by"]),
-        ("raised=true&name=e", []),
+        ("state=unacknowledged", ["k_by"]), ("state=normal&name=e", ["e"]), ("state=shelved", []),
+        ("name=k_by&name=e", ["k_by", "e"]), ("raised=true&all=true", ["k_by"]), ("raised=true&name=e", []),
     ],
-)
+)  # fmt: skip
 def test_alarms_are_filtered(http: httpx.Client, query: str, names: list[str]) -> None:
     assert [one.name for one in answered(http.get(f"{PLACE}/alarms?{query}"), AlarmStates).alarms] == names
 
@@ -254,8 +245,7 @@ def test_health_says_what_changed_since_when_and_who_agrees(http: httpx.Client) 
     assert health.report.opinions
     for opinion in health.report.opinions:
         k_by = next(one for one in opinion.agreement if one.name == "k_by")
-        assert k_by.between == ("likelihood", opinion.by)
-        assert k_by.verdict == "agree"
+        assert (k_by.between, k_by.verdict) == (("likelihood", opinion.by), "agree")
         assert abs(k_by.difference_z or 9.0) < 4
 
 
@@ -294,8 +284,7 @@ def test_spectra_and_orbits(http: httpx.Client) -> None:
     assert spectra.densities[0].unit == "m^2/Hz"
     orbits = answered(http.get(f"{PLACE}/orbits?revolutions=3"), OrbitSnapshot)
     assert {one.location for one in orbits.orbits} == {"bearing", "disc"}
-    assert orbits.revolutions == 3
-    assert orbits.path_reason == ""
+    assert (orbits.revolutions, orbits.path_reason) == (3, "")
     assert all(one.path is not None for one in orbits.orbits)
     assert len(orbits.pulses_s) == 4
     # The samples are the newest: the last whole revolution ends less than another one before the end of the stream.
@@ -325,8 +314,7 @@ def test_service_routes(http: httpx.Client) -> None:
 
 def test_page_for_people_is_kept_by_its_content(http: httpx.Client) -> None:
     answer = http.get("/")
-    assert answer.headers["content-type"] == "text/html; charset=utf-8"
-    assert answer.headers["cache-control"] == "no-cache"
+    assert (answer.headers["content-type"], answer.headers["cache-control"]) == ("text/html; charset=utf-8", "no-cache")
     assert "unsafe" not in answer.headers["content-security-policy"]
     assert "//" not in answer.text
     assert not re.search(r"<script(?! type=\"module\" src=)|<style|style=|\bon\w+=", answer.text)
@@ -348,15 +336,10 @@ def test_page_for_people_is_kept_by_its_content(http: httpx.Client) -> None:
 @pytest.mark.parametrize(
     ("path", "near"),
     [
-        (f"{PLACE}/heath", f"{PLACE}/health"),
-        ("/api/v1/machine/demo/lab", PLACE),
-        ("/api/v1/alarms", None),
-        ("/machines", "/api/v1/machines"),
-        ("/heathz", "/healthz"),
-        ("/favicon.ico", None),
-        ("/" + 5000 * "x", None),
+        (f"{PLACE}/heath", f"{PLACE}/health"), ("/api/v1/machine/demo/lab", PLACE), ("/api/v1/alarms", None),
+        ("/machines", "/api/v1/machines"), ("/heathz", "/healthz"), ("/favicon.ico", None), ("/" + 5000 * "x", None),
     ],
-)
+)  # fmt: skip
 def test_an_unknown_path_is_named_with_the_nearest_there_is(http: httpx.Client, path: str, near: str | None) -> None:
     found = problem(http.get(path), 404)
     assert path[:64] in found.detail

@@ -38,13 +38,11 @@ def description() -> dict[str, Any]:
 
 
 def sections(page: str) -> dict[str, str]:
-    """Text under each second-level heading."""
     parts = re.split(r"^## (.+)$", page, flags=re.MULTILINE)
     return {title.strip("`"): body for title, body in zip(parts[1::2], parts[2::2], strict=True)}
 
 
 def routes(described: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Every route by its heading."""
     return {
         f"{method.upper()} {path}": route
         for path, methods in described["paths"].items()
@@ -113,7 +111,6 @@ def shortened(text: str) -> str:
 
 
 def overview(found: dict[str, dict[str, Any]]) -> str:
-    """All routes in a table."""
     rows = ""
     for title, route in found.items():
         scopes = [scope for part in route.get("security", []) for scope in part.get("token", [])]
@@ -159,7 +156,6 @@ def test_every_section_says_more_than_the_description() -> None:
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
-    """Address and token of a service with an alarm of a gap."""
     with fed(tmp_path_factory.mktemp("machine"), GUARDED) as (runtime, feed):
         feed.gap()
         with client(runtime, token(runtime)) as http:
@@ -178,13 +174,9 @@ def test_commands_in_the_page_work(served: tuple[str, str], tmp_path: Path) -> N
         assert "http://127.0.0.1:8080" in command
         done = subprocess.run(
             ["/bin/sh", "-c", command.replace("http://127.0.0.1:8080", url)],
-            env={"ROTORWATCH_TOKEN": text, "PATH": "/usr/local/bin:/usr/bin:/bin"},
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=300,
-            check=False,
-        )
+            env={"ROTORWATCH_TOKEN": text, "PATH": "/usr/local/bin:/usr/bin:/bin"}, cwd=tmp_path, capture_output=True,
+            text=True, timeout=300, check=False,
+        )  # fmt: skip
         ended_by_us = 28
         assert done.returncode in ((0, ended_by_us) if "--max-time" in command else (0,)), done.stderr
         assert done.stdout, command

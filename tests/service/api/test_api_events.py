@@ -52,7 +52,6 @@ def shared() -> Iterator[Runtime]:
 
 
 def happen(worker: Monitored, count: int = 1) -> None:
-    """Bring about alarm events."""
     for _ in range(count):
         kind: Any = "unshelve" if worker.history.last_sequence() % 2 == 0 else "shelve"
         worker.operate(OperatorAction(kind, "k_by", actor="anna", reason="x"))
@@ -60,16 +59,12 @@ def happen(worker: Monitored, count: int = 1) -> None:
 
 @dataclass(slots=True)
 class Reader:
-    """An open stream."""
-
     events: Iterator[httpx_sse.ServerSentEvent]
 
     def next(self, kind: str = "alarm") -> httpx_sse.ServerSentEvent:
-        """Next event of a kind."""
         return next(event for event in self.events if event.event == kind)
 
     def alarms(self, count: int) -> list[AlarmCloudEvent]:
-        """So many alarm events that follow."""
         return [AlarmCloudEvent.model_validate_json(self.next().data) for _ in range(count)]
 
 
@@ -93,17 +88,14 @@ def test_what_happens_arrives_with_an_id_to_go_on_from(shared: Runtime) -> None:
     before = lab.history.last_sequence(), heavy.history.last_sequence()
     with reading(shared) as reader:
         start = reader.next("start")
-        assert start.id == f"{LAB}={before[0]},{HEAVY}={before[1]}"
-        assert start.retry == 2000
+        assert (start.id, start.retry) == (f"{LAB}={before[0]},{HEAVY}={before[1]}", 2000)
         assert json.loads(start.data) == {}
         happen(lab)
         first = reader.next()
-        assert first.id == f"{LAB}={before[0] + 1},{HEAVY}={before[1]}"
-        assert first.data == log(lab)[-1]
+        assert (first.id, first.data) == (f"{LAB}={before[0] + 1},{HEAVY}={before[1]}", log(lab)[-1])
         happen(heavy)
         second = reader.next()
-        assert second.id == f"{LAB}={before[0] + 1},{HEAVY}={before[1] + 1}"
-        assert second.data == log(heavy)[-1]
+        assert (second.id, second.data) == (f"{LAB}={before[0] + 1},{HEAVY}={before[1] + 1}", log(heavy)[-1])
 
 
 @pytest.mark.parametrize("by_header", [True, False])
@@ -319,9 +311,7 @@ def test_what_matters_most_of_a_window(alarm: str, settled: bool, vibration: flo
         ("?from=tomorrow", "", 422, "from: expected one of now, beginning (found 'tomorrow')"),
     ],
 )
-def test_where_no_stream_can_begin_a_problem_says_why(
-    shared: Runtime, query: str, header: str, status: int, text: str
-) -> None:
+def test_a_stream_that_cannot_begin_says_why(shared: Runtime, query: str, header: str, status: int, text: str) -> None:
     with client(shared) as http:
         answer = http.get(EVENTS + query, headers={"last-event-id": header} if header else {})
         assert problem(answer, status).detail.startswith(text)

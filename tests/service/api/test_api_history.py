@@ -28,13 +28,9 @@ from tests.sure import sure
 
 IDENTITY = identity_of(Installed(LAB))
 FLOWING = StreamStatus(
-    publisher_alive=True,
-    silent=False,
-    silent_since_ns=None,
-    data_age_s=9.0,
-    replay_announced=False,
+    publisher_alive=True, silent=False, silent_since_ns=None, data_age_s=9.0, replay_announced=False,
     descriptor_mismatch=(),
-)
+)  # fmt: skip
 NAMES = ("k_by", "e", "model")
 
 
@@ -85,13 +81,10 @@ def test_a_follower_gets_each_event_once(busy: tuple[Runtime, httpx.Client]) -> 
 @pytest.mark.parametrize(
     ("query", "expected"),
     [
-        ("name=e", [9, 8, 3, 2]),
-        ("kind=unshelved", [11, 9, 7, 5, 3, 1]),
-        ("kind=shelved&name=model&after=-1", [4, 10]),
-        ("severity=danger", []),
-        ("severity=alert&limit=1", [11]),
+        ("name=e", [9, 8, 3, 2]), ("kind=unshelved", [11, 9, 7, 5, 3, 1]),
+        ("kind=shelved&name=model&after=-1", [4, 10]), ("severity=danger", []), ("severity=alert&limit=1", [11]),
     ],
-)
+)  # fmt: skip
 def test_events_are_filtered(busy: tuple[Runtime, httpx.Client], query: str, expected: list[int]) -> None:
     assert sequences(page(busy[1], query)) == expected
 
@@ -164,8 +157,7 @@ def test_no_data_is_said_beside_a_raised_alarm_and_hides_it_not() -> None:
     record = MachineHealth(HealthState.ALERT, 1.0, latest, (alarm, Alarm("e")), Quality(), 0)
     lost = FLOWING.model_copy(update={"silent": True, "silent_since_ns": START_NS})
     health = conversion.health(IDENTITY, record, lost)
-    assert health.state == "alert"
-    assert health.reason == "no data since 2026-01-01T00:00:00Z"
+    assert (health.state, health.reason) == ("alert", "no data since 2026-01-01T00:00:00Z")
     assert [(entry.name, entry.raised) for entry in health.alarms] == [("k_by", True)]
     calm = replace(record, state=HealthState.HEALTHY, alarms=())
     assert conversion.health(IDENTITY, calm, lost).state == "no-data"

@@ -79,9 +79,7 @@ def test_acknowledge_with_the_etag(plant: tuple[Runtime, Feed, httpx.Client]) ->
         ({"If-Match": "*"}, {"expected_state": "acknowledged"}),
     ],
 )
-def test_an_alarm_that_is_not_as_it_was_seen_is_left_alone(
-    untouched: httpx.Client, headers: dict[str, str], body: dict[str, str]
-) -> None:
+def test_an_alarm_seen_otherwise_stays(untouched: httpx.Client, headers: dict[str, str], body: dict[str, str]) -> None:
     found = problem(untouched.post(f"{GAP}/acknowledge", json=body, headers=headers), 409)
     assert found.detail.startswith("data-gap is unacknowledged (version 0), no longer as it was seen (")
     assert found.detail.endswith("): look again")
@@ -138,9 +136,7 @@ def test_shelving_and_its_end_and_an_alarm_that_never_was(plant: tuple[Runtime, 
     assert sure(done.alarm.shelf).until_ns - done.events[0].data.time_ns == 3600e9
 
 
-def test_latched_alarms_are_reset_and_out_of_service_is_for_who_configures(
-    plant: tuple[Runtime, Feed, httpx.Client],
-) -> None:
+def test_latched_alarms_are_reset_and_who_configures_takes_out(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
     runtime, feed, http = plant
     for _ in range(130):  # until a hop is complete: then the data are free of gaps again
         feed.put_good()
@@ -174,10 +170,7 @@ def test_latched_alarms_are_reset_and_out_of_service_is_for_who_configures(
         ("data-gap/shelve", {"If-Match": "*"}, {"reason": "x", "duration_s": 0}, 422, "duration_s: expected above 0"),
         ("data-gap/shelve", {"If-Match": "*"}, {"reason": "  "}, 422, "reason: expected one line of text that"),
         (
-            "data-gap/shelve",
-            {"If-Match": "*"},
-            {"reason": "x", "duration_s": 3601},
-            409,
+            "data-gap/shelve", {"If-Match": "*"}, {"reason": "x", "duration_s": 3601}, 409,
             "shelve of data-gap: duration_s",
         ),
         ("data-gap/unshelve", {"If-Match": "*"}, {}, 409, "data-gap is unacknowledged: unshelve is not possible"),
@@ -186,7 +179,7 @@ def test_latched_alarms_are_reset_and_out_of_service_is_for_who_configures(
         ("nose/acknowledge", {"If-Match": "*"}, {}, 404, "no alarm nose; there are: k_by, c_by"),
         ("events/acknowledge", {"If-Match": "*"}, {}, 404, "no alarm events; there are:"),
     ],
-)
+)  # fmt: skip
 def test_orders_that_cannot_be_followed_are_explained(
     untouched: httpx.Client, path: str, headers: dict[str, str], body: Any, status: int, text: str
 ) -> None:

@@ -108,17 +108,12 @@ def test_nobody_gives_a_token_that_is_valid_for_longer_than_his_own(monitor: Gua
 @pytest.mark.parametrize(
     ("wish", "said"),
     [
-        ({"name": " x"}, "name is ' x'"),
-        ({"name": "anonymous"}, "is not a valid name of a token's user"),
+        ({"name": " x"}, "name is ' x'"), ({"name": "anonymous"}, "is not a valid name of a token's user"),
         ({"name": "rw_000000000000_" + 43 * "0"}, "is not a valid name of a token's user"),
-        ({"name": "a\nb"}, "name is"),
-        ({"scopes": []}, "scopes: "),
-        ({"scopes": ["admin"]}, "scopes"),
-        ({"days": 0}, "days: "),
-        ({"days": 3651}, "days: "),
-        ({"secret": "x"}, "secret: "),
+        ({"name": "a\nb"}, "name is"), ({"scopes": []}, "scopes: "), ({"scopes": ["admin"]}, "scopes"),
+        ({"days": 0}, "days: "), ({"days": 3651}, "days: "), ({"secret": "x"}, "secret: "),
     ],
-)
+)  # fmt: skip
 def test_wrong_wishes_are_refused(monitor: Guarded, wish: dict[str, Any], said: str) -> None:
     with monitor.client(monitor.token(*Scope, name="chief")) as chief:
         told = problem(chief.post(TOKENS, json={"name": "x", "scopes": ["read"], **wish}), 422)

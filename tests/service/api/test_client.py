@@ -91,14 +91,11 @@ def test_alarms_and_their_log(plant: Client, seen: tuple[Runtime, MachineWorker]
     assert plant.alarms(PLACE, names=["e"]).alarms == tuple(one for one in everything.alarms if one.name == "e")
     forwards = list(plant.alarm_events(PLACE, after=-1))
     assert [event.data.sequence for event in forwards] == list(range(everything.sequence + 1))
-    assert list(plant.alarm_events(PLACE)) == forwards[::-1]
-    assert list(plant.alarm_events(PLACE, after=0)) == forwards[1:]
+    assert (list(plant.alarm_events(PLACE)), list(plant.alarm_events(PLACE, after=0))) == (forwards[::-1], forwards[1:])
     assert list(plant.alarm_events(PLACE, name="c_by")) == [e for e in forwards[::-1] if e.data.name == "c_by"]
 
 
-def test_pages_are_put_together(
-    plant: Client, seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pages_are_joined(plant: Client, seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyPatch) -> None:
     reports, forwards = list(plant.reports(PLACE)), list(plant.alarm_events(PLACE, after=-1))
     assert len(reports) == seen[1].tally.windows > 10
     monkeypatch.setattr("rotorwatch.client.client._PAGE", 3)
@@ -106,8 +103,7 @@ def test_pages_are_put_together(
     end_ns = [report.end_ns for report in reports]
     assert [r.end_ns for r in plant.reports(PLACE, since_ns=end_ns[8], until_ns=end_ns[1])] == end_ns[2:9]
     monkeypatch.setattr("rotorwatch.client.client._PAGE", 1)
-    assert list(plant.alarm_events(PLACE, after=-1)) == forwards
-    assert list(plant.alarm_events(PLACE)) == forwards[::-1]
+    assert (list(plant.alarm_events(PLACE, after=-1)), list(plant.alarm_events(PLACE))) == (forwards, forwards[::-1])
     entries = list(plant.audit())
     assert [entry.number for entry in entries] == sorted((entry.number for entry in entries), reverse=True)
 
@@ -117,8 +113,7 @@ def test_readings_over_time(plant: Client) -> None:
     shown = [r.parameters[0].relative_change for r in plant.reports(PLACE) if r.parameters]
     assert [reading.value for reading in readings] == shown[::-1]
     (bucket,) = plant.trend(PLACE, "parameter", ["k_by"], points=1)
-    assert bucket.count == len(readings)
-    assert bucket.minimum == min(reading.value for reading in readings)
+    assert (bucket.count, bucket.minimum) == (len(readings), min(reading.value for reading in readings))
     assert {one.name for one in plant.trend(PLACE, "parameter", points=2)} >= {"k_by", "e", "EI"}
     assert len(list(plant.readings(PLACE, "speed"))) == len(readings)
 
@@ -147,9 +142,7 @@ def test_snapshots(plant: Client) -> None:
         (lambda plant: next(plant.events(after="demo/lab=900")), LogReplaced, "the log of demo/lab ends at"),
     ],
 )
-def test_refusals_are_exceptions_with_the_services_words(
-    plant: Client, ask: Any, kind: type[Exception], told: str
-) -> None:
+def test_refusals_are_exceptions_in_its_own_words(plant: Client, ask: Any, kind: type[Exception], told: str) -> None:
     with pytest.raises(ClientError) as caught:
         ask(plant)
     assert type(caught.value) is kind
@@ -350,12 +343,9 @@ def generated(runtime: Runtime, tmp_path_factory: pytest.TempPathFactory) -> Ite
     (folder / "config.json").write_text(json.dumps({"post_hooks": []}), encoding="utf-8")  # nobody reads it
     options = ["--path", "openapi.json", "--config", "config.json", "--output-path", PACKAGE, "--meta", "none"]
     done = subprocess.run(
-        [sys.executable, "-m", "openapi_python_client", "generate", *options, "--fail-on-warning"],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+        [sys.executable, "-m", "openapi_python_client", "generate", *options, "--fail-on-warning"], cwd=folder,
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     assert "WARNING" not in done.stdout + done.stderr
     sys.path.insert(0, str(folder))

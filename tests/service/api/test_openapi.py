@@ -37,51 +37,33 @@ STREAMS = {"/api/v1/events", "/api/v1/replays/{replay_id}/events"}
 PUBLIC = {("GET", "/"), ("GET", "/healthz"), ("GET", "/page/{version}/{name:path}")}
 #: What is there and in no description of an interface for programs.
 UNDESCRIBED = {
-    ("GET", "/"),
-    ("GET", "/openapi.json"),
-    ("GET", "/docs"),
-    ("GET", "/docs/{name}"),
+    ("GET", "/"), ("GET", "/openapi.json"), ("GET", "/docs"), ("GET", "/docs/{name}"),
     ("GET", "/page/{version}/{name:path}"),
-}
+}  # fmt: skip
 #: What there is not: whoever has no token does not even learn that.
 STRAY = {("GET", "/nowhere"), ("PATCH", "/api/v1/machines"), ("POST", "/healthz")}
 VALUES = {
-    "site": "demo",
-    "version": "0",
-    "machine": "lab",
-    "name": "k_by",
-    "replay_id": "0123456789ab",
+    "site": "demo", "version": "0", "machine": "lab", "name": "k_by", "replay_id": "0123456789ab",
     "token_id": "0123456789ab",
-}
+}  # fmt: skip
 CASES = int(os.environ.get("ROTORWATCH_API_CASES", "0"))
 #: Routes of whose arguments more must hold than a schema can say, such as that one is above another.
 DEPENDENT = {
-    "GET /api/v1/events",
-    "GET /api/v1/machines/{site}/{machine}/alarms",
-    "GET /api/v1/machines/{site}/{machine}/alarms/events",
-    "GET /api/v1/machines/{site}/{machine}/correlations",
-    "GET /api/v1/machines/{site}/{machine}/full-spectra",
-    "GET /api/v1/machines/{site}/{machine}/orbits",
-    "GET /api/v1/machines/{site}/{machine}/readings",
-    "GET /api/v1/machines/{site}/{machine}/spectra",
-    "GET /api/v1/machines/{site}/{machine}/vectors",
-    "GET /api/v1/machines/{site}/{machine}/waterfalls",
-    "GET /api/v1/machines/{site}/{machine}/waveforms",
-    "GET /api/v1/trends",
-    "POST /api/v1/replays",
+    "GET /api/v1/events", "GET /api/v1/machines/{site}/{machine}/alarms",
+    "GET /api/v1/machines/{site}/{machine}/alarms/events", "GET /api/v1/machines/{site}/{machine}/correlations",
+    "GET /api/v1/machines/{site}/{machine}/full-spectra", "GET /api/v1/machines/{site}/{machine}/orbits",
+    "GET /api/v1/machines/{site}/{machine}/readings", "GET /api/v1/machines/{site}/{machine}/spectra",
+    "GET /api/v1/machines/{site}/{machine}/vectors", "GET /api/v1/machines/{site}/{machine}/waterfalls",
+    "GET /api/v1/machines/{site}/{machine}/waveforms", "GET /api/v1/trends", "POST /api/v1/replays",
     "POST /api/v1/tokens",
-}
+}  # fmt: skip
 #: What a request that is as described may be answered with: there is no such thing, not now, or not unseen.
 STATE = {404, 409, 428}
 #: Of the checks there are, those that a description can be held to.
 CHECKS = [
-    schemathesis.checks.not_a_server_error,
-    checks.status_code_conformance,
-    checks.content_type_conformance,
-    checks.response_headers_conformance,
-    checks.response_schema_conformance,
-    checks.negative_data_rejection,
-]
+    schemathesis.checks.not_a_server_error, checks.status_code_conformance, checks.content_type_conformance,
+    checks.response_headers_conformance, checks.response_schema_conformance, checks.negative_data_rejection,
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -103,20 +85,17 @@ def description(http: httpx.Client) -> dict[str, Any]:
 
 
 def application(runtime: Runtime) -> FastAPI:
-    """The application as it is served."""
     store = runtime.store
     return create_app(runtime, Guard(store.tokens, store.audit, runtime.settings.access, runtime.settings.http.host))
 
 
 def routes(app: FastAPI) -> set[tuple[str, str]]:
-    """Method and path of every route."""
     return {
         (method, context.path or "") for context in iter_route_contexts(app.routes) for method in context.methods or ()
     }
 
 
 def needed(method: str, path: str) -> Scope:
-    """Which scope a route must ask for."""
     if path.startswith(("/api/v1/audit", "/api/v1/history", "/api/v1/tokens")) or path.endswith(
         ("/remove-from-service", "/return-to-service")
     ):
@@ -156,9 +135,7 @@ def test_no_route_answers_without_a_valid_token(runtime: Runtime, description: d
     assert asked >= 3 * 30
 
 
-def test_a_method_that_a_path_does_not_take_is_no_matter_of_its_body(
-    http: httpx.Client, description: dict[str, Any]
-) -> None:
+def test_a_method_that_a_path_has_not_is_refused_by_name(http: httpx.Client, description: dict[str, Any]) -> None:
     for path, methods in description["paths"].items():
         for method in {"get", "post", "put", "patch", "delete"} - methods.keys():
             answer = http.request(method, path.format(**VALUES))
@@ -189,9 +166,7 @@ def test_every_route_asks_for_its_scope(runtime: Runtime, http: httpx.Client, de
     assert http.get("/openapi.json").status_code == 200
 
 
-def test_an_unknown_machine_is_a_problem_that_names_the_known_ones(
-    http: httpx.Client, description: dict[str, Any]
-) -> None:
+def test_an_unknown_machine_is_a_problem_that_names_others(http: httpx.Client, description: dict[str, Any]) -> None:
     for path, methods in description["paths"].items():
         for method in methods if path.startswith("/api/v1/machines/{site}") else ():
             found = problem(ask(http, method.upper(), path.replace("{machine}", "pump")), 404)
@@ -246,7 +221,6 @@ def test_everything_is_described_with_examples(description: dict[str, Any]) -> N
 
 
 def inner(value: object) -> Iterator[dict[str, Any]]:
-    """Every object in a JSON value."""
     if isinstance(value, dict):
         yield value
         value = list(value.values())
@@ -319,12 +293,9 @@ def made_up(
     there = {one.name for one in operation.query}
 
     @hypothesis.settings(
-        max_examples=cases,
-        derandomize=not CASES,
-        database=None,
-        phases=[hypothesis.Phase.generate],
+        max_examples=cases, derandomize=not CASES, database=None, phases=[hypothesis.Phase.generate],
         suppress_health_check=list(hypothesis.HealthCheck),
-    )
+    )  # fmt: skip
     @hypothesis.given(case=operation.as_strategy(mode, path_parameters=path))
     def run(case: schemathesis.Case[Any]) -> None:
         if mode is POSITIVE:  # by the letter of OpenAPI other arguments may be given as well

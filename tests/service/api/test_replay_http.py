@@ -35,7 +35,6 @@ ENDED = ("finished", "stopped", "failed")
 
 
 def machine_text(name: str) -> str:
-    """A shipped machine file."""
     return (Path(models.machine.__file__).parent / "machines" / f"{name}.toml").read_text(encoding="utf-8")
 
 
@@ -168,9 +167,7 @@ def test_an_offline_replay_over_http_finds_what_it_finds_on_the_command_line(
     assert event.data.name == "c_bz"
 
     worker = runtime.machines()[0]
-    assert worker.history.reports(limit=10) == ()
-    assert worker.history.events(limit=10) == ()
-    assert worker.health().alarms == ()
+    assert (worker.history.reports(limit=10), worker.history.events(limit=10), worker.health().alarms) == ((), (), ())
 
 
 def test_a_paced_replay_is_paused_moved_and_stopped(client: httpx.Client, runtime: Runtime) -> None:
@@ -204,12 +201,10 @@ def test_a_paced_replay_is_paused_moved_and_stopped(client: httpx.Client, runtim
 def test_a_stretch_and_another_machine_from_our_own_page(client: httpx.Client, runtime: Runtime) -> None:
     own = {"Origin": runtime.http_url, "Sec-Fetch-Site": "same-origin"}
     done = ended(client, start(client, own, machine="lab", from_ns=START_NS + 10**9, to_ns=START_NS + 31 * 10**9))
-    assert done.state == "finished"
-    assert done.machine == "lab"
+    assert (done.state, done.machine) == ("finished", "lab")
     assert done.summary is not None
     assert done.summary.bundle is None
-    assert done.summary.blocks == 300
-    assert sure(done.progress).fraction == 1.0
+    assert (done.summary.blocks, sure(done.progress).fraction) == (300, 1.0)
     failed = ended(client, start(client, from_ns=START_NS + DAY_NS))
     assert failed.state == "failed"
     assert "nothing was recorded in between" in failed.error
@@ -253,17 +248,14 @@ def test_what_would_have_been_raised_with_a_machine_file_that_is_sent_and_anothe
         ({"recordings": []}, 422, "recordings: "),
         ({"from_ns": 5, "to_ns": 5}, 422, "to_ns: 5 is not later than from_ns, 5"),
         ({"recordings": ["demo/pump/20260101T020000Z.mcap.part"]}, 409, "incomplete"),
-        ({"mode": "paced", "pace": 0.01}, 422, "pace: "),
-        ({"shell": "rm"}, 422, "shell: "),
+        ({"mode": "paced", "pace": 0.01}, 422, "pace: "), ({"shell": "rm"}, 422, "shell: "),
         ({"machine": "../lab.toml"}, 422, "neither shipped nor monitored; monitored are demo/lab"),
         ({"machine": "lab", "bundle": "/etc"}, 422, "is not the name of shipped networks"),
-        ({"bundle": "lab"}, 422, "needs machine"),
-        ({"changes": ["alarms.on_delay_s ="]}, 422, "changes: "),
-        ({"changes": ["alarms.on_delay_s = -1"]}, 422, "on_delay_s"),
-        ({"changes": ["alarms.delay = 1"]}, 422, "delay"),
+        ({"bundle": "lab"}, 422, "needs machine"), ({"changes": ["alarms.on_delay_s ="]}, 422, "changes: "),
+        ({"changes": ["alarms.on_delay_s = -1"]}, 422, "on_delay_s"), ({"changes": ["alarms.delay = 1"]}, 422, "delay"),
         ({"changes": ["alarms.on_delay_s = 1"], "mode": "paced"}, 422, "changes: nothing is evaluated"),
     ],
-)
+)  # fmt: skip
 def test_wrong_requests_are_refused(client: httpx.Client, changes: dict[str, Any], status: int, detail: str) -> None:
     before = get(client, REPLAYS, ReplayList).replays
     found = problem(client.post(REPLAYS, json={"recordings": [ID], **changes}), status)

@@ -53,8 +53,7 @@ def test_a_token_works_at_once_and_not_a_request_longer(tmp_path: Path, commands
         token = created.stdout.strip()
         assert "shown this once" in created.stderr
         assert token not in created.stderr
-        assert status(monitor, token) == 200
-        assert status(monitor, token, "DELETE", "/machine") == 403
+        assert (status(monitor, token), status(monitor, token, "DELETE", "/machine")) == (200, 403)
 
         listed = run(commands, "token", "list", "--config", config).stdout
         token_id, secret = token.split("_")[1:]
@@ -91,7 +90,7 @@ def test_a_token_works_at_once_and_not_a_request_longer(tmp_path: Path, commands
         (("revoke", "000000000000"), "there is no token '000000000000'"),
     ],
 )
-def test_mistakes_exit_2_with_a_sentence(
+def test_mistakes_exit_2_and_say_so(
     commands: typer.Typer, config: str, arguments: tuple[str, ...], expected: str
 ) -> None:
     result = run(commands, "token", *arguments, "--config", config)
@@ -99,9 +98,7 @@ def test_mistakes_exit_2_with_a_sentence(
     assert expected in result.stderr
 
 
-def test_lists_lose_nothing_on_a_narrow_terminal(
-    commands: typer.Typer, config: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_narrow_terminals_show_whole_lists(commands: typer.Typer, config: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     scopes = [word for scope in Scope for word in ("--scope", scope)]
     token = run(commands, "token", "create", "a dashboard beside the door", *scopes, "--config", config).stdout
@@ -132,11 +129,8 @@ def test_the_audit_log_shows_each_action_once(tmp_path: Path, commands: typer.Ty
         lines = run(commands, "audit", "--config", config).stdout.splitlines()
         assert len(lines) == 4
         wanted = (
-            "POST /cut/short",
-            "GET /health",
-            "DELETE /machine",
-            "shelve demo/lab k_by: [bold]bolt[/bold] replaced",
-        )
+            "POST /cut/short", "GET /health", "DELETE /machine", "shelve demo/lab k_by: [bold]bolt[/bold] replaced",
+        )  # fmt: skip
         for line, what in zip(lines, wanted, strict=True):
             assert what in line
         assert "not known" in lines[0]
@@ -171,9 +165,7 @@ def test_the_command_that_a_monitor_prints_creates_a_token_that_it_takes(tmp_pat
         assert httpx.get(f"{url}/api/v1/machines", headers=headers, trust_env=False, timeout=180.0).status_code == 200
 
 
-def test_the_hint_knows_where_the_history_is_and_shows_no_password(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_hint_knows_the_history_and_shows_no_password(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert f"ROTORWATCH_HISTORY__URL=sqlite:///{tmp_path}/" in access_commands.creation_hint(None, HistorySettings())
     url = "postgresql://watch:secret@db/plant"

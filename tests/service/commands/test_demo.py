@@ -21,7 +21,6 @@ WHOLE, QUICK = ("service", "demo"), ("tests.service.commands.quick_demo",)
 
 
 def children_of(pid: int) -> list[int]:
-    """Processes whose parent is `pid`."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -48,7 +47,6 @@ def none_is_left(processes: list[int]) -> None:
 
 
 def check_lines(output: str) -> None:
-    """What holds for every line of a demo."""
     for line in output.splitlines():
         assert len(line.rstrip()) <= 100
         assert not ("healthy" in line and "changed" in line)
@@ -118,9 +116,7 @@ def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path:
         ),
     ],
 )
-def test_however_the_demo_ends_it_leaves_nothing_behind(
-    number: signal.Signals, code: int, running: int, tmp_path: Path
-) -> None:
+def test_however_a_demo_ends_it_leaves_nothing(number: signal.Signals, code: int, running: int, tmp_path: Path) -> None:
     """While the monitor starts, and later beside the simulator."""
     with demo(tmp_path, *WHOLE) as one:
         until(lambda: len(children_of(one.process.pid)) == running, "programs")

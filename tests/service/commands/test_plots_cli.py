@@ -32,7 +32,6 @@ def run_up(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def without_angle(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same machine without a keyphasor."""
     return replaying.without_angle(tmp_path_factory.mktemp("plots") / "plain.mcap", scenario_blocks(5.0))
 
 
@@ -184,9 +183,7 @@ def test_a_stream_without_its_descriptor(faulty: Path, tmp_path: Path) -> None:
     assert (code, "no channel descriptor on rotorwatch/demo/lab/descriptor" in said) == (1, True)
 
 
-def test_without_matplotlib_it_says_what_to_install(
-    faulty: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_matplotlib_it_says_so(faulty: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)  # what import does then is what it does without the package
     code, said = run("orbit", faulty, "--out", tmp_path / "orbit.png")
     assert (code, "pip install 'rotorwatch[plots]'" in said) == (2, True)

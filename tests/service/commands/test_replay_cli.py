@@ -81,19 +81,16 @@ def test_channels_that_do_not_fit_are_said(faulty: Path, tmp_path: Path) -> None
         (("--offline", "--key", "demo/fan"), "machines with sample blocks: demo/lab"),
         (("--offline", "--prefix", "x"), "--prefix makes sense only without --offline"),
         (("--offline", "--pace", "10"), "--pace makes sense only without --offline"),
-        (("--offline", "--progress", "json"), "--out"),
-        (("--offline", "--set", "alarms.on_delay_s="), "changes: "),
+        (("--offline", "--progress", "json"), "--out"), (("--offline", "--set", "alarms.on_delay_s="), "changes: "),
         (("--offline", "--set", "alarms.on_delay_s=-1"), "alarms.on_delay_s"),
         (("--offline", "--set", "alarms.delay_s=1"), "alarms.delay_s"),
         (("--offline", "--set", "alarms.on_delay_s"), "--set 'alarms.on_delay_s': expected FIELD=VALUE"),
         (("--machine", "lab"), "--machine makes sense only with --offline"),
-        (("--pace", "0"), "--pace is '0', expected 0.1 to 1000, or max"),
-        (("--pace", "nan"), "--pace is 'nan'"),
-        (("--loop", "0"), "--loop is '0'"),
-        (("--prefix", "a/*"), "--prefix is 'a/*'"),
+        (("--pace", "0"), "--pace is '0', expected 0.1 to 1000, or max"), (("--pace", "nan"), "--pace is 'nan'"),
+        (("--loop", "0"), "--loop is '0'"), (("--prefix", "a/*"), "--prefix is 'a/*'"),
         (("--prefix", "", "--loop", "2"), "--loop needs a prefix"),
     ],
-)
+)  # fmt: skip
 def test_options_that_cannot_be_used(faulty: Path, arguments: tuple[str, ...], message: str) -> None:
     from typer.testing import CliRunner  # noqa: PLC0415  # in this process: a dozen starts would take a minute
 

@@ -36,17 +36,14 @@ def written(folder: Path, text: str) -> Path:
 def test_defaults_watch_the_shipped_machine_on_loopback() -> None:
     settings = load_settings()
     assert [(entry.file, entry.bundle) for entry in settings.machines] == [("lab", "lab")]
-    assert settings.link.listen == (DEFAULT_LISTEN,)
-    assert settings.http.host == "127.0.0.1"
+    assert (settings.link.listen, settings.http.host) == ((DEFAULT_LISTEN,), "127.0.0.1")
     assert settings.queue.when_full == "drop"
 
 
 def test_file_is_read_and_paths_are_relative_to_it(tmp_path: Path) -> None:
     settings = load_settings(written(tmp_path, GOOD))
-    assert settings.http.port == 9000
-    assert settings.queue.blocks == 10
-    assert settings.machines[0].file == str(tmp_path / "machine.toml")
-    assert settings.machines[0].bundle == "lab"
+    assert (settings.http.port, settings.queue.blocks) == (9000, 10)
+    assert (settings.machines[0].file, settings.machines[0].bundle) == (str(tmp_path / "machine.toml"), "lab")
     assert settings.machines[0].load().name == "lab"
     (tmp_path / "lab").mkdir()
     assert load_settings(tmp_path / "service.toml").machines[0].bundle == str(tmp_path / "lab")
@@ -56,8 +53,7 @@ def test_environment_goes_over_the_file(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setenv("ROTORWATCH_HTTP__PORT", "9001")
     monkeypatch.setenv("ROTORWATCH_MACHINES", '[{"file": "heavy"}]')
     settings = load_settings(written(tmp_path, GOOD))
-    assert settings.http.port == 9001
-    assert settings.queue.blocks == 10
+    assert (settings.http.port, settings.queue.blocks) == (9001, 10)
     assert [(entry.file, entry.bundle) for entry in settings.machines] == [("heavy", None)]
 
 

@@ -23,8 +23,6 @@ Answering = Callable[["Got"], tuple[int, Mapping[str, str]]]
 
 @dataclass(frozen=True, slots=True)
 class Got:
-    """One request."""
-
     path: str
     headers: Mapping[str, str]
     body: bytes
@@ -57,7 +55,6 @@ class Hook:
 
 @contextmanager
 def hook(answer: Answering = _taken, context: ssl.SSLContext | None = None) -> Iterator[Hook]:
-    """Serve until the block is left."""
     found = Hook(answer=answer)
 
     class Handler(BaseHTTPRequestHandler):
@@ -116,23 +113,13 @@ def alarm_event(sequence: int, place: str = "demo/lab", *, annunciated: bool = T
     text = json.dumps(example(AlarmCloudEvent))
     event = AlarmCloudEvent.model_validate_json(text)
     identifier = f"{place}/{sequence}/{fields['alarm']}/{fields['kind']}"
-    data = event.data.model_copy(
-        update={
-            "sequence": sequence,
-            "kind": EventKind(fields["kind"]),
-            "severity": Severity(fields["severity"]),
-            "annunciated": annunciated,
-        }
-    )
+    data = event.data.model_copy(update={
+        "sequence": sequence, "kind": EventKind(fields["kind"]), "severity": Severity(fields["severity"]),
+        "annunciated": annunciated,
+    })  # fmt: skip
     event = event.model_copy(update={"id": identifier, "sequence": f"{sequence:020d}", "data": data})
     return StoredEvent(
-        sequence=sequence,
-        id=identifier,
-        time_ns=1_767_225_600_000_000_000 + sequence,
-        recorded_ns=1_767_225_600_000_000_000 + sequence,
-        state="unacknowledged",
-        occurrence=1,
-        actor="",
-        text=event.model_dump_json(),
-        **fields,
-    )
+        sequence=sequence, id=identifier, time_ns=1_767_225_600_000_000_000 + sequence,
+        recorded_ns=1_767_225_600_000_000_000 + sequence, state="unacknowledged", occurrence=1, actor="",
+        text=event.model_dump_json(), **fields,
+    )  # fmt: skip

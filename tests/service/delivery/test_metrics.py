@@ -27,8 +27,6 @@ LAB = {"site": "demo", "machine": "lab"}
 
 @dataclass(frozen=True)
 class Read:
-    """One scrape."""
-
     samples: Mapping[tuple[str, frozenset[tuple[str, str]]], float]
     kinds: Mapping[str, str]
 
@@ -126,16 +124,13 @@ def test_data_and_alarms_are_counted_as_they_came(read: Read, served: tuple[Runt
     for name in ("queue_blocks", "queue_dropped_blocks_total", "link_missed_blocks_total", "publisher_alive",
                  "worker_errors_total", "history_waiting_steps", "lag_seconds", "restored_at_start"):  # fmt: skip
         assert read.of_lab(name) == 0.0, name
-    assert read.of_lab("worker_alive") == 1.0
-    assert read.of_lab("alarms", state="unacknowledged", severity="alert") == 1.0
-    assert read.of_lab("alarms", state="acknowledged", severity="alert") == 0.0
-    assert read.of_lab("alarm_sequence") == 0.0
+    assert read.of_lab("worker_alive") == read.of_lab("alarms", state="unacknowledged", severity="alert") == 1.0
+    assert read.of_lab("alarms", state="acknowledged", severity="alert") == read.of_lab("alarm_sequence") == 0.0
     assert read.of_lab("alarm_events_total", kind="raised") == 1.0
     assert read.of_lab("alarm_events_total", kind="shelved") == 0.0
     states = {state: value for (name, labels), value in read.samples.items() for label, state in labels
               if name == "rotorwatch_machine_state" and label == "state"}  # fmt: skip
-    assert states.pop(worker.health().state.value) == 1.0
-    assert set(states.values()) == {0.0}
+    assert (states.pop(worker.health().state.value), set(states.values())) == (1.0, {0.0})
     identity = worker.identity
     assert read.of_lab("machine_info", bundle="", machine_hash=identity["machine_hash"]) == 1.0
 
@@ -152,12 +147,10 @@ def test_blocks_that_wait_are_told_as_seconds_of_data(served: tuple[Runtime, str
 
 def test_the_service_itself(read: Read, served: tuple[Runtime, str, Read]) -> None:
     recorder = sure(served[0].machines()[0].status().recorder)
-    assert read.of_lab("recorder_state", state="recording") == 1.0
-    assert read.of_lab("recorder_state", state="off") == 0.0
+    assert (read.of_lab("recorder_state", state="recording"), read.of_lab("recorder_state", state="off")) == (1.0, 0.0)
     assert 16 <= read.of_lab("recorder_received_messages_total") <= recorder.received
     assert read("ready") == read("session_open") == 1.0
-    assert read("history_failing") == 0.0
-    assert read("webhook_delivered_events_total", webhook="pager") == 1.0
+    assert (read("history_failing"), read("webhook_delivered_events_total", webhook="pager")) == (0.0, 1.0)
     assert read("webhook_pending_events", webhook="pager") == 0.0
     assert read("webhook_failed_attempts_total", webhook="pager") == 0.0
     assert read("webhook_state", webhook="pager", state="working") == 1.0
@@ -176,8 +169,7 @@ def test_requests_and_refusals_are_counted_by_route(served: tuple[Runtime, str, 
         for _ in range(3):
             assert http.get(f"{PLACE}/health").status_code == 200
         assert http.get("/api/v1/machines/demo/pump/health").status_code == 404
-        assert http.get("/nothing/here").status_code == 404
-        assert http.request("BREW", "/metrics").status_code == 405
+        assert (http.get("/nothing/here").status_code, http.request("BREW", "/metrics").status_code) == (404, 405)
         assert other.get(f"{PLACE}/health").status_code == 403
         assert stranger.get(f"{PLACE}/health").status_code == 401
         assert http.post("/metrics", json={}, headers={"origin": "https://elsewhere.example"}).status_code == 403
@@ -244,8 +236,7 @@ def test_after_a_restart(tmp_path: Path) -> None:
         assert parsed(runtime.metrics.text().decode()).of_lab("restored_at_start") == 0.0
     with running(plan) as runtime:
         read = parsed(runtime.metrics.text().decode())
-        assert read.of_lab("restored_at_start") == 1.0
-        assert read.of_lab("alarm_sequence") == 0.0
+        assert (read.of_lab("restored_at_start"), read.of_lab("alarm_sequence")) == (1.0, 0.0)
         assert read.of_lab("alarm_events_total", kind="raised") == 0.0
         assert read.of_lab("alarms", state="unacknowledged", severity="alert") == 1.0
         with pytest.MonkeyPatch.context() as patch:

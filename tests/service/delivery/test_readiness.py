@@ -27,9 +27,7 @@ def asked(runtime: Runtime) -> tuple[int, Readiness]:
     return answer.status_code, Readiness.model_validate(fields)
 
 
-def test_a_history_that_cannot_be_written_is_a_reason_until_it_can(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_history_that_cannot_be_written_is_a_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "history.sqlite"
     # As the runtime makes it, but not as patient with its database.
     monkeypatch.setattr("service.runtime.runtime.Store", partial(Store, timeout_s=2.0, retry_s=0.05))

@@ -83,8 +83,7 @@ def test_a_deleted_history_is_written_again_with_all_it_held(tmp_path: Path) -> 
         at.put(*(block(40 + n, run=2, sequence=n) for n in range(1, 15)))
         log = at.log()
         assert log[: len(before) + 1] == [*before, (len(before), "raised", FAULT)]
-        assert at.store.lost == ""
-        assert at.history.waiting == 0
+        assert (at.store.lost, at.history.waiting) == ("", 0)
     assert in_file(tmp_path, "SELECT sequence, kind, alarm FROM alarm_events ORDER BY sequence")[: len(log)] == log
     assert in_file(tmp_path, "SELECT token_id FROM tokens") == [("aaaa",)]
     assert in_file(tmp_path, "SELECT count(*) FROM audit_log") == [(1,)]
@@ -175,8 +174,7 @@ def test_a_backup_is_taken_from_a_running_monitor_and_restored_without_one(tmp_p
     with bench(tmp_path) as at:
         at.put(*map(block, range(12)), block(40, run=2, sequence=0))
         before = at.log()
-        assert history(tmp_path, "check")[0] == 0
-        assert history(tmp_path, "backup", str(copy))[0] == 0
+        assert history(tmp_path, "check")[0] == history(tmp_path, "backup", str(copy))[0] == 0
         assert stat.S_IMODE(copy.stat().st_mode) == 0o600
         assert list(tmp_path.glob("copy*")) == [copy]
         code, said = history(tmp_path, "backup", str(copy))

@@ -53,32 +53,19 @@ def lab(shared: Store) -> MachineStore:
 
 def alarm_event(sequence: int, **changes: object) -> StoredEvent:
     fields: dict[str, object] = {
-        "sequence": sequence,
-        "id": f"event-{sequence}",
-        "time_ns": T0 + sequence * NS,
-        "recorded_ns": T0 + sequence * NS + 7,
-        "kind": "raised",
-        "alarm": "k_by",
-        "severity": "alert",
-        "state": "unacknowledged",
-        "occurrence": sequence // 2,
-        "actor": "",
+        "sequence": sequence, "id": f"event-{sequence}", "time_ns": T0 + sequence * NS,
+        "recorded_ns": T0 + sequence * NS + 7, "kind": "raised", "alarm": "k_by", "severity": "alert",
+        "state": "unacknowledged", "occurrence": sequence // 2, "actor": "",
         "text": f'{{"sequence": {sequence}, "note": "ü → ✓"}}',
-    }
+    }  # fmt: skip
     return StoredEvent(**(fields | changes))  # type: ignore[arg-type]  # fields of any kind
 
 
 def head(end_ns: int, **changes: object) -> CheckpointHead:
     fields: dict[str, object] = {
-        "format": 1,
-        "bundle": None,
-        "machine_hash": "ab12",
-        "code_version": "0.1.0",
-        "end_ns": end_ns,
-        "recorded_ns": end_ns + 1,
-        "alarms": "{}",
-        "state": bytes(range(256)),
-    }
+        "format": 1, "bundle": None, "machine_hash": "ab12", "code_version": "0.1.0", "end_ns": end_ns,
+        "recorded_ns": end_ns + 1, "alarms": "{}", "state": bytes(range(256)),
+    }  # fmt: skip
     return CheckpointHead(**(fields | changes))  # type: ignore[arg-type]  # fields of any kind
 
 
@@ -120,8 +107,7 @@ def test_everything_comes_back_as_it_went_in(store: Store, url: str) -> None:
 
     with opened(url) as again:
         lab = again.machine("demo", "lab")
-        assert lab.last_sequence() == 5
-        assert lab.events() == tuple(step.events[0] for step in steps)
+        assert (lab.last_sequence(), lab.events()) == (5, tuple(step.events[0] for step in steps))
         assert [report for _, report in lab.reports()] == [step.reports[0] for step in reversed(steps)]
         for place, (quantity, name) in enumerate((("parameter", "k_by"), ("parameter", "e"), ("misfit", "z"))):
             found = [(one.end_ns, one.value, one.standard_error) for one in lab.readings(quantity=quantity, name=name)]
@@ -159,8 +145,7 @@ def test_a_step_that_is_written_twice_leaves_its_events_once(lab: MachineStore) 
     assert lab.commit(Step(events=events[:2]))
     assert lab.commit(Step(events=events))
     assert lab.commit(Step(events=events[1:2]))
-    assert lab.events() == events
-    assert lab.last_sequence() == 2
+    assert (lab.events(), lab.last_sequence()) == (events, 2)
 
 
 def test_events_that_contradict_the_log_are_refused_with_their_step(lab: MachineStore) -> None:
@@ -295,8 +280,7 @@ def test_audit_log_is_numbered_and_found(store: Store) -> None:
     found = store.audit.entries()
     assert [entry.number for entry in found] == numbers[::-1]
     assert found[-1].reason == "0 \\0 \\ud800"
-    assert store.audit.entries(limit=3) == found[:3]
-    assert store.audit.entries(found[2].number, 2) == found[3:5]
+    assert (store.audit.entries(limit=3), store.audit.entries(found[2].number, 2)) == (found[:3], found[3:5])
     assert {entry.machine for entry in store.audit.entries(machine="demo/m1")} == {"demo/m1"}
     assert {entry.actor for entry in store.audit.entries(actor="actor 0")} == {"actor 0"}
     for asked_for in (lambda: store.audit.entries(limit=0), lambda: store.machine("demo", "lab").events(limit=0)):
@@ -309,8 +293,7 @@ def test_tokens_are_kept_and_revoked_once(store: Store) -> None:
     second = TokenRecord("bbbb", "script", (), b"other", T0 + 1, T0 + 5, None)
     store.tokens.add(second)
     store.tokens.add(first)
-    assert store.tokens.all() == (first, second)
-    assert store.tokens.find("bbbb") == second
+    assert (store.tokens.all(), store.tokens.find("bbbb")) == ((first, second), second)
     assert store.tokens.find("cccc") is None
     with pytest.raises(StoreError, match="aaaa: there is one with this identifier already"):
         store.tokens.add(first)

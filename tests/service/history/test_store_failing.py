@@ -187,7 +187,6 @@ class _Relay(socketserver.BaseRequestHandler):
 
 @contextmanager
 def losing_proxy(server: PostgresServer) -> Iterator[tuple[LosingProxy, str]]:
-    """A running proxy and the folder of its socket."""
     # Not below pytest's folders: the path of a socket may have a hundred letters.
     with tempfile.TemporaryDirectory(prefix="pg-") as folder, LosingProxy(server, Path(folder)) as proxy:
         thread = threading.Thread(target=proxy.serve_forever, kwargs={"poll_interval": 0.01})
@@ -330,9 +329,7 @@ ENDLESS = select(func.count()).select_from(ONES.union_all(select(ONES.c.n)))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_whoever_asks_while_the_history_is_closed_is_answered(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_whoever_asks_a_closing_history_is_answered(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.history.database._FINISH_S", 0.05)
     database = Database(database_url(kind, tmp_path), QUICK_S)
     database.answer_s = 5.0  # as long as a PostgreSQL server goes on with a query that nobody waits for

@@ -39,9 +39,7 @@ def test_tables_change_with_their_revision() -> None:
     assert (REVISION, digest) == ("0005", "13f485abccd4a3bf596a894b7f8f295facc7f6a1eb3e74b19529c3388ee19897")
 
 
-def test_tables_of_an_older_version_are_migrated_and_keep_what_they_hold(
-    url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tables_of_older_versions_are_migrated(url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with opened(url) as store:
         assert store.machine("demo", "lab").commit(Step(readings=(StoredReading(1, "parameter", "e", 0.1, None),)))
     folder = Path(shutil.copytree(migrations.FOLDER, tmp_path / "migrations"))

@@ -41,7 +41,6 @@ def pages(fetch: Callable[[int | None], Sequence[_T]], number: Callable[[_T], in
 
 
 def within(times: Sequence[int], since: int | None, until: int | None) -> list[int]:
-    """Places of the times within bounds."""
     return [
         place
         for place, time in enumerate(times)

@@ -26,8 +26,6 @@ RETENTION = Retention(reports_days=14, readings_days=90, bucket_s=600, buckets_d
 
 @dataclass(slots=True)
 class Clock:
-    """The computer's time, as the test says."""
-
     now_ns: int = field(default=T0)
 
     def __call__(self) -> int:
@@ -127,8 +125,7 @@ def test_downsampled_is_what_numpy_says(store: Store, clock: Clock) -> None:
     part = written.part(slice(100, 500))
     assert found[0].start_ns == since
     assert_same(list(found), by_numpy(part, "k_by", part.ends, found[0]))
-    assert lab.downsampled(quantity="parameter", names=["EI"]) == ()
-    assert lab.downsampled(quantity="equation") == ()
+    assert lab.downsampled(quantity="parameter", names=["EI"]) == lab.downsampled(quantity="equation") == ()
     assert lab.downsampled(quantity="parameter", since_ns=until, until_ns=since) == ()
 
 
@@ -157,9 +154,7 @@ def test_reduced_readings_and_those_that_are_still_there_are_one_trend(store: St
         assert_same(found, by_numpy(written, name, starts, found[0]))
 
 
-def test_a_trend_over_many_windows_is_taken_from_buckets_to_the_reading(
-    store: Store, clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_trend_of_many_windows_is_of_buckets(store: Store, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.history.trend._SINGLE", 100)
     lab = store.machine("demo", "lab")
     written = write(lab, clock, 1500)
@@ -202,8 +197,7 @@ def test_everything_goes_in_its_time_but_alarms_and_audit(store: Store, clock: C
     assert n_buckets > 0
     assert store.reduction.run(written + 999 * DAY) == Dropped()
     assert store.reduction.run(written + 1000 * DAY) == Dropped(buckets=n_buckets)
-    assert lab.downsampled(quantity="parameter") == ()
-    assert lab.events() == (alarm_event(0),)
+    assert (lab.downsampled(quantity="parameter"), lab.events()) == ((), (alarm_event(0),))
     assert len(store.audit.entries()) == 1
 
 

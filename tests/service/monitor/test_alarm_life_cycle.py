@@ -20,18 +20,13 @@ from service.monitor.alarms.operation import KIND_OF_EVENT, OperationRefused, Op
 ROOT = Path(__file__).parents[3]
 S = 10**9
 HOUR_S = 3600.0
-SETTINGS = AlarmSettings.model_validate(
-    {
-        "on_delay_s": 10,
-        "off_delay_s": 15,
-        "latching": ["c_by"],
-        "longest_shelf_s": 2 * HOUR_S,
-        "suppress": [
-            {"alarms": ["model", "k_by"], "while_alarm": "data-stuck", "because": "a sensor is stuck"},
-            {"alarms": ["model"], "below_rpm": 600, "because": "the machine is coasting down"},
-        ],
-    }
-)
+SETTINGS = AlarmSettings.model_validate({
+    "on_delay_s": 10, "off_delay_s": 15, "latching": ["c_by"], "longest_shelf_s": 2 * HOUR_S,
+    "suppress": [
+        {"alarms": ["model", "k_by"], "while_alarm": "data-stuck", "because": "a sensor is stuck"},
+        {"alarms": ["model"], "below_rpm": 600, "because": "the machine is coasting down"},
+    ],
+})  # fmt: skip
 
 
 def written(cell: Cell) -> str:
@@ -178,8 +173,7 @@ def test_rules_suppress_and_give_back() -> None:
     book.update_state("data-stuck", False, (now_s + 5) * S, at_once=True)
     told = book.suppress(None, (now_s + 5) * S)  # an unknown speed changes nothing of what depends on it
     assert [(event.kind, event.alarm.name) for event in told] == [("unsuppressed", "k_by")]
-    assert state_of(book) is AlarmState.UNACKNOWLEDGED
-    assert state_of(book, "model") is AlarmState.SUPPRESSED
+    assert (state_of(book), state_of(book, "model")) == (AlarmState.UNACKNOWLEDGED, AlarmState.SUPPRESSED)
     book.suppress(1320.0, (now_s + 10) * S)
     assert state_of(book, "model") is AlarmState.NORMAL
 
@@ -194,9 +188,7 @@ def test_rules_suppress_and_give_back() -> None:
     ],
 )
 @pytest.mark.parametrize("cleared_before", [False, True])
-def test_a_rule_takes_no_acknowledgement_off_anybody(
-    name: str, acknowledged: bool, owed: AlarmState, cleared_before: bool
-) -> None:
+def test_a_rule_takes_no_acknowledgement(name: str, acknowledged: bool, owed: AlarmState, cleared_before: bool) -> None:
     book, now_s = raised(name)
     if acknowledged:
         book.operate(act("acknowledge", name), now_s * S)
@@ -229,8 +221,7 @@ def test_a_clock_that_is_set_leaves_shelving_as_long_as_it_was_meant() -> None:
     book, now_s = raised()
     book.operate(act("shelve", duration_s=600), now_s * S)
     book.clock_stepped((now_s + 10**6) * S, 10**6 * S)
-    assert book.passed((now_s + 10**6) * S) == ()
-    assert len(book.passed((now_s + 10**6 + 600) * S)) == 1
+    assert (book.passed((now_s + 10**6) * S), len(book.passed((now_s + 10**6 + 600) * S))) == ((), 1)
 
 
 @pytest.mark.parametrize(

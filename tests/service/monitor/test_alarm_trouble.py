@@ -104,7 +104,6 @@ class Bench:
         self.settle()
 
     def settle(self) -> None:
-        """Wait until everything that was put is done."""
         done: list[bool] = []
         until(lambda: len(self.worker.inbox) == 0, "empty queue")
         self.worker.inbox.call(lambda: done.append(True))
@@ -135,7 +134,6 @@ def bench(folder: Path, clocks: Clocks = REAL, **alarms: object) -> Iterator[Ben
 
 
 def watched(monkeypatch: pytest.MonkeyPatch, look: Callable[[Step], None]) -> None:
-    """Look at every step before it is committed."""
     commit = MachineStore.commit
 
     def looked_at(history: MachineStore, step: Step) -> bool:
@@ -184,8 +182,7 @@ def test_a_defect_after_an_alarm_loses_no_event(tmp_path: Path, monkeypatch: pyt
         assert at.worker.errors == 1
         at.put(block(45, run=2, sequence=1))
         at.worker.operate(order("acknowledge", GAP))
-        assert at.log() == [*TOLD, (3, "raised", FAULT), (4, "acknowledged", GAP)]
-        assert len(at.outlet.events) == 5
+        assert (at.log(), len(at.outlet.events)) == ([*TOLD, (3, "raised", FAULT), (4, "acknowledged", GAP)], 5)
 
 
 def test_what_the_history_refused_goes_with_the_next_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -214,8 +211,7 @@ def test_a_network_that_is_gone_fails_no_operation(tmp_path: Path) -> None:
         at.outlet.is_gone = True
         (event,) = at.worker.operate(order("shelve", "k_by"))
         assert event.data.kind == "shelved"
-        assert at.log() == [(0, "shelved", "k_by")]
-        assert at.worker.last_error == "OSError: no route"
+        assert (at.log(), at.worker.last_error) == ([(0, "shelved", "k_by")], "OSError: no route")
 
 
 @pytest.mark.parametrize(("by_the_log", "expected"), [(5, 5), (1, 3)], ids=["log ahead", "log begun anew"])

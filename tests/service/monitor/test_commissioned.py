@@ -105,9 +105,7 @@ def test_another_speed_is_not_evaluable_here_and_raises_nothing_but_levels() -> 
         ),
     ],
 )
-def test_a_rub_is_told_and_what_it_is_taken_for_is_named_with_reserve(
-    clearance_m: float, size: float, of: Callable[[], Installed]
-) -> None:
+def test_a_rub_is_told_and_names_with_reserve(clearance_m: float, size: float, of: Callable[[], Installed]) -> None:
     scenario, machine = load_scenario("healthy")
     rubbing = scenario.model_copy(
         update={"rub": Rub(clearance_m=clearance_m), "events": (Event(at_s=0.0, anomaly="rub", size=size),)}
@@ -259,7 +257,6 @@ def of_sensors(columns: list[int], blocks: Sequence[SampleBlock]) -> list[Sample
 
 
 def with_sensors(columns: list[int], duration_s: float) -> Installed:
-    """The machine with some of its sensors, commissioned for as long."""
     machine = MACHINE.model_copy(update={"sensors": tuple(MACHINE.sensors[n] for n in columns)})
     made = commissioned(machine, recording(machine, of_sensors(columns, before()[: round(10 * duration_s)])))
     return Installed(machine, None, sure(made.commissioned))

@@ -35,7 +35,6 @@ def monitor() -> MachineMonitor:
 
 
 def feed(target: MachineMonitor, stream: Sequence[SampleBlock]) -> tuple[list[Report], list[AlarmEvent]]:
-    """Windows and events of all blocks."""
     windows: list[Report] = []
     events: list[AlarmEvent] = []
     for block in stream:
@@ -100,8 +99,7 @@ def test_every_parameter_and_equation_is_accounted_for() -> None:
         assert reading.interval_95 is not None
         assert abs(reading.z or 0.0) < 4.5
     verdicts = {equation.equation: equation for equation in window.equations}
-    assert list(verdicts) == ["28", "29", "30", "31"]
-    assert verdicts["30"].reason == "not measured: psi_dot, psi, phi_dot"
+    assert (list(verdicts), verdicts["30"].reason) == (["28", "29", "30", "31"], "not measured: psi_dot, psi, phi_dot")
     assert verdicts["30"].parameters == ()
     for number in ("28", "29", "31"):
         assert verdicts[number].evaluable
@@ -194,8 +192,7 @@ def test_where_no_hop_is_whole_nothing_stays_healthy(torn: str) -> None:
     assert feed(again, spoilt[100:])[1] == events
     windows, events = feed(target, after[400:])
     assert windows
-    assert target.health().state is HealthState.HEALTHY
-    assert target.health().reason == ""
+    assert (target.health().state, target.health().reason) == (HealthState.HEALTHY, "")
 
 
 @pytest.mark.parametrize("restarted", [False, True])

@@ -79,8 +79,7 @@ def test_a_defect_in_evaluation_is_an_alarm_and_no_health(monkeypatch: pytest.Mo
     # And when it is over, that is said as well.
     events = [event for one in stream[710:] for event in monitor.step(one).events]
     assert named(tuple(events)) == [("cleared", FAULT)]
-    assert monitor.health().state is HealthState.HEALTHY
-    assert monitor.health().reason == ""
+    assert (monitor.health().state, monitor.health().reason) == (HealthState.HEALTHY, "")
 
 
 def test_a_defect_before_the_evaluation_is_no_health_either(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,9 +95,7 @@ def test_a_defect_before_the_evaluation_is_no_health_either(monkeypatch: pytest.
     assert DEFECT in monitor.health().reason
 
 
-def test_a_service_with_a_defect_is_not_ready_and_says_of_which_machine(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_service_with_a_defect_is_not_ready_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(KnownMachineEvaluator, "evaluate", defective)
     address = endpoint()
     with service(address, machine_file(tmp_path, PATIENT), when_full="wait") as (runtime, worker):
@@ -117,9 +114,7 @@ def test_a_service_with_a_defect_is_not_ready_and_says_of_which_machine(
         until(lambda: worker.errors == worker.tally.windows - 11, "an error for each window that was full")
 
 
-def test_what_the_history_refuses_of_one_machine_is_that_machines(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_history_refuses_of_a_machine_is_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     refusing = [True]
 
     def refuse(step: Step) -> None:
@@ -153,9 +148,7 @@ def stuffed() -> tuple[MachineMonitor, Callable[[int, int], None]]:
     return monitor, give
 
 
-def test_what_the_monitor_dropped_itself_is_no_fault_of_the_stream(
-    stuffed: tuple[MachineMonitor, Callable[[int, int], None]],
-) -> None:
+def test_what_the_monitor_dropped_is_no_gap(stuffed: tuple[MachineMonitor, Callable[[int, int], None]]) -> None:
     monitor, give = stuffed
     for number in range(20):
         give(number, 0)
@@ -240,9 +233,7 @@ def test_the_last_step_at_a_stop_survives_a_defect(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize("kind", ["unheard-of", "gap"])
-def test_an_event_without_words_goes_out_and_holds_up_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
+def test_an_event_without_words_holds_up_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     told = []
     with bench(tmp_path) as at:
         at.put(block(0))
@@ -272,9 +263,7 @@ INTEGER = st.one_of(st.integers(-(2**70), 2**70), st.sampled_from([0, 2**16 - 1,
     start_ns=st.one_of(st.just(START_NS), INTEGER),
 )
 @example(headers=[(0, 0, LAB.rate_hz, 0), (0, 0, LAB.rate_hz, 1)], start_ns=START_NS)  # two versions of one block
-def test_whatever_is_accepted_can_be_remembered_and_restored(
-    headers: list[tuple[int, int, float, int]], start_ns: int
-) -> None:
+def test_whatever_is_accepted_can_be_restored(headers: list[tuple[int, int, float, int]], start_ns: int) -> None:
     installed = install(machine_in_order(), None)
     monitor = MachineMonitor(installed)
     good = block(0)

@@ -33,19 +33,14 @@ from tests.service.rig.live import LAB, scenario_blocks
 from tests.sure import sure
 
 RATE_HZ, BLOCK_S, START_NS = 5120.0, 0.5, 1_767_225_600_000_000_000
-FAN = MachineFile.model_validate(
-    {
-        "site": "plant",
-        "name": "fan",
-        "rate_hz": RATE_HZ,
-        "sensors": [
-            {"name": "DE-H", "quantity": "acceleration", "location": "DE", "direction": "horizontal", "unit": "m/s2"},
-            {"name": "NDE-V", "quantity": "velocity", "location": "NDE", "direction": "vertical", "unit": "mm/s"},
-        ],
-        "window": {"length_s": 20.0, "max_span_s": 30.0},
-        "levels": {"reference_windows": 3},
-    }
-)
+FAN = MachineFile.model_validate({
+    "site": "plant", "name": "fan", "rate_hz": RATE_HZ,
+    "sensors": [
+        {"name": "DE-H", "quantity": "acceleration", "location": "DE", "direction": "horizontal", "unit": "m/s2"},
+        {"name": "NDE-V", "quantity": "velocity", "location": "NDE", "direction": "vertical", "unit": "mm/s"},
+    ],
+    "window": {"length_s": 20.0, "max_span_s": 30.0}, "levels": {"reference_windows": 3},
+})  # fmt: skip
 
 
 def blocks(

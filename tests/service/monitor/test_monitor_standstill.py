@@ -58,7 +58,6 @@ def stopping(machine: MachineFile, what: str) -> Iterator[SampleBlock]:
 
 
 def watched(monitor: MachineMonitor, stream: list[SampleBlock]) -> tuple[list[Report], list[tuple[EventKind, str]]]:
-    """Reports, and what happened to alarms."""
     done = [monitor.step(block) for block in stream]
     return (
         [report for one in done for report in one.windows],

@@ -91,9 +91,7 @@ def test_what_follows_from_a_schedule() -> None:
         ((0.1, 10.0), {"lag_to_s": 0.06}, "window.lag_to_s is 0.06, expected at most half of a snapshot, 0.05"),
     ],
 )
-def test_what_does_not_go_together_is_told(
-    tmp_path: Path, schedule: tuple[float, float], window: dict[str, float], says: str
-) -> None:
+def test_mistakes_are_told(tmp_path: Path, schedule: tuple[float, float], window: dict[str, float], says: str) -> None:
     with pytest.raises(MachineFileError) as told:
         checked(Machine, scheduled(*schedule, **window), tmp_path / "kit.toml")
     assert says in str(told.value)

@@ -23,13 +23,9 @@ def watched(duration_s: float, change: Event) -> Sequence[Report]:
     """Full windows of a machine that one force shakes, which shows most of what is left of the rotation."""
     direction = np.array([[0.5, 0.7, 0.0, -0.4, 0.6, 0.0]])
     scenario = Scenario(
-        machine="lab",
-        seed=5_280_031,
-        duration_s=duration_s,
-        sources=sources_along(direction, 70.0, 0.3),
-        sensors=Sensors(noise_relative=0.01, noise_corner_hz=300.0),
-        events=(change,),
-    )
+        machine="lab", seed=5_280_031, duration_s=duration_s, sources=sources_along(direction, 70.0, 0.3),
+        sensors=Sensors(noise_relative=0.01, noise_corner_hz=300.0), events=(change,),
+    )  # fmt: skip
     windows, events = feed(MachineMonitor(Installed(LAB, None)), [block for block, _ in blocks(scenario, LAB)])
     assert not [event for event in events if not event.alarm.name.startswith(LEVEL)]
     return [window for window in windows if window.filled == 1.0]
@@ -52,13 +48,10 @@ def test_without_a_phase_reference_what_does_not_fit_is_outside_the_model() -> N
     without = LAB.model_copy(update={"sensors": tuple(one for one in LAB.sensors if one.quantity != "shaft_angle")})
     other = without.rotor.model_copy(update={"m2_kg": 1.3 * without.rotor.m2_kg})
     scenario = Scenario(
-        machine="lab",
-        seed=5_280_032,
-        duration_s=75.0,
+        machine="lab", seed=5_280_032, duration_s=75.0,
         sources=sources_along(np.array([[0.5, 0.7, 0.0, -0.4, 0.6, 0.0]]), 70.0, 0.3),
-        sensors=Sensors(noise_relative=0.01, noise_corner_hz=300.0),
-        events=(Event(at_s=66.0, speed_rpm=1.05 * RPM),),
-    )
+        sensors=Sensors(noise_relative=0.01, noise_corner_hz=300.0), events=(Event(at_s=66.0, speed_rpm=1.05 * RPM),),
+    )  # fmt: skip
     stream = blocks(scenario, without.model_copy(update={"rotor": other}))
     windows, events = feed(MachineMonitor(Installed(without, None)), [block for block, _ in stream])
     assert {event.alarm.name for event in events} == {MODEL}

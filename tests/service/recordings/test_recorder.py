@@ -149,8 +149,7 @@ def test_files_are_closed_by_size_and_each_stands_alone(tmp_path: Path) -> None:
         assert (first.payload, first.publish_time_ns) == (DESCRIPTOR.payload, DESCRIPTOR.publish_time_ns)
         # Logged with what follows, so that the file does not seem to begin when the descriptor was announced.
         assert summarize_recording(path).start_ns >= NOW_NS
-    assert recorder.status().synced == len(content) + 1
-    assert recorder.status().files == len(names)
+    assert (recorder.status().synced, recorder.status().files) == (len(content) + 1, len(names))
     assert not list(recorder.folder.glob("*.part"))
 
 
@@ -261,8 +260,6 @@ def test_a_write_error_is_told_and_recording_resumes_without_loss(tmp_path: Path
 
 
 class Sender:
-    """Puts blocks on the stream's key and remembers them."""
-
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
         self.sent: list[bytes] = []
@@ -275,7 +272,6 @@ class Sender:
 
 
 def status_of(recorder: Program) -> dict[str, Any]:
-    """The latest line in full."""
     lines = recorder.output().rpartition("\n")[0].splitlines()
     return dict(json.loads(lines[-1])) if lines else {}
 
@@ -298,8 +294,7 @@ def test_a_full_queue_drops_samples_and_counts_but_keeps_the_rest() -> None:
     for message in blocks(30):  # 19 and the alarm find room
         backlog.put(message)
     assert (backlog.received, backlog.dropped) == (31, 19)
-    assert backlog.take(0.0) == [alarm, *blocks(30)[19:]]
-    assert backlog.take(0.0) == []
+    assert (backlog.take(0.0), backlog.take(0.0)) == ([alarm, *blocks(30)[19:]], [])
     backlog.put(blocks(1, size=200_000)[0])
     assert backlog.dropped == 20
     for _ in range(400):

@@ -56,7 +56,6 @@ class Victim:
     kill_at: int
 
     def status(self, name: str) -> int:
-        """A count of the latest status printed in full."""
         lines = self.recorder.output().rpartition("\n")[0].splitlines()
         return int(json.loads(lines[-1])[name]) if lines else 0
 

@@ -33,7 +33,6 @@ FAULT = parse_fault("c_bz=0.5@0")
 
 @pytest.fixture(scope="module")
 def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The lab machine with too much damping, 70 s: one alarm."""
     stream = scenario_blocks(BLOCKS / 10, FAULT)
     return recording(tmp_path_factory.mktemp("recordings") / "faulty.mcap", stream)
 
@@ -67,9 +66,7 @@ def test_offline_says_what_the_monitor_says(faulty: Path, expected: OfflineSumma
     ]
     assert expected.windows == sum(len(report.windows) for report in reports) > 10
     assert expected.alarms == sum(len(report.events) for report in reports) == 1
-    assert expected.raised == ("c_bz",)
-    assert expected.blocks == BLOCKS
-    assert expected.refused_blocks == {}
+    assert (expected.raised, expected.blocks, expected.refused_blocks) == (("c_bz",), BLOCKS, {})
     assert expected.data_s == pytest.approx(BLOCKS / 10)
     assert expected.descriptor_differences == ()
     assert not expected.stopped

@@ -102,7 +102,6 @@ def as_blocks(machine: Machine, samples: FloatArray) -> Iterator[SampleBlock]:
 
 
 def _sine(phase: FloatArray, w: float, amplitude: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Displacement and velocity."""
     shifted = phase + rng.uniform(0, 2 * np.pi)
     return amplitude * np.cos(shifted), -amplitude * w * np.sin(shifted)
 

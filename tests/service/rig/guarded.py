@@ -33,15 +33,11 @@ JSON = {"content-type": "application/json"}
 
 
 class Shelving(BaseModel):
-    """A body."""
-
     reason: str
 
 
 @dataclass(slots=True)
 class Clock:
-    """Monotonic seconds that tests move."""
-
     now_s: float = 1000.0
 
     def __call__(self) -> float:
@@ -74,7 +70,6 @@ class Guarded:
         return record, text
 
     def entries(self) -> list[AuditRecord]:
-        """Everything in the audit log, oldest first."""
         return list(reversed(self.store.audit.entries(limit=1000)))
 
 

@@ -31,8 +31,6 @@ def why_not() -> str:
 
 
 class Running(Protocol):
-    """What runs on a host."""
-
     def kill(self) -> object:
         """kill -9."""
 
@@ -48,7 +46,6 @@ class Hosts:
         return ("ip", "netns", "exec", self._space(name))
 
     def network(self, name: str) -> str:
-        """What a thread moves to a host by (`move_to`)."""
         return f"/run/netns/{self._space(name)}"
 
     def middle_from(self, name: str) -> str:
@@ -56,7 +53,6 @@ class Hosts:
         return f"10.77.{self.names.index(name)}.1"
 
     def address(self, name: str) -> str:
-        """Address of a host."""
         return f"10.77.{self.names.index(name)}.2"
 
     def cut(self, name: str) -> None:
@@ -89,12 +85,9 @@ class Hosts:
         _ip("-n", space, "route", "add", "default", "via", self.middle_from(name))
 
     def take_away(self, name: str) -> None:
-        """Take a host away, if it is there."""
         subprocess.run(["ip", "netns", "del", self._space(name)], capture_output=True, check=False)
 
     def asked(self, name: str, url: str) -> str:
-        """Answer to an HTTP request that is sent on a host."""
-
         def answer() -> str:
             move_to(self.network(name))
             time.sleep(0.15)  # of one caller 600 questions a minute are answered

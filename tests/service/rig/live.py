@@ -87,14 +87,11 @@ def advanced_publisher(
 ) -> zenoh.ext.AdvancedPublisher:
     """As the simulator's: what is lost is noticed, and as much is kept for who comes late."""
     return zenoh.ext.declare_advanced_publisher(
-        session,
-        key,
-        congestion_control=zenoh.CongestionControl.BLOCK,
+        session, key, congestion_control=zenoh.CongestionControl.BLOCK,
         cache=zenoh.ext.CacheConfig(max_samples=kept) if kept else None,
         sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=heartbeat_s, sporadic_heartbeat=None),
-        publisher_detection=detected,
-        **more,
-    )
+        publisher_detection=detected, **more,
+    )  # fmt: skip
 
 
 def settings(
@@ -107,18 +104,14 @@ def settings(
 ) -> ServiceSettings:
     """Settings of a service on loopback with a free HTTP port, and others of its sections."""
     made = ServiceSettings(
-        link=LinkSettings(listen=(listen,)),
-        http=HttpSettings(port=0),
-        history=IN_MEMORY,
-        access=OPEN,
+        link=LinkSettings(listen=(listen,)), http=HttpSettings(port=0), history=IN_MEMORY, access=OPEN,
         machines=(MachineEntry(file=machine, bundle=bundle),),
         queue=QueueSettings.model_validate({"blocks": bound, "when_full": when_full}),
-    )
+    )  # fmt: skip
     return made.model_copy(update=others)
 
 
 def kept_in(folder: Path) -> HistorySettings:
-    """Settings of a history that is there after a restart."""
     return HistorySettings(url=f"sqlite:///{folder / 'history.sqlite'}")
 
 
@@ -133,13 +126,11 @@ def worker_of(runtime: Runtime) -> MachineWorker:
 def service(
     listen: str, machine: str = "lab", bundle: str | None = None, when_full: str = "drop", bound: int = 600
 ) -> Iterator[tuple[Runtime, MachineWorker]]:
-    """A running service with one machine."""
     with running(settings(listen, machine, bundle, when_full, bound)) as runtime:
         yield runtime, worker_of(runtime)
 
 
 def machine_file(folder: Path, *replacements: tuple[str, str]) -> str:
-    """The shipped machine file with some lines replaced."""
     text = (ROOT / "models/machines/lab.toml").read_text(encoding="utf-8")
     for old, new in replacements:
         assert old in text
@@ -186,26 +177,20 @@ class Feed:
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(5))
 
     def samples(self, n_samples: int = 200) -> npt.NDArray[np.float32]:
-        """Noise in every channel."""
         return self.rng.standard_normal((n_samples, len(self.machine.sensors))).astype(np.float32)
 
     def block(self, **changes: object) -> SampleBlock:
         """The block that comes next, with some fields replaced."""
         fields: dict[str, object] = {
-            "start_ns": self.start_ns,
-            "sequence": self.sequence,
-            "run": self.run,
-            "rate_hz": self.machine.rate_hz,
+            "start_ns": self.start_ns, "sequence": self.sequence, "run": self.run, "rate_hz": self.machine.rate_hz,
             "samples": self.samples(),
-        }
+        }  # fmt: skip
         return SampleBlock(**(fields | changes))  # type: ignore[arg-type]  # tests give fields of any kind
 
     def put(self, block: SampleBlock, schema_hash: str | None = None) -> None:
-        """Publish one block."""
         self.put_raw(*encode_block(block, self.machine.descriptor.schema_hash if schema_hash is None else schema_hash))
 
     def put_raw(self, payload: bytes, attachment: bytes, encoding: str) -> None:
-        """Publish bytes."""
         self.session.put(
             self.machine.keys.stream,
             payload,
@@ -236,14 +221,12 @@ class Feed:
 
 @contextmanager
 def feeding(plan: ServiceSettings) -> Iterator[tuple[Runtime, Feed]]:
-    """A running service, and what puts blocks of its first machine."""
     with running(plan) as runtime, open_session(plan.link.listen[0]) as session:
         yield runtime, Feed(session, runtime.machines()[0].machine)
 
 
 @contextmanager
 def fed_service(machine: str = "lab", **how: Any) -> Iterator[tuple[Runtime, MachineWorker, Feed]]:
-    """A running service with one machine and settings as those of `settings`, its worker, and what feeds it."""
     with feeding(settings(endpoint(), machine, **how)) as (runtime, feed):
         yield runtime, worker_of(runtime), feed
 
@@ -257,11 +240,9 @@ class Program:
     err: Path
 
     def output(self) -> str:
-        """Standard output so far."""
         return self.out.read_text(encoding="utf-8")
 
     def errors(self) -> str:
-        """Standard error so far."""
         return self.err.read_text(encoding="utf-8")
 
     def wait_for(self, text: str) -> None:
@@ -275,17 +256,14 @@ class Program:
         return self.output().split("HTTP API ", 1)[1].split()[0]
 
     def health(self, place: str = "demo/lab") -> Health:
-        """Health of a machine over HTTP."""
         answer = httpx.get(f"{self.url()}/api/v1/machines/{place}/health", trust_env=False, timeout=180.0)
         return Health.model_validate_json(answer.raise_for_status().content)
 
     def kill(self) -> None:
-        """kill -9."""
         self.process.kill()
         self.process.wait()
 
     def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
-        """Ask the program to stop and return its exit code."""
         self.process.send_signal(number)
         return self.process.wait(180)
 
@@ -311,13 +289,9 @@ def program(
     with out.open("wb") as out_file, err.open("wb") as err_file:
         if within:
             process = subprocess.Popen(
-                [*within, sys.executable, "-m", *arguments],
-                cwd=cwd,
-                stdin=subprocess.DEVNULL,
-                stdout=out_file,
-                stderr=err_file,
-                env=variables,
-            )
+                [*within, sys.executable, "-m", *arguments], cwd=cwd, stdin=subprocess.DEVNULL, stdout=out_file,
+                stderr=err_file, env=variables,
+            )  # fmt: skip
         else:
             process = Preloaded(arguments, cwd, out, err, variables, network)
     try:

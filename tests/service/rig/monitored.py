@@ -65,30 +65,25 @@ def fed(folder: Path, access: AccessSettings = OPEN, *lines: tuple[str, str]) ->
 
 
 def token(runtime: Runtime, *scopes: Scope, name: str = "anna") -> str:
-    """A token that holds until the service stops."""
     record, text = new_token(name, scopes or Scope, now_ns=time.time_ns())
     runtime.store.tokens.add(record)
     return text
 
 
 def client(runtime: Runtime, text: str = "") -> httpx.Client:
-    """A client of the running service, with or without a token."""
     headers = {"authorization": f"Bearer {text}"} if text else {}
     return httpx.Client(base_url=runtime.http_url, trust_env=False, headers=headers, timeout=180.0)
 
 
 def answered(answer: httpx.Response, model: type[M]) -> M:
-    """What a request was answered with, as its model."""
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"] == "application/json"
     return model.model_validate_json(answer.content)
 
 
 def problem(answer: httpx.Response, status: int) -> Problem:
-    """What a request was refused with."""
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
     found = Problem.model_validate_json(answer.content)
-    assert found.status == status
-    assert found.instance == answer.request.url.path
+    assert (found.status, found.instance) == (status, answer.request.url.path)
     return found

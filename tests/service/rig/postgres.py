@@ -38,7 +38,6 @@ class PostgresServer:
     account: str | None
 
     def url(self, database: str) -> str:
-        """Address of a database."""
         return f"postgresql://{USER}@/{database}?host={self.folder}"
 
     def new_database(self, name: str, template: str = "template1") -> str:
@@ -47,7 +46,6 @@ class PostgresServer:
         return self.url(name)
 
     def start(self) -> None:
-        """Start it and wait until it answers."""
         options = f"-c listen_addresses='' -k {self.folder} -c max_connections=40 -c shared_buffers=16MB -c fsync=off"
         log = str(self.folder / "log")
         self.run("pg_ctl", "-D", str(self.folder / "data"), "-l", log, "-w", "-o", options, "start")
@@ -57,18 +55,12 @@ class PostgresServer:
         self.run("pg_ctl", "-D", str(self.folder / "data"), "-m", "immediate", "-w", "stop")
 
     def run(self, program: str, *arguments: str) -> None:
-        """Run one of PostgreSQL's programs."""
         done = subprocess.run(
-            [str(self.programs / program), *arguments],
-            user=self.account,
-            cwd=self.folder,
-            stdin=subprocess.DEVNULL,
+            [str(self.programs / program), *arguments], user=self.account, cwd=self.folder, stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE if program != "pg_ctl" else subprocess.DEVNULL,
             stderr=subprocess.STDOUT if program != "pg_ctl" else subprocess.DEVNULL,
-            env={"PATH": os.environ["PATH"], "LC_ALL": "C"},
-            check=False,
-            timeout=300,
-        )
+            env={"PATH": os.environ["PATH"], "LC_ALL": "C"}, check=False, timeout=300,
+        )  # fmt: skip
         assert done.returncode == 0, f"{program} {arguments}: {done.stdout!r}"
 
 

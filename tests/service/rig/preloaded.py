@@ -52,36 +52,29 @@ class Preloaded:
 
     @property
     def pid(self) -> int:
-        """Number of the process."""
         return sure(self._process.pid)
 
     @property
     def returncode(self) -> int | None:
-        """Exit code, negative for a signal."""
         return self._process.exitcode
 
     def poll(self) -> int | None:
-        """Exit code, None while it runs."""
         return self._process.exitcode
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for the end."""
         self._process.join(timeout)
         if self._process.exitcode is None:
             raise subprocess.TimeoutExpired(self.args, sure(timeout))
         return self._process.exitcode
 
     def send_signal(self, number: int) -> None:
-        """Send a signal if it still runs."""
         if self.poll() is None:
             os.kill(self.pid, number)
 
     def terminate(self) -> None:
-        """Ask it to end."""
         self.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
-        """kill -9."""
         self.send_signal(signal.SIGKILL)
 
 

@@ -30,7 +30,6 @@ def recording(path: Path, stream: Sequence[SampleBlock], machine: Machine = LAB)
 
 
 def write(path: Path, messages: Sequence[RecordedMessage]) -> Path:
-    """A recording of these messages."""
     with RecordingWriter(path) as writer:
         for message in messages:
             writer.write(message)
@@ -67,7 +66,6 @@ def lines_of(worker: MachineWorker) -> list[str]:
 
 
 def digest_of(worker: MachineWorker) -> str:
-    """SHA-256 of these lines."""
     return hashlib.sha256("".join(line + "\n" for line in lines_of(worker)).encode()).hexdigest()
 
 

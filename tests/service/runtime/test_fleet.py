@@ -59,7 +59,6 @@ def cluster() -> Iterator["Cluster"]:
 
 
 def actors_of(runtime: Runtime) -> list[Any]:
-    """What Ray runs for the shards."""
     assert isinstance(runtime._machines, Shards)
     return [shard.process for shard in runtime._machines._shards]
 

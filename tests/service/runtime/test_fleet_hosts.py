@@ -38,11 +38,8 @@ AGAIN_S = 60.0
 FAULT = "k_by=-0.33@30"
 START_NS = 1_767_225_600 * 10**9
 _VARIABLES = {
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_worker_niceness": "0",
-    "OPENBLAS_NUM_THREADS": "1",
-    "PYTHONPATH": str(ROOT),
-}
+    "RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT),
+}  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -52,21 +49,15 @@ class Group:
     process: subprocess.Popen[bytes]
 
     def kill(self) -> None:
-        """kill -9."""
         with suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
 
 
 def ray_node(net: Hosts, host: str, log: Path, *options: str) -> Group:
-    """Start Ray on a host, and wait until it has."""
     command = [
-        *net.within(host),
-        str(Path(sys.executable).with_name("ray")),
-        "start",
-        "--disable-usage-stats",
-        "--block",
-    ]
+        *net.within(host), str(Path(sys.executable).with_name("ray")), "start", "--disable-usage-stats", "--block",
+    ]  # fmt: skip
     command += ["--node-ip-address", net.address(host), *options]
     variables = os.environ | _VARIABLES
     with log.open("wb") as out:
@@ -134,7 +125,6 @@ def undisturbed(file: Path, seed: int, length_s: float) -> list[tuple[int, str, 
 
 
 def logs_of(database: str) -> dict[str, list[tuple[int, str, str, int]]]:
-    """Alarm log of every machine."""
     found: dict[str, list[tuple[int, str, str, int]]] = {name: [] for name in KITS}
     query = "SELECT name, sequence, kind, alarm, time_ns FROM alarm_events JOIN machines USING (machine_id)"
     with psycopg.connect(database) as connection:

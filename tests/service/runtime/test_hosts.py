@@ -53,12 +53,9 @@ def test_what_a_cut_cable_and_a_lost_host_cost_is_stated_and_the_alarm_log_arriv
 
         def started(host: str, *arguments: str) -> Program:
             made = program(
-                tmp_path,
-                *arguments,
-                network=net.network(host),
-                ROTORWATCH_HISTORY__URL=f"sqlite:///{history}",
+                tmp_path, *arguments, network=net.network(host), ROTORWATCH_HISTORY__URL=f"sqlite:///{history}",
                 ROTORWATCH_QUEUE__WHEN_FULL="drop",
-            )
+            )  # fmt: skip
             return running.enter_context(made)
 
         def published(start_ns: int, fault_s: float, length_s: float) -> Program:

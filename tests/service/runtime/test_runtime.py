@@ -134,8 +134,7 @@ def test_data_after_silence_end_it(tmp_path: Path) -> None:
         for _ in range(3):
             feed.put(feed.block(samples=np.full((200, 9), np.nan, dtype=np.float32)))
         until(lambda: sum(worker.health().quality.refused_blocks.values()) == 3, "refusals")
-        assert worker.health().state == "no-data"
-        assert worker.health().quality.accepted_blocks == accepted
+        assert (worker.health().state, worker.health().quality.accepted_blocks) == ("no-data", accepted)
 
 
 class _Poisoned(MachineMonitor):
@@ -157,12 +156,10 @@ def test_defect_in_the_monitor_costs_one_block_and_is_shown(monkeypatch: pytest.
         feed.put_good()
         until(lambda: worker.health().quality.accepted_blocks == 2, "block after the defect")
         health = worker.health()
-        assert health.worker_errors == 1
-        assert health.last_worker_error == "ZeroDivisionError: defect in the monitor"
+        assert (health.worker_errors, health.last_worker_error) == (1, "ZeroDivisionError: defect in the monitor")
         until(lambda: "monitor-fault" in {one.name for one in worker.alarms().alarms if one.raised}, "the alarm on it")
         answer = httpx.get(f"{runtime.http_url}/readyz", trust_env=False, timeout=180.0)
-        assert answer.status_code == 200
-        assert answer.json()["machines"][0]["worker_errors"] == 1
+        assert (answer.status_code, answer.json()["machines"][0]["worker_errors"]) == (200, 1)
 
 
 def test_several_machines_have_nothing_to_do_with_each_other(tmp_path: Path) -> None:

@@ -60,11 +60,8 @@ def test_alarms_and_what_operators_did_survive_kill_9(tmp_path: Path) -> None:
         do(first, "remove-from-service", "data-stuck", "normal")
         before = log(first)
         assert [one[:2] for one in before] == [
-            ("raised", "c_bz"),
-            ("acknowledged", "c_bz"),
-            ("shelved", "model"),
-            ("removed-from-service", "data-stuck"),
-        ]
+            ("raised", "c_bz"), ("acknowledged", "c_bz"), ("shelved", "model"), ("removed-from-service", "data-stuck"),
+        ]  # fmt: skip
         first.kill()
 
     with running(tmp_path, address, file) as second:

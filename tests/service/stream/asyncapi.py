@@ -57,18 +57,6 @@ _TOPICS: dict[str, _Topic] = {
 
 
 def asyncapi(truth: type[BaseModel]) -> dict[str, Any]:
-    """Build the document.
-
-    Parameters
-    ----------
-    truth : type
-        Record that the simulator publishes; the monitor does not know it.
-
-    Returns
-    -------
-    dict
-        Plain JSON values. Schemas are of JSON Schema draft 7, the default of AsyncAPI 3.0.
-    """
     topics: dict[str, tuple[_Topic, type[BaseModel] | None]]
     topics = {name: (topic, truth if name == "truth" else topic.model) for name, topic in _TOPICS.items()}
     models = [model for _, model in topics.values() if model is not None]
@@ -76,21 +64,15 @@ def asyncapi(truth: type[BaseModel]) -> dict[str, Any]:
     sent: list[tuple[type[BaseModel], Literal["serialization"]]] = [(model, "serialization") for model in models]
     _, schemas = models_json_schema(sent, ref_template="#/components/schemas/{model}")
     document: dict[str, Any] = {
-        "asyncapi": "3.0.0",
-        "info": {"title": "rotorwatch", "version": __version__, "description": _DESCRIPTION},
+        "asyncapi": "3.0.0", "info": {"title": "rotorwatch", "version": __version__, "description": _DESCRIPTION},
         "defaultContentType": _JSON,
-        "servers": {
-            "monitor": {
-                "host": "127.0.0.1:7447",
-                "protocol": "zenoh",
-                "description": "where a monitor listens unless its settings say otherwise",
-            }
-        },
-        "channels": {},
-        "operations": {},
+        "servers": {"monitor": {
+            "host": "127.0.0.1:7447", "protocol": "zenoh",
+            "description": "where a monitor listens unless its settings say otherwise",
+        }},
+        "channels": {}, "operations": {},
         "components": {
-            "schemas": _draft_7(_named_apart(schemas["$defs"])),
-            "messages": {},
+            "schemas": _draft_7(_named_apart(schemas["$defs"])), "messages": {},
             "parameters": {
                 "site": {"description": "site of the machine", "examples": ["demo"]},
                 "machine": {"description": "name of the machine", "examples": ["lab"]},
@@ -98,7 +80,7 @@ def asyncapi(truth: type[BaseModel]) -> dict[str, Any]:
                 "limit": {"description": f"at most so many events, 1 to {MOST_EVENTS}", "default": "100"},
             },
         },
-    }
+    }  # fmt: skip
     keys = MachineKeys("SITE", "MACHINE")
     for name, (topic, model) in topics.items():
         address = getattr(keys, name).replace(keys.root, f"{PREFIX}/{{site}}/{{machine}}")
@@ -131,7 +113,6 @@ def _add_topic(document: dict[str, Any], name: str, address: str, topic: _Topic,
 
 
 def _add_log(document: dict[str, Any]) -> None:
-    """Add the alarm log, which is asked for on the key of its events."""
     address = f"{document['channels']['alarm_event']['address']}?after={{after}};limit={{limit}}"
     channel = document["channels"]["alarm_log"] = _channel(address, "The alarm log, by query, from any event on.")
     channel["parameters"] |= {name: _reference("parameters", name) for name in ("after", "limit")}

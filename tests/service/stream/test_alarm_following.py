@@ -66,9 +66,7 @@ def take_all(order: LogOrder) -> list[AlarmCloudEvent]:
         max_size=60,
     ),
 )
-def test_any_order_of_arrival_gives_the_log_from_the_given_event_on(
-    after: int, happenings: list[tuple[str, int]]
-) -> None:
+def test_any_order_of_arrival_gives_the_log_from_an_event_on(after: int, happenings: list[tuple[str, int]]) -> None:
     order = LogOrder(PLACE, after)
     taken: list[AlarmCloudEvent] = []
 
@@ -167,8 +165,6 @@ def monitor(address: str, *places: str) -> Iterator[list[Monitor]]:
 
 
 class Following:
-    """`follow_alarms` in a thread."""
-
     def __init__(
         self,
         where: str | LinkSettings,
@@ -224,8 +220,7 @@ def test_follower_asks_for_the_past_and_hears_the_present() -> None:
             for _ in range(5):
                 machine.happen()
             following.reaches(1238)
-    assert following.sequences() == list(range(18, 1239))
-    assert following.taken == machine.log[18:]
+    assert (following.sequences(), following.taken) == (list(range(18, 1239)), machine.log[18:])
 
 
 def test_missed_events_are_asked_for_at_once_or_when_the_state_tells() -> None:
@@ -381,8 +376,7 @@ def test_who_may_not_write_reads_what_was_committed(store: Store, url: str) -> N
     lab.commit(Step(events=events))
     pump.commit(Step(events=events[:1]))
     for read in (store.alarms_since, partial(committed_events, url)):
-        assert read("demo", "lab", events[1].recorded_ns) == events[1:]
-        assert read("demo", "pump", 0) == events[:1]
+        assert (read("demo", "lab", events[1].recorded_ns), read("demo", "pump", 0)) == (events[1:], events[:1])
         assert read("demo", "fan", 0) == ()
 
 

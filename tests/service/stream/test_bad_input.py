@@ -104,8 +104,7 @@ def test_refused_explained_and_carried_on(fed: tuple[Runtime, MachineWorker, Fee
     feed.put_good()
     until(lambda: worker.health().quality.accepted_blocks == before.accepted_blocks + 1, "good block after the bad one")
     after = worker.health().quality
-    assert after.gaps == before.gaps
-    assert after.last_refusal == refused.last_refusal
+    assert (after.gaps, after.last_refusal) == (before.gaps, refused.last_refusal)
     assert worker.errors == 0
     assert runtime.readiness().ready
 
@@ -120,7 +119,7 @@ def test_refused_explained_and_carried_on(fed: tuple[Runtime, MachineWorker, Fee
         ({"rate_hz": "fast"}, "descriptor cannot be read: rate_hz: expected a number (found 'fast')"),
     ],
 )
-def test_descriptor_that_differs_is_named(
+def test_another_descriptor_is_named(
     fed: tuple[Runtime, MachineWorker, Feed], change: dict[str, object], named: str
 ) -> None:
     _, worker, feed = fed
@@ -158,7 +157,6 @@ def later(text: str | bytes) -> str:
 
 
 def documents(version: str) -> tuple[str, list[str]]:
-    """A report, and the alarm log."""
     folder = FIXTURES / version
     return (folder / "report.json").read_text(), (folder / "alarm_log.jsonl").read_text().splitlines()
 
@@ -206,8 +204,7 @@ def test_recordings_of_every_version_are_read(version: str) -> None:
     ]
     assert [(block.sequence, block.samples.shape) for block in blocks] == [(0, (200, 9)), (1, (200, 9))]
     selection = Selection((path,))
-    assert len(everything(stream_table(selection))) == 400
-    assert len(everything(report_table(selection))) == 1
+    assert (len(everything(stream_table(selection))), len(everything(report_table(selection)))) == (400, 1)
     assert len(everything(alarm_table(selection))) == 6
 
 

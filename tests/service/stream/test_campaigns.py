@@ -33,17 +33,13 @@ def test_a_monitor_at_work_bears_whatever_is_sent(
     monkeypatch.setattr(sys, "argv", ["wire_fuzz", "--small", "--json", str(result)])
     assert importlib.import_module("wire_fuzz").main() == 0, capsys.readouterr()
     found = json.loads(result.read_text(encoding="utf-8"))
-    assert found["messages"] == 3000
-    assert len(found["kinds"]) == 10
-    assert found["unsendable"] == 0
+    assert (found["messages"], len(found["kinds"]), found["unsendable"]) == (3000, 10, 0)
     assert found["others"]["demo/second"]["windows"] > 10
     assert sum(found["refused"].values()) > 100
 
 
 @pytest.mark.slow
-def test_a_monitor_at_work_bears_callers_of_every_kind(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_monitor_bears_all_callers(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", ["http_campaign", "--small"])
     code = importlib.import_module("http_campaign").main()
     said = capsys.readouterr().out

@@ -141,12 +141,9 @@ def misshapen(good: SampleBlock, rng: np.random.Generator) -> SampleBlock:
     sequence = max(0, [*sequences, 2**63, 2**64 - 1][rng.integers(7)])
     start_ns = good.start_ns + (min(sequence, good.sequence + 50) - good.sequence) * 10**8
     wrong: list[dict[str, object]] = [
-        {"rate_hz": 1000.0},
-        {"samples": np.full_like(good.samples, np.nan)},
-        {"samples": good.samples[:1]},
-        {"samples": good.samples[:, :3]},
-        {"start_ns": -1},
-    ]
+        {"rate_hz": 1000.0}, {"samples": np.full_like(good.samples, np.nan)}, {"samples": good.samples[:1]},
+        {"samples": good.samples[:, :3]}, {"start_ns": -1},
+    ]  # fmt: skip
     place = {"sequence": sequence, "start_ns": start_ns, "run": int(rng.integers(1, 3))}
     return replace(good, **(place | wrong[rng.integers(5)]))  # type: ignore[arg-type]  # fields of any kind
 
@@ -169,9 +166,7 @@ def test_what_can_be_no_block_costs_none(seed: int) -> None:
 
 
 @pytest.mark.parametrize("encode", [encode_block, encode_arrow])
-def test_what_may_be_a_block_of_the_machine_is_known_by_its_form(
-    encode: Callable[..., tuple[bytes, bytes, str]],
-) -> None:
+def test_what_may_be_a_block_of_a_machine_is_known_by_form(encode: Callable[..., tuple[bytes, bytes, str]]) -> None:
     monitor = MachineMonitor(install(LAB, None))
     (block,) = scenario_blocks(0.1)
     assert monitor.could_use(*encode(block, ""))
@@ -420,20 +415,13 @@ def test_no_parameter_is_blamed_on_other_machines(name: str, kind: Foreign) -> N
 # As factors of both masses, length and inertia. The first fits no parameters but for ten seconds at a time, the second
 # one those of a machine with another shaft.
 @pytest.mark.parametrize("factors", [(0.44, 0.7, 0.54, 0.61), (0.56, 1.33, 0.7, 0.44)])
-def test_no_parameter_is_blamed_where_the_file_is_that_of_another_rotor(
-    factors: tuple[float, float, float, float],
-) -> None:
+def test_no_parameter_is_blamed_where_the_file_is_of_another_rotor(factors: tuple[float, float, float, float]) -> None:
     machine = load_machine("lab")
     rotor, (m1, m2, length, inertia) = machine.rotor, factors
-    other = rotor.model_copy(
-        update={
-            "m1_kg": m1 * rotor.m1_kg,
-            "m2_kg": m2 * rotor.m2_kg,
-            "shaft_length_m": length * rotor.shaft_length_m,
-            "I2_kg_m2": inertia * rotor.I2_kg_m2,
-            "I2p_kg_m2": inertia * rotor.I2p_kg_m2,
-        }
-    )
+    other = rotor.model_copy(update={
+        "m1_kg": m1 * rotor.m1_kg, "m2_kg": m2 * rotor.m2_kg, "shaft_length_m": length * rotor.shaft_length_m,
+        "I2_kg_m2": inertia * rotor.I2_kg_m2, "I2p_kg_m2": inertia * rotor.I2p_kg_m2,
+    })  # fmt: skip
     monitor = MachineMonitor(install(machine, None))
     samples = simulated(machine.model_copy(update={"rotor": other}), SEED, 110.0)
     events = [one for block in as_blocks(machine, samples) for one in monitor.step(block).events]

@@ -328,7 +328,7 @@ def hurry(feed: Feed, worker: MachineWorker, stream: list[SampleBlock], until_se
         time.sleep(0.002)  # a loop that never rests takes the processor from the worker
 
 
-def test_an_overloaded_service_loses_no_sample_says_so_and_is_replayed_to_the_same_answer(
+def test_an_overloaded_service_loses_no_sample_and_is_replayed_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shedding, "_LASTING_S", 0.3)  # data come a hundred times as fast as from a machine

@@ -28,11 +28,8 @@ NAMES = [name for name, value in vars(MachineKeys).items() if isinstance(value, 
 WITHOUT_JSON = {"stream", "publisher_alive", "monitor_alive", "replay_alive"}
 TAKEN: dict[str, type[BaseModel]] = {"descriptor": ChannelDescriptor, "truth": TruthRecord}
 SENT: dict[str, type[BaseModel]] = {
-    "report": Report,
-    "health": Health,
-    "alarm_state": AlarmStates,
-    "alarm_event": AlarmCloudEvent,
-}
+    "report": Report, "health": Health, "alarm_state": AlarmStates, "alarm_event": AlarmCloudEvent,
+}  # fmt: skip
 JSON_BLOCK = re.compile(r"```json\n(.*?)```", flags=re.DOTALL)
 
 
@@ -44,7 +41,6 @@ def sections() -> dict[str, str]:
 
 
 def shown(name: str) -> dict[str, Any]:
-    """The example of a topic."""
     (text,) = JSON_BLOCK.findall(sections()[getattr(KEYS, name)])
     found: dict[str, Any] = json.loads(text)
     return found

@@ -76,9 +76,7 @@ def test_full_inbox_drops_what_waits_and_counts_it() -> None:
     assert len(inbox) == 0
 
 
-def test_a_worker_that_waits_for_more_blocks_is_woken_by_enough_of_them_or_by_a_call(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_worker_that_waits_for_blocks_is_woken_by_enough_or_by_a_call(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.stream.inbox._PATIENCE_S", 600.0)
     inbox, order = Inbox(100, "drop"), list[bytes]()
 
@@ -101,9 +99,7 @@ def test_a_worker_that_waits_for_more_blocks_is_woken_by_enough_of_them_or_by_a_
 
 
 @pytest.mark.parametrize(("bound", "odd"), [(2, False), (100, True)])
-def test_nobody_waits_for_more_where_there_is_no_room_or_something_is_wrong(
-    bound: int, odd: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nobody_waits_without_room_or_in_trouble(bound: int, odd: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.stream.inbox._PATIENCE_S", 600.0)
     inbox, taken = Inbox(bound, "wait", may_be_block=lambda _: not odd), list[object]()
     thread = threading.Thread(target=lambda: taken.append(inbox.get(50)), daemon=True)
@@ -238,8 +234,7 @@ def test_late_joiner_asks_for_health_and_alarm_state() -> None:
         until(lambda: worker.health().quality.accepted_blocks == 5, "blocks")
         with open_session(runtime.settings.link.listen[0]) as session:
             health = Health.model_validate_json(query(session, KEYS.health))
-            assert health.quality.accepted_blocks == 5
-            assert health.machine_hash == worker.identity["machine_hash"]
+            assert (health.quality.accepted_blocks, health.machine_hash) == (5, worker.identity["machine_hash"])
             states = AlarmStates.model_validate_json(query(session, KEYS.alarm_state))
             assert (states.site, states.machine, states.alarms) == ("demo", "lab", ())
             alive = [reply.ok.key_expr for reply in session.liveliness().get("rotorwatch/**") if reply.ok is not None]
@@ -247,7 +242,6 @@ def test_late_joiner_asks_for_health_and_alarm_state() -> None:
 
 
 def query(session: zenoh.Session, key: str) -> str:
-    """The answer to a query, asked again until the declaration of the queryable has arrived."""
     found: list[str] = []
 
     def ask() -> bool:

@@ -201,12 +201,9 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
     url = plant.runtime.http_url
     told: dict[str, Any] = dict(example(Health))
     report: dict[str, Any] = told["report"] | {
-        "state": "watching",
-        "suspect": "a rub at the bearing",
-        "level_growth": example(LevelGrowth),
-        "sensors": [example(SensorFault)],
-        "shapes": [example(Shape)],
-    }
+        "state": "watching", "suspect": "a rub at the bearing", "level_growth": example(LevelGrowth),
+        "sensors": [example(SensorFault)], "shapes": [example(Shape)],
+    }  # fmt: skip
     report["opinions"][0]["agreement"][0]["verdict"] = "disagree"
     told |= {"report": report, "reason": "<b>reason</b> & more"}
 

@@ -25,17 +25,9 @@ def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
         feed.put_good()
         for number in range(OLD):
             running.store.audit.append(
-                number,
-                200,
-                actor="anna",
-                address="",
-                method="POST",
-                path="/api/v1/x",
-                action="reset",
-                machine="demo/lab",
-                alarm="k_by",
-                reason="long ago",
-            )
+                number, 200, actor="anna", address="", method="POST", path="/api/v1/x", action="reset",
+                machine="demo/lab", alarm="k_by", reason="long ago",
+            )  # fmt: skip
         yield running
 
 

@@ -22,22 +22,18 @@ from tests.service.rig.run_up import BLOCKS
 #: Element, what it asks for, what is drawn, and what it says of that.
 PLOTS = (
     (
-        "waveform-plot",
-        "waveforms",
-        "canvas",
+        "waveform-plot", "waveforms", "canvas",
         r"^Newest samples, 8 revolutions of 2026-01-01 00:01:17 UTC, 0\.36\d? s, d",
     ),
     (
-        "vector-plot",
-        "vectors",
-        "canvas, svg",
+        "vector-plot", "vectors", "canvas, svg",
         r"^1× of y1, history, \d+ vectors of a window each.*1320 rpm.* over time$",
     ),
     ("waterfall-plot", "waterfalls", "canvas", r"^Newest samples, 20 spectra of y1, .*strongest shade is \d+ µm p-p"),
     ("full-spectrum-plot", "full-spectra", "canvas", r"^Newest samples, .*, 19 averages"),
     ("centreline-plot", "centrelines", "svg", r"^History, \d+ mean positions"),
     ("correlation-plot", "correlations", "canvas", r"^Window .*without mean and 1×; distance from theory"),
-)
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -89,9 +85,7 @@ def test_plots_are_drawn_when_they_are_opened_and_say_what_they_show(browser: Br
         kept(page, "plots-phone")
 
 
-def test_the_drawing_turns_the_unbalance_with_the_shaft_and_names_the_sensor_at_fault(
-    browser: Browser, runtime: Runtime
-) -> None:
+def test_the_drawing_turns_the_unbalance_and_names_the_sensor_at_fault(browser: Browser, runtime: Runtime) -> None:
     """A shaft that turns from z to y, its heavy spot first at 30°, now a quarter turn further that way: at -60°."""
     told: dict[str, Any] = dict(example(Health))
     report: dict[str, Any] = told["report"]
@@ -124,7 +118,7 @@ def test_the_drawing_turns_the_unbalance_with_the_shaft_and_names_the_sensor_at_
         expect(drawing.locator("g.part", has_text="c_by")).to_contain_text("too little data yet")
 
 
-def test_the_measurement_of_a_plant_still_runs(
+def test_a_plant_is_measured(
     browser: Browser, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.syspath_prepend(ROOT / "benchmarks")

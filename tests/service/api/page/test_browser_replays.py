@@ -168,12 +168,8 @@ _DRAGGED = """(scrub, to) => {
 }"""
 ORBITS, SPECTRUM = "Orbits of this window", "Spectrum of this window"
 FOLDS = (
-    ORBITS,
-    SPECTRUM,
-    "Waveform at its end",
-    "Full spectrum at its end",
-    "Correlations and residuals of the equations",
-)
+    ORBITS, SPECTRUM, "Waveform at its end", "Full spectrum at its end", "Correlations and residuals of the equations",
+)  # fmt: skip
 
 
 def unfolded(page: Page, *headings: str) -> None:

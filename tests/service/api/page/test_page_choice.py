@@ -21,11 +21,8 @@ STATES = Path(service.api.__file__).parent / "page" / "monitor" / "states.js"
 RAISED = [(), ("k_by",), ("level:y1",), ("stream-lost",), ("k_by", "level:z1"), ("c_by", "stream-lost", "level:y1")]
 CHANGES = [None, -0.2, 0.0, 0.03]
 LEVELS: list[list[tuple[float | None, str]]] = [
-    [],
-    [(1.4, "normal")],
-    [(3.0, "alert"), (0.1, "normal")],
-    [(None, "normal"), (2.9, "danger")],
-]
+    [], [(1.4, "normal")], [(3.0, "alert"), (0.1, "normal")], [(None, "normal"), (2.9, "danger")],
+]  # fmt: skip
 _ASKED = """
 import { worst } from "STATES";
 const told = await new Response(Deno.stdin.readable).json();
@@ -100,9 +97,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Health, dict[s
     return list(zip(all_of_them, answers[::2], answers[1::2], strict=True))
 
 
-def test_an_overview_leaves_what_the_page_shows(
-    found: list[tuple[Health, dict[str, object], dict[str, object]]],
-) -> None:
+def test_an_overview_has_what_the_page_shows(found: list[tuple[Health, dict[str, object], dict[str, object]]]) -> None:
     assert len(found) > 6000
     different = [(whole, brief) for _, whole, brief in found if whole != brief]
     assert not different, different[:3]

@@ -25,14 +25,9 @@ OPTIONS = {
 }
 #: What the page calls by a shorter name than the API.
 CALLED = {
-    "AlarmEvent": "AlarmEventData",
-    "Bucket": "ReadingBucket",
-    "Density": "ChannelDensity",
-    "Ellipse": "OrbitEllipse",
-    "Orbits": "OrbitSnapshot",
-    "Spectra": "SpectrumSnapshot",
-    "Stream": "StreamStatus",
-}
+    "AlarmEvent": "AlarmEventData", "Bucket": "ReadingBucket", "Density": "ChannelDensity", "Ellipse": "OrbitEllipse",
+    "Orbits": "OrbitSnapshot", "Spectra": "SpectrumSnapshot", "Stream": "StreamStatus",
+}  # fmt: skip
 
 
 def found(folder: Path, checked: list[Path]) -> str:
@@ -93,9 +88,7 @@ def compared(folder: Path, schemas: dict[str, Any], records: str, *beside: Path)
     return found(folder, [folder / "told.ts", *beside])
 
 
-def test_every_module_is_of_the_types_it_says_and_reads_the_records_of_the_api(
-    tmp_path: Path, schemas: dict[str, Any]
-) -> None:
+def test_every_module_is_of_the_types_it_says_and_reads_the_api(tmp_path: Path, schemas: dict[str, Any]) -> None:
     modules = sorted(PAGE.rglob("*.js"))
     assert len(modules) > 20
     assert compared(tmp_path, schemas, RECORDS.read_text(), *modules) == ""
