@@ -73,9 +73,6 @@ def test_what_nobody_asks_for_is_never_refused_and_operators_are_told() -> None:
     }  # fmt: skip
 
 
-# The book
-
-
 def raised(name: str = "k_by", change: float = -0.2, at_s: int = 0) -> tuple[AlarmBook, int]:
     book = AlarmBook(SETTINGS)
     for time_s in range(at_s, at_s + 15, 5):
@@ -237,8 +234,6 @@ def test_settings_that_make_no_sense(field: str, value: object, match: str) -> N
     with pytest.raises(ValueError, match=match):
         AlarmSettings.model_validate({field: value})
 
-
-# Walks at random
 
 NAMES = ("k_by", "c_by", "model", "data-stuck")
 steps = st.one_of(

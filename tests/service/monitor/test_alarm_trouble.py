@@ -186,21 +186,25 @@ def test_a_defect_after_an_alarm_loses_no_event(tmp_path: Path, monkeypatch: pyt
 
 
 def test_what_the_history_refused_goes_with_the_next_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    refusals = [True]
+    refusing = [True]
 
     def refuse(step: Step) -> None:
-        if step.events and refusals:
-            refusals.clear()
+        if step.events and refusing:
             raise StoreError("demo/lab: refused")
 
     watched(monkeypatch, refuse)
     with bench(tmp_path) as at:
         at.put(block(0), block(30, run=2, sequence=0))
         # Operators hear of it all the same, and what was refused goes into the log before the alarm on that.
-        assert [len(at.outlet.events), at.worker.errors] == [4, 1]
+        assert [len(at.outlet.events), at.worker.errors] == [4, 2]
+        # It is that machine's: the history of others works.
+        assert {FAULT, GAP} <= {alarm.name for alarm in at.worker.alarms().alarms if alarm.raised}
+        assert ("refused" in at.worker.trouble, at.store.trouble) == (True, "")
+        refusing.clear()
         at.worker.operate(order("acknowledge", GAP))
+        assert at.worker.trouble == ""
         assert [kind for _, kind, _ in at.log()] == ["raised", "cleared", "raised", "raised", "acknowledged"]
-        assert len(at.outlet.events) == 5  # and once
+        assert (at.log()[3], len(at.outlet.events)) == ((3, "raised", FAULT), 5)  # and once
     with bench(tmp_path) as at:
         assert at.worker.restart.startswith("went on where it stood")
 
@@ -239,9 +243,6 @@ def test_a_state_of_unknown_health_is_damaged() -> None:
     arrays = from_bytes(monitor.state().state) | {"calm": np.array(["splendid"])}
     with pytest.raises(CheckpointError, match=r"calm is .*splendid.*, expected one of warming, healthy"):
         MachineMonitor(install(machine(), None)).restore(to_bytes(arrays), ())
-
-
-# Clocks
 
 
 def test_shelving_after_a_wrong_clock_was_set_right_is_as_long_as_it_says(tmp_path: Path) -> None:
@@ -364,9 +365,6 @@ def test_data_that_come_late_without_a_gap_end_the_silence_not_before_it_began()
     (again,) = monitor.step(block(1)).events
     assert (lost.kind, again.kind) == ("raised", "cleared")
     assert again.time_ns == lost.time_ns == block(0).end_ns + 5 * S
-
-
-# Suppression, severity, evidence
 
 
 def test_an_alarm_comes_back_when_its_rule_is_taken_out_of_the_machine_file() -> None:

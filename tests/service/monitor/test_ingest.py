@@ -24,13 +24,10 @@ def judge(*blocks: SampleBlock) -> list[Admission]:
     return [gate.judge(each) for each in blocks]
 
 
-def test_contiguous_blocks_are_accepted_silently() -> None:
+def test_contiguous_blocks_are_accepted_silently_with_jitter_too() -> None:
     verdicts = judge(*(block(number) for number in range(5)))
     assert verdicts == [Admission()] * 5
     assert all(verdict.continuous for verdict in verdicts)
-
-
-def test_jitter_within_the_tolerance_is_no_gap() -> None:
     assert judge(block(0), block(1, shift_ns=150_000), block(2))[1:] == [Admission(), Admission()]
 
 

@@ -54,11 +54,6 @@ def healthy(duration_s: float) -> Sequence[SampleBlock]:
 
 
 @cache
-def first_window() -> Report:
-    return feed(monitor(), healthy(63.0))[0][-1]
-
-
-@cache
 def _watching() -> MachineMonitor:
     target = monitor()
     assert feed(target, healthy(65.0))[0][-1].state is HealthState.HEALTHY
@@ -92,7 +87,7 @@ def test_reports_do_not_depend_on_the_blocks() -> None:
 
 
 def test_every_parameter_and_equation_is_accounted_for() -> None:
-    window = first_window()
+    window = feed(monitor(), healthy(63.0))[0][-1]
     assert [reading.name for reading in window.parameters] == list(PARAMETERS)
     for reading in window.parameters:
         assert reading.by == "likelihood"
@@ -105,6 +100,17 @@ def test_every_parameter_and_equation_is_accounted_for() -> None:
         assert verdicts[number].evaluable
         assert verdicts[number].msd is not None
         assert all(abs(reading.z or 0.0) < 4.5 for reading in verdicts[number].parameters)
+    assert [found.name for found in window.detectable] == list(PARAMETERS)
+    for found in window.detectable:
+        reading = next(one for one in window.parameters if one.name == found.name)
+        assert found.loss < 0 < found.gain
+        assert found.gain > 6 * (reading.standard_error or 1.0)  # threshold and power together
+    assert window.verdict is not None
+    assert (window.verdict.changed, window.verdict.detected, window.verdict.settled) == ((), False, True)
+    assert window.verdict.confidence > 0.99
+    (relation,) = (opinion for opinion in window.opinions if opinion.by == "relation")
+    assert {one.verdict for one in relation.agreement if one.name != "EI"} == {"agree"}
+    assert {one.verdict for one in relation.agreement if one.name == "EI"} == {"only-one"}
 
 
 def test_a_gap_is_reported_and_is_neither_a_fault_nor_healthy() -> None:
@@ -323,21 +329,6 @@ def test_one_wild_sample_does_not_blind_the_monitor() -> None:
     windows, events = feed(monitor(), [replace(everything[0], samples=wild), *everything[1:]])
     assert windows[-1].state is HealthState.HEALTHY
     assert not events
-
-
-def test_a_report_says_what_would_have_been_noticed_and_who_agrees() -> None:
-    window = first_window()
-    assert [found.name for found in window.detectable] == list(PARAMETERS)
-    for found in window.detectable:
-        reading = next(one for one in window.parameters if one.name == found.name)
-        assert found.loss < 0 < found.gain
-        assert found.gain > 6 * (reading.standard_error or 1.0)  # threshold and power together
-    assert window.verdict is not None
-    assert (window.verdict.changed, window.verdict.detected, window.verdict.settled) == ((), False, True)
-    assert window.verdict.confidence > 0.99
-    (relation,) = (opinion for opinion in window.opinions if opinion.by == "relation")
-    assert {one.verdict for one in relation.agreement if one.name != "EI"} == {"agree"}
-    assert {one.verdict for one in relation.agreement if one.name == "EI"} == {"only-one"}
 
 
 def test_where_peaks_are_cut_off_now_and_then_the_range_is_what_is_told() -> None:

@@ -1,6 +1,5 @@
 """A defect in the monitor, a history that refuses, a computer that cannot keep up: each is said to be what it is."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +13,13 @@ from models.machine import Machine
 from models.signals.wire import ARROW_ENCODING, encode_block, write_arrow
 from rotorwatch.records.alarms import EventKind, Evidence
 from rotorwatch.records.health import HealthState
-from service.history.records import Checkpoint, Step, StoreError
+from service.history.records import Checkpoint
 from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.known_machine import KnownMachineEvaluator
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import identity_of
 from service.stream.checkpoints import checkpoint_step, restored
-from tests.service.monitor.test_alarm_trouble import bench, block, named, order, watched
+from tests.service.monitor.test_alarm_trouble import bench, block, named, order
 from tests.service.rig.live import (
     IN_ORDER,
     LAB,
@@ -61,7 +60,7 @@ def raised(monitor: MachineMonitor) -> set[str]:
 
 def test_a_defect_in_evaluation_is_an_alarm_and_no_health(monkeypatch: pytest.MonkeyPatch) -> None:
     monitor = MachineMonitor(install(soon_over(LAB), None))
-    stream = scenario_blocks(92.0)
+    *stream, later = scenario_blocks(92.1)
     for one in stream[:660]:
         monitor.step(one)
     assert monitor.health().state is HealthState.HEALTHY
@@ -80,17 +79,10 @@ def test_a_defect_in_evaluation_is_an_alarm_and_no_health(monkeypatch: pytest.Mo
     events = [event for one in stream[710:] for event in monitor.step(one).events]
     assert named(tuple(events)) == [("cleared", FAULT)]
     assert (monitor.health().state, monitor.health().reason) == (HealthState.HEALTHY, "")
-
-
-def test_a_defect_before_the_evaluation_is_no_health_either(monkeypatch: pytest.MonkeyPatch) -> None:
-    monitor = MachineMonitor(install(LAB, None))
-    stream = scenario_blocks(68.0)
-    for one in stream[:660]:
-        monitor.step(one)
+    # And before the evaluation.
     monkeypatch.setattr(monitor._window, "feed", defective)
-    report = monitor.step(stream[660])
-    assert str(report.fault) == DEFECT
-    assert named(report.events) == [("raised", FAULT)]
+    report = monitor.step(later)
+    assert (str(report.fault), named(report.events)) == (DEFECT, [("raised", FAULT)])
     assert monitor.health().state is HealthState.NOT_EVALUABLE
     assert DEFECT in monitor.health().reason
 
@@ -114,42 +106,12 @@ def test_a_service_with_a_defect_is_not_ready_and_says_why(tmp_path: Path, monke
         until(lambda: worker.errors == worker.tally.windows - 11, "an error for each window that was full")
 
 
-def test_what_the_history_refuses_of_a_machine_is_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    refusing = [True]
-
-    def refuse(step: Step) -> None:
-        if refusing and step.events:
-            raise StoreError("demo/lab: refused")
-
-    watched(monkeypatch, refuse)
-    with bench(tmp_path) as at:
-        at.put(block(0), block(30, run=2, sequence=0))
-        assert {FAULT, GAP} <= {alarm.name for alarm in at.worker.alarms().alarms if alarm.raised}
-        assert "refused" in at.worker.trouble
-        assert at.store.trouble == ""
-        refusing.clear()
-        at.worker.operate(order("acknowledge", GAP))
-        assert at.worker.trouble == ""
-        assert (3, "raised", FAULT) in at.log()
-
-
-# Overload
-
-
-@pytest.fixture
-def stuffed() -> tuple[MachineMonitor, Callable[[int, int], None]]:
-    """A monitor, and what gives it a block with so many dropped before it."""
-    monitor = MachineMonitor(install(machine_in_order(), None))
-    stream = scenario_blocks(60.0)
+def test_what_the_monitor_dropped_is_no_gap() -> None:
+    monitor, stream = MachineMonitor(install(machine_in_order(), None)), scenario_blocks(60.0)
 
     def give(number: int, dropped: int) -> None:
         monitor.step_payload(*encode_block(stream[number], ""), dropped)
 
-    return monitor, give
-
-
-def test_what_the_monitor_dropped_is_no_gap(stuffed: tuple[MachineMonitor, Callable[[int, int], None]]) -> None:
-    monitor, give = stuffed
     for number in range(20):
         give(number, 0)
     give(120, 100)  # 10 s, longer than a silence may last
@@ -201,9 +163,6 @@ def test_a_full_queue_says_so_to_operators(tmp_path: Path) -> None:
         assert event.alarm == OVERLOADED
 
 
-# What cannot be remembered or put into words
-
-
 def test_a_state_that_cannot_be_built_keeps_no_alarm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with bench(tmp_path) as at:
         at.put(block(0))
@@ -221,12 +180,7 @@ def test_a_state_that_cannot_be_built_keeps_no_alarm(tmp_path: Path, monkeypatch
     with bench(tmp_path) as at:
         assert at.worker.restart.startswith("went on where it stood")
         assert at.log()[-1][1:] == ("acknowledged", GAP)
-
-
-def test_the_last_step_at_a_stop_survives_a_defect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with bench(tmp_path) as at:
-        at.put(block(0))
-        monkeypatch.setattr(MachineMonitor, "state", defective)
+        monkeypatch.setattr(MachineMonitor, "state", defective)  # nor does it keep the last step from being made
         at.worker.stop()
         assert not at.worker.status().alive
         assert DEFECT in at.worker.last_error
