@@ -105,11 +105,10 @@ def test_a_window_that_is_not_full_may_scatter_more() -> None:
     assert (limits(full)["overall"].state, limits(first_hop)["overall"].state) == ("danger", "normal")
 
 
-def test_what_varied_in_the_healthy_windows_may_vary() -> None:
+@pytest.mark.parametrize(("overall", "state"), [(2.4e-3, "normal"), (0.41e-3, "normal"), (2.6e-3, "alert")])
+def test_what_varied_in_the_healthy_windows_may_vary(overall: float, state: str) -> None:
     healthy = reference(*(window(overall=value * 1e-3) for value in (0.5, 1.0, 2.0)))
-    assert limits(judged(CASING, window(overall=2.4e-3), healthy))["overall"].state == "normal"
-    assert limits(judged(CASING, window(overall=0.41e-3), healthy))["overall"].state == "normal"
-    assert limits(judged(CASING, window(overall=2.6e-3), healthy))["overall"].state == "alert"
+    assert limits(judged(CASING, window(overall=overall), healthy))["overall"].state == state
 
 
 @pytest.mark.parametrize(
@@ -183,15 +182,13 @@ def test_every_operating_state_has_levels_of_its_own() -> None:
         *(window(speed_rad_s=-2 * SPEED, overall=value) for value in (4e-3, 4.1e-3)),
     )
     assert [state.windows for state in healthy.states] == [2, 2]
-    assert limits(judged(CASING, window(speed_rad_s=2 * SPEED, overall=4.5e-3), healthy))["overall"].state == "normal"
-    slow = judged(CASING, window(speed_rad_s=SPEED, overall=4.5e-3), healthy)
-    assert limits(slow)["overall"].state == "danger"
-    between = judged(CASING, window(speed_rad_s=1.3 * SPEED, overall=4.5e-3), healthy)
-    assert limits(between)["overall"].source == "commissioned at another speed"
-    assert limits(between)["overall"].state == "alert"
-
-
-def test_a_machine_that_runs_down_through_speeds_nobody_knows_has_not_fallen_silent() -> None:
+    fast, slow, between = (
+        limits(judged(CASING, window(speed_rad_s=times * SPEED, overall=4.5e-3), healthy))["overall"]
+        for times in (2.0, 1.0, 1.3)
+    )
+    assert (fast.state, slow.state, between.state) == ("normal", "danger", "alert")
+    assert between.source == "commissioned at another speed"
+    # One that runs down through speeds that nobody knows has not fallen silent.
     healthy = reference(*(window(speed_rad_s=SPEED, overall=value) for value in (1e-3, 1.1e-3)))
     quiet = (limits(judged(CASING, window(speed_rad_s=speed, overall=1e-4), healthy)) for speed in (SPEED, SPEED / 2))
     assert [one["overall"].state for one in quiet] == ["alert", "normal"]
