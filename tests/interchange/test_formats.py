@@ -103,53 +103,31 @@ def write_wav(path: Path, columns: Columns) -> None:
     wavfile.write(path, int(RATE_HZ), np.column_stack([columns["x"], columns["v"], columns["a"]]))
 
 
+UNITS = (("x", "um"), ("v", "mm/s"), ("a", "rad"))
+
+
 def write_uff(path: Path, columns: Columns) -> None:
     sets = [
         pyuff.prepare_58(
-            binary=1,
-            func_type=1,
-            rsp_node=number,
-            rsp_dir=2,
-            ref_node=0,
-            ref_dir=0,
-            data=columns[name],
-            x=columns["t"],
-            id1=name,
-            abscissa_spacing=1,
-            abscissa_min=0.0,
-            abscissa_inc=1 / RATE_HZ,
-            num_pts=columns[name].size,
-            ord_data_type=4,
-            abscissa_spec_data_type=17,
-            ordinate_spec_data_type=8,
-            orddenom_spec_data_type=0,
-            z_axis_value=0.0,
-            ordinate_axis_units_lab=unit,
+            binary=1, func_type=1, rsp_node=number, rsp_dir=2, ref_node=0, ref_dir=0, data=columns[name],
+            x=columns["t"], id1=name, abscissa_spacing=1, abscissa_min=0.0, abscissa_inc=1 / RATE_HZ,
+            num_pts=columns[name].size, ord_data_type=4, abscissa_spec_data_type=17, ordinate_spec_data_type=8,
+            orddenom_spec_data_type=0, z_axis_value=0.0, ordinate_axis_units_lab=unit,
         )
-        for number, (name, unit) in enumerate([("x", "um"), ("v", "mm/s"), ("a", "rad")])
-    ]
+        for number, (name, unit) in enumerate(UNITS)
+    ]  # fmt: skip
     pyuff.UFF(str(path)).write_sets(sets, "add")
 
 
 def write_tdms(path: Path, columns: Columns) -> None:
+    known = {"wf_increment": 1 / RATE_HZ, "wf_start_time": np.datetime64(START[:-1]), "wf_start_offset": 0.0}
     with nptdms.TdmsWriter(str(path)) as writer:
         for first in range(0, COUNT, 30_000):
-            writer.write_segment(
-                [
-                    nptdms.ChannelObject(
-                        "run",
-                        name,
-                        columns[name][first : first + 30_000],
-                        {
-                            "wf_increment": 1 / RATE_HZ,
-                            "wf_start_time": np.datetime64("2026-01-31T12:00:00"),
-                            "wf_start_offset": 0.0,
-                            "unit_string": unit,
-                        },
-                    )
-                    for name, unit in (("x", "um"), ("v", "mm/s"), ("a", "rad"))
-                ]
-            )
+            part = slice(first, first + 30_000)
+            writer.write_segment([
+                nptdms.ChannelObject("run", name, columns[name][part], known | {"unit_string": unit})
+                for name, unit in UNITS
+            ])  # fmt: skip
 
 
 def write_mf4(path: Path, columns: Columns) -> None:
@@ -157,55 +135,41 @@ def write_mf4(path: Path, columns: Columns) -> None:
 
     with asammdf.MDF(version="4.10") as file:
         file.start_time = datetime(2026, 1, 31, 12, tzinfo=UTC)
-        units = (("x", "um"), ("v", "mm/s"), ("a", "rad"))
-        file.append([asammdf.Signal(columns[name], columns["t"], name=name, unit=unit) for name, unit in units[:2]])
+        file.append([asammdf.Signal(columns[name], columns["t"], name=name, unit=unit) for name, unit in UNITS[:2]])
         file.append([asammdf.Signal(columns["a"], columns["t"], name="a", unit="rad")])
         file.append([asammdf.Signal(columns["a"][:10], columns["t"][:10], name="v", unit="mm/s")])
         file.save(path, overwrite=True)
 
 
 def without_units(text: str) -> str:
-    for unit in ("um", "mm/s", "rad"):
+    for _, unit in UNITS:
         text = text.replace(f', unit = "{unit}"', "")
     return text
 
 
+def named(x: str, v: str, a: str = '"a"') -> str:
+    """Channels from other columns."""
+    return CHANNELS.replace('"x"', x).replace('"v"', v).replace('"a"', a)
+
+
+BEGIN = f'[time]\nstart = "{START}"\n'
+GERMAN = '[csv]\ndelimiter = ";"\ndecimal = ","\nskip_lines = 1\nskip_lines_after_header = 1\nencoding = "latin-1"\n'
+TABLE = named('"table", index = 0', '"table", index = 1', '"table", index = 2')
 CASES: dict[str, tuple[str, Callable[[Path, Columns], None], str]] = {
     "csv": ("run.csv", write_csv, TIME_COLUMN + CHANNELS),
-    "csv-german": (
-        "run.txt",
-        write_german_csv,
-        TIME_COLUMN
-        + '[csv]\ndelimiter = ";"\ndecimal = ","\nskip_lines = 1\nskip_lines_after_header = 1\nencoding = "latin-1"\n'
-        + CHANNELS,
-    ),
+    "csv-german": ("run.txt", write_german_csv, TIME_COLUMN + GERMAN + CHANNELS),
     "parquet": ("run.parquet", write_parquet, TIME_COLUMN + CHANNELS),
-    "npz": ("run.npz", write_npz, f'[time]\nrate_from = "fs"\nstart = "{START}"\n' + CHANNELS),
-    "npz-table": (
-        "run.npz",
-        write_npz_table,
-        RATE
-        + CHANNELS.replace('"x"', '"table", index = 0')
-        .replace('"v"', '"table", index = 1')
-        .replace('"a"', '"table", index = 2'),
-    ),
-    "mat-5": (
-        "run.mat",
-        write_mat,
-        f'[time]\nrate_from = "fs"\nstart = "{START}"\n' + CHANNELS.replace('"x"', '"run.x"').replace('"v"', '"run.v"'),
-    ),
+    "npz": ("run.npz", write_npz, f'{BEGIN}rate_from = "fs"\n{CHANNELS}'),
+    "npz-table": ("run.npz", write_npz_table, RATE + TABLE),
+    "mat-5": ("run.mat", write_mat, f'{BEGIN}rate_from = "fs"\n' + named('"run.x"', '"run.v"')),
     "mat-5-structs": ("run.mat", write_mat_of_structs, RATE + OF_STRUCTS),
     "mat-7.3-structs": ("run.mat", write_mat73_of_structs, RATE + OF_STRUCTS),
-    "hdf5": ("run.h5", write_mat73, RATE + CHANNELS.replace('"x"', '"run.x"').replace('"v"', '"run.v"')),
-    "mat-7.3": ("run.mat", write_mat73, RATE + CHANNELS.replace('"x"', '"run.x"').replace('"v"', '"run.v"')),
-    "wav": (
-        "run.wav",
-        write_wav,
-        f'[time]\nstart = "{START}"\n' + CHANNELS.replace('"x"', "1").replace('"v"', "2").replace('"a"', "3"),
-    ),
-    "uff": ("run.uff", write_uff, f'[time]\nstart = "{START}"\n' + without_units(CHANNELS)),
-    "tdms": ("run.tdms", write_tdms, without_units(CHANNELS).replace('"v"', '"run/v"')),
-    "mf4": ("run.mf4", write_mf4, without_units(CHANNELS).replace('"v"', '"0/v"')),
+    "hdf5": ("run.h5", write_mat73, RATE + named('"run.x"', '"run.v"')),
+    "mat-7.3": ("run.mat", write_mat73, RATE + named('"run.x"', '"run.v"')),
+    "wav": ("run.wav", write_wav, BEGIN + named("1", "2", "3")),
+    "uff": ("run.uff", write_uff, BEGIN + without_units(CHANNELS)),
+    "tdms": ("run.tdms", write_tdms, without_units(named('"x"', '"run/v"'))),
+    "mf4": ("run.mf4", write_mf4, without_units(named('"x"', '"0/v"'))),
 }
 
 
@@ -300,25 +264,23 @@ def test_pickled_objects_are_not_loaded(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # pyuff's own
-def test_a_data_set_that_is_cut_off_is_missing_and_said_to_be_cut(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda content: content[:-100], "no data set 'a'; there are set 1, set 2, x, v; the file is truncated"),
+        (lambda content: content.replace(b"         4      1000", b"         4      1200"),
+         "run.uff: is truncated: 1000 samples of x are there, expected the 1200"),
+    ],
+    ids=["cut off", "fewer samples than its header says"],
+)  # fmt: skip
+def test_a_data_set_that_is_not_whole_is_told(tmp_path: Path, spoil: Callable[[bytes], bytes], said: str) -> None:
     t, x, v, a = signals(1000)
     write_uff(tmp_path / "run.uff", {"t": t, "x": x, "v": v, "a": a})
-    (tmp_path / "run.uff").write_bytes((tmp_path / "run.uff").read_bytes()[:-100])
-    with pytest.raises(
-        SourceError, match=r"no data set 'a'; there are set 1, set 2, x, v; the file is truncated, it ends with"
-    ):
-        imported(tmp_path, tmp_path / "run.uff", f'[time]\nstart = "{START}"\n' + without_units(CHANNELS))
-
-
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # pyuff's own
-def test_a_data_set_with_fewer_samples_than_its_header_says_is_refused(tmp_path: Path) -> None:
-    t, x, v, a = signals(1000)
-    write_uff(tmp_path / "run.uff", {"t": t, "x": x, "v": v, "a": a})
-    content = (tmp_path / "run.uff").read_bytes()
-    assert content.count(b"         4      1000") == 3
-    (tmp_path / "run.uff").write_bytes(content.replace(b"         4      1000", b"         4      1200"))
-    with pytest.raises(SourceError, match=r"run.uff: is truncated: 1000 samples of x are there, expected the 1200"):
-        imported(tmp_path, tmp_path / "run.uff", f'[time]\nstart = "{START}"\n' + without_units(CHANNELS))
+    whole = (tmp_path / "run.uff").read_bytes()
+    (tmp_path / "run.uff").write_bytes(spoil(whole))
+    assert spoil(whole) != whole
+    with pytest.raises(SourceError, match=said):
+        imported(tmp_path, tmp_path / "run.uff", BEGIN + without_units(CHANNELS))
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"])

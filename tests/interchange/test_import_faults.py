@@ -38,11 +38,6 @@ IN_ORDER = CHANNELS.replace('"x"', "1").replace('"v"', "2").replace('"a"', "3")
 """Channels by their number, of files without names."""
 
 
-def test_a_good_file_is_the_reference(tmp_path: Path) -> None:
-    done, _ = imported(tmp_path, table(tmp_path / "run.csv", GOOD), TEXT)
-    assert done.written.samples == 1000
-
-
 def test_days_of_matlab_are_times(tmp_path: Path) -> None:
     rows = [f"{740013.5 + number / 2000 / 86_400:.12f},{row.partition(',')[2]}" for number, row in enumerate(GOOD)]
     mapping = TEXT.replace(f'start = "{START}"', 'unit = "d"\nstart = "datenum"')
@@ -311,13 +306,7 @@ def test_the_example_goes_through_import_and_export(tmp_path: Path) -> None:
     assert pyarrow.parquet.read_metadata(out).num_rows == 4000
 
 
-def test_the_examples_machine_file_is_accepted() -> None:
-    found = run("check-config", EXAMPLE / "machine.toml")
-    assert found.returncode == 0, found.stderr
-    assert "9 channels at 2000 Hz" in found.stdout
-
-
-def test_a_file_that_cannot_be_imported_is_exit_code_2(tmp_path: Path) -> None:
+def test_files_that_cannot_be_used_are_exit_code_2(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text("t,x\n0,1\n", encoding="utf-8")
     found = run(
         *("import", tmp_path / "run.csv", "--mapping", EXAMPLE / "mapping.toml"),
@@ -327,12 +316,8 @@ def test_a_file_that_cannot_be_imported_is_exit_code_2(tmp_path: Path) -> None:
     assert "run.csv: no column" in found.stderr
     assert "Traceback" not in found.stderr
     assert not list(tmp_path.glob("*.mcap*"))
-
-
-def test_a_recording_that_is_not_there_is_exit_code_2(tmp_path: Path) -> None:
     found = run("export", tmp_path / "none.mcap", "--to", "csv", "--out", tmp_path / "out.csv")
-    assert found.returncode == 2
-    assert "none.mcap: cannot be read" in found.stderr
+    assert (found.returncode, "none.mcap: cannot be read" in found.stderr) == (2, True)
 
 
 @pytest.mark.parametrize("command", ["import", "export"])

@@ -90,15 +90,9 @@ def test_a_duplicated_time_is_named(tmp_path_factory: pytest.TempPathFactory, ro
     scale=st.floats(1e-3, 1e3), offset=st.floats(-50, 50), sign=st.sampled_from([1, -1]),
 )  # fmt: skip
 def test_any_mix_of_units_gives_the_same_motion(
-    tmp_path_factory: pytest.TempPathFactory,
-    displacement: str,
-    velocity: str,
-    angle: str,
-    kept: tuple[str, str],
-    scale: float,
-    offset: float,
-    sign: int,
-) -> None:
+    tmp_path_factory: pytest.TempPathFactory, displacement: str, velocity: str, angle: str, kept: tuple[str, str],
+    scale: float, offset: float, sign: int,
+) -> None:  # fmt: skip
     folder = tmp_path_factory.mktemp("units")
     _, x, v, a = signals(400)
     x_SI, v_SI = x * 1e-6, v * 1e-3
@@ -299,11 +293,8 @@ def test_a_sampled_tachometer_becomes_the_shaft_angle(tmp_path: Path) -> None:
     time, x, v, angle = signals(140_000)
     teeth = np.sin(8 * 2 * np.pi * SPEED_HZ * time)
     np.savez(tmp_path / "run.npz", x=x, v=v, tacho=2 + teeth)
-    mapping = (
-        TIME
-        + CHANNELS_OF_KEYPHASOR
-        + '[keyphasor]\ncolumn = "tacho"\nthreshold = 2.0\nhysteresis = 0.5\npulses_per_revolution = 8\n'
-    )
+    keyphasor = '[keyphasor]\ncolumn = "tacho"\nthreshold = 2.0\nhysteresis = 0.5\npulses_per_revolution = 8\n'
+    mapping = TIME + CHANNELS_OF_KEYPHASOR + keyphasor
     _, recording = imported(tmp_path, tmp_path / "run.npz", mapping)
     (found,) = stretches(recording)
     # Which of the eight teeth is the first is not known: the angle is right but for a constant eighth.
