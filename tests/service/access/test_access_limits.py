@@ -25,9 +25,6 @@ from tests.service.rig.live import until
 READ, OPERATE, CONFIGURE = Scope
 
 
-# How much
-
-
 def test_large_bodies_are_refused_while_they_are_read(tmp_path: Path) -> None:
     with (
         guarded(tmp_path, AccessSettings(limits=LimitSettings(body_bytes=10_000))) as monitor,
@@ -177,9 +174,6 @@ def test_so_many_streams(tmp_path: Path) -> None:
             until(lambda: seats.taken == 0, "streams that were left give their seats back")
             with one.stream("GET", "/events") as again:
                 assert again.status_code == 200
-
-
-# What is written down
 
 
 def test_what_is_done_is_written_down_before_and_after(monitor: Guarded) -> None:

@@ -95,9 +95,6 @@ def test_secrets_are_hidden_wherever_they_stand_and_if_they_are_cut_off(before: 
     assert masked(f"{before}{text[: 16 + length]}{after}") == f"{before}{text[:16]}…{after}"
 
 
-# Rates
-
-
 @given(st.integers(1, 5), st.lists(st.tuples(st.sampled_from("ab"), st.floats(0.0, 40.0)), max_size=60))
 def test_never_more_than_so_many_in_any_minute(amount: int, hits: list[tuple[str, float]]) -> None:
     now_s = 0.0
@@ -120,9 +117,6 @@ def test_many_addresses_do_not_fill_the_memory() -> None:
     for number in range(1000):
         window.hit(str(number))
     assert (len(window), window.wait("999")) == (100, 60.0)
-
-
-def test_what_is_over_is_forgotten() -> None:
     now_s = 0.0
     window = MovingWindow(1, clock=lambda: now_s)
     window.hit("a")
@@ -139,9 +133,6 @@ def test_what_is_over_is_forgotten() -> None:
 )  # fmt: skip
 def test_what_counts_as_one_address(address: str, network: str) -> None:
     assert network_of(address) == network
-
-
-# Settings
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "10.0.0.1", "monitor.plant", ""])  # noqa: S104  # refused
@@ -251,31 +242,24 @@ def refused(tls: HttpTlsSettings) -> str:
 
 
 @pytest.mark.parametrize("name", ["certificate", "key", "client_ca"])
-def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, authority: trustme.CA, name: str) -> None:
+def test_a_file_that_cannot_be_read_or_is_none_is_named(tmp_path: Path, authority: trustme.CA, name: str) -> None:
     tls = files(tmp_path, authority, client_ca=True)
     path: Path = getattr(tls, name)
     path.unlink()
     assert refused(tls) == f"{path}: tls.{name} cannot be read: No such file or directory"
     path.mkdir()
     assert refused(tls) == f"{path}: tls.{name} cannot be read: Is a directory"
+    path.rmdir()
+    path.touch(0o600)
+    for content in (b"", b"nonsense\n", b"\0\xff"):
+        path.write_bytes(content)
+        assert refused(tls).startswith(f"{path}: tls.{name} holds no ")
 
 
-@pytest.mark.parametrize("name", ["certificate", "key", "client_ca"])
-@pytest.mark.parametrize("content", [b"", b"nonsense\n", b"\0\xff"])
-def test_a_file_that_is_none_is_named(tmp_path: Path, authority: trustme.CA, name: str, content: bytes) -> None:
-    tls = files(tmp_path, authority, client_ca=True)
-    path: Path = getattr(tls, name)
-    path.write_bytes(content)
-    assert refused(tls).startswith(f"{path}: tls.{name} holds no ")
-
-
-def test_a_key_of_another_certificate_is_refused(tmp_path: Path, authority: trustme.CA) -> None:
+def test_a_key_of_another_certificate_or_that_all_can_read_is_refused(tmp_path: Path, authority: trustme.CA) -> None:
     tls = files(tmp_path, authority)
     tls.key.write_bytes(authority.issue_cert("x", key_type=trustme.KeyType.ECDSA).private_key_pem.bytes())
     assert refused(tls) == f"{tls.key}: tls.key is not the key of tls.certificate {tls.certificate}"
-
-
-def test_a_key_that_everybody_can_read_is_refused(tmp_path: Path, authority: trustme.CA) -> None:
     tls = files(tmp_path, authority)
     tls.key.chmod(0o644)
     assert "readable by every user" in refused(tls)

@@ -52,9 +52,6 @@ def text_of(reply: zenoh.Reply) -> str:
     return sure(reply.ok).payload.to_string()
 
 
-# The door
-
-
 def test_only_the_right_password_opens(router: Plant, tmp_path: Path) -> None:
     knock(router.link("lab"))
     kept(tmp_path / "wrong", "wrong-word")
@@ -134,9 +131,6 @@ def test_a_certificates_common_name_is_the_name_in_the_grants(tmp_path: Path) ->
         assert heard == [LAB.keys.stream, PUMP.stream, PUMP.stream]
 
 
-# What is written
-
-
 @pytest.mark.parametrize(
     ("who", "key", "owner"),
     [
@@ -203,9 +197,6 @@ def test_nobody_lives_in_anothers_name(router: Plant) -> None:
         seen = [str(r.ok.key_expr) for r in other.liveliness().get("rotorwatch/demo/lab/alive/*", timeout=60.0) if r.ok]
         assert sorted(seen) == sorted(alive)
         assert len(tokens) == 12
-
-
-# What is read
 
 
 def test_a_viewer_reads_no_more_than_its_grant(router: Plant) -> None:

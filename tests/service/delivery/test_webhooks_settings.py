@@ -113,6 +113,8 @@ def test_a_secret_that_others_can_read_or_that_is_missing(tmp_path: Path, monkey
     missing = WebhookSettings(name="pager", url="https://p.example/", secret_file=tmp_path / "none")
     with pytest.raises(MachineFileError, match=r"none cannot be read: No such file"):
         signing_keys(missing)
+    with pytest.raises(MachineFileError, match=r"webhooks\.pager: secret_file"):  # rather than telling nobody of alarms
+        Runtime(settings(endpoint(), webhooks=(missing,)))
     variable = WebhookSettings.model_validate(
         {"name": "pager", "url": "https://p.example/", "secret_variable": "HOOK_SECRET"}
     )
@@ -129,13 +131,6 @@ def test_an_authority_that_is_none(tmp_path: Path) -> None:
     for file, said in (("ca.pem", "holds no certificate"), ("none.pem", "cannot be read: No such file")):
         with pytest.raises(MachineFileError, match=said):
             Receiver(settings_for("https://pager.example/", tmp_path, ca_file=tmp_path / file))
-
-
-def test_a_monitor_does_not_start_without_its_secrets(tmp_path: Path) -> None:
-    """Rather not at all than without telling anybody of alarms."""
-    webhook = WebhookSettings(name="pager", url="https://p.example/", secret_file=tmp_path / "none")
-    with pytest.raises(MachineFileError, match=r"webhooks\.pager: secret_file"):
-        Runtime(settings(endpoint(), webhooks=(webhook,)))
 
 
 @pytest.fixture
