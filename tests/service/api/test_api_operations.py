@@ -20,6 +20,7 @@ from tests.sure import sure
 
 READ, OPERATE, CONFIGURE = Scope
 GAP = f"{PLACE}/alarms/data-gap"
+ANY = {"If-Match": "*"}
 
 
 @contextmanager
@@ -76,7 +77,7 @@ def test_acknowledge_with_the_etag(plant: tuple[Runtime, Feed, httpx.Client]) ->
         ({}, {"expected_state": "normal"}),
         ({"If-Match": '"0"'}, {"expected_state": "shelved"}),
         ({"If-Match": '"17"'}, {"expected_state": "unacknowledged"}),
-        ({"If-Match": "*"}, {"expected_state": "acknowledged"}),
+        (ANY, {"expected_state": "acknowledged"}),
     ],
 )
 def test_an_alarm_seen_otherwise_stays(untouched: httpx.Client, headers: dict[str, str], body: dict[str, str]) -> None:
@@ -162,22 +163,22 @@ def test_latched_alarms_are_reset_and_who_configures_takes_out(plant: tuple[Runt
         ("data-gap/acknowledge", {}, {}, 428, "state how you saw the alarm"),
         ("data-gap/acknowledge", {"If-Match": "0"}, {}, 422, 'If-Match: expected an ETag such as "17", or *'),
         ("data-gap/acknowledge", {"If-Match": '"0", "1"'}, {}, 422, 'If-Match: expected an ETag such as "17"'),
-        ("data-gap/acknowledge", {"If-Match": "*"}, {"reason": "a\u0000b"}, 422, "reason: expected one line of text"),
-        ("data-gap/acknowledge", {"If-Match": "*"}, {"duration_s": 5}, 422, "duration_s: unknown"),
-        ("data-gap/acknowledge", {"If-Match": "*"}, {"reason": "x" * 501}, 422, "reason: expected at most 500"),
-        ("data-gap/acknowledge", {"If-Match": "*"}, [], 422, "body: expected an object, {...}"),
-        ("data-gap/shelve", {"If-Match": "*"}, {}, 422, "reason: missing"),
-        ("data-gap/shelve", {"If-Match": "*"}, {"reason": "x", "duration_s": 0}, 422, "duration_s: expected above 0"),
-        ("data-gap/shelve", {"If-Match": "*"}, {"reason": "  "}, 422, "reason: expected one line of text that"),
+        ("data-gap/acknowledge", ANY, {"reason": "a\u0000b"}, 422, "reason: expected one line of text"),
+        ("data-gap/acknowledge", ANY, {"duration_s": 5}, 422, "duration_s: unknown"),
+        ("data-gap/acknowledge", ANY, {"reason": "x" * 501}, 422, "reason: expected at most 500"),
+        ("data-gap/acknowledge", ANY, [], 422, "body: expected an object, {...}"),
+        ("data-gap/shelve", ANY, {}, 422, "reason: missing"),
+        ("data-gap/shelve", ANY, {"reason": "x", "duration_s": 0}, 422, "duration_s: expected above 0"),
+        ("data-gap/shelve", ANY, {"reason": "  "}, 422, "reason: expected one line of text that"),
         (
-            "data-gap/shelve", {"If-Match": "*"}, {"reason": "x", "duration_s": 3601}, 409,
+            "data-gap/shelve", ANY, {"reason": "x", "duration_s": 3601}, 409,
             "shelve of data-gap: duration_s",
         ),
-        ("data-gap/unshelve", {"If-Match": "*"}, {}, 409, "data-gap is unacknowledged: unshelve is not possible"),
-        ("data-gap/reset", {"If-Match": "*"}, {}, 409, "data-gap is unacknowledged: reset is not possible"),
-        ("k_by/acknowledge", {"If-Match": "*"}, {}, 409, "k_by is normal: acknowledge is not possible"),
-        ("nose/acknowledge", {"If-Match": "*"}, {}, 404, "no alarm nose; there are: k_by, c_by"),
-        ("events/acknowledge", {"If-Match": "*"}, {}, 404, "no alarm events; there are:"),
+        ("data-gap/unshelve", ANY, {}, 409, "data-gap is unacknowledged: unshelve is not possible"),
+        ("data-gap/reset", ANY, {}, 409, "data-gap is unacknowledged: reset is not possible"),
+        ("k_by/acknowledge", ANY, {}, 409, "k_by is normal: acknowledge is not possible"),
+        ("nose/acknowledge", ANY, {}, 404, "no alarm nose; there are: k_by, c_by"),
+        ("events/acknowledge", ANY, {}, 404, "no alarm events; there are:"),
     ],
 )  # fmt: skip
 def test_orders_that_cannot_be_followed_are_explained(
@@ -202,7 +203,7 @@ def test_bodies_that_are_none_are_problems(untouched: httpx.Client) -> None:
 def test_what_was_done_and_what_was_refused_is_in_the_audit_log(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
     runtime, _, http = plant
     with client(runtime, token(runtime, READ, name="screen")) as screen:
-        problem(screen.post(f"{GAP}/acknowledge", json={}, headers={"If-Match": "*"}), 403)
+        problem(screen.post(f"{GAP}/acknowledge", json={}, headers=ANY), 403)
     problem(http.post(f"{GAP}/acknowledge", json={"reason": "late"}, headers={"If-Match": '"9"'}), 409)
     answered(http.post(f"{GAP}/acknowledge", json={"reason": "seen"}, headers={"If-Match": '"0"'}), OperationDone)
     entries = answered(http.get("/api/v1/audit"), AuditList).entries
@@ -218,7 +219,7 @@ def test_what_was_done_and_what_was_refused_is_in_the_audit_log(plant: tuple[Run
 def test_a_monitor_that_is_being_stopped_says_so(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
     runtime, _, http = plant
     worker_of(runtime).stop()
-    found = problem(http.post(f"{GAP}/acknowledge", json={}, headers={"If-Match": "*"}), 503)
+    found = problem(http.post(f"{GAP}/acknowledge", json={}, headers=ANY), 503)
     assert found.detail == "demo/lab: the monitor is being stopped"
     found = problem(http.get("/readyz"), 503)
     assert (found.model_extra or {})["machines"][0]["worker_alive"] is False

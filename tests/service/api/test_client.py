@@ -191,9 +191,6 @@ def test_nobody_there() -> None:
             next(plant.events())
 
 
-# Services that are fed by hand
-
-
 @contextmanager
 def gapped(plan: ServiceSettings, *, feed_it: bool = True) -> Iterator[Runtime]:
     """A service with a gap in its stream, which is an alarm at once."""
@@ -284,9 +281,6 @@ def test_encrypted(tmp_path: Path) -> None:
             plant.health(PLACE)
     with pytest.raises(ClientError, match=r"nowhere\.pem"):
         Client("https://127.0.0.1", ca=tmp_path / "nowhere.pem")
-
-
-# The page
 
 
 def test_examples_in_the_page_run(

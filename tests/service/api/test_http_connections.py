@@ -50,6 +50,15 @@ def connections(url: str, count: int, sends: bytes = b"") -> Iterator[list[socke
         yield found
 
 
+def stalled(url: str) -> socket.socket:
+    """A connection of a reader that has asked for much and takes nothing."""
+    place, one = httpx.URL(url), socket.socket()
+    one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    one.connect((place.host, place.port))
+    one.sendall(DESCRIPTION * 40)
+    return one
+
+
 def over(connection: socket.socket) -> bool:
     """Whether the server has ended a connection; reads what has arrived."""
     try:
@@ -104,26 +113,24 @@ def test_streams_and_regular_callers_go_on() -> None:
 
 
 def test_whoever_takes_nothing_of_an_answer_is_cut_off() -> None:
-    with monitor(send_timeout_s=0.5) as runtime:
-        place = httpx.URL(runtime.http_url)
-        with socket.socket() as reader, socket.socket() as steady:
-            for one in (reader, steady):
-                one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-                one.connect((place.host, place.port))
-                one.sendall(DESCRIPTION * 40)
-            taken = 0
+    with (
+        monitor(send_timeout_s=0.5) as runtime,
+        stalled(runtime.http_url) as reader,
+        stalled(runtime.http_url) as steady,
+    ):
+        taken = 0
 
-            def cut_off() -> bool:
-                nonlocal taken
-                steady.setblocking(False)
-                with suppress(BlockingIOError):
-                    taken += len(steady.recv(65536))
-                # What is sent into a connection that was reset fails; nothing is taken from it meanwhile.
-                return reader.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) != 0
+        def cut_off() -> bool:
+            nonlocal taken
+            steady.setblocking(False)
+            with suppress(BlockingIOError):
+                taken += len(steady.recv(65536))
+            # What is sent into a connection that was reset fails; nothing is taken from it meanwhile.
+            return reader.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) != 0
 
-            until(cut_off, "end of the reader that stopped")
-            assert steady.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) == 0
-            assert taken
+        until(cut_off, "end of the reader that stopped")
+        assert steady.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) == 0
+        assert taken
 
 
 def test_half_open_requests_make_room_for_others() -> None:
@@ -156,12 +163,8 @@ def test_no_more_connections_than_the_settings_say() -> None:
 def test_readers_that_stop_make_room_for_others() -> None:
     """Not at once, but long before their time is over."""
     with monitor(connections=3, send_timeout_s=3600) as runtime, ExitStack() as opened:
-        place = httpx.URL(runtime.http_url)
         for _ in range(3):
-            one = opened.enter_context(socket.socket())
-            one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            one.connect((place.host, place.port))
-            one.sendall(DESCRIPTION * 40)
+            opened.enter_context(stalled(runtime.http_url))
         until(lambda: httpx.get(f"{runtime.http_url}/healthz", trust_env=False).status_code == 200, "room")
 
 

@@ -113,15 +113,18 @@ def ask(http: httpx.Client, method: str, path: str) -> httpx.Response:
     return answer
 
 
-def test_every_route_is_described(runtime: Runtime, description: dict[str, Any]) -> None:
-    described = {(method.upper(), path) for path, methods in description["paths"].items() for method in methods}
+@pytest.fixture(scope="module")
+def described(description: dict[str, Any]) -> set[tuple[str, str]]:
+    return {(method.upper(), path) for path, methods in description["paths"].items() for method in methods}
+
+
+def test_every_route_is_described(runtime: Runtime, described: set[tuple[str, str]]) -> None:
     assert routes(application(runtime)) <= described | UNDESCRIBED
     assert len(described) >= 30
 
 
-def test_no_route_answers_without_a_valid_token(runtime: Runtime, description: dict[str, Any]) -> None:
+def test_no_route_answers_without_a_valid_token(runtime: Runtime, described: set[tuple[str, str]]) -> None:
     asked = 0
-    described = {(method.upper(), path) for path, methods in description["paths"].items() for method in methods}
     for text in ("", "rw_000000000000_" + 43 * "0", "secret"):
         with client(runtime, text) as nobody:
             for method, path in sorted(described | UNDESCRIBED | STRAY):
@@ -143,11 +146,10 @@ def test_a_method_that_a_path_has_not_is_refused_by_name(http: httpx.Client, des
             assert answer.headers["allow"] == ", ".join(sorted(methods)).upper()
 
 
-def test_every_route_asks_for_its_scope(runtime: Runtime, http: httpx.Client, description: dict[str, Any]) -> None:
+def test_every_route_asks_for_its_scope(runtime: Runtime, http: httpx.Client, description: Any, described: Any) -> None:
     """With all scopes but the one a route is refused, with that one alone it is not."""
     with_scope = {scope: token(runtime, scope, name=f"only {scope}") for scope in Scope}
     without = {scope: token(runtime, *(one for one in Scope if one != scope), name=f"no {scope}") for scope in Scope}
-    described = {(method.upper(), path) for path, methods in description["paths"].items() for method in methods}
     for method, path in sorted(described | UNDESCRIBED):
         if (method, path) in PUBLIC:
             continue
@@ -229,7 +231,7 @@ def inner(value: object) -> Iterator[dict[str, Any]]:
             yield from inner(one)
 
 
-def test_generators_find_names_and_forms_that_they_understand(description: dict[str, Any]) -> None:
+def test_generators_find_names_tags_and_forms_that_they_understand(description: dict[str, Any]) -> None:
     assert description["info"]["version"] == __version__
     names = [route["operationId"] for methods in description["paths"].values() for route in methods.values()]
     assert len(set(names)) == len(names)
@@ -243,19 +245,16 @@ def test_generators_find_names_and_forms_that_they_understand(description: dict[
     assert all("items" in one for one in tuples)
     # With every problem written out at every operation it was half a megabyte.
     assert len(json.dumps(description, ensure_ascii=False)) < 5_000 * len(names)
+    there = {one["name"] for one in description["tags"]}
+    used = {tag for methods in description["paths"].values() for route in methods.values() for tag in route["tags"]}
+    assert used == there
+    assert set(description["components"]["securitySchemes"]) == {"token", "browser"}
 
 
 def check(schemas: dict[str, Any], schema: dict[str, Any], shown: object, place: str) -> None:
     whole = {**schema, "components": {"schemas": schemas}}
     error = next(iter(jsonschema_rs.validator_for(whole).iter_errors(shown)), None)
     assert error is None, f"{place}: {error}"
-
-
-def test_tags_are_described(description: dict[str, Any]) -> None:
-    there = {one["name"] for one in description["tags"]}
-    used = {tag for methods in description["paths"].values() for route in methods.values() for tag in route["tags"]}
-    assert used == there
-    assert set(description["components"]["securitySchemes"]) == {"token", "browser"}
 
 
 def validated(case: schemathesis.Case[Any], url: str, text: str) -> Any:
