@@ -34,7 +34,7 @@ def test_services_are_the_three_and_start_in_order() -> None:
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_service_has_no_more_rights_than_it_needs(name: str) -> None:
+def test_service_has_no_more_rights_than_it_needs_and_a_command_and_check_that_exist(name: str) -> None:
     service = SERVICES[name]
     user, group = service["user"].split(":")
     assert int(user) > 0
@@ -52,6 +52,15 @@ def test_service_has_no_more_rights_than_it_needs(name: str) -> None:
         else:
             assert mode == "ro"
             assert (ROOT / source).is_file()
+    check = SERVICES[name]["healthcheck"]
+    assert check["test"][:3] == ["CMD", "python", "/opt/healthcheck.py"]
+    assert {"interval", "timeout", "retries", "start_period"} <= set(check)
+    assert "COPY deploy/healthcheck.py /opt/healthcheck.py" in (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    words = [str(word) for word in SERVICES[name]["command"]]
+    group = typer.main.get_command(PROGRAMS[words[0]])
+    command = group.commands[words[1]]  # type: ignore[attr-defined]  # the program has several commands
+    known = {option for parameter in command.params for option in parameter.opts}
+    assert {word for word in words if word.startswith("--")} <= known
 
 
 def test_only_loopback_of_the_host_is_published() -> None:
@@ -60,23 +69,6 @@ def test_only_loopback_of_the_host_is_published() -> None:
     assert COMPOSE["networks"]["streams"]["internal"] is True
     for name in ("router", "simulator"):
         assert SERVICES[name]["networks"] == ["streams"]
-
-
-@pytest.mark.parametrize("name", SERVICES)
-def test_command_exists_with_these_options(name: str) -> None:
-    words = [str(word) for word in SERVICES[name]["command"]]
-    group = typer.main.get_command(PROGRAMS[words[0]])
-    command = group.commands[words[1]]  # type: ignore[attr-defined]  # the program has several commands
-    known = {option for parameter in command.params for option in parameter.opts}
-    assert {word for word in words if word.startswith("--")} <= known
-
-
-@pytest.mark.parametrize("name", SERVICES)
-def test_health_is_checked_by_what_is_in_the_image(name: str) -> None:
-    check = SERVICES[name]["healthcheck"]
-    assert check["test"][:3] == ["CMD", "python", "/opt/healthcheck.py"]
-    assert {"interval", "timeout", "retries", "start_period"} <= set(check)
-    assert "COPY deploy/healthcheck.py /opt/healthcheck.py" in (ROOT / "Dockerfile").read_text(encoding="utf-8")
 
 
 def test_image_is_pinned_unprivileged_and_built_from_what_is_not_ignored() -> None:

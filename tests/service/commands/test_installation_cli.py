@@ -78,6 +78,7 @@ def test_init_writes_files_that_the_other_commands_take(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
+        (("init",), "--site is missing, and there is no terminal to ask for it"),
         (("init", "--site", "plant", "--name", "fan", "--sensor", "a b c d e"), "--rate-hz is missing"),
         ((*FAN, "--sensor", "DE-A acceleration"), "has 2 words, expected 5"),
         ((*FAN, "--sensor", "DE-A acceleration G DE axial"), "did you mean g"),
@@ -94,11 +95,15 @@ def test_init_says_what_is_wrong_and_writes_nothing(tmp_path: Path, arguments: t
     assert list(tmp_path.iterdir()) == []
 
 
+def examined_by_doctor(folder: Path, *more: str, rate_hz: float = RATE_HZ) -> subprocess.CompletedProcess[str]:
+    address = endpoint()
+    with publishing(folder, address, 120, 2.0, rate_hz=rate_hz):
+        return run("doctor", "--machine", str(folder / "fan.toml"), "--listen", address, *more)
+
+
 def test_the_doctor_says_what_arrives(tmp_path: Path) -> None:
     run(*FAN, "--folder", str(tmp_path))
-    address = endpoint()
-    with publishing(tmp_path, address, 120, 2.0):
-        done = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", address, "--seconds", "2")
+    done = examined_by_doctor(tmp_path, "--seconds", "2")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "sampling rate 2560 Hz, expected 2560" in done.stdout
     # Of however many blocks arrived: a busy computer gives fewer, and noise does the rest.
@@ -109,9 +114,7 @@ def test_the_doctor_says_what_arrives(tmp_path: Path) -> None:
 
 def test_the_doctor_waits_for_snapshots(tmp_path: Path) -> None:
     run(*FAN, "--folder", str(tmp_path), "--snapshots", "0.5 2")
-    address = endpoint()
-    with publishing(tmp_path, address, 120, 2.0):
-        done = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", address)
+    done = examined_by_doctor(tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "listening for 12.5 s" in done.stdout  # ten, and a period with its snapshot
     assert "0.5 s in the latest snapshot, in blocks of 1280 samples" in done.stdout
@@ -120,9 +123,7 @@ def test_the_doctor_waits_for_snapshots(tmp_path: Path) -> None:
 
 def test_the_doctor_says_what_is_wrong(tmp_path: Path) -> None:
     run(*FAN, "--folder", str(tmp_path))
-    address = endpoint()
-    with publishing(tmp_path, address, 120, 2.0, rate_hz=2000.0):
-        done = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", address, "--seconds", "2")
+    done = examined_by_doctor(tmp_path, "--seconds", "2", rate_hz=2000.0)
     assert done.returncode == 1
     assert "rate_hz" in done.stdout
     assert "blocks would be refused" in done.stdout
@@ -182,9 +183,3 @@ def test_init_asks_until_a_channel_is_empty_and_again_for_what_cannot_be_used(tm
     assert "has 4 words, expected 5" in done.stdout
     assert "unit 'furlong' is not one of" in done.stdout
     assert [one.name for one in load_machine_file(tmp_path / "fan.toml").sensors] == ["DE-H", "NDE-V"]
-
-
-def test_init_asks_nobody_where_nobody_is(tmp_path: Path) -> None:
-    done = run("init", "--folder", str(tmp_path))
-    assert done.returncode == 2
-    assert "--site is missing, and there is no terminal to ask for it" in done.stderr

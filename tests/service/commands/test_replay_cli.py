@@ -101,7 +101,7 @@ def test_options_that_cannot_be_used(faulty: Path, arguments: tuple[str, ...], m
     assert message in found.stderr
 
 
-def test_files_that_cannot_be_used(tmp_path: Path, faulty: Path) -> None:
+def test_files_and_addresses_that_cannot_be_used(tmp_path: Path, faulty: Path) -> None:
     (tmp_path / "text.mcap").write_text("no recording", encoding="utf-8")
     found = run(tmp_path / "text.mcap", "--offline")
     assert found.returncode == 2
@@ -110,6 +110,8 @@ def test_files_that_cannot_be_used(tmp_path: Path, faulty: Path) -> None:
     found = run(write(tmp_path / "empty.mcap", other), "--offline")
     assert found.returncode == 2
     assert "empty.mcap: contains no sample blocks" in found.stderr
+    found = run(faulty, "--connect", endpoint())
+    assert (found.returncode, "nothing answers there" in found.stderr) == (1, True)
 
 
 def test_a_monitor_in_the_namespace_of_a_replay(faulty: Path, tmp_path: Path) -> None:
@@ -130,12 +132,6 @@ def test_a_monitor_in_the_namespace_of_a_replay(faulty: Path, tmp_path: Path) ->
         assert [alarm.name for alarm in monitor.health().alarms if alarm.raised] == ["c_bz"]
         assert monitor.stop() == 0
     assert not (tmp_path / "recordings").exists()
-
-
-def test_nobody_to_connect_to_is_exit_code_1(faulty: Path) -> None:
-    found = run(faulty, "--connect", endpoint())
-    assert found.returncode == 1
-    assert "nothing answers there" in found.stderr
 
 
 def test_endpoints_of_the_command_line_replace_those_of_a_link_file(tmp_path: Path) -> None:

@@ -40,19 +40,18 @@ def test_defaults_watch_the_shipped_machine_on_loopback() -> None:
     assert settings.queue.when_full == "drop"
 
 
-def test_file_is_read_and_paths_are_relative_to_it(tmp_path: Path) -> None:
+def test_file_is_read_with_paths_beside_it_and_the_environment_over_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     settings = load_settings(written(tmp_path, GOOD))
     assert (settings.http.port, settings.queue.blocks) == (9000, 10)
     assert (settings.machines[0].file, settings.machines[0].bundle) == (str(tmp_path / "machine.toml"), "lab")
     assert settings.machines[0].load().name == "lab"
     (tmp_path / "lab").mkdir()
     assert load_settings(tmp_path / "service.toml").machines[0].bundle == str(tmp_path / "lab")
-
-
-def test_environment_goes_over_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROTORWATCH_HTTP__PORT", "9001")
     monkeypatch.setenv("ROTORWATCH_MACHINES", '[{"file": "heavy"}]')
-    settings = load_settings(written(tmp_path, GOOD))
+    settings = load_settings(tmp_path / "service.toml")
     assert (settings.http.port, settings.queue.blocks) == (9001, 10)
     assert [(entry.file, entry.bundle) for entry in settings.machines] == [("heavy", None)]
 

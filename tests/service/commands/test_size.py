@@ -92,9 +92,6 @@ def test_the_answer_is_told_in_80_columns_and_says_what_was_not_measured() -> No
     assert "OUTSIDE of what was measured: channels 64" in outside
     assert "OUTSIDE of what was measured: rate 25600 Hz" in outside
     assert max(len(line) for line in (inside + outside).splitlines()) <= 80
-
-
-def test_another_program_gets_figures() -> None:
     found = json.loads(told("--machines", "20", "--levels-only", "--channels", "8", "--json"))
     assert found["kind"]["diagnosed"] is False
     assert found["network_in_mb_s"] == pytest.approx(20 * 8 * 2000 * 4 / 1e6)
