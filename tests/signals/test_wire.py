@@ -199,9 +199,6 @@ def test_a_truncated_arrow_stream_is_refused() -> None:
     assert refused > len(payload) * 0.9
 
 
-# The page -------------------------------------------------------------------------------------------------------------
-
-
 _C_TYPES = {
     "int64_t": ctypes.c_int64, "uint64_t": ctypes.c_uint64, "double": ctypes.c_double,
     "uint8_t": ctypes.c_uint8, "uint16_t": ctypes.c_uint16, "uint32_t": ctypes.c_uint32,
@@ -280,9 +277,6 @@ def test_the_page_python_example_is_received(tmp_path: Path) -> None:
     # float32 resolves 10 um to 1e-6 um
     np.testing.assert_allclose(samples[:, 0], 10 * np.cos(angle), atol=2e-6)
     np.testing.assert_allclose(samples[:, 2], angle % (2 * np.pi), atol=1e-6)
-
-
-# What comes from outside must not cost more than it weighs
 
 
 def _compressed(n_values: int, codec: str) -> bytes:

@@ -111,12 +111,9 @@ def test_what_a_history_lacks_is_said(settings: Path, tmp_path: Path, arguments:
     assert (code, message in said) == (2, True), said
 
 
-def test_without_recordings_and_history_it_asks_for_either(tmp_path: Path) -> None:
+def test_without_recordings_it_asks_for_a_history_and_makes_none(tmp_path: Path) -> None:
     code, said = run("orbit", "--out", tmp_path / "picture.png")
     assert (code, "no recordings are named: expected FILE..." in said) == (2, True)
-
-
-def test_a_history_that_is_not_there_is_not_made(tmp_path: Path) -> None:
     (tmp_path / "plant.toml").write_text('[history]\nurl = "sqlite:///none.sqlite"\n', encoding="utf-8")
     code, said = run("polar", "--history", tmp_path / "plant.toml", "--out", tmp_path / "picture.png")
     assert (code, "unable to open" in said) == (1, True), said

@@ -105,24 +105,18 @@ def test_a_recorded_orbit_is_turned() -> None:
     assert orbit.names == ("y of z2 and y2", "z of z2 and y2")
 
 
-def test_a_descriptor_with_another_angle_is_another_stream() -> None:
+def test_the_angle_is_in_descriptors_told_to_clients_and_written_by_init(tmp_path: Path) -> None:
     assert descriptor_mismatch(TURNED.descriptor.model_dump_json().encode(), TURNED) == ()
     fields = json.loads(TURNED.descriptor.model_dump_json())
     fields["channels"][0]["angle_deg"] = 50.0
     (found,) = descriptor_mismatch(json.dumps(fields).encode(), TURNED)
     assert found == "channels.0.angle_deg (y1) is '50.0', expected '45.0'"
-
-
-def test_the_client_is_told_the_angle() -> None:
     identity = Identity(site="demo", machine="lab", bundle=None, machine_hash="9a0c41d27be8")
     told = machine_description(identity, TURNED, HealthState.HEALTHY)
     angles = {channel.name: channel.angle_deg for channel in told.channels if channel.angle_deg is not None}
     assert angles == {"y1": 45.0, "z1": 135.0, "y2": 100.0, "z2": 160.0}
-
-
-def test_init_writes_the_angle(tmp_path: Path) -> None:
     sensors = ["VE-1X displacement um bearing X 45", "VE-1Y displacement um bearing Y 135"]
     init(folder=tmp_path, site="p", name="pump", rate_hz=2560.0, sensor=sensors, speed_rpm=None, zones=None)
-    found = load_machine_file(tmp_path / "pump.toml")
-    assert [one.angle_deg for one in found.sensors] == [45, 135]
-    assert found.descriptor.states == ("y1", "z1")
+    pump = load_machine_file(tmp_path / "pump.toml")
+    assert [one.angle_deg for one in pump.sensors] == [45, 135]
+    assert pump.descriptor.states == ("y1", "z1")
