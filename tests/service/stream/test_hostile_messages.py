@@ -97,9 +97,6 @@ def test_health_stays_small_whatever_is_sent() -> None:
         assert len(worker.health().model_dump_json()) < 100 * KB
 
 
-# Two publishers, and forgeries
-
-
 def raised(monitor: MachineMonitor) -> set[str]:
     return {alarm.name for alarm in monitor.health().alarms if alarm.raised}
 
@@ -193,9 +190,6 @@ def test_a_forged_block_that_lets_true_ones_go_on_is_not_the_one_that_was_used()
     assert not monitor.used
 
 
-# Floods
-
-
 def raw(run: int, size: int = 4, encoding: str = BLOCK_ENCODING, source: str = "") -> RawBlock:
     header = struct.pack("<qQdBBHI", 0, 0, 2000.0, 1, 1, run, size // 4)
     return RawBlock(b"\0" * size, header, encoding, source)
@@ -280,9 +274,6 @@ def test_a_flood_of_bad_messages_costs_no_good_block(tmp_path: Path) -> None:
         assert sum(health.quality.refused_blocks.values()) > 1000  # how many come through is the network's affair
 
 
-# Replays
-
-
 def test_a_message_larger_than_any_block_is_not_taken_and_ends_no_link() -> None:
     address, key = endpoint(), LAB.keys.stream
     sizes: list[int] = []
@@ -335,9 +326,6 @@ def test_blocks_that_say_they_are_replayed_are_not_the_machines() -> None:
         assert worker.health().quality.refused_blocks == {}
 
 
-# Messages in the monitor's own name
-
-
 def test_what_others_say_in_the_monitors_name_stays_on_the_network(tmp_path: Path) -> None:
     """Nor does a token that nobody is behind hide that the data have stopped."""
     address, quick = endpoint(), ("[operation]", "[ingest]\nno_data_after_s = 1.0\nblock_to_s = 0.5\n\n[operation]")
@@ -362,6 +350,7 @@ def test_what_others_say_in_the_monitors_name_stays_on_the_network(tmp_path: Pat
 
 DURATION_S = 68.0
 SEED = 7_730_001
+LONG = pytest.mark.long
 
 
 def watched(name: str, kind: Foreign, seed: int) -> tuple[list[Report], set[str]]:
@@ -378,7 +367,16 @@ def watched(name: str, kind: Foreign, seed: int) -> tuple[list[Report], set[str]
     return windows, raised
 
 
-def judge(name: str, kind: Foreign, seed: int) -> None:
+# One sine far from every mode of the lightly damped machine passes for the one resonance of a softer shaft.
+CASES = [
+    *(pytest.param("lab", kind, SEED, marks=LONG if "sines" in kind else ()) for kind in FOREIGN),
+    *(pytest.param("heavy", kind, SEED + 2, marks=LONG) for kind in FOREIGN),
+    *(pytest.param("light", kind, SEED + 2, marks=pytest.mark.slow if kind == "sines" else LONG) for kind in FOREIGN),
+]
+
+
+@pytest.mark.parametrize(("name", "kind", "seed"), CASES)
+def test_no_parameter_is_blamed_for_what_is_no_rotor(name: str, kind: Foreign, seed: int) -> None:
     windows, raised = watched(name, kind, seed)
     assert len(windows) >= 2
     assert not raised & set(PARAMETERS)
@@ -390,26 +388,6 @@ def judge(name: str, kind: Foreign, seed: int) -> None:
         assert not window.suspect or ("sine" in kind and window.suspect.startswith("a line "))
         assert all(reading.relative_change is None for reading in window.parameters)
         assert window.verdict is None or not window.verdict.changed
-
-
-@pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=pytest.mark.long if "sines" in kind else ()) for kind in FOREIGN]
-)
-def test_no_parameter_is_blamed_for_what_is_no_rotor(kind: Foreign) -> None:
-    judge("lab", kind, SEED)
-
-
-# One sine far from every mode of the lightly damped machine passes for the one resonance of a softer shaft.
-CASES = [
-    pytest.param(name, kind, marks=pytest.mark.slow if (name, kind) == ("light", "sines") else pytest.mark.long)
-    for name in ("heavy", "light")
-    for kind in FOREIGN
-]
-
-
-@pytest.mark.parametrize(("name", "kind"), CASES)
-def test_no_parameter_is_blamed_on_other_machines(name: str, kind: Foreign) -> None:
-    judge(name, kind, SEED + 2)
 
 
 # As factors of both masses, length and inertia. The first fits no parameters but for ten seconds at a time, the second

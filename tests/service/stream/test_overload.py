@@ -58,19 +58,10 @@ def loud_in_between(seconds: float) -> list[SampleBlock]:
     ]
 
 
-# When windows are skipped
-
-
 def queue_of(
     arrivals_s: Sequence[float], evaluated_s: float, skipped_s: float, held: Callable[[float], float] = lambda at: at
 ) -> list[tuple[float, float, bool]]:
-    """A worker whose hops cost so much, with blocks that arrive at these times, 50 a hop.
-
-    Returns
-    -------
-    list of tuple
-        Of each hop: when its last block came, when it is done, whether it was skipped.
-    """
+    """Of each hop of a worker, of 50 blocks: when its last block came, when it is done, whether it was skipped."""
     rule, now_s, found = LoadShedding(), 0.0, []
     ends = arrivals_s[49::50]
     for number, came_s in enumerate(ends):
@@ -122,9 +113,6 @@ def test_once_it_keeps_up_again_a_short_delay_costs_no_window() -> None:
     assert not rule.skips(49, 50, 140.0)
     assert not rule.skips(60, 50, 145.0)
     assert not rule.skips(49, 50, 200.0)
-
-
-# What a monitor says of a window that it skips
 
 
 @pytest.fixture(scope="module")
@@ -228,9 +216,6 @@ def test_what_grows_beside_a_named_change_is_heard_in_skipped_windows(kit: Insta
     assert 95 < told[f"raised {LEVEL}y1"] < 125
 
 
-# Which blocks say that it is behind
-
-
 def message(number: int, source: str) -> RawBlock:
     return RawBlock(*encode_block(scenario_blocks(10.0)[number], ""), source=source)
 
@@ -260,9 +245,6 @@ def test_blocks_of_others_and_bursts_for_an_idle_worker_are_no_reason_to_skip() 
     burst.join()
     assert inbox.behind == 0
     assert inbox.behind == 39  # until all are taken again
-
-
-# Whose turn it is
 
 
 def test_the_last_block_of_a_hop_waits_for_its_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -313,9 +295,6 @@ def test_turns_come_one_by_one_in_the_order_in_which_they_were_asked_for(monkeyp
         ends.set()
         endless.result()
     assert not shedding._turns
-
-
-# A running service
 
 
 def hurry(feed: Feed, worker: MachineWorker, stream: list[SampleBlock], until_sent: int, ahead: int) -> None:
