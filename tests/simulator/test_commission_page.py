@@ -189,15 +189,16 @@ def test_a_page_is_whole_and_needs_nothing_else(folder: Path, name: str) -> None
     assert {one or other for one, other in asked} <= set(names)
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_json_beside_the_page_is_the_report(folder: Path, name: str) -> None:
-    _, report = written(folder, name)
-    assert report == case(name)[0].report
-    assert json.loads((folder / name.replace(" ", "-") / JSON).read_text(encoding="utf-8"))["verdict"] == report.verdict
+def printed(report: CommissioningReport, width: int = 80) -> str:
+    console = Console(file=StringIO(), width=width, highlight=False)
+    print_report(report, console)
+    file = console.file
+    assert isinstance(file, StringIO)
+    return file.getvalue()
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_verdict_checks_and_equations_are_all_there(folder: Path, name: str) -> None:
+def test_verdict_checks_and_equations_are_all_there_in_json_and_in_80_columns(folder: Path, name: str) -> None:
     text, report = written(folder, name)
     verdict, checks = section(text, "verdict"), section(text, "checks")
     assert squeezed(headline(report)) in verdict
@@ -212,6 +213,23 @@ def test_verdict_checks_and_equations_are_all_there(folder: Path, name: str) -> 
     for row in report.equations:
         told = "yes" if row.used else f"no: {row.reason}"
         assert squeezed(f"{row.number} {row.title} {', '.join(row.parameters)} {told}") in equations
+    assert report == case(name)[0].report
+    assert json.loads((folder / name.replace(" ", "-") / JSON).read_text(encoding="utf-8"))["verdict"] == report.verdict
+    text = printed(report)
+    assert max(len(line.rstrip("\n")) for line in text.splitlines()) <= 80
+    assert "…" not in text
+    seen = squeezed(text)
+    assert squeezed(headline(report)) in seen
+    for step in next_steps(report):
+        assert step.split()[0] in seen
+    wide = squeezed(printed(report, 400))
+    for check in report.checks:
+        assert squeezed(f"{check.verdict} {check.name} {check.text}") in wide
+    for one in report.parameters:
+        if one.evaluable:
+            assert re.search(rf"^{one.name} .*{percent(sure(one.window_error))} ", text, re.MULTILINE)
+        else:
+            assert re.search(rf"^{one.name} +not readable", text, re.MULTILINE)
 
 
 @pytest.mark.parametrize("name", [*LEVELS, "no phase reference"])
@@ -286,15 +304,12 @@ def test_a_machine_of_whose_motion_nothing_is_measured_is_said_to_be_compared_by
     assert {one.channel for one in report.levels} == {one.name for one in LAB.sensors if one.name != "theta"}
 
 
-def test_nothing_of_a_recordings_name_reaches_the_page_as_markup(folder: Path) -> None:
+def test_nothing_of_names_and_descriptions_reaches_the_page_as_markup(folder: Path, tmp_path: Path) -> None:
     for name in ("partial", "none", "second excitation"):
         text, _ = written(folder, name)
         assert "<script" not in text
         assert RUDE in section(text, "recordings")
     assert f"{RUDE}: a steady line at 41.40 Hz" in section(written(folder, "second excitation")[0], "checks")
-
-
-def test_a_description_is_escaped(tmp_path: Path) -> None:
     made, recordings, machine = case("no hop")
     rude = machine.model_copy(update={"description": "</p><script>alert(1)</script> pump & motor"})
     text = write_report(tmp_path, made.report, recordings, machine=rude).read_text(encoding="utf-8")
@@ -411,34 +426,6 @@ def test_changes_that_cannot_be_found_are_said_to_be_so() -> None:
     sharp = one.model_copy(update={"detectable_loss": -0.05, "detectable_gain": 0.052, "wished": 0.1})
     told = " ".join(budget_sentences(report.model_copy(update={"parameters": (sharp,)})))
     assert "The wished change of 10% of c_by is found with the present settings." in told
-
-
-def printed(report: CommissioningReport, width: int = 80) -> str:
-    console = Console(file=StringIO(), width=width, highlight=False)
-    print_report(report, console)
-    file = console.file
-    assert isinstance(file, StringIO)
-    return file.getvalue()
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_the_terminal_says_the_same_in_80_columns(name: str) -> None:
-    report = case(name)[0].report
-    text = printed(report)
-    assert max(len(line.rstrip("\n")) for line in text.splitlines()) <= 80
-    assert "…" not in text
-    seen = squeezed(text)
-    assert squeezed(headline(report)) in seen
-    for step in next_steps(report):
-        assert step.split()[0] in seen
-    wide = squeezed(printed(report, 400))
-    for check in report.checks:
-        assert squeezed(f"{check.verdict} {check.name} {check.text}") in wide
-    for one in report.parameters:
-        if one.evaluable:
-            assert re.search(rf"^{one.name} .*{percent(sure(one.window_error))} ", text, re.MULTILINE)
-        else:
-            assert re.search(rf"^{one.name} +not readable", text, re.MULTILINE)
 
 
 def test_square_brackets_are_no_markup_of_the_terminal() -> None:

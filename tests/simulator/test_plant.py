@@ -70,18 +70,13 @@ def _covariance(machine: Machine, condition: Condition) -> tuple[FloatArray, Flo
     return A, stationary_covariance(A, expanded_B(condition.sources))
 
 
-def test_covariances_are_those_of_lyapunov(
+def test_covariances_are_those_of_lyapunov_from_the_first_sample_on(
     machine: Machine, condition: Condition, stochastic: list[FloatArray]
 ) -> None:
     _, R = _covariance(machine, condition)
     deviation = np.sqrt(np.diag(R)[:12])
     estimates = np.array([x.T @ x / len(x) for x in stochastic]) / np.outer(deviation, deviation)
     _assert_agrees(estimates, R[:12, :12] / np.outer(deviation, deviation), np.ones((12, 12)))
-
-
-def test_the_first_sample_is_stationary(machine: Machine, condition: Condition) -> None:
-    _, R = _covariance(machine, condition)
-    deviation = np.sqrt(np.diag(R)[:12])
     plain = _without_unbalance(machine)
     first = np.array([Plant(plain, condition, np.random.default_rng(s)).advance(1).states[0] for s in range(500)])
     squares = first[:, :, None] * first[:, None, :] / np.outer(deviation, deviation)

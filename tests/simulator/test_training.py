@@ -110,6 +110,11 @@ def test_amortised_networks_learn_and_are_trained_again_to_the_last_bit(bundle: 
     mean, factor = first.networks[0](np.clip(inputs, -8, 8))
     assert np.corrcoef(mean[:, 0], log_ratio[:, 0])[0, 1] > 0.25  # a few steps; chance gives 0 ± 0.05
     assert np.all(factor[:, [0, 1], [0, 1]] > 0)
+    with pytest.raises(EstimationError, match="lab: 0 windows are too few to train on"):
+        train_networks(
+            COARSE, ForceFeatures(COARSE).states, (draws.mean, draws.directions), draws.n_common, [], 1000, LOG_RATIO,
+            SEED,
+        )  # fmt: skip
 
 
 def test_a_batch_depends_on_seed_and_number_alone(recipe: FeatureDraws) -> None:
@@ -120,17 +125,6 @@ def test_a_batch_depends_on_seed_and_number_alone(recipe: FeatureDraws) -> None:
     assert several[0][0].shape == (draws.windows, 525)
     assert not np.array_equal(several[0][1], several[1][1])
     assert np.abs(again[1]).max() <= LOG_RATIO
-
-
-def test_too_few_windows_are_refused(recipe: FeatureDraws) -> None:
-    from models.diagnosis.networks.training import train_networks  # noqa: PLC0415
-
-    draws = recipe
-    with pytest.raises(EstimationError, match="lab: 0 windows are too few to train on"):
-        train_networks(
-            COARSE, ForceFeatures(COARSE).states, (draws.mean, draws.directions), draws.n_common, [], 1000, LOG_RATIO,
-            SEED,
-        )  # fmt: skip
 
 
 def test_a_small_training_finds_and_sizes_a_fault_on_new_windows(monkeypatch: pytest.MonkeyPatch) -> None:
