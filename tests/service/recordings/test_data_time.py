@@ -108,21 +108,23 @@ def test_a_recording_of_two_runs_at_the_same_times(twice: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("name", ["slow", "quick"])
-def test_spectra_are_of_the_latest_seconds_of_the_data(name: str, request: pytest.FixtureRequest) -> None:
+@pytest.mark.parametrize(
+    ("name", "latest_s", "averages", "hop_s", "starts_s"),
+    [
+        ("slow", (20, 40), 19, 4, range(0, 40, 4)), ("quick", (20, 40), 19, 4, range(0, 40, 4)),
+        ("twice", (10, 25), None, 5, range(0, 25, 5)),
+    ],
+)  # fmt: skip
+def test_spectra_are_of_the_latest_seconds_of_the_data_and_of_two_runs_of_the_later_one(
+    name: str, latest_s: tuple[int, int], averages: int | None, hop_s: float, starts_s: range,
+    request: pytest.FixtureRequest,
+) -> None:  # fmt: skip
     stream = stream_of(request.getfixturevalue(name))
     found = read_spectrum(stream, stream.displacements, 20.0, 0.5, "amplitude")
-    assert ((found.start_ns - START_NS) / S, (found.end_ns - START_NS) / S, found.averages) == (20, 40, 19)
-    fall = read_waterfall(stream, stream.displacements[0], 4.0, 0.5, "amplitude")
-    assert ((fall.start_ns - START_NS) / S).tolist() == list(range(0, 40, 4))
-
-
-def test_of_two_runs_the_later_one_is_shown(twice: Path) -> None:
-    stream = stream_of(twice)
-    found = read_spectrum(stream, stream.displacements, 20.0, 0.5, "amplitude")
-    assert ((found.start_ns - START_NS) / S, (found.end_ns - START_NS) / S) == (10, 25)
-    fall = read_waterfall(stream, stream.displacements[0], 5.0, 0.5, "amplitude")
-    assert ((fall.start_ns - START_NS) / S).tolist() == [0, 5, 10, 15, 20]
+    assert ((found.start_ns - START_NS) / S, (found.end_ns - START_NS) / S) == latest_s
+    assert found.averages == (averages or found.averages)
+    fall = read_waterfall(stream, stream.displacements[0], hop_s, 0.5, "amplitude")
+    assert ((fall.start_ns - START_NS) / S).tolist() == list(starts_s)
 
 
 @pytest.mark.parametrize(

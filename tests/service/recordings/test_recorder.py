@@ -24,6 +24,7 @@ from service.recordings.leftovers import is_locked
 from service.recordings.recorder import MachineRecorder
 from service.settings.service import RecordingSettings, ServiceSettings
 from tests.loopback import session_of
+from tests.service.recordings.test_recorder_killed import Sender
 from tests.service.rig.live import LAB, Program, endpoint, feeding, open_session, program, settings, until, worker_of
 from tests.sure import sure
 
@@ -243,32 +244,23 @@ def test_a_write_error_is_told_and_recording_resumes_without_loss(tmp_path: Path
         recorder.wait_for("idle")  # it listens and has subscribed
         with open_session(listen, "client") as session:
             send = Sender(session)
-            send(20)
+            for _ in range(20):
+                send()
             until(lambda: status_of(recorder).get("synced", 0) >= 20, "confirmed messages")
             unlimited = resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE)
             resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (300_000, unlimited[1]))
-            send(150)
+            for _ in range(150):
+                send()
             until(lambda: status_of(recorder).get("state") == "failing", "failing recorder")
             assert "File too large" in str(status_of(recorder)["problem"])
             assert "recording fails, trying again" in recorder.errors()
             resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, unlimited)
             until(lambda: status_of(recorder).get("state") == "recording", "recorder that works")
-            send(10)
+            for _ in range(10):
+                send()
             until(lambda: status_of(recorder).get("received", 0) >= 180, "all messages")
         assert recorder.stop() == 0
         check_whole(recorder, tmp_path / "kept", send.sent)
-
-
-class Sender:
-    def __init__(self, session: zenoh.Session) -> None:
-        self.session = session
-        self.sent: list[bytes] = []
-        self.rng = np.random.default_rng(8)
-
-    def __call__(self, count: int) -> None:
-        for _ in range(count):
-            self.sent.append(self.rng.bytes(4800))
-            self.session.put(KEYS.stream, self.sent[-1], congestion_control=zenoh.CongestionControl.BLOCK)
 
 
 def status_of(recorder: Program) -> dict[str, Any]:
@@ -276,14 +268,14 @@ def status_of(recorder: Program) -> dict[str, Any]:
     return dict(json.loads(lines[-1])) if lines else {}
 
 
-def check_whole(recorder: Program, directory: Path, sent: list[bytes]) -> None:
+def check_whole(recorder: Program, directory: Path, sent: list[tuple[bytes, bytes]]) -> None:
     status = status_of(recorder)
     assert (status["lost"], status["dropped"], status["problem"]) == (0, 0, "")
     assert status["failures"] != 0
     listed = Catalogue(directory).recordings()
     assert len(listed) >= 2
     assert [one for one in listed if not one.complete or one.problem] == []
-    found = [m.payload for one in listed for m in read_recording(one.path, keys=[KEYS.stream])]
+    found = [(m.payload, m.attachment) for one in listed for m in read_recording(one.path, keys=[KEYS.stream])]
     assert found == sent
 
 

@@ -57,7 +57,9 @@ def monitor_in(namespace: str, link: LinkSettings) -> Iterator[MachineWorker]:
         yield worker_of(runtime)
 
 
-def test_offline_says_what_the_monitor_says(faulty: Path, expected: OfflineSummary) -> None:
+def test_offline_says_what_the_monitor_says_in_two_files_too(
+    faulty: Path, expected: OfflineSummary, tmp_path: Path
+) -> None:
     monitor = MachineMonitor(install(LAB, "lab"))
     reports = [
         report
@@ -70,9 +72,6 @@ def test_offline_says_what_the_monitor_says(faulty: Path, expected: OfflineSumma
     assert expected.data_s == pytest.approx(BLOCKS / 10)
     assert expected.descriptor_differences == ()
     assert not expected.stopped
-
-
-def test_offline_in_two_files_is_the_same(faulty: Path, expected: OfflineSummary, tmp_path: Path) -> None:
     summary, _ = offline(*split(faulty, tmp_path, 400))
     assert (summary.sha256, summary.windows) == (expected.sha256, expected.windows)
 

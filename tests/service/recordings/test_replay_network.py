@@ -18,7 +18,7 @@ from service.stream.inbox import RawBlock
 from service.stream.replay_link import LiveMachineError, NetworkPlan, replay_to_network
 from service.stream.transport import Link, MachineCallbacks, MachineLink, route
 from tests.loopback import session_of
-from tests.service.rig.live import LAB, endpoint, scenario_blocks, service, until
+from tests.service.rig.live import LAB, endpoint, scenario_blocks, until
 from tests.service.rig.replaying import recording, write
 
 Heard = list[tuple[str, bytes, bytes, str]]
@@ -103,38 +103,32 @@ def test_each_pass_has_a_prefix_of_its_own(source: RecordingSource) -> None:
     assert [entry[0] for entry in heard] == [f"r/x/{number}/{LAB.keys.stream}" for number in (1, 2) for _ in range(30)]
 
 
-def test_original_keys_are_refused_while_a_monitor_is_alive(source: RecordingSource) -> None:
-    address = endpoint()
-    with service(address) as (_, worker):
-        with pytest.raises(LiveMachineError, match=f"a live monitor of demo/lab is there .{LAB.keys.monitor_alive}"):
-            replay_to_network(source, plan(source, address, ""), Control())
-        assert (worker.health().quality.accepted_blocks, worker.history.reports()) == (0, ())
-
-
-def test_original_keys_are_refused_while_a_publisher_is_alive(source: RecordingSource) -> None:
-    address = endpoint()
+@pytest.mark.parametrize("who", ["publisher", "monitor"])
+def test_original_keys_are_refused_while_somebody_is_alive(source: RecordingSource, who: str) -> None:
+    address, alive = endpoint(), getattr(LAB.keys, f"{who}_alive")
     with session(address) as other, hearing(other) as heard:
-        token = other.liveliness().declare_token(LAB.keys.publisher_alive)
-        with pytest.raises(LiveMachineError, match="a live publisher of demo/lab is there"):
+        token = other.liveliness().declare_token(alive)
+        with pytest.raises(LiveMachineError, match=f"a live {who} of demo/lab is there .{alive}.: replay under"):
             replay_to_network(source, plan(source, address, ""), Control())
         token.undeclare()  # type: ignore[no-untyped-call]
     assert heard == []
+
+
+def replay_until_refused(source: RecordingSource, what: NetworkPlan, errors: list[str]) -> None:
+    try:
+        replay_to_network(source, what, Control())
+    except LiveMachineError as error:
+        errors.append(str(error))
 
 
 @pytest.mark.parametrize("who", ["publisher", "monitor"])
 def test_original_keys_are_left_as_soon_as_somebody_live_appears(source: RecordingSource, who: str) -> None:
     address, errors = endpoint(), list[str]()
     keys = MachineKeys("demo", "lab")
-
-    def run() -> None:
-        try:
-            # Three seconds of recording at this pace would take half a minute.
-            replay_to_network(source, plan(source, address, "", pace=0.1), Control())
-        except LiveMachineError as error:
-            errors.append(str(error))
-
     with session(address) as other, hearing(other, keys.stream) as heard:
-        thread = threading.Thread(target=run)
+        # Three seconds of recording at this pace would take half a minute.
+        slow = plan(source, address, "", pace=0.1)
+        thread = threading.Thread(target=replay_until_refused, args=(source, slow, errors))
         thread.start()
         until(lambda: bool(heard), "first block")
         token = other.liveliness().declare_token(keys.publisher_alive if who == "publisher" else keys.monitor_alive)
@@ -152,16 +146,11 @@ def test_a_monitor_that_starts_during_a_replay_on_the_original_keys_takes_none_o
     def nothing(_: object) -> None:
         return None
 
-    def run() -> None:
-        try:
-            replay_to_network(source, plan(source, address, "", pace=0.5), Control())
-        except LiveMachineError as error:
-            errors.append(str(error))
-
     callbacks = MachineCallbacks(taken.append, nothing, nothing, nothing, lambda: "{}", lambda: "{}", lambda *_: "[]")
     with route(LinkSettings(listen=(address,))):
         other = Link(LinkSettings(mode="client", connect=(address,)))
-        thread = threading.Thread(target=run)
+        slow = plan(source, address, "", pace=0.5)
+        thread = threading.Thread(target=replay_until_refused, args=(source, slow, errors))
         with hearing(other.session, LAB.keys.stream) as heard:
             thread.start()
             until(lambda: bool(heard), "first block")
