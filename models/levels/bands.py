@@ -24,6 +24,8 @@ _FIRST_BIN = 2
 _COUNTS = 0.01
 """Part of a channel's rms below which a band is not looked at: what is there is mostly the noise of the sensor."""
 _CHANCE = 1e-9
+NEIGHBOURHOOD = 2.0 ** (1 / _PER_OCTAVE) - 1
+"""Relative change of the speed that moves a line by a band: out of its neighbourhood, if by more."""
 LINE = 0.2
 """Least part of the power of its band that the strongest bin of a line has."""
 OF_BIN = 1.5

@@ -104,12 +104,20 @@ class LevelJudge:
         self._limits: dict[tuple[object, ...], dict[str, _Nearest]] = {}
         self._growth = lru_cache(maxsize=16 * len(self._channels))(_growth_limit)
 
-    def judge(self, levels: WindowLevels, reference: LevelReference | None) -> tuple[ChannelLevels, ...]:
-        """Levels of one window, channel by channel."""
+    def judge(
+        self, levels: WindowLevels, reference: LevelReference | None, *, moved: bool = False
+    ) -> tuple[ChannelLevels, ...]:
+        """Levels of one window, channel by channel.
+
+        Parameters
+        ----------
+        moved : bool
+            Whether lines were in other bands for a part of it, so that no growth can be told.
+        """
         alike = None if reference is None else self._alike(levels, reference)
         relative = None if alike is None else self._relatives[alike]
         grown: Sequence[Growth | None] = [None] * len(self._channels)
-        if relative is not None and relative.bands is not None and levels.bands is not None:
+        if relative is not None and relative.bands is not None and levels.bands is not None and not moved:
             grown = growth(levels.bands, relative.bands)
         values = np.full((len(_SHOWN), len(grown)), np.nan)
         values[: len(_MEASURED)] = [levels.values[name] for name in _MEASURED]

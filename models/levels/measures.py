@@ -362,8 +362,8 @@ class WindowLevels:
     bands : BandLevels or None
     lines : ndarray, shape (n_hops, n_bands, n), or None
         Mean squares of the strongest bin of each band, where lines are looked for.
-    unsteady : float
-        From the slowest hop to the fastest, relative to the speed; infinite where that is not known.
+    speeds_rad_s : ndarray, shape (n_hops,), or None
+        Of each hop; nan where it is not known.
     moments : tuple of ndarray, or None
         Of each hop, what `random_kurtosis` is made of, and the mean squares in the bands.
     contact : ndarray, shape (n_hops, n), or None
@@ -377,9 +377,17 @@ class WindowLevels:
     hops: int = 1
     bands: BandLevels | None = None
     lines: FloatArray | None = None
-    unsteady: float = math.inf
+    speeds_rad_s: FloatArray | None = None
     moments: tuple[FloatArray, FloatArray, _ComplexArray, FloatArray] | None = None
     contact: FloatArray | None = None
+
+    @property
+    def unsteady(self) -> float:
+        """From the slowest hop to the fastest, relative to the speed; infinite where that is not known."""
+        speeds = self.speeds_rad_s
+        if not self.speed_rad_s or speeds is None or not np.all(np.abs(speeds) > STANDS_RAD_S):
+            return math.inf
+        return float(np.ptp(speeds)) / abs(self.speed_rad_s)
 
     @property
     def line_parts(self) -> FloatArray | None:
@@ -457,8 +465,8 @@ def window_levels(
     )
     lines = np.stack([hop.lines for hop in hops]) if plan.lines else None
     moments = sums[:, 7], sums[:, 3] - sums[:, 6], every_order[:, 1:], in_bands
-    unsteady = float(np.ptp(speeds_rad_s)) / abs(speed_rad_s) if speed_rad_s and turning.all() else math.inf
-    return WindowLevels(values, scatter, vectors, speed_rad_s, count, bands, lines, unsteady, moments, sums[:, CONTACT])
+    contact = sums[:, CONTACT]
+    return WindowLevels(values, scatter, vectors, speed_rad_s, count, bands, lines, speeds_rad_s, moments, contact)
 
 
 def _mean(values: npt.NDArray[_Number]) -> npt.NDArray[_Number]:

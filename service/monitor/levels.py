@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 
 from models.alarm_names import LEVEL
+from models.checkpoint import checked
 from models.commissioning.commissioned import Installed
 from models.diagnosis.likelihood.motions import natural_frequencies
 from models.diagnosis.lines import LatestLines, new_line, steady_lines
 from models.diagnosis.moments import Plan
 from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.window import WindowStatistics
+from models.levels.bands import NEIGHBOURHOOD
 from models.levels.contact import LatestContact
 from models.levels.judgement import Foreign, LevelJudge, channel_state, fallen
 from models.levels.measures import WindowLevels
@@ -74,6 +76,7 @@ class LevelWatch:
         )
         self._contact = LatestContact(_WINDOWS_OF_CONTACT * plan.hops)
         self._lines = LatestLines()
+        self._moved_ns = 0  # from when on all has been at about the newest speed
         self.latest: tuple[ChannelLevels, ...] = ()
         self._found: WindowLevels | None = None
         self._states = [state_name(channel) for channel in channels]
@@ -94,7 +97,12 @@ class LevelWatch:
         found = window.levels(errors=self._takes_first and self._first.learning)
         if found is None:
             return
-        self.latest = self.judged(found)
+        speeds, hops = found.speeds_rad_s, window.hops
+        if speeds is not None and speeds[-1]:
+            apart = np.flatnonzero(np.abs(speeds / speeds[-1] - 1) > NEIGHBOURHOOD)
+            if apart.size:  # the hop after them may have begun as they were
+                self._moved_ns = hops[int(apart[-1]) + 1].end_ns
+        self.latest = self._judge.judge(found, self.reference, moved=hops[0].start_ns < self._moved_ns)
         self._found = found
         stood = any(abs(hop.turned_rad) < _STILL_RAD for hop in window.hops)  # not where there is no angle: nan
         if self._takes_first and window.filled == 1 and not stood:
@@ -138,7 +146,8 @@ class LevelWatch:
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """What is remembered, as named arrays: the first windows, and what the latest had of a contact and of lines."""
-        return {**self._first.checkpoint(), **self._contact.checkpoint(), **self._lines.checkpoint()}
+        moved = {"moved_ns": np.array(self._moved_ns, dtype=np.int64)}
+        return {**self._first.checkpoint(), **self._contact.checkpoint(), **self._lines.checkpoint(), **moved}
 
     def restore(self, arrays: Mapping[str, np.ndarray], *, first_alone: bool) -> None:
         """Go on where `checkpoint` was called.
@@ -157,6 +166,7 @@ class LevelWatch:
         if not first_alone:
             self._contact.restore(arrays)
             self._lines.restore(arrays)
+            self._moved_ns = int(checked(arrays, "moved_ns", np.int64, ()))
 
     def tell(
         self,

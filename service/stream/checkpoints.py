@@ -25,7 +25,7 @@ from service.monitor.alarms.book import NO_ALARMS
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import Identity, MonitorState
 
-FORMAT = 10
+FORMAT = 11
 """Goes up when what a monitor remembers changes its form."""
 _LOOK_BACK_NS, _LATE_NS = 300 * 10**9, 3600 * 10**9
 

@@ -202,6 +202,25 @@ def test_levels_are_judged_at_a_speed_that_was_not_commissioned() -> None:
         assert "levels are judged as at the nearest commissioned speed: speed is 1399 rpm" in now.reason
 
 
+def test_a_drive_that_goes_to_its_other_set_point_has_not_grown() -> None:
+    angle = Sensor(name="angle", quantity="shaft_angle", location="shaft", direction="rotation", unit="rad")
+    limits = FAN.levels.model_copy(update={"reference_windows": 4})
+    drive = FAN.model_copy(update={"sensors": (*FAN.sensors, angle), "levels": limits})
+    rng, size, turned = np.random.default_rng(92), round(BLOCK_S * RATE_HZ), 0.0
+    # The first windows, two at either set point; later it changes within a hop.
+    monitor, slow = MachineMonitor(install(drive, None)), ((41.0, 81.0), (106.0, 126.4))
+    for number in range(round(160 / BLOCK_S)):
+        t = number * BLOCK_S + np.arange(size) / RATE_HZ
+        speed_hz = np.where(np.any([(t >= begin) & (t < end) for begin, end in slow], axis=0), 22.3, 24.8)
+        theta = turned + np.cumsum(2 * np.pi * speed_hz / RATE_HZ)
+        turned = theta[-1]
+        samples = 3.0 * np.cos(theta)[:, None] + 0.3 * rng.standard_normal((size, 2))
+        every = np.column_stack([samples, theta % (2 * np.pi)]).astype(np.float32)
+        block = SampleBlock(START_NS + round(number * BLOCK_S * 1e9), number, 1, RATE_HZ, every)
+        for window in monitor.step(block).windows:
+            assert all((one.growth or 1.0) < 1.5 for one in window.levels)  # up to 150
+
+
 def test_a_machine_that_is_watched_says_what_would_have_been_seen() -> None:
     monitor = MachineMonitor(install(FAN, None))
     run(monitor, blocks(1, 30))
