@@ -107,13 +107,7 @@ class LevelJudge:
     def judge(
         self, levels: WindowLevels, reference: LevelReference | None, *, moved: bool = False
     ) -> tuple[ChannelLevels, ...]:
-        """Levels of one window, channel by channel.
-
-        Parameters
-        ----------
-        moved : bool
-            Whether lines were in other bands for a part of it, so that no growth can be told.
-        """
+        """Levels of one window, channel by channel; no growth where lines `moved` to other bands within it."""
         alike = None if reference is None else self._alike(levels, reference)
         relative = None if alike is None else self._relatives[alike]
         grown: Sequence[Growth | None] = [None] * len(self._channels)

@@ -49,18 +49,9 @@ COMPARED = ("overall", "velocity", "s_max", "x1", "x2", "high", "envelope")
 """Those that are compared with a reference."""
 
 _SUMS = (
-    "mean",
-    "peak",
-    "peak_to_peak",
-    "fourth",
-    "radius",
-    "contact",
-    "swell",
-    "mean_square",
-    "velocity_square",
-    "high_square",
-    "envelope_square",
-)
+    "mean", "peak", "peak_to_peak", "fourth", "radius", "contact", "swell", "mean_square",
+    "velocity_square", "high_square", "envelope_square",
+)  # fmt: skip
 CONTACT = _SUMS.index("contact")
 """Row of `HopLevels.sums`."""
 _SQUARES = slice(7, None)  # mean squares, of which a root is shown
