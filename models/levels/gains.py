@@ -124,9 +124,10 @@ def left_of_1x(logs: FloatArray, errors: FloatArray, places: Sequence[str], plac
     """
     names = tuple(dict.fromkeys(places))
     own = np.array([[one == name for one in places] for name in names]) / [[places.count(name)] for name in names]
-    left = own @ logs - math.log(factor) * np.array([name == place for name in names])
-    weight = (own @ errors) ** -2.0
-    squares = float(weight @ (left - weight @ left / weight.sum()) ** 2)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a dead channel has no 1x
+        left = own @ logs - math.log(factor) * np.array([name == place for name in names])
+        weight = (own @ errors) ** -2.0
+        squares = float(weight @ (left - weight @ left / weight.sum()) ** 2)
     return max(0.0, squares - len(names) + 1) if math.isfinite(squares) else 0.0
 
 

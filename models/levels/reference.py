@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from models.checkpoint import checked, texts
 from models.errors import CheckpointError
-from models.levels.bands import BandLevels, BandReference, learn_bands
+from models.levels.bands import NEIGHBOURHOOD, BandLevels, BandReference, learn_bands
 from models.levels.gains import GainReference
 from models.levels.kurtosis import HopReference, learn_hops
 from models.levels.lines import expected_lines, learn_lines
@@ -53,6 +53,8 @@ class OperatingState(BaseModel):
     speed_rad_s: tuple[_Finite, _Finite] | None  # slowest and fastest window; None where the speed is not known
     levels: dict[str, dict[str, ReferenceLevel]]  # by channel and measure
     hops: float = Field(ge=1)  # mean number of hops in a window
+    # Whether the speed moved lines to other bands within a window.
+    varied: bool = Field(default=False, exclude_if=lambda found: not found)
     # By channel.
     bands: dict[str, BandReference] = {}
     # Largest part of each band's power that the strongest bin of a hop had, see `models.levels.lines`.
@@ -190,6 +192,7 @@ def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingS
             for column, channel in enumerate(channels)
         },
         hops=float(np.mean([one.hops for one in group])),
+        varied=any(NEIGHBOURHOOD < one.unsteady < math.inf for one in group),
         bands={
             channel: learn_bands(bands, column) for column, channel in enumerate(channels) if len(bands) == len(group)
         },

@@ -8,6 +8,7 @@ import os
 import struct
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -183,14 +184,18 @@ def _arrays_in(name: str, value: Any) -> Iterator[tuple[str, Array]]:
             place = name if array.size == 1 else f"{name}({number + 1})"
             for field in array.dtype.names:
                 yield from _arrays_in(f"{place}.{field}", struct[field])
-    elif array.dtype == object:
+    elif array.dtype == object and isinstance(value, np.ndarray):  # a sparse matrix is none
         for number, inner in enumerate(array.ravel(order="F")):
             yield from _arrays_in(f"{name}{{{number + 1}}}", inner)
     elif array.dtype.kind in "fiub":
         yield name, np.atleast_1d(array)
 
 
-def _collect_hdf5(found: dict[str, Any], name: str, item: Any) -> None:
+def _collect_within(found: dict[str, Any], place: str, within: tuple[str, ...], name: str, item: Any) -> None:
+    _collect_hdf5(found, f"{place}/{name}", item, within)
+
+
+def _collect_hdf5(found: dict[str, Any], name: str, item: Any, within: tuple[str, ...] = ()) -> None:
     """Take numeric data sets; MATLAB's table (n, m) is stored as (m, n), which the longer side settles.
 
     Cells, and fields of several structs, are references to what is stored elsewhere in the file.
@@ -202,10 +207,12 @@ def _collect_hdf5(found: dict[str, Any], name: str, item: Any) -> None:
         is_cell = not parent or item.attrs.get("MATLAB_class", b"") == b"cell"
         for number, reference in enumerate(np.ravel(item[()])):
             place = f"{name}{{{number + 1}}}" if is_cell else f"{parent}({number + 1})/{field}"
-            inner = item.file[reference]
-            _collect_hdf5(found, place, inner)
+            if not reference or (inner := item.file[reference]).name in within:  # to nothing, or in a circle
+                continue
+            inside = (*within, inner.name)
+            _collect_hdf5(found, place, inner, inside)
             if hasattr(inner, "visititems"):
-                inner.visititems(lambda of_it, it, place=place: _collect_hdf5(found, f"{place}/{of_it}", it))
+                inner.visititems(partial(_collect_within, found, place, inside))
         return
     is_array = item.ndim in (1, 2) and item.size > 0 and item.dtype.kind in "fiu"
     if is_array and item.attrs.get("MATLAB_class", b"") != b"char":

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -124,12 +125,28 @@ def _places(paths: Sequence[Path]) -> list[int]:
     parts = [re.split(r"(\d+)", path.name) for path in paths]
     columns = list(zip(*parts, strict=False))
     differing = [place for place, column in enumerate(columns) if len(set(column)) > 1]
+    places = list(range(len(paths)))
     if len(differing) == 1 and differing[0] % 2 and len({len(row) for row in parts}) == 1:
-        numbers = [int(part) for part in columns[differing[0]]]
-        steps = [after - before for before, after in pairwise(numbers)]
-        if (step := gcd(*steps)) and median(steps) == step:
-            return [(number - numbers[0]) // step for number in numbers]
-    return list(range(len(paths)))
+        found = filter(None, map(_steps, _readings(columns[differing[0]])))
+        places = min(found, key=lambda steps: steps[-1], default=places)
+    return places
+
+
+def _readings(texts: Sequence[str]) -> Iterator[list[int]]:
+    """Numbers in names: as they are, and as times of day or dates, in seconds."""
+    yield [int(text) for text in texts]
+    for form, length in (("%H%M", 4), ("%H%M%S", 6), ("%Y%m%d", 8)):
+        with suppress(ValueError):
+            if {len(text) for text in texts} == {length}:
+                times = [datetime.strptime(text, form).replace(tzinfo=UTC) for text in texts]
+                yield [int((time - times[0]).total_seconds()) for time in times]
+
+
+def _steps(numbers: Sequence[int]) -> list[int] | None:
+    """Places of numbers that count in equal steps, but for what is missing; None if they do not."""
+    steps = [after - before for before, after in pairwise(numbers)]
+    step = gcd(*steps)
+    return [(number - numbers[0]) // step for number in numbers] if step and median(steps) == step else None
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,13 @@ from models.checkpoint import checked
 from models.commissioning.commissioned import Installed
 from models.diagnosis.likelihood.motions import natural_frequencies
 from models.diagnosis.lines import LatestLines, new_line, steady_lines
-from models.diagnosis.moments import Plan
+from models.diagnosis.moments import HopMoments, Plan
 from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.window import WindowStatistics
 from models.levels.bands import NEIGHBOURHOOD
 from models.levels.contact import LatestContact
 from models.levels.judgement import Foreign, LevelJudge, channel_state, fallen
-from models.levels.measures import WindowLevels
+from models.levels.measures import STANDS_RAD_S, WindowLevels
 from models.levels.reference import FirstWindows, LevelReference, expected_levels
 from models.machine import Machine, MachineFile
 from models.signals.channels import state_name, with_channel_names
@@ -76,7 +76,7 @@ class LevelWatch:
         )
         self._contact = LatestContact(_WINDOWS_OF_CONTACT * plan.hops)
         self._lines = LatestLines()
-        self._moved_ns = 0  # from when on all has been at about the newest speed
+        self._moved, self._moved_ns = False, 0  # from when on all has been at about the newest speed
         self.latest: tuple[ChannelLevels, ...] = ()
         self._found: WindowLevels | None = None
         self._states = [state_name(channel) for channel in channels]
@@ -97,16 +97,23 @@ class LevelWatch:
         found = window.levels(errors=self._takes_first and self._first.learning)
         if found is None:
             return
-        speeds, hops = found.speeds_rad_s, window.hops
-        if speeds is not None and speeds[-1]:
-            apart = np.flatnonzero(np.abs(speeds / speeds[-1] - 1) > NEIGHBOURHOOD)
-            if apart.size:  # the hop after them may have begun as they were
-                self._moved_ns = hops[int(apart[-1]) + 1].end_ns
-        self.latest = self._judge.judge(found, self.reference, moved=hops[0].start_ns < self._moved_ns)
+        self._moved = self._has_moved(found, window.hops)
+        self.latest = self._judge.judge(found, self.reference, moved=self._moved)
         self._found = found
         stood = any(abs(hop.turned_rad) < _STILL_RAD for hop in window.hops)  # not where there is no angle: nan
         if self._takes_first and window.filled == 1 and not stood:
             self._first.take(window.hops[0].start_ns, window.hops[-1].end_ns, found)
+
+    def _has_moved(self, found: WindowLevels, hops: Sequence[HopMoments]) -> bool:
+        """Whether lines lay in other bands for a part of the window, as they did in no healthy one."""
+        speeds = found.speeds_rad_s
+        if speeds is not None and abs(speeds[-1]) > STANDS_RAD_S:
+            apart = np.flatnonzero(np.abs(speeds / speeds[-1] - 1) > NEIGHBOURHOOD)
+            if apart.size:  # the hop after them may have begun as they were
+                self._moved_ns = hops[int(apart[-1]) + 1].end_ns
+        if self.reference is not None and self.reference.at(found.speed_rad_s)[0].varied:
+            return False
+        return hops[0].start_ns < self._moved_ns <= hops[-1].end_ns  # it is later where the clock was set back
 
     def foreign(self, window: SlidingWindow, statistics: WindowStatistics, *, named: bool) -> Foreign:
         """What the latest window shows that no change of a parameter makes: a new line, or see `LevelJudge.foreign`."""
@@ -200,5 +207,6 @@ class LevelWatch:
             held = state in faulty or (explained and not alarms.present(name))
             held |= unlike and (self._by_angle or not fallen(levels))
             beyond = now.beyond and (now.absolute or now.danger or not held)
-            # In the deadband, or while a sensor is at fault, an alarm stays as it is.
-            alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=now.small)
+            # In the deadband, while a sensor is at fault, or growth cannot be told, an alarm stays as it is.
+            small = now.small and not self._moved
+            alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=small)

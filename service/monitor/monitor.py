@@ -455,7 +455,7 @@ class MachineMonitor:
         suspect = evaluation.deciding.suspect
         astride_s = self._test.astride_s if evaluation.alone and not foreign.text else 0.0
         self._alarms.found(verdict, self._test.unexplained, suspect, end_ns, hidden=foreign.hides, astride_s=astride_s)
-        explained = bool(verdict.changed) and not verdict.outside_model
+        explained = bool(verdict.changed) and not (verdict.outside_model or foreign.hides)
         self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=explained)
         reason = evaluation.reason(told=bool(verdict.current))
         if evaluation.shapes:

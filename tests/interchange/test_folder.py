@@ -38,6 +38,14 @@ def by_tens(number: int) -> str:
     return f"run2_{10 * number:04d}.npz"
 
 
+def by_clock(number: int) -> str:
+    return f"acc_{BEGIN + timedelta(minutes=number + 58):%H%M}.npz"  # 1258, 1259, 1300
+
+
+def by_day(number: int) -> str:
+    return f"{BEGIN + timedelta(days=number):%Y%m%d}.npz"  # 20260131, 20260201
+
+
 def write(folder: Path, name: Callable[[int], str], numbers: range = range(FILES), every_s: float = EVERY_S) -> Path:
     """Snapshots of one motion, the newest written first."""
     folder.mkdir()
@@ -112,7 +120,9 @@ def test_the_time_in_a_waveform_counts_more_than_the_one_in_the_name_of_its_file
     assert begun == [begin_ns + round(number * EVERY_S * 1e9) for number in range(3)]
 
 
-@pytest.mark.parametrize(("name", "mapping"), [(by_date, NAMED), (by_number, NUMBERED), (by_tens, NUMBERED)])
+@pytest.mark.parametrize(
+    ("name", "mapping"), [(by_date, NAMED), *((name, NUMBERED) for name in (by_number, by_tens, by_clock, by_day))]
+)
 def test_a_snapshot_that_is_missing_is_told_and_the_others_keep_their_times(
     tmp_path: Path, name: Callable[[int], str], mapping: str
 ) -> None:

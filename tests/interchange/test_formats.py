@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 import pyuff
+import scipy.sparse
 from scipy.io import savemat, wavfile
 
 from models.signals.recording import read_recording
@@ -68,7 +69,8 @@ def write_mat_of_structs(path: Path, columns: Columns) -> None:
         several[0, number] = (name, columns[name])
     cells = np.empty((1, 2), dtype=object)
     cells[0, :] = ["angle", {"a": columns["a"]}]
-    savemat(path, {"run": {"Info": "bearing 3", "Y": several}, "more": cells, "fs": RATE_HZ})
+    sparse = scipy.sparse.eye_array(3)  # which nothing is read of
+    savemat(path, {"run": {"Info": "bearing 3", "Y": several}, "more": cells, "fs": RATE_HZ, "sparse": sparse})
 
 
 def write_mat73_of_structs(path: Path, columns: Columns) -> None:
@@ -78,6 +80,7 @@ def write_mat73_of_structs(path: Path, columns: Columns) -> None:
         for name in "xv":
             stored[name] = columns[name][None, :]
         stored.create_group("s")["a"] = columns["a"][:, None]
+        stored["s"].create_dataset("circle", data=[stored["s"].ref, h5py.Reference()], dtype=h5py.ref_dtype)
         stored["t"] = np.array([97], dtype=np.uint16)
         stored["t"].attrs["MATLAB_class"] = np.bytes_("char")
         data = file.create_dataset("run/Y/Data", (2, 1), dtype=h5py.ref_dtype)

@@ -338,8 +338,8 @@ def telling(covariance: FloatArray) -> npt.NDArray[np.intp]:
         If a moment does not scatter.
     """
     # A little less of each following moment, so that rounding does not choose between two that say equally much.
-    scale = np.sqrt(np.diag(covariance) * (1 + np.linspace(0, _OWN, covariance.shape[0])))
     with np.errstate(invalid="ignore", divide="ignore"):
+        scale = np.sqrt(np.diag(covariance) * (1 + np.linspace(0, _OWN, covariance.shape[0])))
         scaled = covariance / np.outer(scale, scale)
     if not np.all(np.isfinite(scaled)):
         raise np.linalg.LinAlgError("a moment does not scatter")

@@ -148,7 +148,7 @@ class AlarmBook:
             # Outside the model no candidate need be right, and `model` says so; and one cause has one alarm.
             told = verdict.outside_model or any(self.present(name) for name in probability)
             unsure = [] if sure or told else named
-            rival = [suspect] if hidden and suspect else []
+            rival = [suspect] if hidden and suspect else []  # told however little the parameter would have changed
             changes = [
                 (abs(one.relative_change or 0.0), self._settings.for_parameter(one.name))
                 for one in verdict.current
@@ -156,11 +156,11 @@ class AlarmBook:
             ]
             self.update_state(
                 CHANGED,
-                any(change > limits.raise_above for change, limits in changes),
+                any(change > limits.raise_above or rival for change, limits in changes),
                 end_ns,
                 " or ".join([*(_candidate(one, alone=not rival) for one in verdict.candidates), *rival]),
                 evidence=evidence,
-                danger=any(change > limits.danger_above for change, limits in changes),
+                danger=any(change > limits.danger_above and not rival for change, limits in changes),
             )
         if verdict.current or unexplained or verdict.outside_model:
             at_once = f"{', '.join(named)} seem to have changed at the same time, so none is named" if another else ""

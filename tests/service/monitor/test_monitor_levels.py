@@ -1,6 +1,6 @@
 """Machines of which nothing is known but their sensors: levels are watched from the first hop on."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from models.commissioning.commissioned import FILE, Installed, install
 from models.commissioning.healthy import healthy_from_blocks
 from models.diagnosis.moments import plan_for
 from models.machine import AlarmSettings, MachineFile, Operation
-from models.signals.block import SampleBlock
+from models.signals.block import FloatArray, SampleBlock
 from models.signals.sensor import Sensor
 from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.example import example
@@ -202,23 +202,52 @@ def test_levels_are_judged_at_a_speed_that_was_not_commissioned() -> None:
         assert "levels are judged as at the nearest commissioned speed: speed is 1399 rpm" in now.reason
 
 
-def test_a_drive_that_goes_to_its_other_set_point_has_not_grown() -> None:
+def drive(
+    seconds: float, speed_hz: Callable[[FloatArray], FloatArray], line: float = 0.0
+) -> tuple[list[tuple[ChannelLevels, ...]], list[tuple[EventKind, str]]]:
+    """Levels and alarms of a drive with a shaft angle and four first windows; a line at 61 Hz comes at 100 s."""
     angle = Sensor(name="angle", quantity="shaft_angle", location="shaft", direction="rotation", unit="rad")
     limits = FAN.levels.model_copy(update={"reference_windows": 4})
-    drive = FAN.model_copy(update={"sensors": (*FAN.sensors, angle), "levels": limits})
+    alarms_as_windows = FAN.alarms.model_copy(update={"off_delay_s": 20.0})
+    changes = {"sensors": (*FAN.sensors, angle), "levels": limits, "alarms": alarms_as_windows}
+    monitor = MachineMonitor(install(FAN.model_copy(update=changes), None))
     rng, size, turned = np.random.default_rng(92), round(BLOCK_S * RATE_HZ), 0.0
-    # The first windows, two at either set point; later it changes within a hop.
-    monitor, slow = MachineMonitor(install(drive, None)), ((41.0, 81.0), (106.0, 126.4))
-    for number in range(round(160 / BLOCK_S)):
+    found, alarms = list[tuple[ChannelLevels, ...]](), list[tuple[EventKind, str]]()
+    for number in range(round(seconds / BLOCK_S)):
         t = number * BLOCK_S + np.arange(size) / RATE_HZ
-        speed_hz = np.where(np.any([(t >= begin) & (t < end) for begin, end in slow], axis=0), 22.3, 24.8)
-        theta = turned + np.cumsum(2 * np.pi * speed_hz / RATE_HZ)
+        theta = turned + np.cumsum(2 * np.pi * speed_hz(t) / RATE_HZ)
         turned = theta[-1]
         samples = 3.0 * np.cos(theta)[:, None] + 0.3 * rng.standard_normal((size, 2))
+        samples += (line * np.sin(2 * np.pi * 61.0 * t) * (t > 100.0))[:, None]
         every = np.column_stack([samples, theta % (2 * np.pi)]).astype(np.float32)
-        block = SampleBlock(START_NS + round(number * BLOCK_S * 1e9), number, 1, RATE_HZ, every)
-        for window in monitor.step(block).windows:
-            assert all((one.growth or 1.0) < 1.5 for one in window.levels)  # up to 150
+        report = monitor.step(SampleBlock(START_NS + round(number * BLOCK_S * 1e9), number, 1, RATE_HZ, every))
+        found += [one.levels for one in report.windows]
+        alarms += [(one.kind, one.alarm.name) for one in report.events]
+    return found, alarms
+
+
+def set_points(slow_hz: float, *slow: tuple[float, float]) -> Callable[[FloatArray], FloatArray]:
+    return lambda t: np.where(np.any([(t >= begin) & (t < end) for begin, end in slow], axis=0), slow_hz, 24.8)
+
+
+def test_a_drive_that_goes_to_its_other_set_point_has_not_grown() -> None:
+    # The first windows, two at either set point; later it changes within a hop.
+    found, _ = drive(160, set_points(22.3, (41.0, 81.0), (106.0, 126.4)))
+    for levels in found:
+        assert all((one.growth or 1.0) < 1.5 for one in levels)  # up to 150
+
+
+def test_a_line_stays_raised_while_the_set_point_changes() -> None:
+    _, alarms = drive(230, set_points(20.0, (41.0, 81.0), (138.5, 183.5)), line=0.6)
+    assert alarms == [(EventKind.RAISED, "level:DE-H"), (EventKind.RAISED, "level:NDE-V")]
+
+
+def test_where_the_speed_always_varies_growth_is_told_all_the_same() -> None:
+    def varying(t: FloatArray) -> FloatArray:
+        return np.asarray(23.55 + 1.25 * np.sin(2 * np.pi * t / 20.0), dtype=np.float64)
+
+    found, _ = drive(140, varying, line=2.0)
+    assert all(sure(one.growth) > 1.5 for one in found[-1])
 
 
 def test_a_machine_that_is_watched_says_what_would_have_been_seen() -> None:
