@@ -1,6 +1,6 @@
 """What one machine costs: the data path's stages over the same samples, as ratios measured side by side in one run.
 
-Run: ``python benchmarks/data_path.py``. The yardstick is the Fourier transform that the cross-spectra need at the very
+Run: ``python -m benchmarks.data_path``. The yardstick is the Fourier transform that the cross-spectra need at the very
 least (one real FFT per segment and channel); absolute times depend on the computer, ratios much less.
 """
 
@@ -14,9 +14,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from studies.subjects import without_parameters
-from studies.watched import commissioned
 
+from benchmarks.studies.subjects import without_parameters
+from benchmarks.studies.watched import commissioned
 from models.commissioning.commissioned import Installed
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import hop_moments, plan_for
