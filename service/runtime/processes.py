@@ -19,8 +19,7 @@ from models.errors import RotorwatchError
 from models.signals.link import LinkSettings
 from service.runtime.shard import run_shard
 from service.settings.service import ServiceSettings
-from service.stream.shard_link import relay_items
-from service.stream.transport import Link
+from service.stream.transport import Link, relay_items
 
 
 class ShardProcess(Protocol):

@@ -16,21 +16,6 @@ from service.stream.transport import Link
 _NEWS, _HEARS = "news", "hears"
 _THREADS = 4
 _ANSWER_S = 15.0
-_DROPPED_US = 1_000_000
-_HELD_UP_US = 2_000_000
-"""By default five seconds, as long as a silence that is called one: machines of other shards would be called lost."""
-
-
-def relay_items(*, waits: bool) -> dict[str, str]:
-    """Zenoh's settings of a router within a monitor, by which streams come to the shards.
-
-    What a publisher has kept comes at once, and is waited for. A publisher of several machines waits for the slowest of
-    their shards. One that takes nothing at all is cut off, unless it `waits` and slows down the source; it gets what it
-    missed when it comes again, from publishers that keep samples.
-    """
-    place = "transport/link/tx/queue/congestion_control"
-    cut_off = {} if waits else {f"{place}/block/wait_before_close": str(_HELD_UP_US)}
-    return {f"{place}/drop/wait_before_drop": str(_DROPPED_US)} | cut_off
 
 
 class KnownSettings(LinkSettings):

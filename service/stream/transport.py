@@ -1,4 +1,4 @@
-"""The service's side of Zenoh; the only module of the service that imports it.
+"""The service's side of Zenoh: sessions, and what is declared for a machine.
 
 ::
 
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from functools import partial
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import zenoh
 import zenoh.ext
@@ -33,15 +33,12 @@ from models.signals.wire import REPLAY_MARK
 from service.stream.inbox import RawBlock
 from service.stream.intake import Intake
 from service.stream.log_query import read_log_query
+from service.stream.subscription import CACHED_BLOCKS, BlockSubscription
 from service.terminal.logs import logger
 
 _JSON = "application/json"
 _CLOUD_EVENT = "application/cloudevents+json"
 _HEARTBEAT_S = 1.0
-_CACHED_BLOCKS = 1200
-"""Fewer than a queue takes by default: what comes at once after a restart must not overflow it."""
-_WAITING_BLOCKS = 4096
-"""Far more than come between two looks of the thread that takes them; beyond, the network waits."""
 _AT_ONCE = 1000
 """Blocks of one machine before the others have their turn."""
 _CACHED_EVENTS = 200
@@ -49,6 +46,9 @@ _QUERY_TIMEOUT_S = 10.0
 _QUICK_CONNECT_S = 3.0
 _CONNECT_S = 10.0
 _NEVER = timedelta(days=365)
+_DROPPED_US = 1_000_000
+_HELD_UP_US = 2_000_000
+"""By default five seconds, as long as a silence that is called one: other machines' streams would be called lost."""
 
 _T = TypeVar("_T")
 _log = logger(part="transport")
@@ -162,6 +162,7 @@ class MachineLink:
         self._callbacks = callbacks
         self._lock = threading.Lock()
         self._closed = False
+        self._blocks: BlockSubscription | None = None
         with ExitStack() as undo:
             self._declare(link.session, undo, wait_when_full)
             self._undeclare = undo.pop_all()
@@ -196,12 +197,14 @@ class MachineLink:
             ).undeclare
         )
         keep(alive.declare_subscriber(keys.publisher_alive, guarded(self._take_alive), history=True).undeclare)
-        directly = zenoh.handlers.Callback(guarded(self._take_block), indirect=False) if wait_when_full else None
-        stream = _stream_subscriber(session, keys.stream, directly)
-        keep(stream.undeclare)
-        if not wait_when_full:
-            keep(self._link.intake.add(partial(guarded(self._take_blocks), stream)))
-        keep(stream.sample_miss_listener(guarded(self._take_miss)).undeclare)
+        if wait_when_full:
+            stream = _waiting_subscriber(session, keys.stream, guarded(self._take_block))
+            keep(stream.undeclare)
+            keep(stream.sample_miss_listener(guarded(self._take_miss)).undeclare)
+        else:
+            blocks = self._blocks = BlockSubscription(session, keys.stream, guarded(self._take_miss))
+            keep(blocks.close)
+            keep(self._link.intake.add(partial(guarded(partial(blocks.take, guarded(self._take_block))), _AT_ONCE)))
         keep(alive.declare_token(keys.monitor_alive).undeclare)
 
     def publish(self, topic: Topic, text: str) -> None:
@@ -225,12 +228,6 @@ class MachineLink:
             attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
             self._callbacks.on_block(RawBlock(sample.payload.to_bytes(), attachment, encoding, _source(sample)))
 
-    def _take_blocks(self, stream: zenoh.ext.AdvancedSubscriber[Any]) -> None:
-        for _ in range(_AT_ONCE):
-            if (sample := stream.try_recv()) is None:
-                return
-            self._take_block(sample)
-
     def _take_miss(self, miss: zenoh.ext.Miss) -> None:
         self._callbacks.on_missed(miss.nb)
 
@@ -241,6 +238,8 @@ class MachineLink:
     def _take_alive(self, sample: zenoh.Sample) -> None:
         alive = sample.kind == zenoh.SampleKind.PUT
         self._callbacks.on_publisher(alive)
+        if alive and self._blocks is not None:
+            self._blocks.publisher_appeared()
         if alive:
             _ask(self._link, self._keys.descriptor, self._take_descriptor)  # without a cache they answer only queries
 
@@ -253,8 +252,8 @@ def tap(link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], N
     link : Link
         Open session; must outlive this.
     on_message : callable
-        Takes each message on a thread of Zenoh's: be short. Descriptors also come as answers to a query, at the start
-        and whenever a publisher appears, so that one announced earlier is known.
+        Takes each message on a thread of the link's: be short. Descriptors also come as answers to a query, at the
+        start and whenever a publisher appears, so that one announced earlier is known.
 
     Returns
     -------
@@ -272,13 +271,18 @@ def tap(link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], N
 
     def take_alive(sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
+            blocks.publisher_appeared()
             _ask(link, keys.descriptor, take)
 
     session = link.session
     with ExitStack() as undo:
         undo.callback(session.declare_subscriber(f"{keys.root}/**", link.guarded(take)).undeclare)
         # The stream as the monitor takes it: blocks that were lost on the way are fetched again.
-        undo.callback(_stream_subscriber(session, keys.stream, link.guarded(take_block)).undeclare)
+        blocks = BlockSubscription(session, keys.stream, lambda _: None)
+        undo.callback(blocks.close)
+        take_blocks = partial(link.guarded(partial(blocks.take, link.guarded(take_block))), _AT_ONCE)
+        undo.callback(take_blocks)  # what has come by then
+        undo.callback(link.intake.add(take_blocks))
         liveliness = session.liveliness()
         alive = liveliness.declare_subscriber(keys.publisher_alive, link.guarded(take_alive), history=True)
         undo.callback(alive.undeclare)
@@ -335,6 +339,18 @@ def follow(
         yield lambda: link.is_open and bool(link.session.info.peers_zid() or link.session.info.routers_zid())
 
 
+def relay_items(*, waits: bool) -> dict[str, str]:
+    """Zenoh's settings of a router by which streams come to monitors, or to the shards of one.
+
+    What a publisher has kept comes at once, and is waited for. A publisher of several machines waits for the slowest of
+    those who take them. One that takes nothing at all is cut off, unless it `waits` and slows down the source; it gets
+    what it missed when it comes again, from publishers that keep samples.
+    """
+    place = "transport/link/tx/queue/congestion_control"
+    cut_off = {} if waits else {f"{place}/block/wait_before_close": str(_HELD_UP_US)}
+    return {f"{place}/drop/wait_before_drop": str(_DROPPED_US)} | cut_off
+
+
 @contextmanager
 def route(settings: LinkSettings) -> Iterator[None]:
     """Run a Zenoh router, whatever the role in the settings.
@@ -344,7 +360,7 @@ def route(settings: LinkSettings) -> Iterator[None]:
     LinkError
         If it cannot listen.
     """
-    with closing(Link(settings.model_copy(update={"mode": "router"}))):
+    with closing(Link(settings.model_copy(update={"mode": "router"}), more=relay_items(waits=False))):
         yield
 
 
@@ -388,31 +404,21 @@ def _advanced_publisher(session: zenoh.Session, key: str, encoding: str, cache: 
     )
 
 
-def _stream_subscriber(
-    session: zenoh.Session, key: str, callback: Callable[[zenoh.Sample], None] | None
-) -> zenoh.ext.AdvancedSubscriber[Any]:
-    """Subscribe to sample blocks: those of a publisher's cache first, those lost on the way fetched again.
+def _waiting_subscriber(
+    session: zenoh.Session, key: str, callback: Callable[[zenoh.Sample], None]
+) -> zenoh.ext.AdvancedSubscriber[None]:
+    """Subscribe to sample blocks, taken on the network's own thread: it may hold that up, and so the publisher.
 
-    Parameters
-    ----------
-    callback : callable or None
-        Takes each of them; if None, they are to be received. One that is called on the network's own thread may hold it
-        up, and no heartbeat is listened to then. But what is missing is fetched there as well: where blocks of the
-        cache and new ones meet, a new one may overtake.
+    No heartbeat is listened to, but what is missing is fetched all the same: where blocks of the cache and new ones
+    meet, a new one may overtake.
     """
-    waits = isinstance(callback, zenoh.handlers.Callback) and not callback.indirect
-    # The period is of no use but to have missing blocks fetched at all, without heartbeats.
-    fetched = zenoh.ext.RecoveryConfig(
-        periodic_queries=_NEVER if waits else None,  # type: ignore[arg-type]  # the stub says seconds
-        heartbeat=None if waits else True,
-    )
-    handler: Any = zenoh.handlers.FifoChannel(_WAITING_BLOCKS) if callback is None else callback
     return zenoh.ext.declare_advanced_subscriber(
         session,
         key,
-        handler,
-        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=_CACHED_BLOCKS),
-        recovery=fetched,
+        zenoh.handlers.Callback(callback, indirect=False),
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=CACHED_BLOCKS),
+        # The period is of no use but to have missing blocks fetched at all, without heartbeats.
+        recovery=zenoh.ext.RecoveryConfig(periodic_queries=_NEVER, heartbeat=None),  # type: ignore[arg-type]  # the stub says seconds
         subscriber_detection=True,
     )
 

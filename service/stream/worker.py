@@ -42,6 +42,7 @@ from service.terminal.logs import Limiter, logger
 _OPERATION_S = 10.0
 _HELD_UP_S = 2.0
 """Time passes in steps of a fraction of this; if not, the program itself stood still."""
+_AGAIN_S = 20.0  # to hear a stream again after a restart: of all machines, what publishers have kept comes first
 _LATEST = 100
 _LONGEST_ERROR = 500
 
@@ -312,7 +313,8 @@ class MachineWorker:
         return end_ns + round((now_s - self._latest_data_s) * 1e9)
 
     def _tick(self) -> None:
-        now_s, limit_s = self._clocks.monotonic_s(), self.machine.ingest.no_data_after_s
+        now_s, least_s = self._clocks.monotonic_s(), _AGAIN_S if self._latest_data_s is None else 0.0
+        limit_s = max(self.machine.ingest.no_data_after_s, least_s)
         if now_s - self._ticked_s > _HELD_UP_S and self._ticked_s - self._heard_s < limit_s:
             self._held_up_s = now_s  # a silence that had begun before goes on
         self._ticked_s = now_s
@@ -324,7 +326,7 @@ class MachineWorker:
             if now_s - self._heard_s >= limit_s:
                 self._conclude_reports(self._monitor.flush())
             elif self._latest_data_s is None or now_s - self._latest_data_s >= limit_s:
-                return  # publishers get as long to be heard again, after a restart too
+                return
         self._conclude((), self._monitor.passed(self._data_now_ns()))
 
     def _skips(self, _: int) -> bool:

@@ -25,7 +25,7 @@ from service.runtime.runtime import Runtime, running
 from service.runtime.shards import Shards, shard_count
 from service.runtime.standing import latest_from_bytes, latest_to_bytes
 from service.settings.service import HistorySettings, MachineEntry, ServiceSettings, ShardSettings
-from service.stream.shard_link import relay_items
+from service.stream.transport import relay_items
 from simulator.scenario import parse_fault
 from tests.service.analysis.snapshotting import latest
 from tests.service.commands.test_demo import children_of

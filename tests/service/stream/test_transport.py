@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import pytest
 import zenoh
@@ -366,13 +367,50 @@ def test_kept_and_live_blocks_arrive_each_once(wait: bool) -> None:
         publisher = advanced_publisher(session, LAB.keys.stream, KEPT, priority=zenoh.Priority.DATA_HIGH)
         for number in range(KEPT):
             publisher.put(number.to_bytes(4, "little") * (SIZE // 4))
+        token = session.liveliness().declare_token(LAB.keys.publisher_alive)
         with machine_link(address, take, wait=wait):
             until(begun.is_set, "first block")
             for number in range(KEPT, KEPT + LIVE):
                 publisher.put(number.to_bytes(4, "little") * (SIZE // 4))
             until(lambda: len(set(seen)) == KEPT + LIVE, "all blocks")
+        token.undeclare()  # type: ignore[no-untyped-call]
         publisher.undeclare()  # type: ignore[no-untyped-call]
     assert sorted(seen) == list(range(KEPT + LIVE))
+
+
+def test_nothing_that_is_kept_is_lost_to_blocks_that_come_meanwhile() -> None:
+    address = endpoint()
+    over = threading.Event()
+    with session_of(LinkSettings(listen=(address,))) as session:
+        publisher = advanced_publisher(session, LAB.keys.stream, 1199)  # Zenoh would hold back 1200 until all are there
+
+        def send() -> None:
+            for number in range(1199):
+                publisher.put(number.to_bytes(4, "little") * (SIZE // 4))
+                if number >= KEPT and over.wait(0.005):
+                    return
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        try:
+            for _ in range(3):
+                seen: list[int] = []
+                numbered = partial(_numbered, seen)
+                with machine_link(LinkSettings(mode="client", connect=(address,)), numbered):
+                    until(partial(_more_than, seen, KEPT), "blocks")
+                assert seen == list(range(len(seen)))
+        finally:
+            over.set()
+            sender.join()
+            publisher.undeclare()  # type: ignore[no-untyped-call]
+
+
+def _numbered(seen: list[int], block: RawBlock) -> None:
+    seen.append(int.from_bytes(block.payload[:4], "little"))
+
+
+def _more_than(seen: list[int], count: int) -> bool:
+    return len(seen) > count
 
 
 def test_all_channels_are_emptied_until_that_is_ended() -> None:
