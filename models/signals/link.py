@@ -82,86 +82,51 @@ def endpoint_fault(text: str) -> str | None:
     return f"{text!r}: expected PROTOCOL/HOST:PORT; did you mean {meant}?"
 
 
-def read_password(field: str, path: Path) -> str:
-    """The password that is alone in a file.
-
-    Raises
-    ------
-    MachineFileError
-        If the file cannot be read, others may read it, or it is not one line.
-    """
-    lines = _secret(field, path).splitlines()
+def _password_in(path: Path) -> str:
+    lines = _secret("password_file", path).splitlines()
     if len(lines) != 1 or not lines[0].strip():
-        raise MachineFileError(f"link.{field}: {path}: expected one line with the password, found {len(lines)} lines")
+        raise MachineFileError(
+            f"link.password_file: {path}: expected one line with the password, found {len(lines)} lines"
+        )
     return lines[0].strip()
 
 
-def read_user_names(field: str, path: Path) -> frozenset[str]:
-    """Names of the users in a file with a line ``name:password`` for each.
-
-    Raises
-    ------
-    MachineFileError
-        If the file cannot be read, others may read it, or a line is none of these.
-    """
-    names: list[str] = []
-    for number, line in enumerate(_secret(field, path).splitlines(), start=1):
+def _user_names_in(path: Path) -> frozenset[str]:
+    """Names of the users in a file with a line ``name:password`` for each."""
+    place, names = f"link.passwords_file: {path}", list[str]()
+    for number, line in enumerate(_secret("passwords_file", path).splitlines(), start=1):
         name, colon, password = line.partition(":")
         if not (name and colon and password) or line != line.strip() or " " in name:
             # Never the line itself: there is a password in it.
             raise MachineFileError(
-                f"link.{field}: {path}: line {number}: expected name:password, without spaces around them, "
-                "comments or empty lines"
+                f"{place}: line {number}: expected name:password, without spaces around them, comments or empty lines"
             )
         if name in names:
-            raise MachineFileError(f"link.{field}: {path}: line {number}: the user {name} already has a line")
+            raise MachineFileError(f"{place}: line {number}: the user {name} already has a line")
         names.append(name)
     if not names:
-        raise MachineFileError(f"link.{field}: {path}: no users, expected a line name:password for each")
+        raise MachineFileError(f"{place}: no users, expected a line name:password for each")
     return frozenset(names)
 
 
-def check_certificate(field: str, path: Path) -> None:
-    """Check that a file has a certificate.
-
-    Raises
-    ------
-    MachineFileError
-        If it cannot be read, or is not PEM.
-    """
+def _check_certificate(field: str, path: Path) -> None:
     if "-----BEGIN CERTIFICATE-----" not in _text(field, path):
         raise MachineFileError(f"link.{field}: {path}: expected a certificate in PEM (-----BEGIN CERTIFICATE-----)")
 
 
-def check_key(field: str, path: Path) -> None:
-    """Check that a file has a private key that others may not read.
-
-    Raises
-    ------
-    MachineFileError
-        If it cannot be read, others may read it, it is not PEM, or needs a passphrase.
-    """
-    text = _secret(field, path)
+def _check_key(certificate: Path, key: Path) -> None:
+    """Check that a file has a private key that others may not read, and that it is that of a certificate."""
+    text = _secret("tls.key", key)
     if "ENCRYPTED" in text:
         raise MachineFileError(
-            f"link.{field}: {path}: the private key needs a passphrase, which cannot be entered here; expected none"
+            f"link.tls.key: {key}: the private key needs a passphrase, which cannot be entered here; expected none"
         )
     if "PRIVATE KEY-----" not in text:
-        raise MachineFileError(f"link.{field}: {path}: expected a private key in PEM (-----BEGIN PRIVATE KEY-----)")
-
-
-def check_pair(field: str, certificate: Path, key: Path) -> None:
-    """Check that a private key is that of a certificate.
-
-    Raises
-    ------
-    MachineFileError
-        If it is another's, or one of them cannot be used.
-    """
+        raise MachineFileError(f"link.tls.key: {key}: expected a private key in PEM (-----BEGIN PRIVATE KEY-----)")
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)
     except ssl.SSLError as error:
-        raise MachineFileError(f"link.{field}: {key} is not the key of {certificate}, or one is damaged") from error
+        raise MachineFileError(f"link.tls.key: {key} is not the key of {certificate}, or one is damaged") from error
 
 
 def _secret(field: str, path: Path) -> str:
@@ -401,12 +366,11 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         place = "transport/link/tls"
         items = {f"{place}/enable_mtls": json.dumps(tls.mutual), f"{place}/verify_name_on_connect": "true"}
         if tls.root_certificate is not None:
-            check_certificate("tls.root_certificate", tls.root_certificate)
+            _check_certificate("tls.root_certificate", tls.root_certificate)
             items[f"{place}/root_ca_certificate"] = json.dumps(str(tls.root_certificate))
         if tls.certificate is not None and tls.key is not None:
-            check_certificate("tls.certificate", tls.certificate)
-            check_key("tls.key", tls.key)
-            check_pair("tls.key", tls.certificate, tls.key)
+            _check_certificate("tls.certificate", tls.certificate)
+            _check_key(tls.certificate, tls.key)
             for role, ends in (("listen", self.listen), ("connect", self.connect)):
                 if self._encrypted(ends) and (role == "listen" or tls.mutual):
                     items[f"{place}/{role}_certificate"] = json.dumps(str(tls.certificate))
@@ -419,7 +383,7 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
             items[f"{place}/user"] = json.dumps(self.user)
             items[f"{place}/password"] = json.dumps(self._password())
         if self.passwords_file is not None:
-            names = read_user_names("passwords_file", self.passwords_file)
+            names = _user_names_in(self.passwords_file)
             items[f"{place}/dictionary_file"] = json.dumps(str(self.passwords_file))
             strangers = sorted({name for grant in self.grants for name in grant.who} - names)
             if strangers:
@@ -428,7 +392,7 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
 
     def _password(self) -> str:
         if self.password_file is not None:
-            return read_password("password_file", self.password_file)
+            return _password_in(self.password_file)
         password = os.environ.get(self.password_variable or "", "")
         if not password:
             raise MachineFileError(
