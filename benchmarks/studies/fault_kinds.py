@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.finite_elements.assembly import ComplexArray
-from models.levels.measures import NYQUIST_PART
+from models.levels.bands import NYQUIST_PART
 from models.signals.block import FloatArray
 
 MOTIONS = (("bearing", "y"), ("disc", "y"), ("bearing", "z"), ("disc", "z"))

@@ -19,17 +19,9 @@ from benchmarks.studies.level_streams import KINDS, At, Scene, drawn, generator,
 from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from models.diagnosis.verdict.calibration import MONTH_S
-from models.levels.bands import band_edges
+from models.levels.bands import NYQUIST_PART, band_edges
 from models.levels.judgement import LevelJudge
-from models.levels.measures import (
-    NYQUIST_PART,
-    HopLevels,
-    LevelPlan,
-    WindowLevels,
-    hop_levels,
-    level_plan,
-    window_levels,
-)
+from models.levels.measures import HopLevels, LevelPlan, WindowLevels, hop_levels, level_plan, window_levels
 from models.levels.orders import ORDERS
 from models.levels.reference import learn_levels
 from models.levels.settings import LevelSettings
@@ -70,9 +62,7 @@ class Drawing:
         n, to_si = round(_HOP_S * rate_hz), np.array([one.to_si for one in sensors])
         taper = np.hanning(n + 1)[:-1]
         scale = 2 / (n * float(taper @ taper))
-        edges = np.append(
-            band_edges(n, NYQUIST_PART), int(NYQUIST_PART * (n // 2)) + 1
-        )  # and what is left of the band of velocities
+        edges = np.append(band_edges(n), int(NYQUIST_PART * (n // 2)) + 1)  # and what is left of the band of velocities
         bins = np.arange(edges[-1])
         poles, rms = scene.poles, scene.noise * to_si
 

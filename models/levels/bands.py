@@ -18,6 +18,11 @@ from scipy.special import fdtri
 
 from models.signals.block import FloatArray
 
+BEYOND_RANGE, ERRORS = 1.25, 6.0
+"""No limit is nearer than so many times the largest healthy level, nor nearer than so many standard errors of a
+window."""
+NYQUIST_PART = 0.8
+"""Part of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
 _PER_OCTAVE = 12
 _FIRST_BIN = 2
 """The taper spreads the mean over the bins before it."""
@@ -34,15 +39,9 @@ _Level = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 @lru_cache(maxsize=8)
-def band_edges(n_samples: int, used: float) -> npt.NDArray[np.intp]:
-    """Bins of a Fourier transform at which bands begin, and the end of the last one.
-
-    Parameters
-    ----------
-    used : float
-        Part of the spectrum that is used.
-    """
-    last = int(used * (n_samples // 2))
+def band_edges(n_samples: int) -> npt.NDArray[np.intp]:
+    """Bins of a Fourier transform at which bands begin, and the end of the last one."""
+    last = int(NYQUIST_PART * (n_samples // 2))
     count = max(0, int(np.log2(max(1, last) / _FIRST_BIN) * _PER_OCTAVE))
     edges = np.unique(np.rint(_FIRST_BIN * 2.0 ** (np.arange(count + 1) / _PER_OCTAVE)).astype(np.intp))
     edges.flags.writeable = False
@@ -110,12 +109,7 @@ class BandLimits:
 
 
 def band_limits(
-    levels: BandLevels,
-    references: Sequence[BandReference | None],
-    ratio: float,
-    beyond_range: float,
-    n_errors: float,
-    shorter: float,
+    levels: BandLevels, references: Sequence[BandReference | None], ratio: float, shorter: float
 ) -> BandLimits:
     """Limits of the bands of all channels.
 
@@ -130,10 +124,6 @@ def band_limits(
         By column.
     ratio : float
         Limit, times the mean of the reference.
-    beyond_range : float
-        No limit is nearer than that, times the largest healthy level.
-    n_errors : float
-        Nor nearer than so many standard errors of a window.
     shorter : float
         By how much a level scatters more than in the healthy windows, while the window fills.
     """
@@ -145,8 +135,8 @@ def band_limits(
             continue
         around, high, error = (_around(np.array(each)) for each in (reference.mean, reference.high, reference.error))
         chance = np.sqrt(fdtri(levels.freedom, np.array(reference.freedom), 1 - _CHANCE))
-        relative = n_errors * np.divide(error, around, out=np.zeros_like(around), where=around > 0)
-        loudest = np.maximum(beyond_range, 1 + relative * np.sqrt(shorter**2 - 1)) * high
+        relative = ERRORS * np.divide(error, around, out=np.zeros_like(around), where=around > 0)
+        loudest = np.maximum(BEYOND_RANGE, 1 + relative * np.sqrt(shorter**2 - 1)) * high
         own[:, column], mean[:, column] = reference.mean, around
         limit[:, column] = np.max(
             [np.maximum(ratio, chance) * around, loudest, (1 + relative * shorter) * around], axis=0

@@ -9,13 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from models.levels.bands import Growth, band_in_words, growth
+from models.levels.bands import ERRORS, Growth, band_in_words, growth
 from models.levels.contact import LatestContact
 from models.levels.gains import left_of_1x, place_of, wrong_gain
 from models.levels.kurtosis import GAUSSIAN, departure, fallen_by_lines, without_lines
 from models.levels.limits import (
-    BEYOND_RANGE,
-    ERRORS,
     PEAK_TO_PEAK,
     Limit,
     RelativeLimits,
@@ -209,9 +207,7 @@ class LevelJudge:
         for at, (column, pair) in enumerate(columns):
             if (healthy := state.contact.get(self._channels[column].name)) is None:
                 continue
-            now, lasting = (
-                departure(hops[:, at], healthy, BEYOND_RANGE, _ERRORS_OF_CONTACT) for hops in (window, several)
-            )
+            now, lasting = (departure(hops[:, at], healthy, _ERRORS_OF_CONTACT) for hops in (window, several))
             # Of no more than the window, it is what that shows, and may be one knock.
             if len(several) > len(window) and window[:, at].mean() - healthy.mean > _STILL * lasting:
                 now = max(now, lasting)
@@ -234,16 +230,16 @@ class LevelJudge:
         if kurtosis is None or levels.moments is None or levels.bands is None:
             return 0.0
         hops, healthy = kurtosis[:, column], state.kurtosis[name]
-        found = departure(hops, healthy, BEYOND_RANGE, n_errors)
+        found = departure(hops, healthy, n_errors)
         if found < 0:
             orders, in_bands = levels.moments[2][:, :, column], levels.moments[3][:, :, column]
             strongest = None if levels.lines is None else levels.lines[:, :, column]
             before, speed_rad_s = (state.bands.get(name), state.lines.get(name, ())), levels.speed_rad_s or 0.0
             lines = fallen_by_lines(levels.bands, in_bands, orders, speed_rad_s, *before, strongest)
-            return found if departure(hops + lines, healthy, BEYOND_RANGE, n_errors) < 0 else 0.0
+            return found if departure(hops + lines, healthy, n_errors) < 0 else 0.0
         if found and healthy.mean < GAUSSIAN:
             random = without_lines(healthy)
-            return found if departure(hops, random, BEYOND_RANGE, n_errors) > 0 else 0.0
+            return found if departure(hops, random, n_errors) > 0 else 0.0
         return found
 
     def _channel(

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from models.levels.bands import LINE, OF_BIN, BandLevels, BandReference
+from models.levels.bands import BEYOND_RANGE, LINE, OF_BIN, BandLevels, BandReference
 from models.signals.block import FloatArray
 
 _PIECES, _APART = 20, 2
@@ -156,7 +156,7 @@ def without_lines(healthy: HopReference) -> HopReference:
     return healthy.model_copy(update={"mean": GAUSSIAN, "scatter": float(scatter)})
 
 
-def departure(hops: FloatArray, reference: HopReference, beyond_range: float, n_errors: float) -> float:
+def departure(hops: FloatArray, reference: HopReference, n_errors: float) -> float:
     """Difference from the healthy mean, of the newest half of a window or of all of it; 0 within its limit.
 
     It has to hold without the hop that departs most: one in which the level steps, or the machine stops, holds two
@@ -164,16 +164,14 @@ def departure(hops: FloatArray, reference: HopReference, beyond_range: float, n_
 
     Parameters
     ----------
-    beyond_range : float
-        No limit is nearer than that, times the healthy range.
     n_errors : float
-        Nor nearer than so many standard errors.
+        No limit is nearer than so many standard errors.
     """
 
     def beyond(kept: FloatArray) -> float:
         difference = float(kept.mean()) - reference.mean
         by_chance = n_errors * reference.scatter * np.sqrt(1 / len(kept) + 1 / reference.hops)
-        limit = max(by_chance, beyond_range * reference.range * np.sqrt(len(hops) / len(kept)))
+        limit = max(by_chance, BEYOND_RANGE * reference.range * np.sqrt(len(hops) / len(kept)))
         return difference if abs(difference) > limit else 0.0
 
     for count in (max(1, len(hops) // 2), len(hops)):

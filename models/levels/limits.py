@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from models.levels.bands import BandLimits, band_limits
+from models.levels.bands import BEYOND_RANGE, ERRORS, BandLimits, band_limits
 from models.levels.measures import WindowLevels
 from models.levels.reference import LevelReference, OperatingState, ReferenceLevel
 from models.levels.settings import LevelSettings
@@ -20,8 +20,6 @@ from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity
 from rotorwatch.records.levels import LevelBound
 
-BEYOND_RANGE = 1.25
-ERRORS = 6.0
 _TURNED = 0.6
 _LEAST_DANGER = 0.25  # of the overall level, for a line that was nothing but noise: it has no level to be a multiple of
 PEAK_TO_PEAK = (Quantity.DISPLACEMENT, Quantity.TILT)
@@ -102,7 +100,7 @@ def relative_limits(
     bands = None
     if seen and levels.bands is not None:  # at a speed that was never seen lines are elsewhere
         own = [state.bands.get(channel.name) for channel in channels]
-        bands = band_limits(levels.bands, own, given.alert_ratio, BEYOND_RANGE, ERRORS, shorter)
+        bands = band_limits(levels.bands, own, given.alert_ratio, shorter)
     return RelativeLimits(source, tuple(limits), tuple(regions), bands)
 
 

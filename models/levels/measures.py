@@ -38,7 +38,7 @@ import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
 
 from models.checkpoint import checked
-from models.levels.bands import BandLevels, band_edges
+from models.levels.bands import NYQUIST_PART, BandLevels, band_edges
 from models.levels.kurtosis import random_kurtosis, swell
 from models.levels.orders import ORDERS, Spectrum, hann_taper, order_vectors, without_orders
 from models.signals.block import FloatArray
@@ -56,8 +56,6 @@ CONTACT = _SUMS.index("contact")
 """Row of `HopLevels.sums`."""
 _SQUARES = slice(7, None)  # mean squares, of which a root is shown
 _HIGH_HZ = 1000.0
-NYQUIST_PART = 0.8
-"""Part of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
 _HANN_BINS = 1.5
 """Bins of a tapered spectrum that say as much as one of an untapered one."""
 STANDS_RAD_S = 2 * np.pi * 0.5
@@ -304,7 +302,7 @@ def _band_cuts(
     n_samples: int, rate_hz: float, band_hz: tuple[float, float]
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Bins at which a band begins or ends, and which of them are edges of narrow bands, and of that of velocities."""
-    edges = band_edges(n_samples, NYQUIST_PART)
+    edges = band_edges(n_samples)
     low, high = (round(edge_hz / (rate_hz / n_samples)) for edge_hz in band_hz)
     band = np.array([min(max(low, 1), high + 1), high + 1])
     cuts = np.union1d(edges, band)
@@ -492,7 +490,7 @@ def _order_errors(orders: _ComplexArray, vectors: _ComplexArray | None) -> Float
 @lru_cache(maxsize=64)
 def _band_grid(rate_hz: float, n_samples: int, count: int) -> tuple[FloatArray, FloatArray]:
     """Edges of the bands, Hz, and degrees of freedom of mean squares in them, of windows of so many hops."""
-    edges = band_edges(n_samples, NYQUIST_PART) - 0.5  # halfway between bins
+    edges = band_edges(n_samples) - 0.5  # halfway between bins
     edges_hz = np.asarray(edges * (rate_hz / n_samples), dtype=np.float64)
     freedom = 2 * count * np.maximum(1.0, np.diff(edges) / _HANN_BINS)
     edges_hz.flags.writeable = freedom.flags.writeable = False

@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 
-from models.levels.measures import NYQUIST_PART, LevelPlan, level_plan
+from models.levels.bands import NYQUIST_PART
+from models.levels.measures import LevelPlan, level_plan
 from models.levels.orders import ORDERS
 from models.levels.settings import LevelSettings
 from models.mistakes import did_you_mean

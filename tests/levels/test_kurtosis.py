@@ -68,14 +68,14 @@ def test_healthy_windows_stay_within_the_limit_and_another_excitation_too() -> N
     for n in range(40):
         gain = np.repeat(np.random.default_rng([7, n]).uniform(0.5, 2.0, HOPS), T.size // HOPS)
         samples = gain * noise(100 + n) + (1 + n % 3) * np.cos(THETA)
-        assert departure(kurtosis(samples), healthy, 1.25, 6.0) == 0.0
+        assert departure(kurtosis(samples), healthy, 6.0) == 0.0
 
 
 def test_a_departure_is_seen_in_the_newest_half_before_the_window_is_full_of_it() -> None:
     healthy, samples = reference(), noise(200) + 2 * np.cos(THETA)
     at = T.size // 2
     samples[at:] = np.clip(samples[at:], -2.5, 2.5)
-    assert departure(kurtosis(samples), healthy, 1.25, 6.0) < 0
+    assert departure(kurtosis(samples), healthy, 6.0) < 0
 
 
 def suspects(meshes: Sequence[float], healthy_mesh: float, spoilt: Callable[[FloatArray], FloatArray]) -> list[str]:
@@ -135,7 +135,7 @@ def test_a_line_beside_the_rotation_beats_and_is_no_level_that_swells() -> None:
 def test_a_machine_commissioned_under_a_load_that_cycles_is_no_rub_once_the_load_is_steady() -> None:
     healthy = sure(learn_hops([kurtosis(cycling(noise(300 + n) + 2 * np.cos(THETA))) for n in range(5)]))
     for n in range(4):
-        assert departure(kurtosis(noise(320 + n) + 2 * np.cos(THETA)), healthy, 1.25, 6.0) == 0.0
+        assert departure(kurtosis(noise(320 + n) + 2 * np.cos(THETA)), healthy, 6.0) == 0.0
 
 
 LATE = np.arange(T.size) >= round(0.63 * T.size)  # in the midst of a hop
@@ -172,5 +172,5 @@ def test_a_rub_is_told_beside_a_line_that_begins() -> None:
 def test_less_will_do_to_doubt_what_else_was_found() -> None:
     healthy = HopReference(mean=3.0, scatter=0.1, hops=1000, range=0.0)
     by_five_errors = np.full(HOPS, 3.0 - 5 * 0.1 / np.sqrt(HOPS))
-    assert departure(by_five_errors, healthy, 1.25, 6.0) == 0.0
-    assert departure(by_five_errors, healthy, 1.25, 4.0) == pytest.approx(-0.144, abs=1e-3)
+    assert departure(by_five_errors, healthy, 6.0) == 0.0
+    assert departure(by_five_errors, healthy, 4.0) == pytest.approx(-0.144, abs=1e-3)
