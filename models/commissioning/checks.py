@@ -322,31 +322,17 @@ def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows
     )
 
 
-def check_halves(machine: MachineFile, first_on_second: Sequence[Diagnosis]) -> Check:
-    """Whether either half of the data, taken for healthy, finds the other half healthy.
-
-    Parameters
-    ----------
-    first_on_second : sequence of Diagnosis
-        Windows read against what was learned on the other half.
-    """
-    return _compared(machine, "halves agree", first_on_second, "between the halves of the healthy data")
-
-
-def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: str) -> Check:
+def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: str | None = None) -> Check:
     """Whether healthy windows agree with what they are compared with.
 
     Parameters
     ----------
-    what : str
-        In words: "the parameters in the machine file".
+    what : str, optional
+        In words: "the parameters in the machine file". Without it, what was learned on the other half of the data.
     """
-    return _compared(machine, f"agrees with {what}", diagnoses, f"between the healthy data and {what}", theory=True)
-
-
-def _compared(
-    machine: MachineFile, name: str, diagnoses: Sequence[Diagnosis], between: str, *, theory: bool = False
-) -> Check:
+    name, between = "halves agree", "between the halves of the healthy data"
+    if what is not None:
+        name, between = f"agrees with {what}", f"between the healthy data and {what}"
     readable = [each for each in diagnoses if each.evaluable]
     if not readable:
         reasons = dict.fromkeys(reading.reason for each in diagnoses for reading in each.parameters if reading.reason)
@@ -385,7 +371,7 @@ def _compared(
         other = outside - little > _MOST_OUTSIDE * len(readable)
         return Check(
             name=name,
-            verdict="refused" if theory and other else "limited",
+            verdict="refused" if what is not None and other else "limited",
             text=f"{outside} of {len(readable)} windows differ by more than chance explains, {between}{why}",
             advice="give fewer parameters in [rotor], so that more is learned from the recordings",
         )

@@ -16,7 +16,6 @@ from models.commissioning.checks import (
     Check,
     check_agreement,
     check_determined,
-    check_halves,
     check_recordings,
     check_shapes,
     check_sources,
@@ -239,7 +238,7 @@ def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progre
             read.append((piece.recording, piece.window.end_ns, stated))
             progress("learning the relations", len(read), len(pieces))
         compared += _halves(group, baseline.rows)
-    halves = check_halves(machine, [each for _, _, each in compared])
+    halves = check_agreement(machine, [each for _, _, each in compared])
     determined_ = check_determined([reason for baseline in baselines for reason in baseline.reasons if reason])
     sources = check_sources(
         {name: [piece.window for piece in pieces if piece.recording == name] for name in _speeds(pieces)}
