@@ -86,10 +86,10 @@ class Excitation:
         low_hz, high_hz = self.machine.window.band_hz
         within_hz = np.clip(frequencies_hz, low_hz, high_hz)
         if state in self.noise:
-            return noise_density(self.noise[state], within_hz, high_hz)
+            return _noise_density(self.noise[state], within_hz, high_hz)
         velocity = state.replace("_ddot", "_dot")
         if velocity in self.noise and velocity not in self.machine.descriptor.states:
-            return (2 * np.pi * within_hz) ** 2 * noise_density(self.noise[velocity], within_hz, high_hz)
+            return (2 * np.pi * within_hz) ** 2 * _noise_density(self.noise[velocity], within_hz, high_hz)
         return np.zeros_like(frequencies_hz)
 
 
@@ -152,11 +152,12 @@ def _noise_of(
     gain = low_pass(groups.nodes_hz, *model.filter(theta)) * groups.weights
     w = 2 * np.pi * groups.nodes_hz
     averages = AVERAGES_PER_BIN * window.n_segments * groups.bins
+    shape = _colour(groups.centre_hz, machine.window.band_hz[1])
     measured = np.einsum("gss->gs", groups.average(window.spectrum)).real
     found = {}
     for at, state in enumerate(window.states):
         theory = np.sum(gain * w ** (2 * _order(state)) * power[:, :, at], axis=1)
-        found[state] = sensor_noise(measured[:, at], theory, averages, groups.centre_hz, machine.window.band_hz[1])
+        found[state] = _sensor_noise(measured[:, at], theory, averages, shape)
     return found
 
 
@@ -177,37 +178,21 @@ _PULL = np.array([0.05, 1.0])
 """Weak pull of level and colour to what is usual, for sensors whose noise does not show."""
 
 
-def noise_density(parameters: FloatArray, frequencies_hz: FloatArray, high_hz: float) -> FloatArray:
-    """d(f) of a sensor, SI²/Hz.
-
-    Parameters
-    ----------
-    parameters : ndarray, shape (2,)
-        ln d₀ and b.
-    frequencies_hz : ndarray
-    high_hz : float
-        End of the band.
-    """
-    shape = np.log1p((frequencies_hz / (2 / 3 * high_hz)) ** 2)
-    return np.asarray(np.exp(parameters[0] + parameters[1] * shape), dtype=np.float64)
+def _noise_density(parameters: FloatArray, frequencies_hz: FloatArray, high_hz: float) -> FloatArray:
+    """d(f) of a sensor with these ln d₀ and b, in a band that ends at `high_hz`, SI²/Hz."""
+    return np.asarray(np.exp(parameters[0] + parameters[1] * _colour(frequencies_hz, high_hz)), dtype=np.float64)
 
 
-def sensor_noise(
-    measured: FloatArray, theory: FloatArray, averages: FloatArray, frequencies_hz: FloatArray, high_hz: float
-) -> FloatArray:
+def _colour(frequencies_hz: FloatArray, high_hz: float) -> FloatArray:
+    return np.asarray(np.log1p((frequencies_hz / (2 / 3 * high_hz)) ** 2), dtype=np.float64)
+
+
+def _sensor_noise(measured: FloatArray, theory: FloatArray, averages: FloatArray, shape: FloatArray) -> FloatArray:
     """Find ln d₀ and b of one sensor, shape (2,).
 
-    Parameters
-    ----------
-    measured, theory : ndarray, shape (n_groups,)
-        Densities as estimated, and as theory has them without noise, SI²/Hz.
-    averages : ndarray, shape (n_groups,)
-        Independent averages of `measured`.
-    frequencies_hz : ndarray, shape (n_groups,)
-    high_hz : float
-        End of the band.
+    From densities as estimated of so many independent averages, and as theory has them without noise, SI²/Hz; `shape`
+    is the colour of their frequencies. All have shape (n_groups,).
     """
-    shape = np.log1p((frequencies_hz / (2 / 3 * high_hz)) ** 2)
     level = float(np.log(averages @ measured / averages.sum()))
     usual = np.array([level + np.log(_USUAL), 0.0])
 

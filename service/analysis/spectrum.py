@@ -1,6 +1,6 @@
 """Spectra of a recorded data: of its latest seconds, and over time or speed."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -174,17 +174,14 @@ def read_spectrum(
     """
     segment = _segment(data, window_s, resolution_hz)
     used, speed_rad_s = _used(data, channels, window_s, segment)
-    total, averages = np.zeros((len(channels), segment // 2 + 1)), 0
-    for stretch in used:
-        power, count = summed_power(stretch.samples, stretch.rate_hz, segment, scaling)
-        total, averages = total + power, averages + count
     rate_hz = data.descriptor.rate_hz
+    powers, averages = _mean_power((stretch.samples for stretch in used), rate_hz, segment, scaling)
     return Spectrum(
         start_ns=used[0].start_ns,
         end_ns=used[-1].end_ns,
         channels=channels,
         frequencies_hz=_lines(segment, rate_hz),
-        values=np.stack([_values(power, one, scaling) for power, one in zip(total / averages, channels, strict=True)]),
+        values=np.stack([_values(power, one, scaling) for power, one in zip(powers, channels, strict=True)]),
         scaling=scaling,
         resolution_hz=rate_hz / segment,
         averages=averages,
@@ -241,12 +238,8 @@ def read_full_spectrum(
         used = [stretch for stretch in used if stretch.samples.shape[0] >= segment]
         if not used:
             raise RotorwatchError(f"{data.place}: the shaft does not turn {segment / each:.0f} times in any stretch")
-    total, averages = np.zeros((len(pairs), segment)), 0
-    for stretch in used:
-        y, z = in_planes(stretch.samples, pairs)
-        power, count = summed_power(y + 1j * z, stretch.rate_hz, segment, "amplitude")
-        total, averages = total + power, averages + count
-    rate_hz = used[0].rate_hz
+    rate_hz, motions = used[0].rate_hz, (in_planes(stretch.samples, pairs) for stretch in used)
+    powers, averages = _mean_power((y + 1j * z for y, z in motions), rate_hz, segment, "amplitude")
     lines = np.asarray((-1 if speed_rad_s < 0 else 1) * np.fft.fftfreq(segment, 1 / rate_hz), dtype=np.float64)
     order = np.argsort(lines)
     return FullSpectrum(
@@ -254,7 +247,7 @@ def read_full_spectrum(
         end_ns=end_ns,
         pairs=tuple(pairs),
         lines=lines[order],
-        values_um=2 * np.sqrt(total[:, order] / averages),
+        values_um=2 * np.sqrt(powers[:, order]),
         orders=orders,
         resolution=rate_hz / segment,
         averages=averages,
@@ -292,10 +285,8 @@ def read_waterfall(
             continue
         while rows and begins_again(rows[-1][1], stretch.start_ns):
             rows.pop()  # of several runs at the same time the one that was recorded last is shown
-        power, count = summed_power(stretch.samples, stretch.rate_hz, segment, scaling)
-        rows.append(
-            (stretch.start_ns, stretch.end_ns, stretch.speed_rad_s, _values(power[0] / count, channel, scaling))
-        )
+        (power,), _ = _mean_power([stretch.samples], stretch.rate_hz, segment, scaling)
+        rows.append((stretch.start_ns, stretch.end_ns, stretch.speed_rad_s, _values(power, channel, scaling)))
     if len(rows) < 2:
         raise RotorwatchError(
             f"{data.place}: {len(rows)} spectra of {data.name} over {window_s:g} s without a gap, expected at "
@@ -315,43 +306,42 @@ def read_waterfall(
     )
 
 
-def summed_power(
-    samples: npt.NDArray[np.inexact], rate_hz: float, segment: int, scaling: Scaling
+def _mean_power(
+    pieces: Iterable[npt.NDArray[np.inexact]], rate_hz: float, segment: int, scaling: Scaling
 ) -> tuple[FloatArray, int]:
-    """Power of Hann-windowed segments that overlap by half, each about its mean, summed.
+    """Mean power of Hann-windowed segments that overlap by half, each about its mean, and how many there are.
 
     Parameters
     ----------
-    samples : ndarray, shape (n_samples, n_channels)
-        At least one segment long.
-    segment : int
-        Samples of a segment.
+    pieces : iterable of ndarray, shape (n_samples, n_channels)
+        Samples without a gap, each at least one segment long.
     scaling : str
         ``amplitude``: squared amplitude of a sine; ``density``: one-sided power spectral density.
 
     Returns
     -------
     ndarray, shape (n_channels, segment // 2 + 1)
-        Sum over the segments; of complex samples, shape (n_channels, segment), in the order of `numpy.fft.fft`.
+        Of complex samples, shape (n_channels, segment), in the order of `numpy.fft.fft`.
     int
-        How many segments.
     """
     from scipy.signal import welch  # noqa: PLC0415  # slow to import; only for these spectra
 
-    overlap = segment // 2
-    count = (samples.shape[0] - overlap) // (segment - overlap)
-    _, mean = welch(
-        samples,
-        rate_hz,
-        window="hann",
-        nperseg=segment,
-        noverlap=overlap,
-        scaling="spectrum" if scaling == "amplitude" else "density",
-        axis=0,
-    )
-    # The one-sided spectrum is that of rms values; of complex samples it is two-sided, and that of circles.
-    factor = 2.0 if scaling == "amplitude" and not np.iscomplexobj(samples) else 1.0
-    return np.asarray(mean.T * factor * count, dtype=np.float64), count
+    total, averages, overlap = np.zeros(()), 0, segment // 2
+    for samples in pieces:
+        count = (samples.shape[0] - overlap) // (segment - overlap)
+        _, mean = welch(
+            samples,
+            rate_hz,
+            window="hann",
+            nperseg=segment,
+            noverlap=overlap,
+            scaling="spectrum" if scaling == "amplitude" else "density",
+            axis=0,
+        )
+        # The one-sided spectrum is that of rms values; of complex samples it is two-sided, and that of circles.
+        factor = 2.0 if scaling == "amplitude" and not np.iscomplexobj(samples) else 1.0
+        total, averages = total + mean.T * factor * count, averages + count
+    return np.asarray(total / averages, dtype=np.float64), averages
 
 
 def lowest_hz(resolution_hz: float) -> float:
