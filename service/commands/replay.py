@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -22,6 +21,7 @@ if TYPE_CHECKING:  # these import pydantic, numpy and pyarrow, which --help must
     from rotorwatch.records.replays import OfflineSummary
     from service.recordings.replay.control import Control
     from service.recordings.replay.source import RecordingSource
+    from service.runtime.archive import MachineTask
     from service.stream.replay_link import NetworkPlan
     from service.terminal.stopping import StopRequest
 
@@ -178,17 +178,22 @@ def replay(
     wishes = Control()
     with _stoppable(wishes), orders(wishes, lines=control, keyboard=not offline and progress == "auto"):
         if offline:
+            from service.runtime.archive import MachineTask  # noqa: PLC0415
+
             wanted = _machines_of(config, machine)
-            for one in set_ or ():
-                if "=" not in one:
-                    raise MachineFileError(f"--set {one!r}: expected FIELD=VALUE, as alarms.on_delay_s=60")
+            for change in set_ or ():
+                if "=" not in change:
+                    raise MachineFileError(f"--set {change!r}: expected FIELD=VALUE, as alarms.on_delay_s=60")
             changes = "\n".join(set_ or ())
             chosen = (source.machine(key),) if ray is None else machines
-            asked = [_Offline(one, wanted(one), changes, from_ns, to_ns, out, overwrite, progress) for one in chosen]
+            tasks = []
+            for one in chosen:
+                recorded = source.paths_between(from_ns, to_ns, frozenset({one.stream}))
+                tasks.append(MachineTask(f"{one.site}/{one.machine}", recorded, wanted(one), changes, from_ns, to_ns))
             if ray is None:
-                _evaluate(source, asked[0], wishes)
+                _evaluate(source, tasks[0], out, overwrite, progress, wishes)
             else:
-                _evaluate_all(source, asked, ray)
+                _evaluate_all(source, tasks, out, overwrite, ray)
             return
         from service.stream.replay_link import NetworkPlan, replay_to_network  # noqa: PLC0415
 
@@ -209,35 +214,31 @@ def replay(
         typer.echo(f"{count} messages replayed", err=True)
 
 
-@dataclass(frozen=True, slots=True)
-class _Offline:
-    keys: "MachineKeys"
-    machine: str | None
-    changes: str
-    from_ns: int
-    to_ns: int
-    out: Path | None
-    overwrite: bool
-    progress: Literal["auto", "json", "none"]
-
-
-def _evaluate(source: "RecordingSource", request: _Offline, control: "Control") -> None:
+def _evaluate(
+    source: "RecordingSource",
+    task: "MachineTask",
+    out: Path | None,
+    overwrite: bool,
+    progress: Literal["auto", "json", "none"],
+    control: "Control",
+) -> None:
     from rotorwatch.records.replays import ReplayLine  # noqa: PLC0415
     from service.recordings.replay.console import show  # noqa: PLC0415
     from service.recordings.replay.machine import choose_machine  # noqa: PLC0415  # keeps --help quick
     from service.recordings.replay.offline import OfflineReplay  # noqa: PLC0415
 
-    as_json = request.progress == "json"
-    if as_json and request.out is None:
+    as_json = progress == "json"
+    if as_json and out is None:
         raise MachineFileError("--progress json writes to standard output: name a file for the results with --out")
-    installed = choose_machine(request.keys, request.machine, request.changes)
-    with _lines(request.out, request.overwrite) as write:
-        run = OfflineReplay(source, request.keys, installed, write, from_ns=request.from_ns, to_ns=request.to_ns)
+    keys = source.machine(task.title)
+    installed = choose_machine(keys, task.machine, task.changes)
+    with _lines(out, overwrite) as write:
+        run = OfflineReplay(source, keys, installed, write, from_ns=task.from_ns, to_ns=task.to_ns)
         for text in run.descriptor_differences:
             typer.echo(f"the recorded channel descriptor differs from the machine file: {text}", err=True)
         # Lines and a bar in one terminal would spoil each other.
-        quiet = request.out is None and sys.stdout.isatty() and not as_json
-        with show("none" if quiet else request.progress) as bar:
+        quiet = out is None and sys.stdout.isatty() and not as_json
+        with show("none" if quiet else progress) as bar:
             summary = run.run(control, bar)
     if as_json:
         typer.echo(ReplayLine(kind="summary", summary=summary).model_dump_json())
@@ -245,26 +246,24 @@ def _evaluate(source: "RecordingSource", request: _Offline, control: "Control") 
         for line in summary_lines(summary):
             typer.echo(line, err=True)
     if summary.stopped:
-        if request.out is not None:
-            typer.echo(f"{request.out} holds the lines up to that point", err=True)
+        if out is not None:
+            typer.echo(f"{out} holds the lines up to that point", err=True)
         raise typer.Exit(130)
     if summary.blocks == 0:
         raise RotorwatchError(f"no block was accepted: {summary.last_refusal or 'there was none'}")
 
 
-def _evaluate_all(source: "RecordingSource", requests: Sequence[_Offline], ray: str) -> None:
+def _evaluate_all(
+    source: "RecordingSource", tasks: "Sequence[MachineTask]", folder: Path | None, overwrite: bool, ray: str
+) -> None:
     """Evaluate every machine on a cluster, and say what was found as soon as it is."""
-    from service.runtime.archive import MachineTask, on_cluster  # noqa: PLC0415  # keeps --help quick
+    from service.runtime.archive import on_cluster  # noqa: PLC0415  # keeps --help quick
 
-    folder, begin_s = requests[0].out, time.monotonic()
+    begin_s, data_s = time.monotonic(), 0.0
     if folder is None:
         raise MachineFileError("--ray evaluates every recorded machine: name a folder for the results with --out")
-    tasks, data_s = [], 0.0
-    for one in requests:
-        files = source.paths_between(one.from_ns, one.to_ns, frozenset({one.keys.stream}))
-        title = f"{one.keys.site}/{one.keys.machine}"
-        tasks.append(MachineTask(title, files, one.machine, one.changes, one.from_ns, one.to_ns))
-        if (file := _file_of(folder, title)).exists() and not one.overwrite:
+    for one in tasks:
+        if (file := _file_of(folder, one.title)).exists() and not overwrite:
             raise MachineFileError(f"{file}: already exists; --overwrite replaces it")
     typer.echo(f"{len(tasks)} machines in {len(source.paths)} recordings ...", err=True)
     for done, (summary, text) in enumerate(on_cluster(ray, tasks), start=1):
@@ -289,13 +288,7 @@ def _file_of(folder: Path, title: str) -> Path:
 
 
 def _machines_of(config: Path | None, machine: str | None) -> "Callable[[MachineKeys], str | None]":
-    """What the command line names for a recorded machine, as `choose_machine` takes it.
-
-    Raises
-    ------
-    MachineFileError
-        If it names machine files twice.
-    """
+    """What the command line names for a recorded machine, as `choose_machine` takes it."""
     if config is None:
         return lambda _: machine
     if machine is not None:
