@@ -215,13 +215,7 @@ _LINEAR = (
 
 
 def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
-    """Learn the relations, in one baseline or in one for each speed.
-
-    Raises
-    ------
-    EstimationError
-        If there is none that the pieces determine.
-    """
+    """Learn the relations, in one baseline or in one for each speed."""
     pieces = [replace(piece, window=piece.window.without_lines) for piece in pieces]
     groups = [pieces]
     baselines = [_baseline(groups[0])]

@@ -45,13 +45,7 @@ class RunUp:
 
 
 def _past_run_up(data: Past, channels: tuple[Channel, ...], order: int) -> RunUp:
-    """Vectors of the windows of the history, as the monitor reported them.
-
-    Raises
-    ------
-    RotorwatchError
-        If no window has the phases of all of these channels at this order.
-    """
+    """Vectors of the windows of the history, as the monitor reported them."""
     measure = f"x{order}"
     found = []
     for report in data.reports:
@@ -162,13 +156,7 @@ class Centreline:
 
 
 def _past_centreline(data: Past, pairs: Sequence[tuple[Channel, Channel]]) -> Centreline:
-    """Mean positions in the windows of the history, as the monitor reported them.
-
-    Raises
-    ------
-    RotorwatchError
-        If there are not two windows with all of them.
-    """
+    """Mean positions in the windows of the history, as the monitor reported them."""
     channels = [channel for pair in pairs for channel in pair]
     rows = []
     for report in data.reports:

@@ -81,13 +81,7 @@ class _Shard:
         self._watcher = threading.Thread(target=self._watch, name=self._name, daemon=True)
 
     def ready(self) -> str:
-        """Wait until its machines are monitored; returns what its process is known by.
-
-        Raises
-        ------
-        RotorwatchError
-            Saying why they cannot be.
-        """
+        """Wait until its machines are monitored; returns what its process is known by."""
         said = self._received(_START_S)
         if said is None:
             how = self.process.ended(0.0) or f"was not ready in {_START_S:g} s"

@@ -246,13 +246,7 @@ def _check_logged(view: Monitored, name: str | None) -> None:
 
 
 def _check_read(view: Monitored, quantity: str, names: Sequence[str], field: str) -> None:
-    """Refuse a name under which nothing is read of a machine, nor was before its file changed.
-
-    Raises
-    ------
-    HTTPException
-        422, with the names there are.
-    """
+    """Refuse a name under which nothing is read of a machine, nor was before its file changed."""
     channels = [one.name for one in view.machine.sensors if one.quantity != "shaft_angle"]
     known: Sequence[str] = (quantity,)
     if quantity == "parameter":

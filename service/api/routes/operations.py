@@ -157,13 +157,7 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
 
 
 def _present(view: Monitored, name: str) -> Alarm:
-    """An alarm as it is now; one that nothing has been seen of yet is normal.
-
-    Raises
-    ------
-    HTTPException
-        404 if there is no such alarm.
-    """
+    """An alarm as it is now; one that nothing has been seen of yet is normal."""
     check_alarm(view, name, 404)
     for one in view.alarms(include_normal=True).alarms:
         if one.name == name:
