@@ -7,8 +7,9 @@ memory (or from the file, where it is mapped).
 import os
 import struct
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,37 +18,25 @@ import numpy as np
 from service.interchange.source import Array, Reference, Source, SourceError, Timing, readable
 
 
-def columns_of(path: Path, array: Any, reference: Reference) -> Any:  # an ndarray, or a data set that slices like one
-    """One column of an array, still in the file if the array is: a function of a slice.
-
-    Raises
-    ------
-    SourceError
-        If the array has another shape than `reference` says.
-    """
-    shape = tuple(int(size) for size in array.shape)
-    if len(shape) == 1 and reference.index in (None, 0):
-        return lambda rows: array[rows]
-    if len(shape) != 2:
-        raise SourceError(f"{path}: {reference.column} has shape {shape}, expected one column or a table of columns")
-    along_first = shape[0] >= shape[1]
-    width = min(shape)
-    index = reference.index if reference.index is not None else 0 if width == 1 else -1
-    if not 0 <= index < width:
-        raise SourceError(
-            f"{path}: {reference.column} has {width} columns of {max(shape)} samples, "
-            f"expected index = 0 to {width - 1}" + ("" if reference.index is None else f" (found {reference.index})")
-        )
-    return (lambda rows: array[rows, index]) if along_first else (lambda rows: array[index, rows])
-
-
 class _Arrays(Source):
-    """Columns of named arrays."""
+    """Columns of named arrays, each still in the file if its array is."""
 
     def _rows(self, reference: Reference) -> tuple[int, Callable[[slice], Any]]:
-        array = self._column(Reference(reference.column))
-        read = columns_of(self.path, array, reference)
-        return max(array.shape), read
+        array = self._column(Reference(reference.column))  # an ndarray, or a data set that slices like one
+        name, asked, shape = f"{self.path}: {reference.column}", reference.index, tuple(int(n) for n in array.shape)
+        if len(shape) == 1 and asked in (None, 0):
+            return len(array), array.__getitem__
+        if len(shape) != 2:
+            raise SourceError(f"{name} has shape {shape}, expected one column or a table of columns")
+        length, width = max(shape), min(shape)
+        index = asked if asked is not None else 0 if width == 1 else -1
+        if not 0 <= index < width:
+            found = "" if asked is None else f" (found {asked})"
+            raise SourceError(
+                f"{name} has {width} columns of {length} samples, expected index = 0 to {width - 1}{found}"
+            )
+        along_first = shape[0] >= shape[1]
+        return length, (lambda rows: array[rows, index]) if along_first else (lambda rows: array[index, rows])
 
 
 class NumpySource(_Arrays):
@@ -97,7 +86,8 @@ class MatlabSource(_Arrays):
                 from scipy.io import loadmat  # noqa: PLC0415  # slow to import; only for these files
 
                 content = loadmat(path, squeeze_me=True)
-                super().__init__(path, dict(_flattened(content)))
+                own = (_arrays_in(name, value) for name, value in content.items() if not name.startswith("__"))
+                super().__init__(path, dict(chain.from_iterable(own)))
 
     def close(self) -> None:
         """Close the file, if it is still open."""
@@ -170,14 +160,8 @@ def _over_full_scale(column: Array) -> Array:
     return column
 
 
-def _flattened(content: Mapping[str, Any]) -> Iterator[tuple[str, Array]]:
-    """Numeric arrays of a file, also those in structs and cells, by the names that MATLAB has for them."""
-    for name, value in content.items():
-        if not name.startswith("__"):
-            yield from _arrays_in(name, value)
-
-
 def _arrays_in(name: str, value: Any) -> Iterator[tuple[str, Array]]:
+    """Numeric arrays of a variable, also those in structs and cells, by the names that MATLAB has for them."""
     array = np.asarray(value)
     if array.dtype.names is not None:  # structs
         for number, struct in enumerate(array.ravel(order="F")):

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -19,7 +19,7 @@ from service.interchange.angle import pulse_times
 from service.interchange.clock import Clock, clock_for
 from service.interchange.formats import DATED, format_of, open_source
 from service.interchange.mapping import Keyphasor, Mapping
-from service.interchange.samples import Gap, Piece, Read, pieces, signals_of
+from service.interchange.samples import Gap, Piece, Read, Signal, pieces, signals_of
 from service.interchange.source import Reference, Source, SourceError
 
 _DATE = re.compile(
@@ -171,9 +171,7 @@ def runs_of_pulses(
     """
     runs = [begun]
     for file in files:
-        with open_source(file.path, mapping) as source:
-            columns = [one.reference for one in signals_of(source, mapping, machine)]
-            clock = _clock_after(first, file, source, columns, mapping, machine)
+        with _following(first, file, mapping, machine) as (source, _, clock):
             own = pulse_times(source, keyphasor, clock, mapping) + float(clock.origin_ns - first.origin_ns)
         before = runs[-1]
         if before.size > 1 and own.size and own[0] - before[-1] < 1.5 * float(np.median(np.diff(before[-9:]))):
@@ -183,11 +181,14 @@ def runs_of_pulses(
     return runs
 
 
-def _clock_after(
-    first: Clock, file: SnapshotFile, source: Source, columns: list[Reference], mapping: Mapping, machine: MachineFile
-) -> Clock:
-    clock = clock_for(source, columns, mapping.time, machine, file.start_ns)
-    return clock if file.start_ns is None else clock.after(first)
+@contextmanager
+def _following(
+    first: Clock, file: SnapshotFile, mapping: Mapping, machine: MachineFile
+) -> Iterator[tuple[Source, list[Signal], Clock]]:
+    with open_source(file.path, mapping) as source:
+        signals = signals_of(source, mapping, machine)
+        clock = clock_for(source, [one.reference for one in signals], mapping.time, machine, file.start_ns)
+        yield source, signals, clock if file.start_ns is None else clock.after(first)
 
 
 def joined(
@@ -216,10 +217,7 @@ def joined(
         yield piece
     for file in files:
         own = Read()
-        with open_source(file.path, mapping) as source:
-            signals = signals_of(source, mapping, machine)
-            columns = [one.reference for one in signals]
-            clock = _clock_after(first, file, source, columns, mapping, machine)
+        with _following(first, file, mapping, machine) as (source, signals, clock):
             if clock.ratio != first.ratio:
                 raise SourceError(
                     f"{file.path}: has {clock.rate_hz:.9g} samples per second, {first.path.name} has "

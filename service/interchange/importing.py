@@ -52,10 +52,8 @@ class Imported:
     clock: Clock
     read: Read  # what was met in the file
     written: Written  # what went into the recording
-    pulses: PulseTrain | None
+    angle: AngleColumn
     cut_rows: int  # rows at the ends of stretches where filters are not settled
-    unknown_angle: int  # rows left out because the shaft angle is not known
-    angle_rpm: float | None  # mean speed of a column of angles, if there is one
     left_out: list[str]  # names in a folder that were not read: other formats, folders, links to nothing
 
 
@@ -114,8 +112,9 @@ def import_file(
             with writer:
                 for message in maker.feed(angle.feed(parts)):
                     writer.write(message)
+                cut_rows = sum(overlap.cut_rows for overlap in overlaps)
                 if maker.written.blocks == 0:
-                    raise SourceError(_nothing(path, machine, read, sum(overlap.cut_rows for overlap in overlaps)))
+                    raise SourceError(_nothing(path, machine, read, cut_rows))
                 alone = [one.row for one, following in pairwise(read.gaps) if following.row == one.row + 1]
                 if len(alone) > _MOST_ALONE * read.rows:
                     raise SourceError(
@@ -126,21 +125,7 @@ def import_file(
         except BaseException:
             writer.part.unlink(missing_ok=True)
             raise
-    cut_rows, unknown = sum(overlap.cut_rows for overlap in overlaps), angle.unknown
-    return Imported(
-        path,
-        recording,
-        machine,
-        mapping,
-        clock,
-        read,
-        maker.written,
-        pulses,
-        cut_rows,
-        unknown,
-        angle.speed_rpm,
-        left_out,
-    )
+    return Imported(path, recording, machine, mapping, clock, read, maker.written, angle, cut_rows, left_out)
 
 
 def _left_out(path: Path, files: tuple[SnapshotFile, ...]) -> list[str]:
@@ -260,11 +245,11 @@ def _filter_lines(done: Imported) -> list[str]:
 
 
 def _angle_lines(done: Imported) -> list[str]:
-    if done.pulses is not None:
-        lines, speed_rpm = _pulse_lines(done, done.pulses)
-    elif done.angle_rpm is not None:
-        speed_rpm = abs(done.angle_rpm)
-        way = ", from z to y" if done.angle_rpm < 0 else ""
+    if done.angle.pulses is not None:
+        lines, speed_rpm = _pulse_lines(done, done.angle.pulses)
+    elif (mean_rpm := done.angle.speed_rpm) is not None:
+        speed_rpm = abs(mean_rpm)
+        way = ", from z to y" if mean_rpm < 0 else ""
         lines = [f"shaft angle: {speed_rpm:.6g} rpm on average{way}"]
     else:
         return []
@@ -284,9 +269,9 @@ def _pulse_lines(done: Imported, train: PulseTrain) -> tuple[list[str], float]:
         f"keyphasor: {train.times.size} pulses, {speed_rpm:.6g} rpm on average, {train.missing} missing ones bridged, "
         f"{train.extra} extra ones left out, {train.interruptions} interruptions"
     ]
-    if done.unknown_angle:
-        lines.append(f"rows left out because the shaft angle is not known: {done.unknown_angle}")
-        share = done.unknown_angle / max(1, done.read.rows)
+    if done.angle.unknown:
+        lines.append(f"rows left out because the shaft angle is not known: {done.angle.unknown}")
+        share = done.angle.unknown / max(1, done.read.rows)
         if share > _NOTED:
             lines.append(
                 f"note: that is {share:.0%} of the file, in which the keyphasor gives no pulses or uneven ones; look "

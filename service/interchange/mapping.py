@@ -3,7 +3,7 @@
 One TOML file; ``docs/interchange.md`` explains each field.
 """
 
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -101,8 +101,7 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
             return None
         if not isinstance(self.start, datetime):
             return _ZEROS_NS[self.start]
-        since = self.start - datetime(1970, 1, 1, tzinfo=UTC)
-        return ((since.days * 86400 + since.seconds) * 1_000_000 + since.microseconds) * 1000
+        return (self.start - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
 
 
 class Column(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):

@@ -91,7 +91,7 @@ def test_pulses_of_a_keyphasor_give_the_angle_in_every_file(tmp_path: Path, mapp
     assert len(angle) == FILES * COUNT
     apart = np.abs(np.angle(np.exp(1j * (angle - _COLUMNS[2]))))
     assert apart.max() < 0.01
-    assert done.unknown_angle == 0
+    assert done.angle.unknown == 0
 
 
 def test_files_that_say_when_they_begin_are_joined_in_that_order_whatever_their_names(tmp_path: Path) -> None:

@@ -276,7 +276,7 @@ def test_pulse_times_of_a_file_become_its_shaft_angle(tmp_path: Path) -> None:
     mapping = TIME + CHANNELS_OF_KEYPHASOR + '[keyphasor]\npulse_times = "k"\nunit = "ms"\n'
     done, recording = imported(tmp_path, tmp_path / "run.npz", mapping)
     (found,) = stretches(recording)
-    assert sure(done.pulses).missing == 1
+    assert sure(done.angle.pulses).missing == 1
     assert found.samples.shape == (20_000, 3)
     assert off_by(found.samples[:, 2], angle).max() < 1e-6
 
@@ -310,8 +310,8 @@ def test_where_the_shaft_stood_there_is_a_gap(tmp_path: Path) -> None:
     mapping = TIME + CHANNELS_OF_KEYPHASOR + '[keyphasor]\npulse_times = "k"\n'
     done, recording = imported(tmp_path, tmp_path / "run.npz", mapping)
     first, second = stretches(recording)
-    assert first.samples.shape[0] + second.samples.shape[0] + done.unknown_angle == 20_000
-    assert 2 * RATE_HZ - 2.1 * RATE_HZ / SPEED_HZ < done.unknown_angle < 2 * RATE_HZ
+    assert first.samples.shape[0] + second.samples.shape[0] + done.angle.unknown == 20_000
+    assert 2 * RATE_HZ - 2.1 * RATE_HZ / SPEED_HZ < done.angle.unknown < 2 * RATE_HZ
     assert "note: that is 20% of the file, in which the keyphasor gives no pulses" in "\n".join(summary_lines(done))
 
 
