@@ -79,7 +79,7 @@ class Claim:
     retry_s: float = 0.0  # when that is tried again, by the monotonic clock
     generation: int = 0  # goes up when the history continues in another file, which may lack what was written before
     waiting: StepBundle = field(default_factory=StepBundle)
-    attempt: StepBundle | None = None
+    attempt: StepBundle = field(default_factory=StepBundle)
     dropped_reports: int = 0
     dropped_readings: int = 0
 
@@ -91,11 +91,11 @@ class Claim:
     @property
     def steps(self) -> int:
         """Steps that are not in the database yet."""
-        return sum(bundle.steps for bundle in (self.attempt, self.waiting) if bundle is not None)
+        return self.attempt.steps + self.waiting.steps
 
     def contents(self) -> str:
         """What is not in the database, in words; with what was dropped to make room."""
-        bundles = [bundle for bundle in (self.attempt, self.waiting) if bundle is not None]
+        bundles = (self.attempt, self.waiting)
         numbers = [event.sequence for bundle in bundles for event in bundle.events]
         n_reports = sum(len(bundle.reports) for bundle in bundles) + self.dropped_reports
         n_readings = sum(len(step) for bundle in bundles for _, step in bundle.readings) + self.dropped_readings
@@ -121,17 +121,16 @@ class Claim:
         while len(waiting.readings) > self.most_reports:
             self.dropped_readings += len(waiting.readings.popleft()[1])
 
-    def take(self) -> StepBundle | None:
-        """What is to be written next: what was tried before, unchanged, or else everything that waits."""
-        if self.attempt is None and self.waiting.steps:
+    def take(self) -> bool:
+        """Attempt what was tried before, unchanged, or else everything that waits; whether there is anything."""
+        if not self.attempt.steps:
             self.attempt, self.waiting = self.waiting, StepBundle()
-        return self.attempt
+        return self.attempt.steps > 0
 
     def put_off(self) -> None:
         """Let nobody wait for what is not written yet."""
         for bundle in (self.attempt, self.waiting):
-            if bundle is not None:
-                bundle.settle(None, written=False)
+            bundle.settle(None, written=False)
 
 
 def pack(machine: str, step: Step, recorded_ns: int) -> tuple[PackedReport, ...]:

@@ -65,8 +65,6 @@ def write_group(
     rows, complete = _Rows(list), list[tuple[int, int, int]]()
     for claim in claims:
         bundle, machine = claim.attempt, found.get(claim.machine_id)
-        if bundle is None:
-            continue
         if machine is None or machine.owner != claim.owner:
             refused[claim] = claim.lost = StoreError(f"another monitor has taken over the history of {claim.title}")
             continue

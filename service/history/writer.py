@@ -13,7 +13,7 @@ from sqlalchemy import Connection, select, text, update
 from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
-from service.history.claim import Claim, PackedReport
+from service.history.claim import Claim, PackedReport, StepBundle
 from service.history.database import Database
 from service.history.file import lock_file
 from service.history.group import SeriesNumbers, write_group
@@ -146,7 +146,7 @@ class Writer:
         now_s = time.monotonic()
         with self._lock:
             due = [claim for claim in self._claims if at_once or not claim.trouble or claim.retry_s <= now_s]
-            return [claim for claim in due if claim.take() is not None]
+            return [claim for claim in due if claim.take()]
 
     def _write(self, ready: list[Claim]) -> bool:
         """Write one transaction; say whether the database has taken all of it."""
@@ -173,9 +173,7 @@ class Writer:
         return True
 
     def _settle(self, claim: Claim, refused: StoreError | None) -> None:
-        bundle, claim.attempt, claim.trouble = claim.attempt, None, ""
-        if bundle is None:
-            return
+        bundle, claim.attempt, claim.trouble = claim.attempt, StepBundle(), ""
         if refused is None:
             claim.written += 1
         elif not bundle.heard:
