@@ -239,5 +239,4 @@ class _Simulation:
         )
 
     def time_ns(self, sample: int) -> int:
-        """Acquisition time of a sample."""
         return self._start_ns + round(sample * 1e9 / self._machine.rate_hz)

@@ -99,7 +99,6 @@ class _Server(uvicorn.Server):
         self._connections = connections
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to listen and to watch."""
         self._connections.watch(asyncio.get_running_loop())
         await super().startup(sockets)
 

@@ -339,7 +339,6 @@ class _Program:
     output: IO[bytes]
 
     def must_run(self) -> None:
-        """Raise if it ended."""
         if (code := self.process.poll()) is not None:
             how = f"was killed ({signal.Signals(-code).name})" if code < 0 else f"ended with exit code {code}"
             self.output.seek(0)

@@ -59,7 +59,6 @@ def add_page_routes(app: FastAPI) -> None:
 
     @app.get("/", include_in_schema=False, response_class=HTMLResponse)
     def page() -> HTMLResponse:
-        """Serve the page for people."""
         return HTMLResponse(index, headers={"Content-Security-Policy": _POLICY, "Cache-Control": "no-cache"})
 
     @app.get(PAGE_FILES + "{version}/{name:path}", include_in_schema=False)
@@ -67,7 +66,6 @@ def add_page_routes(app: FastAPI) -> None:
         version: Annotated[str, InPath(description="digest of all files")],
         name: Annotated[str, InPath(description="of the file")],
     ) -> Response:
-        """Serve what the page loads."""
         if version != digest or name not in found:
             raise HTTPException(404, f"the page has no file {name[:80]} in this version; reload /")
         # What runs as a worker goes by the policy it comes with.
@@ -80,12 +78,10 @@ def add_docs_routes(app: FastAPI, guard: Guard) -> None:
 
     @app.get("/docs", dependencies=[guard.read], include_in_schema=False, response_class=HTMLResponse)
     def docs() -> HTMLResponse:
-        """Show the API."""
         return HTMLResponse(_DOCS, headers={"Content-Security-Policy": _DOCS_POLICY})
 
     @app.get("/docs/{name}", dependencies=[guard.read], include_in_schema=False)
     def docs_asset(
         name: Annotated[Literal["swagger-ui-bundle.js", "swagger-ui.css"], InPath(description="of the file")],
     ) -> FileResponse:
-        """Serve what the page loads."""
         return FileResponse(_ASSETS / name, headers={"Cache-Control": "private, max-age=86400"})
