@@ -133,7 +133,7 @@ def band_limits(
             continue
         if not np.allclose(levels.edges_hz, reference.edges_hz, rtol=1e-3):
             continue
-        around, high, error = (_around(np.array(each)) for each in (reference.mean, reference.high, reference.error))
+        around, high, error = (widened(np.array(each)) for each in (reference.mean, reference.high, reference.error))
         chance = np.sqrt(fdtri(levels.freedom, np.array(reference.freedom), 1 - _CHANCE))
         relative = ERRORS * np.divide(error, around, out=np.zeros_like(around), where=around > 0)
         loudest = np.maximum(BEYOND_RANGE, 1 + relative * np.sqrt(shorter**2 - 1)) * high
@@ -166,9 +166,9 @@ def growth(levels: BandLevels, limits: BandLimits) -> list[Growth | None]:
     ]
 
 
-def _around(values: FloatArray) -> FloatArray:
-    """Largest of each band and its two neighbours."""
-    padded = np.pad(values, 1, mode="edge")
+def widened(values: FloatArray) -> FloatArray:
+    """Largest of each band and its two neighbours, to which a line moves when the speed does."""
+    padded = np.concatenate([values[:1], values, values[-1:]])
     return np.asarray(np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:]))
 
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from models.levels.bands import LINE, OF_BIN, BandLevels, BandReference, band_in_words
+from models.levels.bands import LINE, OF_BIN, BandLevels, BandReference, band_in_words, widened
 from models.levels.measures import WindowLevels
 from models.signals.block import FloatArray
 
@@ -109,9 +109,7 @@ def new_line(
     known = [name in healthy_bands and len(healthy_bands[name].low) == len(parts) for name in channels]
     if not all(known) or any(len(healthy_parts.get(name, ())) != len(parts) for name in channels):
         return ""
-    # A line moves to the next band when the speed does.
-    padded = np.pad(np.array([healthy_parts[name] for name in channels]).T, ((1, 1), (0, 0)), mode="edge")
-    before = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
+    before = widened(np.array([healthy_parts[name] for name in channels]).T)
     new = (before < _HAD_ONE) & (parts > np.maximum(LINE, _OVER_HEALTHY * before))
     quietest = np.array([healthy_bands[name].low for name in channels]).T
     least = np.pad(quietest**2, ((1, 1), (0, 0)))  # a line that is spread over an edge is in both bands
