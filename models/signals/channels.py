@@ -38,30 +38,23 @@ UNIT_TO_SI: dict[Quantity, dict[str, float]] = {
 
 _SPELLING = str.maketrans({"\N{MICRO SIGN}": "u", "\N{GREEK SMALL LETTER MU}": "u", "²": "2", "^": None})
 
+_RATES: dict[Quantity, str] = {Quantity.DISPLACEMENT: "", Quantity.VELOCITY: "_dot", Quantity.ACCELERATION: "_ddot"}
 _STATE_NAMES: dict[tuple[Quantity, str, str], str] = {
-    (Quantity.DISPLACEMENT, "bearing", "y"): "y1",
-    (Quantity.DISPLACEMENT, "disc", "y"): "y2",
+    **{
+        (quantity, location, direction): f"{direction}{number}{rate}"
+        for quantity, rate in _RATES.items()
+        for direction in "yz"
+        for number, location in enumerate(("bearing", "disc"), start=1)
+    },
     (Quantity.TILT, "disc", "y"): "psi",
-    (Quantity.DISPLACEMENT, "bearing", "z"): "z1",
-    (Quantity.DISPLACEMENT, "disc", "z"): "z2",
     (Quantity.TILT, "disc", "z"): "phi",
-    (Quantity.VELOCITY, "bearing", "y"): "y1_dot",
-    (Quantity.VELOCITY, "disc", "y"): "y2_dot",
     (Quantity.TILT_RATE, "disc", "y"): "psi_dot",
-    (Quantity.VELOCITY, "bearing", "z"): "z1_dot",
-    (Quantity.VELOCITY, "disc", "z"): "z2_dot",
     (Quantity.TILT_RATE, "disc", "z"): "phi_dot",
-    (Quantity.ACCELERATION, "bearing", "y"): "y1_ddot",
-    (Quantity.ACCELERATION, "disc", "y"): "y2_ddot",
-    (Quantity.ACCELERATION, "bearing", "z"): "z1_ddot",
-    (Quantity.ACCELERATION, "disc", "z"): "z2_ddot",
     (Quantity.SHAFT_ANGLE, "shaft", "rotation"): "theta",
 }
-
 _LOCATIONS, _DIRECTIONS = ("bearing", "disc", "shaft"), ("y", "z", "rotation")
 _ELSEWHERE = ("DE", "NDE", "casing")
 """Names of other places that are never taken for a misspelt one."""
-_RATES: dict[Quantity, str] = {Quantity.DISPLACEMENT: "", Quantity.VELOCITY: "_dot", Quantity.ACCELERATION: "_ddot"}
 LEAST_APART_DEG = 30.0
 """Angle between two sensors from which on they are turned to y and z: nearer, their noise would be all there is."""
 _PLACE = r"^[A-Za-z0-9][A-Za-z0-9 _.:/+-]*$"

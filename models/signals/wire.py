@@ -47,18 +47,10 @@ def write_arrow(samples: npt.NDArray[Any], metadata: dict[str, str]) -> bytes:
     return stream
 
 
-def read_arrow(stream: bytes) -> tuple[npt.NDArray[Any], dict[str, bytes]]:
-    """Read what `write_arrow` writes, from any Arrow library.
+def _read_arrow(stream: bytes) -> tuple[npt.NDArray[Any], dict[str, bytes]]:
+    """Read what `write_arrow` writes, from any Arrow library: samples, a read-only view of the stream, and metadata.
 
-    Returns
-    -------
-    samples : ndarray, shape (n_samples, n_channels)
-        A read-only view of `stream`.
-
-    Raises
-    ------
-    WireError
-        If it is anything else; nothing larger than the stream is allocated to find out.
+    Whatever else it is, nothing larger than the stream is allocated to find out.
     """
     try:
         kind, schema, _, after = _message(stream, 0)
@@ -270,7 +262,7 @@ def _decode_raw(payload: bytes, attachment: bytes) -> SampleBlock:
 
 
 def _decode_arrow(payload: bytes) -> SampleBlock:
-    samples, metadata = read_arrow(payload)
+    samples, metadata = _read_arrow(payload)
     numbers = {field: _metadata_number(metadata, field) for field in _ARROW_FIELDS}
     return _checked(**numbers, samples=samples)
 
