@@ -238,7 +238,7 @@ def replay_to_network(
     source: RecordingSource,
     plan: NetworkPlan,
     control: Control,
-    on_progress: Callable[[ReplayProgress], None] | None = None,
+    on_progress: Callable[[ReplayProgress], None] = lambda _: None,
 ) -> int:
     """Publish recordings until the end of the last pass, or until `control` says stop.
 

@@ -91,7 +91,7 @@ class OfflineReplay:
             self._describe(descriptor)
 
     def run(
-        self, control: Control | None = None, on_progress: Callable[[ReplayProgress], None] | None = None
+        self, control: Control | None = None, on_progress: Callable[[ReplayProgress], None] = lambda _: None
     ) -> OfflineSummary:
         """Replay, until the end or until `control` says stop.
 
@@ -114,13 +114,11 @@ class OfflineReplay:
                 message.payload, message.attachment, self._encoding(message.encoding)
             ):
                 self._note(report)
-            if on_progress is not None:
-                on_progress(self._progress(time_ns))
+            on_progress(self._progress(time_ns))
         if not control.stopped:
             for report in self._monitor.flush():
                 self._note(report)
-            if on_progress is not None:
-                on_progress(self._progress(self._to_ns - 1))
+            on_progress(self._progress(self._to_ns - 1))
         return self._summary(time.perf_counter() - begin_s, stopped=control.stopped)
 
     def _describe(self, message: RecordedMessage) -> None:

@@ -30,7 +30,7 @@ def play(
     put: Callable[[RecordedMessage], None],
     plan: PlayPlan,
     control: Control,
-    on_progress: Callable[[ReplayProgress], None] | None = None,
+    on_progress: Callable[[ReplayProgress], None] = lambda _: None,
 ) -> int:
     """Hand out the messages of one pass, byte for byte, until its end or until `control` says stop.
 
@@ -46,8 +46,6 @@ def play(
     begin_ns: int | None = plan.from_ns
 
     def tell(at_ns: int) -> None:
-        if on_progress is None:
-            return
         done = (at_ns - plan.from_ns) / max(1, plan.to_ns - 1 - plan.from_ns)
         on_progress(
             ReplayProgress(
