@@ -7,8 +7,6 @@ commissioned instead (`models.commissioning`).
 Every field carries its unit in its name; unknown keys are refused. ``docs/machine-file.md`` explains each field.
 """
 
-import hashlib
-import json
 import math
 from collections.abc import Iterable
 from contextlib import suppress
@@ -368,13 +366,6 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
                 "channels": [sensor.model_dump(include=set(Channel.model_fields)) for sensor in self.sensors],
             }
         )
-
-    @property
-    def physics_hash(self) -> str:
-        """Twelve hexadecimal digits that change with the rotor, its operation or condition range, rate or window."""
-        fields = {"rotor", "operation", "condition", "rate_hz", "window", "schedule"}
-        text = json.dumps(self.model_dump(mode="json", include=fields), sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 class Machine(MachineFile):

@@ -15,7 +15,7 @@ from scipy.special import ndtri
 from benchmarks.studies import alarm_readings as t
 from benchmarks.studies import results as r
 from benchmarks.studies.bound import bound_of
-from benchmarks.studies.opinions import LAYOUTS, SEVERAL
+from benchmarks.studies.opinions import LAYOUTS, SEVERAL, physics_hash
 from benchmarks.studies.results import Chart, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from models.commissioning.commissioned import KnowledgeLevel
@@ -272,5 +272,5 @@ def delay(options: Options) -> Study:
         tables=_tables(own),
         goals=partial(_goals, own),
         charts=_charts,
-        made_with={machine.name: machine.physics_hash},
+        made_with={machine.name: physics_hash(machine)},
     )

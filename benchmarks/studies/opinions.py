@@ -1,5 +1,7 @@
 """What the diagnosticians say of one window, as columns of a record, and whether that is right."""
 
+import hashlib
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from time import process_time
@@ -56,10 +58,17 @@ class Trained:
         return relation, NetworkDiagnostician(self.machine, self.bundle.amortised), likelihood
 
 
+def physics_hash(machine: Machine) -> str:
+    """Twelve hexadecimal digits that change with the rotor, its operation or condition range, rate or window."""
+    fields = {"rotor", "operation", "condition", "rate_hz", "window", "schedule"}
+    text = json.dumps(machine.model_dump(mode="json", include=fields), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
 def made_with(machines: Iterable[Trained]) -> dict[str, str]:
     """What all records of a study of these machines must share."""
     return {
-        one.machine.name: f"{one.machine.physics_hash} {one.bundle.identity if one.bundle else ''}" for one in machines
+        one.machine.name: f"{physics_hash(one.machine)} {one.bundle.identity if one.bundle else ''}" for one in machines
     }
 
 

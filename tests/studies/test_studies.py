@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from benchmarks.studies import __main__ as command
 from benchmarks.studies.delay import bound_time_s, with_hop
 from benchmarks.studies.evaluate import evaluate
+from benchmarks.studies.opinions import physics_hash
 from benchmarks.studies.pages import write_page
 from benchmarks.studies.paper import full_correlation
 from benchmarks.studies.reproduction import CONDITIONS, own_equations
@@ -270,6 +271,14 @@ def test_limits_of_several_values_keep_the_rate_together_and_none_decides_those_
         alone += [name for one in found for name in one]
     assert np.mean(exceeded) == pytest.approx(0.05, abs=0.006)
     assert alone.count("small") / len(alone) == pytest.approx(0.5, abs=0.1)
+
+
+def test_records_are_of_all_that_networks_depend_on() -> None:
+    lab = load_machine("lab")
+    alarm = lab.model_copy(update={"alarms": lab.alarms.model_copy(update={"on_delay_s": 61.0})})
+    rotor = lab.model_copy(update={"rotor": lab.rotor.model_copy(update={"m1_kg": 0.51})})
+    assert physics_hash(alarm) == physics_hash(lab)
+    assert physics_hash(rotor) != physics_hash(lab)
 
 
 def test_figures_are_of_the_records_that_are_asked_for() -> None:
