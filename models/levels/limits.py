@@ -105,15 +105,10 @@ def relative_limits(
 
 
 def _region(channel: Channel, one: ReferenceLevel, centre: complex, alert: float, shorter: float) -> Region:
-    factor = _level_per_amplitude(channel)
+    factor = 2.0 if channel.quantity in PEAK_TO_PEAK else math.sqrt(0.5)  # level of a line over its amplitude
     farthest = max(BEYOND_RANGE * one.turned, one.turned + _filling(one, shorter) * one.mean / factor)
     by_chance = ERRORS * one.error * shorter / factor
     return Region(centre, max(_TURNED * abs(centre), farthest, by_chance), alert, one.mean)
-
-
-def _level_per_amplitude(channel: Channel) -> float:
-    """Ratio of the level of a line to its amplitude."""
-    return 2.0 if channel.quantity in PEAK_TO_PEAK else math.sqrt(0.5)
 
 
 def _shorter(state: OperatingState, hops: int) -> float:
