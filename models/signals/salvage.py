@@ -22,7 +22,6 @@ class Salvage:
     # Earliest and latest log time recovered; both 0 if nothing was.
     start_ns: int = 0
     end_ns: int = 0
-    size_bytes: int = 0  # size of the damaged file
     lost_bytes: int = 0  # bytes of it that could not be read; what was still in the writer's memory is not among them
     damaged_chunks: int = 0  # chunks before the end that could not be read and were passed over
     unnamed_messages: int = 0  # messages that were lost because the chunk that names their key is damaged
@@ -108,7 +107,7 @@ def salvaged_messages(path: Path) -> Iterator[RecordedMessage]:
 def _nothing_yet(path: Path) -> Salvage:
     with reading(path):
         stat = path.stat()
-    return Salvage(size_bytes=stat.st_size, lost_bytes=stat.st_size, written_ns=stat.st_mtime_ns)
+    return Salvage(lost_bytes=stat.st_size, written_ns=stat.st_mtime_ns)
 
 
 def _salvaged(damaged: Path, salvage: Salvage) -> Iterator[RecordedMessage]:
