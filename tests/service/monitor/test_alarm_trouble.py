@@ -353,6 +353,19 @@ def test_a_program_that_stood_still_calls_nobody_silent(tmp_path: Path) -> None:
         assert at.log() == [(0, "raised", STREAM_LOST)]
 
 
+def test_a_stream_has_time_to_be_heard_again_after_a_restart(tmp_path: Path) -> None:
+    now_s = [0.0]
+    clocks = Clocks(monotonic_s=lambda: now_s[0])
+    with bench(tmp_path, clocks) as at:
+        at.put(block(0))
+    with bench(tmp_path, clocks) as at:
+        for seconds, expected in ((19, []), (2, [(0, "raised", STREAM_LOST)])):
+            for _ in range(seconds):
+                now_s[0] += 1.0
+                at.tick()
+            assert at.log() == expected
+
+
 def test_a_silence_is_longer_than_a_block() -> None:
     with pytest.raises(ValueError, match="no_data_after_s is 5, expected more than block_to_s, 30"):
         IngestSettings(block_to_s=30.0)
