@@ -19,6 +19,7 @@ _WAITING_BLOCKS = 4096
 """Far more than come between two looks of whoever takes them; beyond, the network waits."""
 _PATIENCE_S = 15.0
 """Longer than Zenoh waits for what is kept, which is 10 s."""
+_PUBLISHERS = 64
 _ANSWERS_S = 0.5
 """In which a publisher is noticed that was there when it was asked."""
 
@@ -54,49 +55,61 @@ class BlockSubscription:
         self._ahead: dict[Hashable, zenoh.Sample] = {}  # new blocks, until what is kept has come to them
         self._ahead_s = self._asked_s  # since when
         self._reached: Hashable = None  # the latest of those that were kept
+        self._numbers: dict[tuple[str, int], int] = {}  # of the latest that were handed on, by publisher
 
     def publisher_appeared(self) -> None:
-        """Ask for what is kept again, if nothing has come so far; from any thread."""
+        """Ask for what is kept again; from any thread."""
         self._appeared = True
 
     def take(self, callback: Callable[[zenoh.Sample], None], most: int) -> None:
         """Call back for every block that has come, some `most` of them; from one thread at a time."""
         for sample in self._come(most):
+            number = _number(sample)
+            if number is not None:
+                if number[1] <= self._numbers.get(number[0], -1):
+                    continue  # kept as well as new
+                if len(self._numbers) > _PUBLISHERS:
+                    self._numbers.clear()
+                self._numbers[number[0]] = number[1]
             callback(sample)
 
     def _come(self, most: int) -> Sequence[zenoh.Sample]:
+        now_s = time.monotonic()
+        if self._appeared and self._reached is None:
+            self._appeared = False
+            if now_s - self._asked_s > _ANSWERS_S:
+                self._close_kept()
+                self._kept, self._asked_s = self._ask(), now_s
         if self._kept is None:
             return _received(self._new, most)
-        now_s = time.monotonic()
-        if self._appeared and self._reached is None and now_s - self._asked_s > _ANSWERS_S:
-            self._kept.undeclare()  # type: ignore[no-untyped-call]
-            self._kept, self._asked_s = self._ask(), now_s
-        self._appeared = False
         # In this order, so that all that has come as kept until now has also come as new, if it is new.
         kept = _received(self._kept, most)
         self._ahead |= {_identity(one): one for one in _received(self._new, most)}
         if not self._ahead:
             self._ahead_s = now_s
-        begin: int | None = None  # with which of the new blocks to go on
+        new = list(self._ahead.values())
         if kept and self._reached is None and _identity(kept[0]) in self._ahead:  # which had all fetched again
-            kept, begin = [], 0
-        elif kept:
-            self._reached = _identity(kept[-1])
-        if begin is None and self._reached in self._ahead:
-            begin = list(self._ahead).index(self._reached) + 1
-        if begin is None and (len(self._ahead) > _WAITING_BLOCKS or now_s - self._ahead_s > _PATIENCE_S):
-            begin = 0
-        if begin is not None:
-            self._kept.undeclare()  # type: ignore[no-untyped-call]
-            kept += list(self._ahead.values())[begin:]
-            self._kept, self._ahead = None, {}
+            kept, caught_up = new, True
+        else:
+            self._reached = _identity(kept[-1]) if kept else self._reached
+            caught_up = self._reached in self._ahead
+            begin = list(self._ahead).index(self._reached) + 1 if caught_up else 0
+            if caught_up or len(new) > _WAITING_BLOCKS or now_s - self._ahead_s > _PATIENCE_S:
+                kept, caught_up = kept + new[begin:], True
+        if caught_up:
+            self._close_kept()
+            self._kept, self._reached, self._ahead = None, None, {}
         return kept
+
+    def _close_kept(self) -> None:
+        if self._kept is not None:
+            self._kept.undeclare()  # type: ignore[no-untyped-call]
 
     def close(self) -> None:
         """Receive nothing any more."""
-        for declared in (self._missed, self._new, self._kept):
-            if declared is not None:
-                declared.undeclare()  # type: ignore[no-untyped-call]
+        self._close_kept()
+        self._missed.undeclare()  # type: ignore[no-untyped-call]
+        self._new.undeclare()  # type: ignore[no-untyped-call]
 
 
 def _received(subscriber: zenoh.ext.AdvancedSubscriber[Any], most: int) -> list[zenoh.Sample]:
@@ -104,10 +117,12 @@ def _received(subscriber: zenoh.ext.AdvancedSubscriber[Any], most: int) -> list[
     return [sample for _, sample in zip(range(most), received, strict=False)]
 
 
-def _identity(sample: zenoh.Sample) -> Hashable:
-    """Whose message it is, and its number there; of one who numbers nothing, what is in it."""
+def _number(sample: zenoh.Sample) -> tuple[tuple[str, int], int] | None:
+    """The publisher and the number of the message; None of one who numbers nothing."""
     info = sample.source_info
-    if info is None:
-        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-        return sample.payload.to_bytes(), attachment, str(sample.encoding)
-    return str(info.source_id.zid), info.source_id.eid, info.source_sn
+    return None if info is None else ((str(info.source_id.zid), info.source_id.eid), info.source_sn)
+
+
+def _identity(sample: zenoh.Sample) -> Hashable:
+    attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+    return _number(sample) or (sample.payload.to_bytes(), attachment, str(sample.encoding))

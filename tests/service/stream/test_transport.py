@@ -405,6 +405,26 @@ def test_nothing_that_is_kept_is_lost_to_blocks_that_come_meanwhile() -> None:
             publisher.undeclare()  # type: ignore[no-untyped-call]
 
 
+def test_a_publisher_that_appears_later_loses_nothing_that_it_has_kept() -> None:
+    address, seen = endpoint(), list[int]()
+    with machine_link(address, partial(_numbered, seen)), session_of(LinkSettings(connect=(address,))) as before:
+        first = advanced_publisher(before, LAB.keys.stream, KEPT)
+        until_subscribed(before, LAB.keys.stream)
+        first.put((7).to_bytes(4, "little"))
+        until(lambda: seen == [7], "the block of the first publisher")
+        with session_of(LinkSettings(mode="client", connect=(address,))) as session:
+            later = advanced_publisher(session, LAB.keys.stream, KEPT)
+            token = session.liveliness().declare_token(LAB.keys.publisher_alive)
+            for number in range(LIVE):  # the first before it can know of a subscriber
+                later.put(number.to_bytes(4, "little"))
+                time.sleep(0.01 * (number > LIVE // 2))
+            until(lambda: len(seen) == 1 + LIVE, "all blocks")
+            token.undeclare()  # type: ignore[no-untyped-call]
+            later.undeclare()  # type: ignore[no-untyped-call]
+        first.undeclare()  # type: ignore[no-untyped-call]
+    assert seen == [7, *range(LIVE)]
+
+
 def _numbered(seen: list[int], block: RawBlock) -> None:
     seen.append(int.from_bytes(block.payload[:4], "little"))
 
