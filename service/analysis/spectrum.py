@@ -157,7 +157,8 @@ def steady(speed_rad_s: FloatArray) -> str:
     slowest, fastest = (float(one(np.abs(speed_rad_s))) for one in (np.min, np.max))
     if fastest - slowest >= _STEADY * max(fastest, 1e-9):
         return ""
-    return f"the speed stays between {slowest * 30 / np.pi:.4g} and {fastest * 30 / np.pi:.4g} rpm"
+    low, high = f"{slowest * 30 / np.pi:.4g}", f"{fastest * 30 / np.pi:.4g}"
+    return f"the speed stays {f'at {low}' if low == high else f'between {low} and {high}'} rpm"
 
 
 def read_spectrum(

@@ -183,7 +183,7 @@ def _level_trends(reports: Sequence[Report]) -> Iterator[LevelTrend]:
         as_velocity = any(one.velocity is not None and one.limit("velocity") is not None for one in known)
         measure = "velocity" if as_velocity else "overall"
         detection = "pp" if known[-1].detection == "peak to peak" else "rms"
-        unit = "velocity, mm/s rms" if as_velocity else f"{unit_in_text(known[-1].unit)} {detection}"
+        unit = "velocity, mm/s rms" if as_velocity else f"overall, {unit_in_text(known[-1].unit)} {detection}"
         limits = [None if one is None else one.limit(measure) for one in there]
         yield LevelTrend(
             f"{channel}   {unit}",

@@ -117,7 +117,7 @@ def paint_waterfall(
     cascade: bool,
 ) -> Figure:
     """Spectra as rows of colour, or as lines one behind the other."""
-    figure = Figure(figsize=look.size_in or (9.5, 7.0 if cascade else 6.0), layout="constrained")
+    figure = Figure(figsize=look.size_in or (9.5, 7.0 if cascade else 6.0), dpi=look.dpi, layout="constrained")
     axes = figure.subplots()
     limits_hz, shown = _shown(found, lines.to_hz)
     axes.set_xlim(limits_hz)
@@ -146,6 +146,11 @@ def _map(axes: Axes, found: Waterfall, shown: npt.NDArray[np.bool_], *, over_spe
         values = values[:, shown]
     else:
         rows, values = _rows_in_time(found, found.values[:, shown])
+    # Columns narrower than a pixel are not all drawn, and a steady line could be missing from the picture. So lines are
+    # put together, as high as the highest of them, until a column has two pixels.
+    group = -(-frequency.size // max(1, int(axes.bbox.width / 2)))
+    first = np.arange(0, frequency.size, group)
+    columns, values = np.append(columns[first], columns[-1]), np.fmax.reduceat(values, first, axis=1)
     top = float(np.nanmax(values)) or 1.0
     norm = LogNorm(max(float(np.nanmin(values[values > 0], initial=top)), top * _depth(found)), top)
     limits = axes.get_xlim()

@@ -37,18 +37,20 @@ from service.analysis.trend import LevelTrend, ParameterTrend, TrendSeries, past
 _GAP = 2.5
 _DASHES = (0, (4, 3))
 _LEAST_PERCENT = 5.0
+_LETTER_IN, _ROW_PT = 0.065, 11.0
+"""Width of a letter in the small print, and how far its lines are apart."""
 
 
 def trend(data: Recorded | Past, machine: str | None, *, levels: bool) -> Paint:
     """Parameters or levels over time, as recorded or with the machine file ``FILE[@BUNDLE]``."""
     if isinstance(data, Recorded):
-        return partial(_paint, read_trend(data, machine, levels=levels))
+        return partial(paint_trend, read_trend(data, machine, levels=levels))
     if machine is not None:
         raise MachineFileError("--machine needs samples: name recordings instead of --history")
-    return partial(_paint, past_trend(data, levels=levels))
+    return partial(paint_trend, past_trend(data, levels=levels))
 
 
-def _paint(trend: TrendSeries, look: Look) -> Figure:
+def paint_trend(trend: TrendSeries, look: Look) -> Figure:
     """Small multiples over one time axis."""
     count = len(trend.parameters)
     measures = [name for name in MEASURES if trend.parameters or np.isfinite(trend.measures[name]).any()]
@@ -62,7 +64,8 @@ def _paint(trend: TrendSeries, look: Look) -> Figure:
         gridspec_kw={"height_ratios": [0.16, *[1.0] * count, *[0.75] * small]},
     )[:, 0]
     step_ns = int(np.median(np.diff(trend.end_ns))) if trend.end_ns.size > 1 else 10**9
-    _states(panels[0], trend, step_ns)
+    ends = as_dates(np.array([trend.end_ns[0], trend.end_ns[-1] + step_ns]))
+    panels[-1].set_xlim(*ends)
     for axes, parameter in zip(panels[1:], trend.parameters, strict=False):
         _parameter(axes, parameter, trend, step_ns)
     for axes, level in zip(panels[1 + count :], trend.levels, strict=False):
@@ -71,11 +74,12 @@ def _paint(trend: TrendSeries, look: Look) -> Figure:
         _measure(axes, name, trend, step_ns)
     for axes in panels[1:]:
         alarm_lines(axes, trend.alarms)
+    rows = {}
     for name, axes in zip((MODEL, *(one.name for one in trend.parameters)), panels, strict=False):
         # A parameter's alarm belongs to its panel, any other to the one of the states.
         own = [one for one in trend.alarms if (one.name if one.name in PARAMETER_TEXT else MODEL) == name]
-        _name_alarms(axes, own)
-    panels[-1].set_xlim(*as_dates(np.array([trend.end_ns[0], trend.end_ns[-1] + step_ns])))
+        rows[name] = _name_alarms(axes, own)
+    _states(panels[0], trend, step_ns, rows[MODEL])
     time_axis(panels[-1])
     figure.legend(handles=_legend(trend), loc="outside lower center", ncols=5, fontsize=8)
     speed = trend.measures["speed"]
@@ -106,8 +110,8 @@ def _legend(trend: TrendSeries) -> list[Patch | Line2D]:
     return handles
 
 
-def _states(axes: Axes, trend: TrendSeries, step_ns: int) -> None:
-    """A strip: what the monitor said of the machine, from each report on to the next."""
+def _states(axes: Axes, trend: TrendSeries, step_ns: int, rows: int) -> None:
+    """A strip: what the monitor said of the machine, from each report on to the next; over it, rows of alarms."""
     after = np.minimum(np.diff(trend.end_ns, append=trend.end_ns[-1] + step_ns), round(_GAP * step_ns))
     for begin, end, state in zip(as_dates(trend.end_ns), as_dates(trend.end_ns + after), trend.states, strict=True):
         axes.axvspan(float(begin), float(end), color=STATE_COLOURS[state], linewidth=0)
@@ -120,7 +124,7 @@ def _states(axes: Axes, trend: TrendSeries, step_ns: int) -> None:
     axes.legend(
         handles=[Patch(color=STATE_COLOURS[state], label=state) for state in seen],
         loc="lower right",
-        bbox_to_anchor=(1.0, 2.0),
+        bbox_to_anchor=(1.0, 2.0 + 1.3 * (rows - 1)),
         ncols=len(seen),
         borderpad=0,
         handlelength=1.0,
@@ -128,13 +132,27 @@ def _states(axes: Axes, trend: TrendSeries, step_ns: int) -> None:
     )
 
 
-def _name_alarms(axes: Axes, alarms: list[AlarmEventData]) -> None:
-    """Events of a parameter in the line of its title; those of the model over the states."""
-    for alarm in alarms[:8]:
+def _name_alarms(axes: Axes, alarms: list[AlarmEventData]) -> int:
+    """Events of a parameter in the line of its title, those of the model over the states, in as many rows as it takes.
+
+    Returns
+    -------
+    int
+        How many rows: side by side, texts of events that are close to each other could not be read.
+    """
+    letter = _LETTER_IN * axes.figure.dpi / axes.bbox.width
+    first, last = axes.get_xlim()
+    taken = [letter * len(axes.get_title(loc="left")) or -1.0]  # up to where each row is full, as a share of the axis
+    for alarm in sorted(alarms[:8], key=lambda event: event.time_ns):
+        text, at = alarm_text(alarm), as_date(alarm.time_ns)
+        half, middle = letter * len(text) / 2, (at - first) / (last - first)
+        row = next((row for row, end in enumerate(taken) if middle - half > end), len(taken))
+        taken[row : row + 1] = [middle + half]
         axes.annotate(
-            alarm_text(alarm), (as_date(alarm.time_ns), 1.0), xycoords=("data", "axes fraction"), xytext=(0, 3),
+            text, (at, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 3 + _ROW_PT * row),
             textcoords="offset points", ha="center", va="bottom", fontsize=8, color=INK,
         )  # fmt: skip
+    return len(taken)
 
 
 def _parameter(axes: Axes, parameter: ParameterTrend, trend: TrendSeries, step_ns: int) -> None:

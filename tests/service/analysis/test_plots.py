@@ -1,23 +1,28 @@
 """What pictures of recordings show: orbits, spectra, correlations and trends, before anything is drawn."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import imread
+from matplotlib.text import Text
 
 from models.commissioning.commissioned import install
 from models.diagnosis.networks.bundle import load_bundle
 from models.errors import MachineFileError, PictureError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.recording import RecordedMessage
-from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData
 from rotorwatch.records.example import example
 from rotorwatch.records.health import MEASURES, Report
 from service.analysis.correlation import correlations_of, latest_window
 from service.analysis.figures.spectrum import Lines, paint_spectrum, paint_waterfall
 from service.analysis.figures.style import Look, draw
+from service.analysis.figures.trend import paint_trend
 from service.analysis.orbit import phase_lag_deg, read_orbits
 from service.analysis.recorded import Recorded
 from service.analysis.spectrum import read_spectrum, read_waterfall, shown_as
@@ -162,6 +167,25 @@ def test_frequencies_and_heights_that_are_shown(tmp_path: Path) -> None:
     assert wide.get_xlim() == (1.0, 500.0)
 
 
+def test_every_line_of_a_wide_band_is_in_the_picture_of_a_waterfall(tmp_path: Path) -> None:
+    """There are eight lines to a pixel."""
+    tones_hz = np.arange(60.0, 760.0, 70.5)
+    signals = {"y1": lambda t: np.sin(2 * np.pi * tones_hz[:, None] * t).sum(axis=0)}
+    stream = made(tmp_path, signals, 12.0)
+    fall = read_waterfall(stream, stream.channels(["y1"])[0], 4.0, 0.5, "amplitude")
+    lines = Lines(4.0, 0.5, "amplitude", log=True)
+    picture = tmp_path / "fall.png"
+    draw(
+        picture,
+        Look(size_in=(3.0, 2.5)),
+        lambda look: paint_waterfall(fall, "x", look, (), lines, over_speed=False, cascade=False),
+    )
+    pixels = imread(picture)
+    map_only = pixels[pixels.shape[0] // 2, : round(0.75 * pixels.shape[1]), :3]  # without the bar of colours
+    bright = (map_only[:, 0] > 0.8) & (map_only[:, 2] < 0.5)
+    assert np.count_nonzero(np.diff(bright.astype(int)) == 1) == tones_hz.size
+
+
 def test_spectra_do_not_reach_across_gaps(tmp_path: Path) -> None:
     """A step across the gap would be broadband; segments on either side do not see it."""
     stream = made(tmp_path, {"y1": lambda t: np.where(t > 4.05, 1000.0, 0.0)}, 10.0, without=[40])
@@ -202,7 +226,7 @@ def test_a_speed_axis_needs_a_speed_that_changes(faulty: Path) -> None:
     stream = recorded(faulty, seconds=(0, 20))
     found = read_waterfall(stream, stream.displacements[0], 4.0, 0.5, "amplitude")
     assert found.values.shape[0] == 5
-    with pytest.raises(RotorwatchError, match=r"the speed stays between 1320 and 1320 rpm"):
+    with pytest.raises(RotorwatchError, match=r"the speed stays at 1320 rpm"):
         found.over_speed()
     with pytest.raises(RotorwatchError, match="1 spectra of demo/lab over 20 s without a gap, expected at least 2"):
         read_waterfall(stream, stream.displacements[0], 20.0, 0.5, "amplitude")
@@ -303,12 +327,28 @@ def test_a_trend_of_recorded_reports_needs_no_samples(
         np.testing.assert_array_equal(one.change, other.change)
         np.testing.assert_array_equal(one.high, other.high)
     levels = read_trend(Recorded(source, keys, source.span().start_ns, source.span().end_ns + 1), levels=True)
-    assert (levels.parameters, levels.levels[0].title) == ((), "y1   µm pp")  # instead of parameters
+    assert (levels.parameters, levels.levels[0].title) == ((), "y1   overall, µm pp")  # instead of parameters
     assert all(np.isfinite(one.level).all() and np.isnan(one.danger).all() for one in levels.levels)
     with pytest.raises(RotorwatchError, match="no sample blocks to compute them from"):
         read_trend(Recorded(source, keys, source.span().start_ns, source.span().end_ns + 1), "lab")
     with pytest.raises(MachineFileError, match="machines with reports or sample blocks: demo/lab"):
         source.machine("demo/fan", reports=True)
+
+
+def test_names_of_alarms_can_be_read_however_close_they_are(computed: TrendSeries) -> None:
+    event, first_ns = AlarmEventData.model_validate(example(AlarmEventData)), int(computed.end_ns[0])
+    named = [("k_by", 1), ("data-gap", 1), ("level:VE-1X", 2), ("level:VE-1Y", 2), ("model", 4), ("stream-lost", 38)]
+    alarms = tuple(event.model_copy(update={"name": name, "time_ns": first_ns + at * S}) for name, at in named)
+    figure = paint_trend(replace(computed, alarms=alarms), Look())
+    FigureCanvasAgg(figure)
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        titles = [one for one in axes.get_children() if isinstance(one, Text) and one not in axes.texts]
+        texts = [one for one in (*axes.texts, *titles) if one.get_text()]
+        boxes = [one.get_window_extent() for one in texts]
+        for at, box in enumerate(boxes):
+            assert not box.count_overlaps(boxes[:at]), texts[at].get_text()
+    assert sum(len(axes.texts) for axes in figure.axes) == len(named)
 
 
 def test_a_trend_of_nothing_says_what_was_looked_for(faulty: Path) -> None:
