@@ -67,17 +67,16 @@ class Described(ABC):
         return tuple(there[name] for name in dict.fromkeys(names))
 
     def chosen(self, names: Sequence[str]) -> tuple[Channel, ...]:
-        """Channels by name; without names all displacements.
+        """Channels by name; without names all of the first quantity measured, displacements before velocities.
 
         Raises
         ------
         MachineFileError
-            If there is no such channel, or none that could be meant.
+            If there is no such channel, or none but the shaft angle.
         """
-        found = self.channels(names) or self.displacements
-        if not found:
-            raise MachineFileError(f"{self.name} measures no displacement: name channels with --channel")
-        return found
+        there = self.descriptor.channels
+        first = min((one.quantity for one in there), key=list(Quantity).index)  # the shaft angle is the last
+        return self.channels(names or [one.name for one in there if one.quantity is first])
 
 
 class Sampled(Described):

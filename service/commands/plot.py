@@ -37,7 +37,12 @@ _ToHzOption = Annotated[
     ),
 ]
 _ChannelsOption = Annotated[
-    list[str] | None, typer.Option("--channel", metavar="NAME", help="Repeatable; all displacements if left out.")
+    list[str] | None,
+    typer.Option(
+        "--channel",
+        metavar="NAME",
+        help="Repeatable; all of the first quantity measured if left out, displacements before velocities.",
+    ),
 ]
 _PlaceOption = Annotated[
     str | None, typer.Option("--place", metavar="NAME", help="Where the probes are; all places if left out.")
@@ -246,7 +251,10 @@ def spectrum(
 def waterfall(
     picture: _Picture,
     channel: Annotated[
-        list[str] | None, typer.Option("--channel", metavar="NAME", help="The first displacement if left out.")
+        list[str] | None,
+        typer.Option(
+            "--channel", metavar="NAME", help="If left out, the first displacement, velocity or acceleration."
+        ),
     ] = None,
     window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds of data per spectrum.")] = 4.0,
     resolution: _ResolutionOption = 0.5,

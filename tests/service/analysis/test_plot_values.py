@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from models.errors import RotorwatchError
+from models.signals.channels import Quantity
 from rotorwatch.records.plots import (
     CentrelineSeries,
     FullSpectrumSnapshot,
@@ -53,6 +54,14 @@ def test_a_waveform_is_the_newest_revolutions_with_their_pulses(data: Sampled) -
     assert at_pulses == pytest.approx(np.round(at_pulses), abs=2e-3)
     assert found.waveforms[0].mean == pytest.approx(RUNOUT_UM, rel=1e-2)
     assert found.speed_rad_s == pytest.approx(2 * np.pi * TO_HZ, rel=0.02)
+
+
+def test_what_is_drawn_of_a_machine_that_measures_no_displacement() -> None:
+    kinds = (Quantity.SHAFT_ANGLE, Quantity.VELOCITY)
+    sensors = tuple(one for one in LAB.sensors if one.quantity in kinds)
+    machine = LAB.model_copy(update={"sensors": sensors})
+    assert {one.name for one in Held(machine, BLOCKS).chosen(())} == {"y1_dot", "y2_dot", "z1_dot", "z2_dot"}
+    assert {one.name for one in Held(LAB, BLOCKS).chosen(())} == {"y1", "y2", "z1", "z2"}
 
 
 def test_a_waveform_without_speed_is_the_newest_moment_and_says_so() -> None:
