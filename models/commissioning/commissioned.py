@@ -88,7 +88,8 @@ def knowledge_of(machine: MachineFile) -> Knowledge:
     if rotor.unknown:
         return Knowledge(
             KnowledgeLevel.PARTIAL,
-            f"[rotor] gives masses and shaft; {', '.join(rotor.unknown)} are identified from the recordings",
+            f"[rotor] gives masses and shaft; what it lacks is identified from the recordings: "
+            f"{', '.join(rotor.unknown)}",
         )
     return Knowledge(
         KnowledgeLevel.PARTIAL,

@@ -155,6 +155,7 @@ def _prepare() -> None:
 
 
 def _serve(settings: "ServiceSettings", config: Path | None, ray_address: str | None = None) -> None:
+    from models.commissioning.commissioned import KnowledgeLevel, knowledge_of  # noqa: PLC0415  # keeps --help quick
     from service.runtime.runtime import running  # noqa: PLC0415  # must see the variables that were set
     from service.terminal.logs import configure_logging  # noqa: PLC0415  # keeps --help quick
     from service.terminal.stopping import stop_request  # noqa: PLC0415
@@ -163,8 +164,9 @@ def _serve(settings: "ServiceSettings", config: Path | None, ray_address: str | 
     with stop_request() as stop, running(settings, ray_address) as service:
         keep_loaded()
         for worker in service.machines():
-            networks = worker.identity["bundle"] or "none: the equations are not evaluated"
-            typer.echo(f"machine {worker.machine.title}, bundle {networks}")
+            full = knowledge_of(worker.machine).level is KnowledgeLevel.FULL
+            without = "the equations are not evaluated" if full else "vibration levels alone are watched"
+            typer.echo(f"machine {worker.machine.title}, bundle {worker.identity['bundle'] or f'none: {without}'}")
         if settings.link.namespace:
             typer.echo(f"Zenoh namespace {settings.link.namespace}: nothing outside it is received")
         for what, ends in (("listening on", settings.link.listen), ("connecting to", settings.link.connect)):
@@ -283,7 +285,7 @@ def demo(
 
 def _checked(file: Path) -> str:
     """Check one file and say what it describes."""
-    from models.commissioning.commissioned import install  # noqa: PLC0415  # keeps --help quick
+    from models.commissioning.commissioned import install, knowledge_of  # noqa: PLC0415  # keeps --help quick
     from models.machine import load_machine_file  # noqa: PLC0415
     from models.mistakes import read_toml  # noqa: PLC0415
     from service.access.tls import lapses, tls_context  # noqa: PLC0415
@@ -293,7 +295,9 @@ def _checked(file: Path) -> str:
     fields = read_toml(file)
     if {"site", "rotor", "sensors"} & set(fields):
         machine = load_machine_file(file)
-        return f"machine {machine.title}, {len(machine.sensors)} channels at {machine.rate_hz:g} Hz"
+        known = knowledge_of(machine)  # a field of [rotor] that is forgotten is no mistake, but costs the diagnosis
+        channels = f"{len(machine.sensors)} channels at {machine.rate_hz:g} Hz"
+        return f"machine {machine.title}, {channels}; knowledge level {known.level}: {known.text}"
     settings = load_settings(file)
     names = []
     for entry in settings.machines:

@@ -82,10 +82,14 @@ def test_check_config_says_what_is_fine_and_what_is_not(tmp_path: Path) -> None:
     )
     wrong_bundle = tmp_path / "bundle.toml"
     wrong_bundle.write_text('[[machines]]\nfile = "heavy"\nbundle = "lab"\n', encoding="utf-8")
-    fine = run("check-config", str(good), str(tmp_path / "machine.toml"))
+    forgotten = tmp_path / "forgotten.toml"  # a field, which is no mistake
+    lines = (tmp_path / "machine.toml").read_text(encoding="utf-8").splitlines()
+    forgotten.write_text("\n".join(one for one in lines if "I2p_kg_m2" not in one), encoding="utf-8")
+    fine = run("check-config", str(good), str(tmp_path / "machine.toml"), str(forgotten))
     assert (fine.returncode, fine.stderr) == (0, "")
     assert f"{good}: ok, settings for demo/lab" in fine.stdout
-    assert f"{tmp_path / 'machine.toml'}: ok, machine demo/lab, 9 channels at 2000 Hz" in fine.stdout
+    assert f"{tmp_path / 'machine.toml'}: ok, machine demo/lab, 9 channels at 2000 Hz; knowledge level full" in fine.stdout
+    assert "knowledge level none: [rotor] lacks I2p_kg_m2" in fine.stdout
     mixed = run("check-config", str(good), str(wrong_machine), str(wrong_bundle))
     assert mixed.returncode == 2
     assert f"{good}: ok" in mixed.stdout
