@@ -88,7 +88,8 @@ def test_check_config_says_what_is_fine_and_what_is_not(tmp_path: Path) -> None:
     fine = run("check-config", str(good), str(tmp_path / "machine.toml"), str(forgotten))
     assert (fine.returncode, fine.stderr) == (0, "")
     assert f"{good}: ok, settings for demo/lab" in fine.stdout
-    assert f"{tmp_path / 'machine.toml'}: ok, machine demo/lab, 9 channels at 2000 Hz; knowledge level full" in fine.stdout
+    found = "ok, machine demo/lab, 9 channels at 2000 Hz; knowledge level full"
+    assert f"{tmp_path / 'machine.toml'}: {found}" in fine.stdout
     assert "knowledge level none: [rotor] lacks I2p_kg_m2" in fine.stdout
     mixed = run("check-config", str(good), str(wrong_machine), str(wrong_bundle))
     assert mixed.returncode == 2
