@@ -54,7 +54,7 @@ class RotorwatchPage extends HTMLElement {
       await load();
       if (location.hash !== asked) return; // gone on meanwhile
     } catch {
-      this.#main.replaceChildren(html("p", {}, "The monitor now serves a newer page: reload this one."));
+      this.#main.replaceChildren(html("p", {}, monitor.unloaded));
       return;
     }
     if (monitor.stranger) return this.#main.replaceChildren(html("sign-in"));

@@ -52,7 +52,7 @@ class AlarmHistory extends MachineElement {
         html("span", {}, one.kind),
         html("span", {}, one.text, " ", one.kind === "raised" && why(this.place, one)),
         html("span", {}, one.actor || "monitor"),
-        html("span", {}, one.reason || one.note),
+        html("span", {}, one.reason),
       ],
     }));
     renew(

@@ -123,7 +123,7 @@ class AlarmList extends HTMLElement {
         html("div", {}, box, machine, html("b", {}, alarm.text), html("small", {}, ` ${alarm.name}`), !this.hasAttribute("alarm") && why(place, alarm)),
         html("div", { class: "states" }, alarm.raised && html("state-mark", { state: alarm.severity }), html("span", {}, alarm.pending ? "pending" : alarm.state)),
         html("time", { class: "number" }, clock(alarm.raised_ns ?? alarm.since_ns)),
-        html("span", {}, known(alarm)),
+        html("span", { class: "wordy" }, known(alarm)),
         html("div", { class: "actions" }, ...buttons),
       ],
     };

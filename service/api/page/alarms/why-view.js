@@ -43,7 +43,7 @@ class WhyView extends HTMLElement {
       const raised = events.events.map((/** @type {{data: any}} */ one) => one.data).find((/** @type {any} */ one) => one.kind === "raised" && one.occurrence === found.occurrence);
       this.#lay(place, found, raised);
     } catch (error) {
-      lay(this, html("h1", {}, name), html("p", { role: "status" }, error instanceof Error ? error.message : String(error)), html("a", { href: `#/machines/${place}` }, place));
+      lay(this, html("h1", {}, `Why? ${name}`), html("p", { role: "status" }, error instanceof Error ? error.message : String(error)), html("a", { href: `#/machines/${place}` }, place));
     }
   }
 

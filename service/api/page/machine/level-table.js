@@ -22,7 +22,7 @@ class LevelTable extends MachineElement {
     const rows = report.levels.map((one) => {
       const worst = one.limits.find((limit) => limit.state === "danger") ?? one.limits.find((limit) => limit.state === "alert");
       const limits = one.limits.map((limit) =>
-        html("div", { title: limit.source }, `${measureText(limit.measure)}: ${limitText(limit, one)}`, html("small", {}, ` ${limit.source}`)),
+        html("div", { title: limit.source }, `${measureText(limit.measure)}: ${limitText(limit, one)} ${shownIn(levelUnit(one, limit.measure))[1]}`, html("small", {}, ` ${limit.source}`)),
       );
       const detection = one.detection === "peak to peak" ? "pp" : "rms";
       return {
@@ -32,13 +32,13 @@ class LevelTable extends MachineElement {
           html("b", {}, one.channel),
           worst ? html("div", {}, html("state-mark", { state: worst.state }), html("div", {}, worst.text)) : "",
           `${shownIn(printed(one.unit))[1]} ${detection}`,
-          ...shown.map((measure) => html("span", { class: "number" }, figure(leveled(one, measure)))),
+          ...shown.map((measure) => html("span", { class: "number" }, figure(leveled(one, measure)), measure === "mean" && one.mean !== null && ` ${shownIn(levelUnit(one, measure))[1]}`)),
           one.zone,
           limits.length ? html("details", {}, html("summary", {}, `${limits.length}`), ...limits) : "none",
         ],
       };
     });
-    const heads = ["channel", "alarm", "unit", ...shown.map((one) => (one === "velocity" ? `velocity, ${shownIn("mm/s")[1]}` : measureText(one))), "zone", "limits"];
+    const heads = ["channel", "alarm", "unit", ...shown.map((one) => (one === "velocity" ? `velocity, ${shownIn("mm/s rms")[1]}` : measureText(one))), "zone", "limits"];
     const growth = report.level_growth?.text;
     renew(this, table(heads, rows, "Vibration levels"), html("p", { class: "note" }, growth ? `${growth[0].toUpperCase()}${growth.slice(1)}.` : ""));
   }

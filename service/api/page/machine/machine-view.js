@@ -47,7 +47,9 @@ class MachineView extends MachineElement {
     }
     if (!this.#built) this.#build();
     const { report, stream } = health;
-    const said = report?.verdict && `${report.verdict.text}.${report.suspect ? ` Best explained by: ${report.suspect}.` : ""}`;
+    const read = report?.verdict?.outside_model || report?.parameters.some((one) => one.relative_change !== null);
+    const levelsAlone = report?.verdict && !read && !report.shapes.length && !report.reason;
+    const said = levelsAlone ? "Nothing is diagnosed on this machine: its vibration levels are compared with those of the healthy recordings." : report?.verdict && `${report.verdict.text}.${report.suspect ? ` Best explained by: ${report.suspect}.` : ""}`;
     const silent = stream.silent && health.state !== "no-data";
     lay(
       this.#head,

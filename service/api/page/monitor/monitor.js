@@ -52,6 +52,10 @@ export class Monitor extends EventTarget {
   connected = false;
   /** @type {number | null} since when nothing is heard */
   lostAt = null;
+  /** What is said where a view could not be loaded. */
+  get unloaded() {
+    return this.connected ? "The monitor now serves a newer page: reload this one." : "There is no connection to the monitor, and this view has not been loaded yet: reload the page once the monitor can be reached.";
+  }
   #tellStream = sharedStream((told) => this.#hear(told));
   #looked = "";
   #due = 0;

@@ -51,7 +51,8 @@ export const measureText = (measure) => MEASURES[measure] ?? measure;
 
 /** Unit of one level of a channel. @param {ChannelLevels} levels @param {string} measure */
 export function levelUnit(levels, measure) {
-  if (["crest", "kurtosis", "growth"].includes(measure)) return "";
+  if (measure === "growth") return "× reference";
+  if (["crest", "kurtosis"].includes(measure)) return "";
   if (measure === "velocity") return "mm/s rms";
   const detection = levels.detection === "peak to peak" ? "pp" : "rms";
   const plain = measure === "mean" || measure === "peak" || measure === "s_max";

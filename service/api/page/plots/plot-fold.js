@@ -1,4 +1,5 @@
 import { html } from "../elements/markup.js";
+import { monitor } from "../monitor/monitor.js";
 
 /**
  * Something that is not always needed, folded: `<plot-fold place shows="plots/waveform-plot" heading>`, with `open` not at first. It is loaded when it is
@@ -18,7 +19,7 @@ class PlotFold extends HTMLElement {
         await import(`../${shows}.js`);
         if (target.open) this.#fill(shows.slice(shows.indexOf("/") + 1));
       } catch {
-        this.#inside.replaceChildren(html("p", { class: "note" }, "The monitor now serves a newer page: reload this one."));
+        this.#inside.replaceChildren(html("p", { class: "note" }, monitor.unloaded));
       }
     };
     this.replaceChildren(html("details", { toggle: toggled, open: this.hasAttribute("open") }, html("summary", {}, html("h2", {}, this.getAttribute("heading"))), this.#inside));

@@ -57,7 +57,10 @@ class SpectrumPlot extends MachineElement {
     const shown = found.densities.find((one) => one.channel === this.#choice.value) ?? found.densities[0];
     this.#chart.hidden = this.#choice.hidden = !shown;
     const theory = found.theory;
-    this.#message.textContent = [this.windowText(found), found.reason, theory.nominal_reason || theory.estimated_reason].filter(Boolean).join("; ");
+    // Whoever looks for 1× has to be told where it is.
+    const once = shown && found.left_out_hz ? "1× is taken out (shaded: where some of it may be left); it is among the vibration levels" : "";
+    const others = shown || this.recorded ? "" : "the waterfall below shows spectra of every channel";
+    this.#message.textContent = [this.windowText(found), once, found.reason, others, theory.nominal_reason || theory.estimated_reason].filter(Boolean).join("; ");
     if (!shown) return;
     this.#chart.setAttribute("aria-label", `spectrum of ${shown.channel}, rms ${figure(shown.rms)}`);
     this.#chart.draw(spectrumDrawing(found, shown));

@@ -50,7 +50,7 @@ class WaterfallPlot extends SamplePlot {
     const ends = [rows[rows.length - 1], rows[Math.floor(rows.length / 2)], rows[0]].map((row) => html("span", {}, named(row, found.over)));
     const along = [0, 0.25, 0.5, 0.75, 1].map((part) => html("span", {}, figure(lines[0] + part * (lines[lines.length - 1] - lines[0]))));
     this.body.append(html("figure", { class: "waterfall" }, html("div", { class: "up number" }, ...ends), canvas, order, html("div", { class: "along number" }, ...along), html("p", { class: "unit" }, "frequency, Hz")));
-    return `${found.source}, ${rows.length} spectra of ${found.channel}, ${stretch(found.start_ns, found.end_ns)}; the strongest shade is ${quantity(top, found.unit)}, with a third of it less a tenth of that${order ? "; dashed: 1×" : ""}`;
+    return `${found.source}, ${rows.length} spectra of ${found.channel}, ${stretch(found.start_ns, found.end_ns)}; the strongest shade is ${quantity(top, found.unit)}, the weakest a thousandth of it or less, on a logarithmic scale${order ? "; dashed: 1×" : ""}`;
   }
 }
 

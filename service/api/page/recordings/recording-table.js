@@ -38,7 +38,7 @@ class RecordingTable extends HTMLElement {
           html("time", { class: "number" }, clock(one.start_ns)),
           html("span", { class: "number" }, size(one.size_bytes)),
           html("span", {}, one.problem || (one.complete ? (one.messages ? "complete" : "empty") : "being written, or left by a crash")),
-          html("span", {}, one.kept_because || "no alarm"),
+          html("span", { class: "wordy" }, one.kept_because || "no alarm"),
           one.complete ? html("div", {}, html("a", { href: `${API}/recordings/${one.id}/download`, download: name, "aria-label": `Download ${name}` }, "Download")) : "",
         ],
       };

@@ -38,7 +38,7 @@ class RecordingsView extends LiveElement {
     lay(this, html("div", { class: "tools" }, html("h1", {}, "Recordings"), this.#machine), this.#message, ...this.#parts, html("replay-list"));
     let heard = monitor.machines.size;
     this.follow("health", () => {
-      if (heard === monitor.machines.size) return;
+      if (!this.#said || heard === monitor.machines.size) return; // nothing is claimed of recordings that were not asked for yet
       heard = monitor.machines.size;
       this.#show();
     });

@@ -230,6 +230,9 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
         ):
             expect(view).to_contain_text(text)
         expect(page.locator(".banner")).to_contain_text("No connection to the monitor since")  # the stream has ended
+        page.route("**/recordings-view.js", lambda route: route.fulfill(body="throw 0", content_type="text/javascript"))
+        page.get_by_role("link", name="Recordings").click()
+        expect(page.locator("main")).to_contain_text("There is no connection to the monitor")
     told["report"] = report | {"parameters": [], "verdict": None, "levels": [growing]}
     told["alarms"] = [told["alarms"][0] | {"name": "level:DE-H", "severity": "danger"}]
     with looking(browser, url) as page:

@@ -52,6 +52,7 @@ def test_plots_are_drawn_when_they_are_opened_and_say_what_they_show(browser: Br
         page.goto(f"{url}/#/machines/demo/lab")
         expect(page.locator("parameter-forest circle.decides")).to_have_count(7)  # one of them in the key
         expect(page.locator("spectrum-plot canvas")).to_be_visible()
+        expect(page.locator("spectrum-plot .note")).to_contain_text("1× is taken out")
         assert not {route for _, route, _, _ in PLOTS} & set(asked)
         for element, route, drawn, said in PLOTS:
             page.locator(f'plot-fold[shows="plots/{element}"] summary').press("Enter")

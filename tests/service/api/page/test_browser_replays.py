@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from models.machine import load_machine
 from rotorwatch.records.replays import ReplayJob, ReplayReportList
@@ -59,6 +59,27 @@ def chosen(page: Page, url: str) -> None:
     page.get_by_role("button", name=re.compile("Choose ten minutes before and after .*k_by")).click()
     expect(page.locator("replay-order")).to_contain_text("1 recording of demo/lab")
     expect(page.get_by_role("checkbox", name="20260101T000000Z.mcap")).to_be_checked()
+
+
+def test_nothing_is_said_of_recordings_before_they_are_known(browser: Browser, runtime: Runtime) -> None:
+    url = runtime.http_url
+    held: dict[str, Route] = {}
+
+    def hold(route: Route) -> None:
+        held["events" if "/events" in route.request.url else "recordings"] = route
+
+    with looking(browser, url) as page:
+        page.add_init_script("delete window.SharedWorker")  # what it asks for cannot be routed
+        page.route("**/api/v1/events?*", hold)
+        page.route("**/recordings?site=*", hold)
+        page.goto(f"{url}/#/recordings/demo/lab")
+        expect(page.get_by_label("Machine", exact=True)).to_have_text("demo/lab")
+        held["events"].continue_()
+        expect(page.get_by_role("link", name="Alarms 1")).to_be_visible()  # the stream has told of the machine
+        page.wait_for_timeout(200)
+        expect(page.locator("recordings-view")).not_to_contain_text("No recording")
+        held["recordings"].continue_()
+        expect(page.locator("recording-table")).to_contain_text("20260101T000000Z.mcap")
 
 
 def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browser, runtime: Runtime) -> None:
