@@ -45,6 +45,8 @@ from service.analysis.trend import recorded_alarms
 _DECADES = 4
 _MOST_TRACES = 60
 _ORDERS = (1, 2)
+_CLOSE = 0.035
+"""Distance of orders, of the axis, up to which their names would cover each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,12 +227,19 @@ def _orders(axes: Axes, found: Spectrum, values: np.ndarray, frequency: np.ndarr
         axes.axvline(at, color=COLOURS[1], linewidth=0.9, linestyle=(0, (3, 2)), zorder=1)
         unit, _ = shown_as(channel, found.scaling)
         high = f": {values[near].max():.3g} {unit}" if found.scaling == "amplitude" and near.any() else ""
-        axes.annotate(
-            f"{order}×", (at, 1.0), xycoords=("data", "axes fraction"), xytext=(3, -2),
-            textcoords="offset points", ha="left", va="top", fontsize=8, color=COLOURS[1],
-        )  # fmt: skip
+        _name_order(axes, f"{order}×", at, order, of_axis=at / order / float(frequency[-1]))
         texts.append(f"{order}× {at:.4g} Hz{high}")
     axes.set_title("     ".join(texts), loc="right", color=COLOURS[1])
+
+
+def _name_order(axes: Axes, text: str, at: float, order: int, *, of_axis: float) -> None:
+    """Name an order beside its line: lower than the one before where orders are too close to stand side by side."""
+    close = of_axis < _CLOSE
+    away = close and at < 0  # from the names on the other side
+    axes.annotate(
+        text, (at, 1.0), xycoords=("data", "axes fraction"), xytext=(-3 if away else 3, -2 - 11 * close * (order - 1)),
+        textcoords="offset points", ha="right" if away else "left", va="top", fontsize=8, color=COLOURS[1],
+    )  # fmt: skip
 
 
 def _order_lines(axes: Axes, found: Waterfall, rows: np.ndarray, *, over_speed: bool) -> None:
@@ -324,10 +333,8 @@ def _marks(axes: Axes, found: FullSpectrum, values: np.ndarray, shown: npt.NDArr
             if not near.any():
                 continue
             axes.axvline(sign * order * turns, color=COLOURS[1], linewidth=0.9, linestyle=(0, (3, 2)), zorder=1)
-            axes.annotate(
-                f"{'−' if sign < 0 else ''}{order}×", (sign * order * turns, 1.0), xycoords=("data", "axes fraction"),
-                xytext=(3, -2), textcoords="offset points", ha="left", va="top", fontsize=8, color=COLOURS[1],
-            )  # fmt: skip
+            text, of_axis = f"{'−' if sign < 0 else ''}{order}×", turns / float(np.ptp(found.lines[shown]))
+            _name_order(axes, text, sign * order * turns, order, of_axis=of_axis)
             heights.append(f"{values[near].max():.3g}")
         if len(heights) == 2:
             texts.append(f"{order}× forward {heights[1]}, reverse {heights[0]} µm p-p")

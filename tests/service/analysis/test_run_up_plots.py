@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 from scipy.signal import cont2discrete, lfilter
@@ -15,6 +16,7 @@ from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from service.analysis.figures.run_up import bode, centreline, polar
+from service.analysis.figures.spectrum import Lines, full_spectrum, spectrum
 from service.analysis.figures.style import Look
 from service.analysis.figures.waveform import waveform
 from service.analysis.orbit import in_planes, orbit_pairs, recorded_pairs
@@ -53,6 +55,20 @@ def test_a_circle_with_the_rotation_is_one_line_and_an_ellipse_two(tmp_path: Pat
     elsewhere = np.abs(found.lines - one) > 2.5 * found.resolution
     assert found.values_um[0, elsewhere].max() < 0.05
     assert found.useful == pytest.approx(4 * one)
+
+
+def test_names_of_orders_can_be_read_in_a_wide_band(tmp_path: Path) -> None:
+    """20 and 40 Hz are ten pixels apart, on either side."""
+    circle = {"theta": turning(20.0), "y1": lambda t: np.cos(125.7 * t), "z1": lambda t: np.sin(125.7 * t)}
+    data, lines = made(tmp_path, circle, 21.0), Lines(20.0, 0.5, "amplitude", log=False, to_hz=900.0)
+    figures = full_spectrum(data, "bearing", lines, orders=False)(Look()), spectrum(data, ["y1"], lines)(Look())
+    for figure, names in zip(figures, (["1×", "2×", "−1×", "−2×"], ["1×", "2×"]), strict=True):
+        FigureCanvasAgg(figure)
+        figure.draw_without_rendering()
+        texts = [one for one in figure.axes[0].texts if "×" in one.get_text()]
+        assert sorted(one.get_text() for one in texts) == names
+        boxes = [one.get_window_extent() for one in texts]
+        assert not any(box.count_overlaps(boxes[:at]) for at, box in enumerate(boxes))
 
 
 def test_orders_stay_sharp_while_the_speed_changes(tmp_path: Path) -> None:
