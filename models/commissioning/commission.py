@@ -332,7 +332,10 @@ def _excluded(windows: Sequence[WindowStatistics], *, everywhere: bool) -> tuple
 
 
 def _only_levels(machine: MachineFile, text: str) -> Check:
-    advice = "give location and direction of the sensors as the model names them, where they are at such places"
+    advice = (
+        "for a diagnosis, not levels alone, give sensors beside a bearing the location bearing, those beside the disc "
+        "or impeller the location disc, and the direction y (horizontal) or z (vertical)"
+    )
     if not machine.holds_band:
         advice = "record longer snapshots, so that band_hz holds 20 frequencies of segment_s"
     return Check(name="can be learned", verdict="limited", text=text, advice=advice)

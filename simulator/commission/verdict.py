@@ -256,10 +256,12 @@ def growth_sentence(report: CommissioningReport) -> str:
     if not found:
         return ""
     (least, first), (most, last) = (edge(found, key=lambda each: each[0]) for edge in (min, max))
+    low, high = f"{100 * least:.0f}%", f"{100 * most:.0f}%"
+    ends = f"{low} ({first.channel} {first.measure}) to {high} ({last.channel} {last.measure})"
     return (
-        f"A level raises an alert, relative to the healthy machine, once it has grown by {100 * least:.0f}% "
-        f"({first.channel} {first.measure}) to {100 * most:.0f}% ({last.channel} {last.measure}). A load that is not "
-        "in the recordings, stronger or from another direction, makes some channels louder as well and raises alerts."
+        "A level raises an alert, relative to the healthy machine, once it has grown by "
+        f"{low if low == high else ends}. A load that is not in the recordings, stronger or from another direction, "
+        "makes some channels louder as well and raises alerts."
     )
 
 

@@ -26,6 +26,7 @@ from simulator.commission.verdict import (
     channel_text,
     dominant,
     duration,
+    growth_sentence,
     headline,
     next_steps,
     parameter_value,
@@ -442,7 +443,11 @@ def test_every_channel_has_words() -> None:
 
 def test_what_growth_of_a_level_raises_an_alert_stands_on_the_page_and_in_the_terminal(folder: Path) -> None:
     text, report = written(folder, "no phase reference")
+    assert "give sensors beside a bearing the location bearing" in section(text, "verdict")
     assert {one.channel for one in report.levels} == {channel.name for channel in case("no phase reference")[2].sensors}
+    growths = [one.model_copy(update={"growth": 0.6 + at / 1e4}) for at, one in enumerate(report.levels)]
+    alike = growth_sentence(report.model_copy(update={"levels": tuple(growths)}))
+    assert "once it has grown by 60%. A load" in alike
     told = section(text, "levels")
     for one in report.levels:
         assert one.growth is not None
