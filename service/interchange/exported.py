@@ -4,6 +4,7 @@ A table is a schema, whose fields carry ``unit`` and ``description`` in their me
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -11,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from models.errors import MachineFileError, RecordingError, WireError
+from models.levels.limits import unit_of
 from models.mistakes import mistakes
 from models.physics.rotor import PARAMETER_TEXT
 from models.signals.block import SampleBlock
@@ -23,10 +25,17 @@ from models.signals.recording import RecordedMessage, read_recording, summarize_
 from models.signals.wire import decode_block
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import MEASURES, Report
+from rotorwatch.records.levels import ChannelLevels
 
 _ROWS = 65536
 _MESSAGES = 1000
 _Row = dict[str, object]
+
+
+class _Levels(BaseModel):
+    """What is read of a report to know its columns."""
+
+    levels: tuple[ChannelLevels, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +145,28 @@ def report_table(selection: Selection) -> Table:
             _field(f"{name}.standard_error", pa.float64(), "1", f"{text}: standard error of the relative change"),
             _field(f"{name}.z", pa.float64(), "1", f"{text}: change over its standard error"),
         ]
+    fields += _level_fields(selection)
     return _message_table(selection, "report", fields, _report_row, "end_ns")
+
+
+def _level_fields(selection: Selection) -> list[pa.Field]:
+    """A column for each level of each channel that is in any of the reports."""
+    found: dict[str, pa.Field] = {}
+    for _, message in _messages(selection, f"{selection.root()}/report"):
+        with suppress(ValidationError):  # told when its row is read
+            for levels in _Levels.model_validate_json(message.payload).levels:
+                pp = levels.detection == "peak to peak"
+                for measure in _level_values(levels):
+                    unit = "deg" if measure.endswith("_deg") else unit_of(levels.unit, measure, pp) or "1"
+                    text = f"{levels.channel}: {ChannelLevels.model_fields[measure].description}"
+                    name = f"{levels.channel}.{measure}"
+                    found.setdefault(name, _field(name, pa.float64(), unit, text))
+    return list(found.values())
+
+
+def _level_values(levels: ChannelLevels) -> dict[str, float]:
+    """Its levels and their phases, as far as there are any."""
+    return {name: value for name, value in vars(levels).items() if isinstance(value, float)}
 
 
 def alarm_table(selection: Selection) -> Table:
@@ -276,6 +306,8 @@ def _report_row(payload: bytes) -> _Row:
     for reading in report.parameters:
         for value in ("relative_change", "standard_error", "z"):
             row[f"{reading.name}.{value}"] = getattr(reading, value)
+    for levels in report.levels:
+        row |= {f"{levels.channel}.{name}": value for name, value in _level_values(levels).items()}
     return row
 
 
