@@ -88,7 +88,7 @@ def creation_hint(config: Path | None, history: "HistorySettings") -> str:
 
 @tokens.command("list")
 def list_(config: HistoryOption = None) -> None:
-    """Show every token there ever was, and which hold.
+    """Show every token ever created, and which are valid.
 
     [bold]Example[/bold]
 

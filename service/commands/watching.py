@@ -112,11 +112,11 @@ def status(
 ) -> None:
     """Table of all machines of a running monitor.
 
-    Exit code 0: no alarm stands on any machine (healthy, warming, not
-    evaluable). 1: an alarm stands on one. 3: none stands, but the data of one
-    have stopped. 4: the monitor does not answer, or does not let us in. 2: an
-    argument that cannot be used. Beneath the table stand the reasons, and
-    alarms kept from operators.
+    Exit code 0: no alarm is raised on any machine (healthy, warming, not
+    evaluable). 1: an alarm is raised on a machine. 3: none is raised, but the
+    data of a machine have stopped. 4: the monitor does not answer, or refuses
+    the token. 2: an argument that cannot be used. Reasons, and alarms that are
+    shelved, suppressed or out of service, are listed below the table.
 
     [bold]Examples[/bold]
 

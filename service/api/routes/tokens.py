@@ -32,7 +32,7 @@ def add_token_routes(app: FastAPI, guard: Guard) -> None:
 
     @app.get(_PLACE, tags=["service"], dependencies=[guard.configure], responses=responses(TokenList))
     def tokens() -> TokenList:
-        """Every token there ever was, without its secret; an application in the open says that none is needed."""
+        """Every token ever created, without its secret; an application in the open says that none is needed."""
         found = tuple(_entry(guard, record) for record in guard.tokens.all())
         return TokenList(needed=not guard.access.open_on_loopback, tokens=found)
 
