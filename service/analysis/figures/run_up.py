@@ -196,8 +196,8 @@ def _paint_centreline(found: Centreline, name: str, clearance_um: float | None, 
         lines.set_array((along[:-1] + along[1:]) / 2)
         axes.add_collection(lines)
         axes.scatter(y, z, c=along, cmap="viridis_r", norm=norm, s=9, zorder=3, linewidths=0)
-        reach = max(float(np.ptp(y)), float(np.ptp(z)), 1e-3)
-        for at in spread_marks(along, y + 1j * z, 0.14 * reach):
+        _frame(axes, found, number, y, z, clearance_um)
+        for at in spread_marks(along, y + 1j * z, 0.12 * float(np.ptp(axes.get_xlim()))):
             axes.plot(y[at], z[at], "o", color=COLOURS[1], markersize=4.5, zorder=4)
             axes.annotate(
                 mark_text(along[at], unit), (y[at], z[at]), xytext=(5, 4), textcoords="offset points", fontsize=8,
@@ -205,7 +205,6 @@ def _paint_centreline(found: Centreline, name: str, clearance_um: float | None, 
             )  # fmt: skip
         if clearance_um is not None:
             axes.add_patch(Circle((0, clearance_um / 2), clearance_um / 2, fill=False, color=GREY, linestyle="--"))
-        _frame(axes, found, number, y, z, clearance_um)
         axes.set_title(f"{pair[0].location}", fontweight="bold")
     bar = figure.colorbar(lines, ax=list(panels), pad=0.02, aspect=32, shrink=0.9)
     bar.set_label(unit)

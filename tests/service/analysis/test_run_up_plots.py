@@ -71,6 +71,16 @@ def test_names_of_orders_can_be_read_in_a_wide_band(tmp_path: Path) -> None:
         assert not any(box.count_overlaps(boxes[:at]) for at, box in enumerate(boxes))
 
 
+def test_marks_of_a_shaft_that_stays_where_it_is_can_be_read(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    noise = {"theta": turning(20.0), **{name: lambda t: rng.normal(0, 0.1, t.size) for name in ("y1", "z1")}}
+    figure = drawn(centreline(made(tmp_path, noise, 60.0), "bearing", 1.0, None))
+    FigureCanvasAgg(figure)
+    figure.draw_without_rendering()
+    boxes = [one.get_window_extent() for one in figure.axes[0].texts]
+    assert not any(box.count_overlaps(boxes[:at]) for at, box in enumerate(boxes))
+
+
 def test_orders_stay_sharp_while_the_speed_changes(tmp_path: Path) -> None:
     """From 20 to 30 Hz in 20 s: over frequencies the line is smeared, over orders it is not."""
 
@@ -310,7 +320,7 @@ def test_a_centreline_is_the_mean_of_the_gaps(tmp_path: Path, keyphasor: bool) -
     if keyphasor:
         assert found.speed_rad_s / (2 * np.pi) == pytest.approx(2.2 + np.arange(1, 20, 2), rel=0.01)
     assert bar.get_ylabel() == ("speed, rpm" if keyphasor else "time after the start, s")
-    assert f"start: y1 {found.y_um[0, 0]:.4g} µm, z1 {found.z_um[0, 0]:.4g} µm" in axes.texts[-1].get_text()
+    assert f"start: y1 {found.y_um[0, 0]:.4g} µm, z1 {found.z_um[0, 0]:.4g} µm" in axes.texts[0].get_text()
     assert axes.get_xlim()[0] < -50 < 50 < axes.get_xlim()[1]  # the whole clearance
     with pytest.raises(RotorwatchError, match="1 stretches of 20 s of demo/lab without a gap, expected at least 2"):
         read_centreline(data, recorded_pairs(data, "bearing"), 20.0)
