@@ -31,7 +31,7 @@
  * @typedef {{location: string, unit: string, ellipse: Ellipse | null, nominal: Ellipse | null, estimated: Ellipse | null, path: {times_s: number[], y: number[], z: number[]} | null}} PlaceOrbit
  * @typedef {{start_ns: number | null, end_ns: number | null, speed_rad_s: number | null, orbits: PlaceOrbit[], revolutions: number, pulses_s: number[], reason: string, path_reason: string}} Orbits
  * @typedef {{channel: string, quantity: string, unit: string, measured: (number | null)[], nominal: (number | null)[] | null, estimated: (number | null)[] | null, rms: number | null}} Density
- * @typedef {{start_ns: number | null, end_ns: number | null, frequencies_hz: number[], rotation_hz: number | null, left_out_hz: [number, number] | null, densities: Density[], theory: {nominal_reason: string, estimated_reason: string}, reason: string, interval_95: [number, number] | null}} Spectra
+ * @typedef {{start_ns: number | null, end_ns: number | null, filled: number, frequencies_hz: number[], rotation_hz: number | null, left_out_hz: [number, number] | null, densities: Density[], theory: {nominal_reason: string, estimated_reason: string}, reason: string, interval_95: [number, number] | null}} Spectra
  * @typedef {{report: Report, spectra: Spectra, orbits: Orbits, correlations?: CorrelationSnapshot | null}} Picture
  * @typedef {{site: string, machine: string, name: string, occurrence: number, before: Picture | null, raised: Picture, settled: Picture | null}} AlarmEvidence
  * @typedef {{token_id: string, name: string, scopes: string[], state: string, created_ns: number, expires_ns: number | null, revoked_ns: number | null, last_used_ns: number | null}} TokenEntry

@@ -1,4 +1,4 @@
-import { figure, printed } from "../monitor/figures.js";
+import { figure, printed, stretch } from "../monitor/figures.js";
 import { html } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import "../elements/line-chart.js";
@@ -6,26 +6,32 @@ import "../elements/line-chart.js";
 const [REFRESH_S, ORDERS] = [15, 5];
 
 /** @typedef {import("../monitor/records.js").Spectra} Spectra */
+/** @typedef {import("../monitor/records.js").WaterfallSnapshot} Waterfall */
+
+/** What spectra have around them: axes and the orders. @param {number[]} lines @param {number | null} turning Hz @param {string} unit */
+function frame(lines, turning, unit) {
+  const orders = turning ? Array.from({ length: ORDERS }, (_, at) => at + 1).filter((order) => order * turning <= lines[lines.length - 1]) : [];
+  return {
+    x: lines,
+    marks: orders.map((order) => ({ at: order * /** @type {number} */ (turning), axis: /** @type {const} */ ("x"), colour: "ink-2", text: `${order}×`, dash: [2, 3] })),
+    time: false,
+    log: true,
+    unit: printed(unit),
+    xUnit: "frequency, Hz",
+    height: 280,
+  };
+}
 
 /** One channel's spectrum beside its theory, with the orders. @param {Spectra} found @param {import("../monitor/records.js").Density} shown @returns {import("../elements/line-chart.js").Drawing} */
 export function spectrumDrawing(found, shown) {
-  const turning = found.rotation_hz;
-  const last = found.frequencies_hz[found.frequencies_hz.length - 1];
-  const orders = turning ? Array.from({ length: ORDERS }, (_, at) => at + 1).filter((order) => order * turning <= last) : [];
   /** @type {import("../elements/line-chart.js").Line[]} */
   const lines = [{ label: "measured", values: shown.measured }];
   if (shown.nominal) lines.push({ label: "as nominal", values: shown.nominal, colour: "nominal", dash: [6, 4] });
   if (shown.estimated) lines.push({ label: "as estimated", values: shown.estimated, colour: "estimated", width: 2 });
   return {
-    x: found.frequencies_hz,
+    ...frame(found.frequencies_hz, found.rotation_hz, shown.unit),
     lines,
-    marks: orders.map((order) => ({ at: order * /** @type {number} */ (turning), axis: "x", colour: "ink-2", text: `${order}×`, dash: [2, 3] })),
-    time: false,
-    log: true,
-    unit: printed(shown.unit),
-    xUnit: "frequency, Hz",
     shaded: found.left_out_hz ? [{ from: found.left_out_hz[0], to: found.left_out_hz[1] }] : [],
-    height: 280,
   };
 }
 
@@ -42,7 +48,28 @@ class SpectrumPlot extends MachineElement {
   }
 
   async ask() {
-    this.#draw(await this.askFor("spectra"));
+    const found = /** @type {Spectra} */ (await this.askFor("spectra"));
+    const held = found.densities.map((one) => one.channel);
+    // Of channels of which only levels are watched no spectrum of the window is kept, but their newest samples are.
+    const there = this.recorded || found.filled < 1 ? [] : ((await this.machineFile())?.sensors ?? []);
+    const others = there.filter((one) => one.quantity !== "shaft_angle" && !held.includes(one.name)).map((one) => one.name);
+    const names = [...held, ...others];
+    if (this.#choice.options.length !== names.length) this.#choice.replaceChildren(...names.map((name) => html("option", { value: name }, name)));
+    const name = this.#choice.value;
+    if (others.includes(name)) this.#drawNewest(await this.askFor("waterfalls", new URLSearchParams({ channel: name, over: "time" }).toString()));
+    else this.#draw(found);
+  }
+
+  /** Amplitudes in the newest samples. @param {Waterfall} found */
+  #drawNewest({ channel, rows, frequencies_hz: lines, unit, start_ns, end_ns }) {
+    this.#chart.hidden = this.#choice.hidden = !rows.length;
+    if (!rows.length || !start_ns || !end_ns) return this.refused(`No samples of ${channel} are there.`);
+    const values = lines.map((_, at) => Math.sqrt(rows.reduce((sum, row) => sum + (row.values[at] ?? 0) ** 2, 0) / rows.length));
+    const speeds = rows.flatMap((row) => row.speed_rad_s ?? []);
+    const turning = speeds.length ? Math.abs(speeds.reduce((sum, one) => sum + one, 0)) / speeds.length / (2 * Math.PI) : 0;
+    this.#chart.setAttribute("aria-label", `spectrum of ${channel}`);
+    this.#chart.draw({ ...frame(lines, turning, unit), lines: [{ label: "measured", values }], shaded: [] });
+    this.#message.textContent = `Amplitudes in the newest samples, ${stretch(start_ns, end_ns)}, mean of ${rows.length} spectra; lines ${figure(lines[1] - lines[0])} Hz apart`;
   }
 
   /** @param {string} why */
@@ -52,15 +79,12 @@ class SpectrumPlot extends MachineElement {
 
   /** @param {Spectra} found */
   #draw(found) {
-    const names = found.densities.map((one) => one.channel);
-    if (this.#choice.options.length !== names.length) this.#choice.replaceChildren(...names.map((name) => html("option", { value: name }, name)));
     const shown = found.densities.find((one) => one.channel === this.#choice.value) ?? found.densities[0];
     this.#chart.hidden = this.#choice.hidden = !shown;
     const theory = found.theory;
     // Whoever looks for 1× has to be told where it is.
     const once = shown && found.left_out_hz ? "1× is taken out (shaded: where some of it may be left); it is among the vibration levels" : "";
-    const others = shown || this.recorded ? "" : "the waterfall below shows spectra of every channel";
-    this.#message.textContent = [this.windowText(found), once, found.reason, others, theory.nominal_reason || theory.estimated_reason].filter(Boolean).join("; ");
+    this.#message.textContent = [this.windowText(found), once, found.reason, theory.nominal_reason || theory.estimated_reason].filter(Boolean).join("; ");
     if (!shown) return;
     this.#chart.setAttribute("aria-label", `spectrum of ${shown.channel}, rms ${figure(shown.rms)}`);
     this.#chart.draw(spectrumDrawing(found, shown));

@@ -53,7 +53,13 @@ def test_plots_are_drawn_when_they_are_opened_and_say_what_they_show(browser: Br
         expect(page.locator("parameter-forest circle.decides")).to_have_count(7)  # one of them in the key
         expect(page.locator("spectrum-plot canvas")).to_be_visible()
         expect(page.locator("spectrum-plot .note")).to_contain_text("1× is taken out")
-        assert not {route for _, route, _, _ in PLOTS} & set(asked)
+        spectrum = page.locator("spectrum-plot")
+        spectrum.get_by_label("Channel").select_option("y1_dot")  # of which the window shows none
+        expect(spectrum.locator(".note")).to_have_text(
+            re.compile("^Amplitudes in the newest samples, .*mean of 20 spec")
+        )
+        expect(page.get_by_role("img", name="spectrum of y1_dot")).to_be_visible()
+        assert not {route for _, route, _, _ in PLOTS if route != "waterfalls"} & set(asked)
         for element, route, drawn, said in PLOTS:
             page.locator(f'plot-fold[shows="plots/{element}"] summary').press("Enter")
             plot = page.locator(element)
