@@ -153,6 +153,12 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
                 "tell whether the machine or its excitation has"
             )
             return Shape(state=one.channel, verdict="changed", z=z, limit=limit, text=text)
+        if not _power(one, self.windows, np.array(self.lags_s), rate).growth <= SEEN_GROWTH:
+            text = (
+                f"{one.channel}: not evaluable, with {self.windows} healthy windows not even noise that makes it "
+                f"{SEEN_GROWTH:g} times as loud would change its shape beyond chance"
+            )
+            return Shape(state=one.channel, verdict="not evaluable", z=z, limit=limit, text=text)
         text = f"{one.channel}: its correlation function has its healthy shape ({figures})"
         return Shape(state=one.channel, verdict="not changed", z=z, limit=limit, text=text)
 

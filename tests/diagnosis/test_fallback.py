@@ -173,6 +173,10 @@ def test_few_healthy_windows_have_no_power_and_say_how_many_would() -> None:
     growths = {count: replace_windows(varies, count).powers(rate)["y1"].growth for count in range(4, 12)}
     assert growths[5] == np.inf
     assert growths[11] < 8
+    (told,), (silent,) = (replace_windows(varies, count).judge(recorded(9, 1)[0], rate) for count in (11, 5))
+    assert told.verdict == "not changed"
+    assert silent.verdict == "not evaluable"
+    assert "with 5 healthy windows not even noise that makes it 8 times as loud" in silent.text
     needed = sure(varies.powers(rate)["y1"].windows)
     assert 5 < needed <= 11
     assert growths[needed] <= 8 < growths[needed - 1]
