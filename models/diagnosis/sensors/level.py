@@ -285,10 +285,13 @@ def gain_jump(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
         along = abs(levels[column] - jumps[column]) < _STAY * level_errors[column]
         if z > MOST_ERRORS and abs(value) > LEAST_JUMP and alone and quiet and straight and along:
             state = window.states[column]
+            why = "expected a change of the machine to show in more than one channel: its gain jumped"
+            if state.startswith(("y1", "z1", "bearing")):  # others hardly feel a bearing well below its resonance
+                why = "so its gain jumped, or the stiffness of the bearing there"
             text = (
                 f"{naming.name(state)}: everything it measures changed by {value:+.0%} at once (± "
                 f"{abs(value) / z:.1%}) while {naming.names(window.states[i] for i in others)} stayed as they were, "
-                "expected a change of the machine to show in more than one channel: its gain jumped"
+                f"{why}"
             )
             findings.append(SensorFault(states=(state,), kind=FaultKind.GAIN, text=text, value=value, z=z))
     return findings

@@ -11,7 +11,8 @@ from scipy.signal import butter, lfilter
 
 from models.diagnosis.moments import Plan, plan_for
 from models.diagnosis.sensors.check import sensor_findings
-from models.diagnosis.sensors.reference import SensorReference, implicated, learn_sensor_reference
+from models.diagnosis.sensors.level import gain_jump
+from models.diagnosis.sensors.reference import Naming, SensorReference, implicated, learn_sensor_reference
 from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
@@ -364,6 +365,17 @@ def displacements_only() -> tuple[Plan, list[int]]:
     keep = [i for i, state in enumerate(plan.states) if not state.endswith("_dot")]
     columns, scales = plan.columns[keep], plan.scales[keep]
     return replace(plan, states=tuple(plan.states[i] for i in keep), columns=columns, scales=scales), [*keep, -1]
+
+
+@pytest.mark.parametrize(("state", "why"), [("y1", "or the stiffness of the bearing there"), ("y2", "its gain jumped")])
+def test_what_jumps_at_a_bearing_alone_may_be_the_bearing(state: str, why: str) -> None:
+    plan, columns = displacements_only()
+    samples = recorded("lab", 1)[:, columns].copy()
+    samples[70_000:, plan.states.index(state)] *= 1.5
+    (window,) = windows_of(plan, samples)
+    (finding,) = gain_jump(window, Naming(()))
+    assert finding.states == (state,)
+    assert finding.text.endswith(why)
 
 
 @pytest.mark.slow
