@@ -80,7 +80,7 @@ class MachineMonitor:
         self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
         self._standstill = Standstill(self._sensors)
         self._plan = plan = plan_for(machine, lagged=judge.needs_lags, levels=True, thorough=installed.thorough)
-        self._watching = installed.watching or not plan.states
+        self.watching = installed.watching or not plan.states
         self._levels = LevelWatch(plan, machine, installed)
         self._senders, self._arrivals = Senders(), Arrivals(machine.ingest.reorder_blocks)
         self._due: deque[Arrived] = deque()
@@ -444,7 +444,7 @@ class MachineMonitor:
         try:
             evaluation = self._evaluator.evaluate(statistics, (self._window, self._test))
         except EstimationError as error:
-            return unread(HealthState.WATCHING if self._watching else HealthState.NOT_EVALUABLE, str(error))
+            return unread(HealthState.WATCHING if self.watching else HealthState.NOT_EVALUABLE, str(error))
         foreign = self._levels.foreign(self._window, statistics, named=bool(self._test.state.findings))
         evaluation = evaluation.named(self.machine.sensors, statistics, foreign.text)
         looks = {n: stretch_of(one, self._window.hops[-n].start_ns, end_ns) for n, one in evaluation.short.items()}

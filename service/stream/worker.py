@@ -102,8 +102,8 @@ class MachineWorker:
         self._unpublished: tuple[StoredEvent, ...] = ()
         self._asleep_s = self._unevaluated_s = 0.0
         self._shedding: LoadShedding | None = None
-        self._sheds = queue.when_full == "drop" and not installed.watching
         self._monitor, self.restart = self._restored(installed)
+        self._sheds = queue.when_full == "drop" and not self._monitor.watching
         self._snapshot: MachineHealth = self._monitor.health()
         self._latest_data_s: float | None = None
         self._operated_ns = 0
