@@ -280,7 +280,7 @@ def check_determined(reasons: Sequence[str], *, only_shapes: bool = False) -> Ch
     advice = "measure what is missing, or record a second condition: another speed, another load, a louder machine"
     text = "; ".join(dict.fromkeys(reasons))
     if only_shapes:
-        text += "; each channel will only be called changed or not changed, and no part of the machine will be named"
+        text += "; each channel is at most called changed or not changed, and no part of the machine will be named"
         advice += "; a machine with more than one bearing and one disc may never satisfy these relations"
     return told(verdict="limited", text=text, advice=advice)
 

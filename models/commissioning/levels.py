@@ -340,7 +340,7 @@ def _without_equations(
     if shape is None:
         check = Check(name="equations", verdict="refused", text=f"{why}; {no_shape}", advice=advice)
         return Learned((check,))
-    text = f"{why}: each channel will only be called changed or not changed, and no part of the machine will be named"
+    text = f"{why}: each channel is at most called changed or not changed, and no part of the machine will be named"
     powers = shape.powers(SequentialSettings.for_machine(machine, short=False).shape_rate)
     equations = Check(name="equations", verdict="limited", text=text, advice=advice)
     return Learned((equations, check_shapes(machine, powers, shape.windows)), shape=shape)

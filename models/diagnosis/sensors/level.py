@@ -287,7 +287,7 @@ def gain_jump(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
             state = window.states[column]
             why = "expected a change of the machine to show in more than one channel: its gain jumped"
             if state.startswith(("y1", "z1", "bearing")):  # others hardly feel a bearing well below its resonance
-                why = "so its gain jumped, or the stiffness of the bearing there"
+                why = "so either its gain jumped or the stiffness of that bearing did"
             text = (
                 f"{naming.name(state)}: everything it measures changed by {value:+.0%} at once (± "
                 f"{abs(value) / z:.1%}) while {naming.names(window.states[i] for i in others)} stayed as they were, "

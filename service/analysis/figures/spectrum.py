@@ -67,7 +67,7 @@ class Lines:
 
 
 def spectrum(data: Recorded, channels: Sequence[str], lines: Lines) -> Paint:
-    """Spectra of the latest seconds; of all displacements if no channel is named."""
+    """Spectra of the latest seconds; of the first quantity measured if no channel is named."""
     found = read_spectrum(data, data.chosen(channels), lines.window_s, lines.resolution_hz, lines.scaling)
     return lambda look: paint_spectrum(found, data.name, look, lines)
 
