@@ -17,10 +17,11 @@ CACHED_BLOCKS = 1200
 """Fewer than a queue takes by default: what comes at once after a restart must not overflow it."""
 _WAITING_BLOCKS = 4096
 """Far more than come between two looks of whoever takes them; beyond, the network waits."""
-_PATIENCE_S = 15.0
-"""Longer than Zenoh waits for what is kept, which is 10 s."""
+_PATIENCE_S, _AGAIN_S = 15.0, 3.0
+"""Longer than Zenoh waits for what is kept, which is 10 s; and when a publisher is asked that appears later: it may be
+gone before it answers, and its stream is not to count as lost."""
 _PUBLISHERS = 64
-_ANSWERS_S = 2.0
+_ANSWERS_S = 0.5
 """In which a publisher is noticed that was there when it was asked."""
 
 
@@ -50,7 +51,7 @@ class BlockSubscription:
             history=zenoh.ext.HistoryConfig(max_samples=CACHED_BLOCKS),
         )
         self._kept: zenoh.ext.AdvancedSubscriber[Any] | None = self._ask()
-        self._asked_s = time.monotonic()
+        self._asked_s, self._patience_s = time.monotonic(), _PATIENCE_S
         self._appeared_s: float | None = None
         self._ahead: dict[Hashable, zenoh.Sample] = {}  # new blocks, until what is kept has come to them
         self._ahead_s = self._asked_s  # since when
@@ -68,9 +69,12 @@ class BlockSubscription:
         """Whether the publisher that appeared may have been there already when what is kept was asked for."""
         return self._appeared_s is not None and self._appeared_s - self._asked_s <= _ANSWERS_S
 
-    def take(self, callback: Callable[[zenoh.Sample], None], most: int) -> None:
-        """Call back for every block that has come, some `most` of them; from one thread at a time."""
-        for sample in self._come(most):
+    def take(self, callback: Callable[[zenoh.Sample], None], most: int, *, last: bool = False) -> None:
+        """Call back for every block that has come, some `most` of them; from one thread at a time.
+
+        The `last` time blocks wait no longer for what is kept.
+        """
+        for sample in self._come(most, last=last):
             number = _number(sample)
             if number is not None:
                 if number[1] <= self._numbers.get(number[0], -1):
@@ -80,10 +84,12 @@ class BlockSubscription:
                 self._numbers[number[0]] = number[1]
             callback(sample)
 
-    def _come(self, most: int) -> Sequence[zenoh.Sample]:
+    def _come(self, most: int, *, last: bool) -> Sequence[zenoh.Sample]:
         now_s = time.monotonic()
-        asked = self._asked_in_time and self._kept is not None and now_s - self._asked_s <= _PATIENCE_S
-        if self._appeared_s is not None and self._reached is None and not asked:  # or else its answer is waited for
+        asked = self._asked_in_time and self._kept is not None and now_s - self._asked_s <= self._patience_s
+        if (
+            self._appeared_s is not None and self._reached is None and not asked and not last
+        ):  # or else its answer is waited for
             self._ask_again()
         if self._kept is None:
             return _received(self._new, most)
@@ -99,7 +105,7 @@ class BlockSubscription:
             self._ahead_s = now_s
         new = list(self._ahead.values())
         if theirs and self._reached is None and _identity(theirs[0]) in self._ahead:
-            if self._appeared_s is not None:  # it was not asked: all answers come before new blocks do
+            if self._appeared_s is not None and not last:  # it was not asked: all answers come before new blocks do
                 self._ask_again()
                 return passed
             kept, caught_up = new, True  # which had all fetched again
@@ -109,8 +115,8 @@ class BlockSubscription:
             self._reached = _identity(theirs[-1]) if theirs else self._reached
             caught_up = self._reached in self._ahead
             begin = list(self._ahead).index(self._reached) + 1 if caught_up else 0
-            since_s = self._asked_s if self._known else self._ahead_s
-            if caught_up or len(new) > _WAITING_BLOCKS or now_s - since_s > _PATIENCE_S:
+            overdue = now_s - (self._ahead_s if self._patience_s > _AGAIN_S else self._asked_s) > self._patience_s
+            if caught_up or last or overdue or len(new) > _WAITING_BLOCKS:
                 kept, caught_up = kept + new[begin:], True
         if caught_up:
             self._close_kept()
@@ -124,7 +130,7 @@ class BlockSubscription:
     def _ask_again(self) -> None:
         self._appeared_s, self._known = None, frozenset(self._numbers)
         self._close_kept()
-        self._kept, self._asked_s = self._ask(), time.monotonic()
+        self._kept, self._asked_s, self._patience_s = self._ask(), time.monotonic(), _AGAIN_S
 
     def _close_kept(self) -> None:
         if self._kept is not None:

@@ -276,9 +276,9 @@ def tap(link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], N
         # The stream as the monitor takes it: blocks that were lost on the way are fetched again.
         blocks = BlockSubscription(session, keys.stream, lambda _: None)
         undo.callback(blocks.close)
-        take_blocks = partial(link.guarded(partial(blocks.take, link.guarded(take_block))), _AT_ONCE)
-        undo.callback(take_blocks)  # what has come by then
-        undo.callback(link.intake.add(take_blocks))
+        take_blocks = partial(blocks.take, link.guarded(take_block))
+        undo.callback(link.guarded(partial(take_blocks, last=True)), _AT_ONCE)  # what has come by then
+        undo.callback(link.intake.add(partial(link.guarded(take_blocks), _AT_ONCE)))
         liveliness = session.liveliness()
         alive = liveliness.declare_subscriber(keys.publisher_alive, link.guarded(take_alive), history=True)
         undo.callback(alive.undeclare)

@@ -220,7 +220,7 @@ def test_a_rate_too_low_for_relations_leaves_the_shapes_of_the_channels() -> Non
     made = made_of(blocks, machine)
     verdict, text, advice = verdict_of(made, "equations")
     assert verdict == "limited"
-    assert text.startswith("a sampling rate of 500 Hz allows no equation: each channel will only be called changed")
+    assert text.startswith("a sampling rate of 500 Hz allows no equation: each channel is at most called changed")
     assert advice == "sample at 794 Hz or faster"
     assert made.commissioned is not None
     assert made.commissioned.shape is not None
