@@ -17,9 +17,8 @@ CACHED_BLOCKS = 1200
 """Fewer than a queue takes by default: what comes at once after a restart must not overflow it."""
 _WAITING_BLOCKS = 4096
 """Far more than come between two looks of whoever takes them; beyond, the network waits."""
-_PATIENCE_S, _AGAIN_S = 15.0, 3.0
-"""Longer than Zenoh waits for what is kept, which is 10 s; and when a publisher is asked that appears later: it may be
-gone before it answers, and its stream is not to count as lost."""
+_PATIENCE_S = 15.0
+"""Longer than Zenoh waits for what is kept, which is 10 s."""
 _PUBLISHERS = 64
 _ANSWERS_S = 0.5
 """In which a publisher is noticed that was there when it was asked."""
@@ -31,7 +30,7 @@ class BlockSubscription:
     Parameters
     ----------
     on_missed : callable
-        Takes what says how many messages were lost on the way and could not be fetched again.
+        Takes the number of messages that were lost on the way and could not be fetched again.
     """
 
     def __init__(self, session: zenoh.Session, key: str, on_missed: Callable[[zenoh.ext.Miss], None]) -> None:
@@ -51,23 +50,16 @@ class BlockSubscription:
             history=zenoh.ext.HistoryConfig(max_samples=CACHED_BLOCKS),
         )
         self._kept: zenoh.ext.AdvancedSubscriber[Any] | None = self._ask()
-        self._asked_s, self._patience_s = time.monotonic(), _PATIENCE_S
-        self._appeared_s: float | None = None
+        self._asked_s = time.monotonic()
+        self._appeared = False
         self._ahead: dict[Hashable, zenoh.Sample] = {}  # new blocks, until what is kept has come to them
         self._ahead_s = self._asked_s  # since when
         self._reached: Hashable = None  # the latest of those that were kept
         self._numbers: dict[tuple[str, int], int] = {}  # of the latest that were handed on, by publisher
-        self._known: frozenset[tuple[str, int]] = frozenset()  # who were heard before it was asked: they need not wait
-        self._publishers = self._new.detect_publishers(self._take_publisher, history=True)
 
-    def _take_publisher(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT:
-            self._appeared_s = time.monotonic()
-
-    @property
-    def _asked_in_time(self) -> bool:
-        """Whether the publisher that appeared may have been there already when what is kept was asked for."""
-        return self._appeared_s is not None and self._appeared_s - self._asked_s <= _ANSWERS_S
+    def publisher_appeared(self) -> None:
+        """Ask for what is kept again; from any thread."""
+        self._appeared = True
 
     def take(self, callback: Callable[[zenoh.Sample], None], most: int, *, last: bool = False) -> None:
         """Call back for every block that has come, some `most` of them; from one thread at a time.
@@ -86,51 +78,32 @@ class BlockSubscription:
 
     def _come(self, most: int, *, last: bool) -> Sequence[zenoh.Sample]:
         now_s = time.monotonic()
-        asked = self._asked_in_time and self._kept is not None and now_s - self._asked_s <= self._patience_s
-        if (
-            self._appeared_s is not None and self._reached is None and not asked and not last
-        ):  # or else its answer is waited for
-            self._ask_again()
+        if self._appeared and self._reached is None:
+            self._appeared = False
+            if now_s - self._asked_s > _ANSWERS_S:
+                self._close_kept()
+                self._kept, self._asked_s = self._ask(), now_s
         if self._kept is None:
             return _received(self._new, most)
         # In this order, so that all that has come as kept until now has also come as new, if it is new.
-        kept, passed = _received(self._kept, most), list[zenoh.Sample]()
-        for one in _received(self._new, most):
-            if self._is_known(one):
-                passed.append(one)
-            else:
-                self._ahead[_identity(one)] = one
-        theirs = [one for one in kept if not self._is_known(one)]
+        kept = _received(self._kept, most)
+        self._ahead |= {_identity(one): one for one in _received(self._new, most)}
         if not self._ahead:
             self._ahead_s = now_s
         new = list(self._ahead.values())
-        if theirs and self._reached is None and _identity(theirs[0]) in self._ahead:
-            if self._appeared_s is not None and not last:  # it was not asked: all answers come before new blocks do
-                self._ask_again()
-                return passed
-            kept, caught_up = new, True  # which had all fetched again
+        if kept and self._reached is None and _identity(kept[0]) in self._ahead:  # which had all fetched again
+            kept, caught_up = new, True
         else:
-            if theirs and self._asked_in_time:
-                self._appeared_s = None  # it has answered
-            self._reached = _identity(theirs[-1]) if theirs else self._reached
+            self._reached = _identity(kept[-1]) if kept else self._reached
             caught_up = self._reached in self._ahead
             begin = list(self._ahead).index(self._reached) + 1 if caught_up else 0
-            overdue = now_s - (self._ahead_s if self._patience_s > _AGAIN_S else self._asked_s) > self._patience_s
+            overdue = now_s - self._ahead_s > _PATIENCE_S
             if caught_up or last or overdue or len(new) > _WAITING_BLOCKS:
                 kept, caught_up = kept + new[begin:], True
         if caught_up:
             self._close_kept()
             self._kept, self._reached, self._ahead = None, None, {}
-        return kept + passed
-
-    def _is_known(self, sample: zenoh.Sample) -> bool:
-        number = _number(sample)
-        return number is not None and number[0] in self._known
-
-    def _ask_again(self) -> None:
-        self._appeared_s, self._known = None, frozenset(self._numbers)
-        self._close_kept()
-        self._kept, self._asked_s, self._patience_s = self._ask(), time.monotonic(), _AGAIN_S
+        return kept
 
     def _close_kept(self) -> None:
         if self._kept is not None:
@@ -139,7 +112,6 @@ class BlockSubscription:
     def close(self) -> None:
         """Receive nothing any more."""
         self._close_kept()
-        self._publishers.undeclare()  # type: ignore[no-untyped-call]
         self._missed.undeclare()  # type: ignore[no-untyped-call]
         self._new.undeclare()  # type: ignore[no-untyped-call]
 

@@ -162,6 +162,7 @@ class MachineLink:
         self._callbacks = callbacks
         self._lock = threading.Lock()
         self._closed = False
+        self._blocks: BlockSubscription | None = None
         with ExitStack() as undo:
             self._declare(link.session, undo, wait_when_full)
             self._undeclare = undo.pop_all()
@@ -201,7 +202,7 @@ class MachineLink:
             keep(stream.undeclare)
             keep(stream.sample_miss_listener(guarded(self._take_miss)).undeclare)
         else:
-            blocks = BlockSubscription(session, keys.stream, guarded(self._take_miss))
+            blocks = self._blocks = BlockSubscription(session, keys.stream, guarded(self._take_miss))
             keep(blocks.close)
             keep(self._link.intake.add(partial(guarded(partial(blocks.take, guarded(self._take_block))), _AT_ONCE)))
         keep(alive.declare_token(keys.monitor_alive).undeclare)
@@ -237,6 +238,8 @@ class MachineLink:
     def _take_alive(self, sample: zenoh.Sample) -> None:
         alive = sample.kind == zenoh.SampleKind.PUT
         self._callbacks.on_publisher(alive)
+        if alive and self._blocks is not None:
+            self._blocks.publisher_appeared()
         if alive:
             _ask(self._link, self._keys.descriptor, self._take_descriptor)  # without a cache they answer only queries
 
@@ -268,6 +271,7 @@ def tap(link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], N
 
     def take_alive(sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
+            blocks.publisher_appeared()
             _ask(link, keys.descriptor, take)
 
     session = link.session

@@ -425,25 +425,6 @@ def test_a_publisher_that_appears_later_loses_nothing_that_it_has_kept() -> None
     assert seen == [7, *range(LIVE)]
 
 
-def test_what_a_publisher_kept_that_connects_again_after_it_was_asked_is_not_lost() -> None:
-    """A monitor that listens asks before its publishers have connected again; an alive token is optional."""
-    address, seen, sent = endpoint(), list[int](), KEPT + LIVE
-    again = {"connect/retry": json.dumps({"period_init_ms": 300, "period_max_ms": 300, "period_increase_factor": 1})}
-    with session_of(LinkSettings(connect=(address,)), **again) as session:
-        publisher = advanced_publisher(session, LAB.keys.stream, KEPT)
-        for number in range(sent):  # more than it keeps
-            publisher.put(number.to_bytes(4, "little"))
-        with machine_link(address, partial(_numbered, seen)):
-            until_subscribed(session, LAB.keys.stream)
-            while not seen and sent < 20 * KEPT:
-                publisher.put(sent.to_bytes(4, "little"))
-                sent += 1
-                time.sleep(0.02)
-        publisher.undeclare()  # type: ignore[no-untyped-call]
-    assert seen[0] < KEPT
-    assert seen == list(range(seen[0], seen[0] + len(seen)))
-
-
 def _numbered(seen: list[int], block: RawBlock) -> None:
     seen.append(int.from_bytes(block.payload[:4], "little"))
 
