@@ -30,7 +30,7 @@ class BlockSubscription:
     Parameters
     ----------
     on_missed : callable
-        Takes the number of messages that were lost on the way and could not be fetched again.
+        Takes what says how many messages were lost on the way and could not be fetched again.
     """
 
     def __init__(self, session: zenoh.Session, key: str, on_missed: Callable[[zenoh.ext.Miss], None]) -> None:
