@@ -1,13 +1,14 @@
-"""Subscribing to sample blocks: what publishers have kept first, then what comes, in order.
+"""Subscribing to sample blocks: what a publisher has kept first, then what comes, in order.
 
-Zenoh's advanced subscriber can ask for what is kept at once, ask publishers that appear later, and have fetched again
-what was lost on the way. One that is to do two of these loses all that is kept if a new block comes between the
-answers: that is handed on, and what is older counts as late (zenoh-ext 1.10, unless a cache holds as much as was asked
-for). So there are two, until one has caught up with the other.
+Zenoh's advanced subscriber can ask for what is kept, and have fetched again what was lost on the way. One that is to do
+both loses all that is kept if a new block comes between the answers: that is handed on, and what is older counts as
+late (zenoh-ext 1.10, unless a cache holds as much as was asked for). So it does the second only, and each publisher's
+cache is asked from here as Zenoh's own subscriber would, once, when the publisher is first found or heard.
 """
 
-import time
-from collections.abc import Callable, Hashable, Sequence
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import zenoh
@@ -17,11 +18,22 @@ CACHED_BLOCKS = 1200
 """Fewer than a queue takes by default: what comes at once after a restart must not overflow it."""
 _WAITING_BLOCKS = 4096
 """Far more than come between two looks of whoever takes them; beyond, the network waits."""
-_PATIENCE_S = 15.0
-"""Longer than Zenoh waits for what is kept, which is 10 s."""
+_ANSWER_S = 10.0
 _PUBLISHERS = 64
-_ANSWERS_S = 0.5
-"""In which a publisher is noticed that was there when it was asked."""
+"""That are known; of those that are waited for no longer, half as many. Anybody may claim to be another one."""
+_BY_TIME = "uhlc"
+"""Stands for the number of a publisher that gives its messages times and no numbers."""
+
+
+@dataclass(slots=True)
+class _Kept:
+    """What a publisher has kept, until its new blocks follow on."""
+
+    answers: Any = None  # of its cache; None when all are there
+    blocks: dict[int, zenoh.Sample] = field(default_factory=dict)
+    new: dict[int, zenoh.Sample] = field(default_factory=dict)  # which came meanwhile
+    reached: int = -1  # the latest that was kept
+    asked: int = -1  # what that was when the cache was asked
 
 
 class BlockSubscription:
@@ -34,6 +46,10 @@ class BlockSubscription:
     """
 
     def __init__(self, session: zenoh.Session, key: str, on_missed: Callable[[zenoh.ext.Miss], None]) -> None:
+        self._session = session
+        self._key = key
+        self._publishers: dict[str, _Kept | None] = {}  # None of those whose new blocks are handed on as they come
+        self._found: deque[zenoh.Reply] = deque()
         # New blocks first: what is kept is asked for when none can be overlooked any more.
         self._new: zenoh.ext.AdvancedSubscriber[Any] = zenoh.ext.declare_advanced_subscriber(
             session,
@@ -43,90 +59,102 @@ class BlockSubscription:
             subscriber_detection=True,
         )
         self._missed = self._new.sample_miss_listener(on_missed)
-        self._ask: Callable[[], zenoh.ext.AdvancedSubscriber[Any]] = lambda: zenoh.ext.declare_advanced_subscriber(
-            session,
-            key,
-            zenoh.handlers.FifoChannel(_WAITING_BLOCKS),
-            history=zenoh.ext.HistoryConfig(max_samples=CACHED_BLOCKS),
-        )
-        self._kept: zenoh.ext.AdvancedSubscriber[Any] | None = self._ask()
-        self._asked_s = time.monotonic()
-        self._appeared = False
-        self._ahead: dict[Hashable, zenoh.Sample] = {}  # new blocks, until what is kept has come to them
-        self._ahead_s = self._asked_s  # since when
-        self._reached: Hashable = None  # the latest of those that were kept
-        self._numbers: dict[tuple[str, int], int] = {}  # of the latest that were handed on, by publisher
+        self.find_publishers()
 
-    def publisher_appeared(self) -> None:
-        """Ask for what is kept again; from any thread."""
-        self._appeared = True
+    def find_publishers(self) -> None:
+        """Have those asked for what they have kept that have not said anything yet; from any thread."""
+        self._query("**", "_max=1", self._found.append)
 
     def take(self, callback: Callable[[zenoh.Sample], None], most: int, *, last: bool = False) -> None:
         """Call back for every block that has come, some `most` of them; from one thread at a time.
 
         The `last` time blocks wait no longer for what is kept.
         """
-        for sample in self._come(most, last=last):
-            number = _number(sample)
-            if number is not None:
-                if number[1] <= self._numbers.get(number[0], -1):
-                    continue  # kept as well as new
-                if len(self._numbers) > _PUBLISHERS:
-                    self._numbers.clear()
-                self._numbers[number[0]] = number[1]
-            callback(sample)
+        while self._found:
+            found = self._found.popleft().ok
+            origin = None if found is None else _origin(found)
+            if origin is not None:
+                self._awaited(origin[0])
+        received = iter(self._new.try_recv, None)
+        for _, sample in zip(range(most), received, strict=False):
+            origin = _origin(sample)
+            if origin is None:
+                callback(sample)
+                continue
+            publisher, number = origin
+            if (kept := self._awaited(publisher)) is None:
+                callback(sample)
+            else:
+                kept.new.setdefault(number, sample)
+        for publisher, kept in list(self._publishers.items()):
+            if kept is not None:
+                for sample in self._join(publisher, kept, waits=not last and len(kept.new) <= _WAITING_BLOCKS):
+                    callback(sample)
+        answered = [name for name, kept in self._publishers.items() if kept is None or kept.answers is None]
+        for publisher in answered[: -_PUBLISHERS // 2]:
+            del self._publishers[publisher]
 
-    def _come(self, most: int, *, last: bool) -> Sequence[zenoh.Sample]:
-        now_s = time.monotonic()
-        if self._appeared and self._reached is None:
-            self._appeared = False
-            if now_s - self._asked_s > _ANSWERS_S:
-                self._close_kept()
-                self._kept, self._asked_s = self._ask(), now_s
-        if self._kept is None:
-            return _received(self._new, most)
-        # In this order, so that all that has come as kept until now has also come as new, if it is new.
-        kept = _received(self._kept, most)
-        self._ahead |= {_identity(one): one for one in _received(self._new, most)}
-        if not self._ahead:
-            self._ahead_s = now_s
-        new = list(self._ahead.values())
-        if kept and self._reached is None and _identity(kept[0]) in self._ahead:  # which had all fetched again
-            kept, caught_up = new, True
-        else:
-            self._reached = _identity(kept[-1]) if kept else self._reached
-            caught_up = self._reached in self._ahead
-            begin = list(self._ahead).index(self._reached) + 1 if caught_up else 0
-            overdue = now_s - self._ahead_s > _PATIENCE_S
-            if caught_up or last or overdue or len(new) > _WAITING_BLOCKS:
-                kept, caught_up = kept + new[begin:], True
-        if caught_up:
-            self._close_kept()
-            self._kept, self._reached, self._ahead = None, None, {}
-        return kept
+    def _awaited(self, publisher: str) -> _Kept | None:
+        """What is to be handed on before new blocks of a publisher, which is asked for it if it is not known yet."""
+        if publisher not in self._publishers and len(self._publishers) < _PUBLISHERS:
+            self._ask(publisher, _Kept())
+        return self._publishers.get(publisher)
 
-    def _close_kept(self) -> None:
-        if self._kept is not None:
-            self._kept.undeclare()  # type: ignore[no-untyped-call]
+    def _join(self, publisher: str, kept: _Kept, *, waits: bool) -> list[zenoh.Sample]:
+        """What can be handed on of a publisher: what it has kept once that is all there, and what came meanwhile."""
+        if kept.answers is not None and not _received(kept) and waits:
+            return []
+        kept.reached = max(kept.blocks, default=kept.reached)
+        new = {number: sample for number, sample in kept.new.items() if number > kept.reached}
+        # Published while the subscription was on its way to it, or after the time for an answer was over.
+        lacks = bool(new) and min(new) > kept.reached + 1 and not publisher.endswith(_BY_TIME)
+        if lacks and waits and kept.reached > kept.asked:
+            self._ask(publisher, kept)
+            return []
+        joined = kept.blocks | new
+        self._publishers[publisher] = None if new or not waits else _Kept(reached=kept.reached, asked=kept.asked)
+        return [joined[number] for number in sorted(joined)]
+
+    def _ask(self, publisher: str, kept: _Kept) -> None:
+        kept.asked = kept.reached
+        numbers = "" if publisher.endswith(_BY_TIME) else f";_sn={kept.reached + 1}.."
+        channel: Any = zenoh.handlers.FifoChannel(_WAITING_BLOCKS)
+        kept.answers = self._query(f"{publisher}/**", f"_max={CACHED_BLOCKS}{numbers}", channel)
+        self._publishers[publisher] = kept
+
+    def _query(self, publishers: str, parameters: str, handler: Any) -> Any:
+        return self._session.get(
+            f"{self._key}/@adv/pub/{publishers}?{parameters}",
+            handler,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=_ANSWER_S,
+        )
 
     def close(self) -> None:
         """Receive nothing any more."""
-        self._close_kept()
         self._missed.undeclare()  # type: ignore[no-untyped-call]
         self._new.undeclare()  # type: ignore[no-untyped-call]
 
 
-def _received(subscriber: zenoh.ext.AdvancedSubscriber[Any], most: int) -> list[zenoh.Sample]:
-    received = iter(subscriber.try_recv, None)
-    return [sample for _, sample in zip(range(most), received, strict=False)]
+def _received(kept: _Kept) -> bool:
+    """Take what has been answered; whether that is all."""
+    try:
+        while (reply := kept.answers.try_recv()) is not None:
+            origin = None if reply.ok is None else _origin(reply.ok)
+            if origin is not None:
+                kept.blocks[origin[1]] = reply.ok
+    except zenoh.ZError:  # no more will come
+        kept.answers = None
+    return kept.answers is None
 
 
-def _number(sample: zenoh.Sample) -> tuple[tuple[str, int], int] | None:
-    """The publisher and the number of the message; None of one who numbers nothing."""
-    info = sample.source_info
-    return None if info is None else ((str(info.source_id.zid), info.source_id.eid), info.source_sn)
-
-
-def _identity(sample: zenoh.Sample) -> Hashable:
-    attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-    return _number(sample) or (sample.payload.to_bytes(), attachment, str(sample.encoding))
+def _origin(sample: zenoh.Sample) -> tuple[str, int] | None:
+    """Where the publisher's cache is, and the number of the message or its time; None of one that gives neither."""
+    if (info := sample.source_info) is not None:
+        return f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn
+    if sample.timestamp is not None:
+        time, _, session = str(sample.timestamp).partition("/")
+        return f"{session}/{_BY_TIME}", int(time)
+    return None

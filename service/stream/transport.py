@@ -239,7 +239,7 @@ class MachineLink:
         alive = sample.kind == zenoh.SampleKind.PUT
         self._callbacks.on_publisher(alive)
         if alive and self._blocks is not None:
-            self._blocks.publisher_appeared()
+            self._blocks.find_publishers()
         if alive:
             _ask(self._link, self._keys.descriptor, self._take_descriptor)  # without a cache they answer only queries
 
@@ -271,7 +271,7 @@ def tap(link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], N
 
     def take_alive(sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
-            blocks.publisher_appeared()
+            blocks.find_publishers()
             _ask(link, keys.descriptor, take)
 
     session = link.session

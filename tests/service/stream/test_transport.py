@@ -405,7 +405,8 @@ def test_nothing_that_is_kept_is_lost_to_blocks_that_come_meanwhile() -> None:
             publisher.undeclare()  # type: ignore[no-untyped-call]
 
 
-def test_a_publisher_that_appears_later_loses_nothing_that_it_has_kept() -> None:
+@pytest.mark.parametrize("alive", [True, False], ids=["alive token", "no token"])
+def test_a_publisher_that_appears_later_loses_nothing_that_it_has_kept(alive: bool) -> None:
     address, seen = endpoint(), list[int]()
     with machine_link(address, partial(_numbered, seen)), session_of(LinkSettings(connect=(address,))) as before:
         first = advanced_publisher(before, LAB.keys.stream, KEPT)
@@ -414,15 +415,52 @@ def test_a_publisher_that_appears_later_loses_nothing_that_it_has_kept() -> None
         until(lambda: seen == [7], "the block of the first publisher")
         with session_of(LinkSettings(mode="client", connect=(address,))) as session:
             later = advanced_publisher(session, LAB.keys.stream, KEPT)
-            token = session.liveliness().declare_token(LAB.keys.publisher_alive)
+            if alive:  # it need not publish any more then
+                session.liveliness().declare_token(LAB.keys.publisher_alive)
             for number in range(LIVE):  # the first before it can know of a subscriber
                 later.put(number.to_bytes(4, "little"))
                 time.sleep(0.01 * (number > LIVE // 2))
             until(lambda: len(seen) == 1 + LIVE, "all blocks")
-            token.undeclare()  # type: ignore[no-untyped-call]
             later.undeclare()  # type: ignore[no-untyped-call]
         first.undeclare()  # type: ignore[no-untyped-call]
     assert seen == [7, *range(LIVE)]
+
+
+def test_what_a_publisher_kept_that_connects_again_after_a_start_is_not_lost() -> None:
+    """A monitor that listens itself is there before its publishers have connected again."""
+    address, seen, sent = endpoint(), list[int](), KEPT + LIVE
+    again = {"connect/retry": json.dumps({"period_init_ms": 300, "period_max_ms": 300, "period_increase_factor": 1})}
+    with session_of(LinkSettings(connect=(address,)), **again) as session:
+        publisher = advanced_publisher(session, LAB.keys.stream, KEPT)
+        for number in range(sent):  # more than it keeps
+            publisher.put(number.to_bytes(4, "little"))
+        with machine_link(address, partial(_numbered, seen)):
+            until_subscribed(session, LAB.keys.stream)
+            while not seen and sent < 20 * KEPT:
+                publisher.put(sent.to_bytes(4, "little"))
+                sent += 1
+                time.sleep(0.02)
+        publisher.undeclare()  # type: ignore[no-untyped-call]
+    assert seen[0] < KEPT
+    assert seen == list(range(seen[0], seen[0] + len(seen)))
+
+
+def test_a_publisher_that_does_not_answer_holds_up_no_other() -> None:
+    address, seen = endpoint(), list[int]()
+    with machine_link(address, partial(_numbered, seen)), session_of(LinkSettings(connect=(address,))) as session:
+        silent = session.declare_publisher(LAB.keys.stream)
+        cache = f"{LAB.keys.stream}/@adv/pub/{silent.id.zid}/{silent.id.eid}/_"
+        unanswered = list[zenoh.Query]()
+        session.declare_queryable(cache, unanswered.append)
+        other = advanced_publisher(session, LAB.keys.stream, KEPT)
+        until_subscribed(session, LAB.keys.stream)
+        silent.put((7).to_bytes(4, "little"), source_info=zenoh.SourceInfo(silent.id, 5))
+        until(lambda: bool(unanswered), "the question for what it has kept")
+        for number in range(LIVE):
+            other.put(number.to_bytes(4, "little"))
+        until(lambda: len(seen) >= LIVE, "the blocks of the other")
+        assert seen == list(range(LIVE))
+        other.undeclare()  # type: ignore[no-untyped-call]
 
 
 def _numbered(seen: list[int], block: RawBlock) -> None:
