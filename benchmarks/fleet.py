@@ -28,12 +28,10 @@ import numpy as np
 import psycopg
 from capacity import BLOCK_S, KINDS, Plant, sending
 from ray.cluster_utils import Cluster
-from running_monitor import on_loopback, serving
+from running_monitor import on_loopback, serving, started
 
 from models.machine import MachineFile, load_machine
-from models.signals.link import LinkSettings
 from service.runtime.fleet import HEALTH_CHECKS
-from service.stream.transport import route
 from simulator.scenario import load_scenario, parse_fault
 from simulator.stream import blocks
 
@@ -62,6 +60,20 @@ def fleet_files(folder: Path, machines: Sequence[MachineFile], database: str, li
         lines.append(f'[[machines]]\nfile = "{file.name}"\nbundle = "lab"')
     (folder / "fleet.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder / "fleet.toml"
+
+
+@contextmanager
+def routing(folder: Path, link: str) -> Iterator[None]:
+    """A Zenoh router in a process of its own: in one with publishers, these and it wait for the same threads."""
+    command, environment = ["service", "router", "--listen", link], dict(os.environ)
+    router = started(command, folder / "router", folder / "router_log", environment)
+    try:
+        while link not in (folder / "router").read_text(encoding="utf-8"):
+            time.sleep(0.1)
+        yield
+    finally:
+        router.terminate()
+        router.wait(60)
 
 
 @contextmanager
@@ -137,7 +149,7 @@ def run(
         settings = fleet_files(folder, machines, database, link, inner)
         command = ("fleet", "--address", cluster.address, "--config", str(settings))
         with (
-            route(LinkSettings(listen=(link,))),
+            routing(folder, link),
             serving(folder, environment, *command) as (_, url),
             sending(link, machines, streams) as (plant, sender),
         ):

@@ -19,6 +19,8 @@ CACHED_BLOCKS = 1200
 _WAITING_BLOCKS = 4096
 """Far more than come between two looks of whoever takes them; beyond, the network waits."""
 _ANSWER_S = 10.0
+_QUESTIONS = 2
+"""Without an answer: a link may break by which it was to come."""
 _PUBLISHERS = 64
 """That are known; of those that are waited for no longer, half as many. Anybody may claim to be another one."""
 _BY_TIME = "uhlc"
@@ -29,11 +31,10 @@ _BY_TIME = "uhlc"
 class _Kept:
     """What a publisher has kept, until its new blocks follow on."""
 
-    answers: Any = None  # of its cache; None when all are there
-    blocks: dict[int, zenoh.Sample] = field(default_factory=dict)
+    answers: Any = None  # of its cache, in order; None when there are no more
     new: dict[int, zenoh.Sample] = field(default_factory=dict)  # which came meanwhile
-    reached: int = -1  # the latest that was kept
-    asked: int = -1  # what that was when the cache was asked
+    reached: int = -1  # the latest of them
+    questions: int = _QUESTIONS  # that are left
 
 
 class BlockSubscription:
@@ -101,22 +102,21 @@ class BlockSubscription:
         return self._publishers.get(publisher)
 
     def _join(self, publisher: str, kept: _Kept, *, waits: bool) -> list[zenoh.Sample]:
-        """What can be handed on of a publisher: what it has kept once that is all there, and what came meanwhile."""
-        if kept.answers is not None and not _received(kept) and waits:
-            return []
-        kept.reached = max(kept.blocks, default=kept.reached)
-        new = {number: sample for number, sample in kept.new.items() if number > kept.reached}
-        # Published while the subscription was on its way to it, or after the time for an answer was over.
+        """What can be handed on of a publisher: what it has kept, and what came meanwhile once that is all there."""
+        joined = _received(kept)
+        if kept.answers is not None and waits:
+            return joined
+        new = kept.new = {number: sample for number, sample in kept.new.items() if number > kept.reached}
+        # Published while the subscription was on its way to it, or not answered.
         lacks = bool(new) and min(new) > kept.reached + 1 and not publisher.endswith(_BY_TIME)
-        if lacks and waits and kept.reached > kept.asked:
+        if lacks and waits and kept.questions:
             self._ask(publisher, kept)
-            return []
-        joined = kept.blocks | new
-        self._publishers[publisher] = None if new or not waits else _Kept(reached=kept.reached, asked=kept.asked)
-        return [joined[number] for number in sorted(joined)]
+            return joined
+        self._publishers[publisher] = None if new or not waits else kept
+        return [*joined, *new.values()]
 
     def _ask(self, publisher: str, kept: _Kept) -> None:
-        kept.asked = kept.reached
+        kept.questions -= 1
         numbers = "" if publisher.endswith(_BY_TIME) else f";_sn={kept.reached + 1}.."
         channel: Any = zenoh.handlers.FifoChannel(_WAITING_BLOCKS)
         kept.answers = self._query(f"{publisher}/**", f"_max={CACHED_BLOCKS}{numbers}", channel)
@@ -138,16 +138,18 @@ class BlockSubscription:
         self._new.undeclare()  # type: ignore[no-untyped-call]
 
 
-def _received(kept: _Kept) -> bool:
-    """Take what has been answered; whether that is all."""
+def _received(kept: _Kept) -> list[zenoh.Sample]:
+    """What has been answered since the last time."""
+    received: list[zenoh.Sample] = []
     try:
-        while (reply := kept.answers.try_recv()) is not None:
+        while kept.answers is not None and (reply := kept.answers.try_recv()) is not None:
             origin = None if reply.ok is None else _origin(reply.ok)
-            if origin is not None:
-                kept.blocks[origin[1]] = reply.ok
+            if origin is not None and origin[1] > kept.reached:
+                kept.reached, kept.questions = origin[1], _QUESTIONS
+                received.append(reply.ok)
     except zenoh.ZError:  # no more will come
         kept.answers = None
-    return kept.answers is None
+    return received
 
 
 def _origin(sample: zenoh.Sample) -> tuple[str, int] | None:
