@@ -232,8 +232,7 @@ class MachineMonitor:
             self._window.gap()
             self._failed(error, block.end_ns)
         fault, self._defect = self._defect, None
-        length_s = float(block.samples.shape[0] / block.rate_hz)
-        return MonitorReport(verdict, tuple(windows), self._alarms.take(), length_s, fault)
+        return MonitorReport(verdict, tuple(windows), self._alarms.take(), len(block.samples) / block.rate_hz, fault)
 
     def _hops(self, block: SampleBlock, verdict: Admission, dropped: int) -> Iterable[int]:
         """Take an accepted block into the window; ends of the hops that it completes, each to be evaluated in turn."""
@@ -395,6 +394,7 @@ class MachineMonitor:
 
     def _count(self, verdict: Admission) -> Admission:
         self._quality = counted(self._quality, verdict)
+        self._data_path.judged(verdict)
         return verdict
 
     def _evaluate(self, end_ns: int) -> Report:

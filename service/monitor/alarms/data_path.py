@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from models.alarm_names import CLOCK, CONFLICT, FAULT, GAP, OVERLOADED, PHASE_REFERENCE, STREAM_LOST, data_alarm
-from models.checkpoint import checked
+from models.checkpoint import checked, texts
 from models.diagnosis.window import WindowStatistics
-from models.ingest import Admission, lasting
+from models.ingest import Admission, Reason, lasting
 from models.machine import MachineFile
 from rotorwatch.records.alarms import Evidence
 from rotorwatch.records.sensor_faults import FaultKind
@@ -28,13 +28,18 @@ class DataPathAlarms:
         self._silence_ns = round(self._silence_s * 1e9)
         self._hop_ns = round(machine.window.hop_s * 1e9)
         self._whole_ns: int | None = None  # end of the latest hop, or where the first could have begun
+        self._refused = ""  # why the first block after those that were used was refused
         self._unseen_windows, self._unseen_blocks, self._unseen_s = 0, 0, 0.0
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything as named arrays."""
         whole_ns = [] if self._whole_ns is None else [self._whole_ns]
         unseen = [self._unseen_windows, self._unseen_blocks, self._unseen_s]
-        return {"whole_ns": np.array(whole_ns, dtype=np.int64), "unseen": np.array(unseen, dtype=np.float64)}
+        return {
+            "whole_ns": np.array(whole_ns, dtype=np.int64),
+            "unseen": np.array(unseen, dtype=np.float64),
+            "refused": np.array([self._refused]),
+        }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called.
@@ -47,6 +52,12 @@ class DataPathAlarms:
         windows, blocks, self._unseen_s = checked(arrays, "unseen", np.float64, (3,)).tolist()
         self._unseen_windows, self._unseen_blocks = int(windows), int(blocks)
         self._whole_ns = next(iter(checked(arrays, "whole_ns", np.int64, (None,)).tolist()), None)
+        self._refused = "".join(texts(arrays, "refused"))
+
+    def judged(self, verdict: Admission) -> None:
+        """Remember why data that come are of no use, in case nothing else comes; a repetition says nothing of that."""
+        if verdict.reason is not None and verdict.reason is not Reason.OVERLAP:
+            self._refused = self._refused or verdict.text
 
     def accepted(self, verdict: Admission, start_ns: int, dropped: int) -> str:
         """A block was accepted.
@@ -68,6 +79,7 @@ class DataPathAlarms:
         overloaded = dropped > 0 and verdict.gap_s > 0
         if verdict.gap_s >= self._silence_s and not overloaded:
             self._lost(before_ns)
+        self._refused = ""
         book.update_state(STREAM_LOST, False, self._found_again_ns(start_ns), at_once=True)
         if overloaded:
             note = self._unseen(blocks=dropped, gap_s=verdict.gap_s)
@@ -155,7 +167,8 @@ class DataPathAlarms:
 
     def _lost(self, end_ns: int) -> None:
         """Raise the alarm on silence, at the time at which it was due: then live and replay say the same."""
-        note = f"no usable data for {self._silence_s:g} s; alarms already raised stay raised"
+        refused = f"; blocks are refused: {self._refused}" if self._refused else ""
+        note = f"no usable data for {self._silence_s:g} s; alarms already raised stay raised{refused}"
         due_ns = end_ns + self._silence_ns
         self._book.update_state(
             STREAM_LOST, True, due_ns, note, evidence=Evidence(start_ns=end_ns, end_ns=due_ns), at_once=True

@@ -323,6 +323,22 @@ def test_a_lost_stream_is_noticed_after_the_machine_file_has_changed() -> None:
     assert (event.kind, event.alarm.name, event.time_ns) == ("raised", STREAM_LOST, START_NS + 5 * S)
 
 
+def test_a_stream_of_which_nothing_is_of_use_says_why() -> None:
+    """A sensor that gives NaN costs all channels of its blocks; what is said does not depend on a restart."""
+    monitor = MachineMonitor(install(machine(), None))
+    for number in range(4):
+        one = block(number)
+        one.samples[10, 2] = np.nan if number else 0.0
+        assert monitor.step(one).verdict.accepted is (number == 0)
+    after, state = MachineMonitor(install(machine(), None)), monitor.state(whole=True)
+    after.restore(state.state, [part for _, part in state.new_parts])
+    end_ns = block(0).end_ns
+    for each in (monitor, after):
+        (event,) = each.passed(end_ns + 5 * S)
+        assert event.alarm.name == STREAM_LOST
+        assert "blocks are refused: demo/lab: block 1, channel y1_dot: sample 10 is nan" in event.text
+
+
 @pytest.mark.parametrize("start_ns", [-1, 2**63 - 1, 10**30])
 def test_times_that_fit_nowhere_are_refused(start_ns: int) -> None:
     monitor = MachineMonitor(install(machine(), None))
