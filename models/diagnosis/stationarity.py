@@ -44,7 +44,7 @@ def segment_levels(segments: ComplexArray, spectrum: ComplexArray, columns: Sequ
     blocks = segments.shape[0] // _BLOCK
     if not n or not blocks:
         return None
-    own = segments[: blocks * _BLOCK, :, columns].reshape(blocks, _BLOCK, count, n)
+    own = np.take(segments[: blocks * _BLOCK], columns, axis=2).reshape(blocks, _BLOCK, count, n)
     mean = spectrum[: blocks * _BLOCK, columns][:, :, columns].reshape(blocks, _BLOCK, n, n).sum(axis=1)
     if not np.all(np.isfinite(mean)):
         return None

@@ -111,4 +111,5 @@ def waveform_of(samples: FloatArray) -> tuple[Waveform, FloatArray]:
 def stacked_waveform(hops: Sequence[Waveform]) -> Waveform:
     """Put hops of equal length below each other, shape (n_hops, n_channels)."""
     _, *names = (one.name for one in fields(Waveform))
-    return Waveform(hops[0].n_samples, *(np.stack([getattr(hop, name) for hop in hops]) for name in names))
+    every = (np.concatenate([getattr(hop, name) for hop in hops]).reshape(len(hops), -1) for name in names)
+    return Waveform(hops[0].n_samples, *every)

@@ -198,11 +198,11 @@ class _Supervisor:
 
     def _look(self, number: int, worker: MachineWorker, link: MachineLink) -> None:
         health = worker.health()
-        before = self._published.get(number)
+        before, now = self._published.get(number), with_flow(health, None, 0)
         # An alarm that changed and changed back is news, to whoever asked in between: its event's number has changed.
-        if before is not None and with_flow(before, None, 0) == with_flow(health, None, 0):
+        if before == now:
             return
-        self._published[number] = health
+        self._published[number] = now
         link.publish("health", health.model_dump_json())
         self._listener.health(health)
         if before is None or before.state != health.state:
