@@ -9,8 +9,10 @@ theoretical spectra.
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from models.diagnosis.likelihood.motions import Mismatch
 from models.diagnosis.likelihood.scoring import Maximum, Weights, Whitened, inverse_factor
@@ -19,7 +21,7 @@ from models.diagnosis.misfit import ACROSS, DELAY, EACH_LATE, UNEQUAL, Alternati
 from models.diagnosis.moments import ComplexArray, through
 from models.diagnosis.readings import beyond
 from models.machine import Machine
-from models.physics.rotor import PARAMETER_TEXT, Q_shaft
+from models.physics.rotor import PARAMETER_TEXT, STATE_INDEX, Q_shaft
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, parts_seen, state_name
 
@@ -115,25 +117,40 @@ def _of_sensors(
         SL⁻ᴴ.
     """
     motions, w = model.motions, model.centre
-    shares, dofs, factor = motions.shares(w), motions.dofs, motions.factor(w, w)
-    numbers = np.array([shares[state][0] for state in motions.states])
-    own, alone = np.eye(motions.n)[numbers], np.eye(numbers.size)
-    tried = {f"gain of {state}": one[:, None] * own for state, one in zip(motions.states, alone, strict=True)}
-    # A sensor that is turned, or sensitive across its axis, shows a part of its place's motion in the other plane.
-    across = (dofs[numbers, None] + 3) % 6 == dofs
-    for state, one, other in zip(motions.states, alone, across, strict=True):
-        if other.any():
-            tried[f"{ACROSS} of {state.translate(_OTHER_PLANE)} in {state}"] = np.outer(one, other)
-    late = {name: delay @ own for name, delay in _delays(machine.sensors, motions.states).items()}
-    weights = np.stack([*tried.values(), *late.values()])  # by state and the motion that it shows
-    by, shown = np.nonzero(weights.any(axis=0))
-    weights, into = weights[:, by, shown], numbers[by]
+    names, at_once, weights, by, shown, into = _tried(tuple(machine.sensors), motions.states)
+    shares, factor = motions.shares(w), motions.factor(w, w)
     share = np.stack([shares[state][1] for state in motions.states])[by]
     seen = (share * (factor[:, into] / factor[:, shown]).T)[..., None] * coloured.swapaxes(0, 1)[shown]
     sides = L_inverse.transpose(2, 0, 1)[into][..., None] * seen[:, :, None]
-    at_once = np.tensordot(weights[: len(tried)], twice_packed(sides), axes=1)
-    delayed = np.tensordot(weights[len(tried) :], twice_packed((-1j * w)[:, None, None] * sides), axes=1)
-    return [*tried, *late], np.concatenate([at_once, delayed])
+    immediate = np.tensordot(weights[:at_once], twice_packed(sides), axes=1)
+    delayed = np.tensordot(weights[at_once:], twice_packed((-1j * w)[:, None, None] * sides), axes=1)
+    return [*names], np.concatenate([immediate, delayed])
+
+
+_Places = npt.NDArray[np.intp]
+
+
+@lru_cache(maxsize=64)
+def _tried(
+    channels: tuple[Channel, ...], states: tuple[str, ...]
+) -> tuple[tuple[str, ...], int, FloatArray, _Places, _Places, _Places]:
+    """What is tried of sensors: names, how many of them are at once and not late, and what each state shows in it.
+
+    Weights by name and by state and motion that it shows; of each of these the state, the motion, and the state's own.
+    """
+    of = np.array([STATE_INDEX[state] % 6 for state in states])
+    dofs, numbers = np.unique(of, return_inverse=True)
+    own, alone = np.eye(dofs.size)[numbers], np.eye(numbers.size)
+    tried = {f"gain of {state}": one[:, None] * own for state, one in zip(states, alone, strict=True)}
+    # A sensor that is turned, or sensitive across its axis, shows a part of its place's motion in the other plane.
+    across = (of[:, None] + 3) % 6 == dofs
+    for state, one, other in zip(states, alone, across, strict=True):
+        if other.any():
+            tried[f"{ACROSS} of {state.translate(_OTHER_PLANE)} in {state}"] = np.outer(one, other)
+    late = {name: delay @ own for name, delay in _delays(channels, states).items()}
+    weights = np.stack([*tried.values(), *late.values()])
+    by, shown = np.nonzero(weights.any(axis=0))
+    return (*tried, *late), len(tried), weights[:, by, shown], by, shown, numbers[by]
 
 
 def _delays(channels: Sequence[Channel], states: Sequence[str]) -> dict[str, FloatArray]:
