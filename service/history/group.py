@@ -35,7 +35,10 @@ _EVENTS = select(alarm_events.c.sequence, alarm_events.c.id).where(
     or_(alarm_events.c.sequence >= bindparam("first"), alarm_events.c.id.in_(bindparam("identifiers", expanding=True))),
 )
 _CHECKPOINT = update(checkpoints).where(checkpoints.c.machine_id == bindparam("which"))
-_PARTS = select(checkpoint_parts.c.name).where(checkpoint_parts.c.machine_id == bindparam("which"))
+_parts = checkpoint_parts.c.machine_id == bindparam("which")
+_PARTS = select(checkpoint_parts.c.name).where(_parts)
+_GONE = delete(checkpoint_parts).where(_parts, checkpoint_parts.c.name.in_(bindparam("gone", expanding=True)))
+_INSERT = {table: insert(table) for table in (alarm_events, checkpoint_parts, reports, windows)}
 
 
 def write_group(
@@ -102,7 +105,7 @@ def write_group(
         _write_checkpoint(connection, claim.machine_id, bundle)
     for table, values in rows.items():
         if values:
-            connection.execute(insert(table), values)
+            connection.execute(_INSERT[table], values)
     for machine_id, after, last in complete:
         fill_buckets(database, connection, machine_id, after, last, bucket_ns)
     return refused, new_series
@@ -171,11 +174,10 @@ def _write_checkpoint(connection: Connection, machine_id: int, bundle: StepBundl
     changed = connection.execute(_CHECKPOINT, {"which": machine_id, **values})
     if changed.rowcount == 0:
         connection.execute(insert(checkpoints).values(machine_id=machine_id, **values))
-    parts = checkpoint_parts.c
     there = connection.scalars(_PARTS, {"which": machine_id})
     gone = [name for name in there if name not in bundle.keep or name in bundle.new_parts]
     if gone:
-        connection.execute(delete(checkpoint_parts).where(parts.machine_id == machine_id, parts.name.in_(gone)))
+        connection.execute(_GONE, {"which": machine_id, "gone": gone})
     new = [{"machine_id": machine_id, "name": name, "data": part} for name, part in bundle.new_parts.items()]
     if new:
-        connection.execute(insert(checkpoint_parts), new)
+        connection.execute(_INSERT[checkpoint_parts], new)
