@@ -21,7 +21,7 @@ import zstandard
 from service.history.records import CheckpointHead, Step, StoredEvent, StoredReading, StoredReport, StoreError
 
 _LARGEST = 2**63
-_LEVEL = 12  # of more a report is an eighth smaller, and takes six times as long
+_LEVEL = 15
 # Never changed: every report that was ever written is read with it, those of before it existed too.
 _LIKE_REPORTS = zstandard.ZstdCompressionDict(
     Path(__file__).with_name("reports.dictionary").read_bytes(), dict_type=zstandard.DICT_TYPE_RAWCONTENT

@@ -35,9 +35,9 @@ _EVENTS = select(alarm_events.c.sequence, alarm_events.c.id).where(
     or_(alarm_events.c.sequence >= bindparam("first"), alarm_events.c.id.in_(bindparam("identifiers", expanding=True))),
 )
 _CHECKPOINT = update(checkpoints).where(checkpoints.c.machine_id == bindparam("which"))
-_parts = checkpoint_parts.c.machine_id == bindparam("which")
-_PARTS = select(checkpoint_parts.c.name).where(_parts)
-_GONE = delete(checkpoint_parts).where(_parts, checkpoint_parts.c.name.in_(bindparam("gone", expanding=True)))
+_OF_MACHINE = checkpoint_parts.c.machine_id == bindparam("which")
+_PARTS = select(checkpoint_parts.c.name).where(_OF_MACHINE)
+_GONE = delete(checkpoint_parts).where(_OF_MACHINE, checkpoint_parts.c.name.in_(bindparam("gone", expanding=True)))
 _INSERT = {table: insert(table) for table in (alarm_events, checkpoint_parts, reports, windows)}
 
 
