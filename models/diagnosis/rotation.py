@@ -27,7 +27,9 @@ _RESOLVED = 0.25  # part of a hop's frequency resolution below which no differen
 # Relative distance from the straight course through most of the hops, beyond which a peak is another one.
 _COURSE = 0.03
 _FOLLOWED_PART = 0.8
-_STRONG, _FEW_HOPS = 15.0, 6  # a stretch of a few hops needs lines that stand out by themselves
+_FEW_HOPS = 6  # a stretch of as few needs lines that stand out by themselves
+STRONG = 15.0
+"""Strength from which a line stands out by itself: noise has none like it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +143,7 @@ def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> Flo
     with np.errstate(invalid="ignore"):
         if len(lines) < _FEW_HOPS:
             near = np.abs(speed / np.median(speed) - 1) < _NEIGHBOUR * len(lines)
-            return speed if np.all(strength > _STRONG) and np.all(near) else None
+            return speed if np.all(strength > STRONG) and np.all(near) else None
         expected = (sweep[1:] + sweep[:-1]) / 2 * hop_s
         near = np.maximum(_NEIGHBOUR * speed, _RESOLVED * 2 * np.pi / hop_s)
         together = np.abs(np.diff(speed) - expected) < near[1:]

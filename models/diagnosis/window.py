@@ -67,6 +67,8 @@ class WindowStatistics:
     speed_rad_s: float  # mean speed (nan if unknown)
     speed_range: tuple[float, float]  # slowest and fastest hop, rad/s (nan if unknown)
     hop_speed_rad_s: FloatArray  # (n_hops,), mean speed of each hop (nan if unknown)
+    # (n_hops,), by how much the most likely rotation stands out of each (`RotationLine.strength`); nan with an angle
+    hop_strength: FloatArray
     hop_jump_rad: FloatArray  # (n_hops,), by which the shaft angle jumped in each (nan if unknown)
     removed_by_hop: bool  # whether the rotation was taken out hop by hop, each with its own amplitude
     # (n_bins, n): squared coherence of each bin with the angle or, where the rotation was taken out hop by hop, with
@@ -230,6 +232,7 @@ def window_statistics(
         speed_rad_s=speed_rad_s,
         speed_range=speed_range,
         hop_speed_rad_s=rotation.hop_speed_rad_s,
+        hop_strength=np.array([np.nan if hop.line is None else hop.line.strength for hop in hops]),
         hop_jump_rad=angle_jumps(hops),
         removed_by_hop=rotation.by_hop,
         phase_kept=phase_kept,

@@ -15,6 +15,7 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading
+from models.diagnosis.rotation import STRONG
 from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.verdict.calibration import beside
 from models.diagnosis.verdict.sequential import SequentialTest
@@ -37,6 +38,8 @@ than another, and of what is outside the model by something else than its spectr
 _HEAVIEST, _SURELY = 20.0, 3.0
 """Times the unbalance of the machine file, in standard errors: a lost blade makes ten of it, millimetres in place of
 micrometres a thousand."""
+_WEAKER = 0.25
+"""Strength of a hop's line over that of the window's others, up to which its speed was another one in a part of it."""
 _OUTSIDE = 4.0
 """Standard deviations of the misfit from which the short stretches of a window are tested for themselves."""
 
@@ -70,6 +73,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         given = "unbalance_phase_rad" in machine.operation.model_fields_set
         self._sought = commissioned is None and not given
         self._tried_ns, self._tried_in_vain = 0, False  # end of the window that the other one was tried on
+        self._stood_out = False  # the rotation, out of the vibration, where there is no shaft angle
         self._compare_with(machine)
 
     def _compare_with(self, machine: Machine) -> None:
@@ -84,6 +88,9 @@ class KnownMachineEvaluator(WindowEvaluator):
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`."""
         speed = self._speed(window)
+        if window.speed_source == "estimated":
+            found = window.hop_strength[np.isfinite(window.hop_speed_rad_s)]
+            self._stood_out |= bool(np.median(found) > STRONG)
         window = window if self.directed else replace(window, directed=False)
         deciding = self._explained(window)
         if self._open:
@@ -179,16 +186,36 @@ class KnownMachineEvaluator(WindowEvaluator):
         EstimationError
             If it does not fit.
         """
+        if not decided.unexplained and (decided.misfit_z or 0.0) <= _INSIDE:
+            return decided
+        if window.speed_source != "phase reference" and (lost := self._lost(window)):
+            raise EstimationError(f"{self._machine.title}: {lost}")
         adjoin = np.isfinite(window.hop_jump_rad[1:])  # and the shaft angle is measured
         steps = np.abs(np.diff(window.hop_speed_rad_s))[adjoin] / self._machine.operation.speed_rad_s
         fastest = float(np.max(steps, initial=0.0))
         limit = max(STEADY, round(_STEADY / max(1, self._machine.window.hops - 1), 3))  # of a ramp as long as a window
-        if fastest <= limit or (not decided.unexplained and (decided.misfit_z or 0.0) <= _INSIDE):
+        if fastest <= limit:
             return decided
         told, most = beyond(100 * fastest, 100 * limit)
         raise EstimationError(
             f"{self._machine.title}: the speed changed by {told} % of nominal from one hop to the next, evaluation "
             f"limit {most} %"
+        )
+
+    def _lost(self, window: WindowStatistics) -> str:
+        """In how many hops the rotation was found, where that is not all of them and it has stood out before.
+
+        A hop in which the shaft came to its speed, or left it, has a line that is much weaker than the others'.
+        """
+        found, operation = np.isfinite(window.hop_speed_rad_s), self._machine.operation
+        if found.any():
+            found &= window.hop_strength > _WEAKER * np.median(window.hop_strength[found])
+        if not self._stood_out or found.all():
+            return ""
+        slowest, fastest = (operation.speed_rpm * (1 + sign * operation.speed_tolerance) for sign in (-1, 1))
+        return (
+            f"the rotation was found in {np.count_nonzero(found)} of {found.size} hops, evaluation limit all of them: "
+            f"the speed left {slowest:.0f} to {fastest:.0f} rpm, or changed too fast"
         )
 
     def _newest(
@@ -215,14 +242,14 @@ class KnownMachineEvaluator(WindowEvaluator):
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Where the likelihood's maximum is followed from, and what is known; networks remember nothing."""
         explained = np.array([] if self._explained_ns is None else [self._explained_ns], dtype=np.int64)
-        sense = [self._open, self._opposite, self._tried_in_vain, self._tried_ns, self._sought]
+        sense = [self._open, self._opposite, self._tried_in_vain, self._tried_ns, self._sought, self._stood_out]
         known = {_EXPLAINED: explained, _SENSE: np.array(sense, dtype=np.int64), _DIRECTED: np.array(self.directed)}
         return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | known
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called, see `WindowEvaluator`."""
         explained = checked(arrays, _EXPLAINED, np.int64, (None,)).tolist()
-        still_open, opposite, in_vain, tried_ns, sought = checked(arrays, _SENSE, np.int64, (5,)).tolist()
+        still_open, opposite, in_vain, tried_ns, sought, stood_out = checked(arrays, _SENSE, np.int64, (6,)).tolist()
         directed = bool(checked(arrays, _DIRECTED, np.bool_, ()))
         machine = in_sense(self._given, "opposite" if opposite else "Eq. 27")
         likelihood = LengthFits(machine)
@@ -231,6 +258,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         self._likelihood, self._explained_ns = likelihood, next(iter(explained), None)
         self._open, self._opposite, self._sought = bool(still_open), bool(opposite), bool(sought)
         self._tried_ns, self._tried_in_vain, self.directed = tried_ns, bool(in_vain), directed
+        self._stood_out = bool(stood_out)
 
     def _speed(self, window: WindowStatistics) -> float | None:
         """Mean speed, if it is one that is evaluated."""

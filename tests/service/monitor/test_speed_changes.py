@@ -15,6 +15,7 @@ from tests.service.monitor.test_monitor import feed
 
 LAB = load_machine("lab")
 RPM = LAB.operation.speed_rpm
+WITHOUT_ANGLE = LAB.model_copy(update={"sensors": tuple(one for one in LAB.sensors if one.name != "theta")})
 
 
 def watched(machine: Machine, moving: Machine, duration_s: float, change: Event) -> tuple[list[Report], set[str]]:
@@ -40,11 +41,23 @@ def test_a_step_of_the_speed_is_no_misfit(to: float) -> None:
     assert "% of nominal from one hop to the next, evaluation limit 1.4 %" in windows[-1].reason
 
 
-def test_without_a_phase_reference_what_does_not_fit_is_outside_the_model() -> None:
-    """Speeds that are estimated, or unknown in some hops, have no steps."""
-    without = LAB.model_copy(update={"sensors": tuple(one for one in LAB.sensors if one.quantity != "shaft_angle")})
-    other = without.rotor.model_copy(update={"m2_kg": 1.3 * without.rotor.m2_kg})
-    moving = without.model_copy(update={"rotor": other})
-    windows, alarms = watched(without, moving, 75.0, Event(at_s=66.0, speed_rpm=1.05 * RPM))
+@pytest.mark.parametrize(
+    "change",
+    [
+        Event(at_s=65.0, speed_rpm=1.35 * RPM, ramp_s=40.0),
+        Event(at_s=65.0, speed_rpm=0.3 * RPM, ramp_s=14.0),
+        Event(at_s=66.0, speed_rpm=1.05 * RPM),
+    ],
+)
+def test_without_a_phase_reference_a_rotation_that_was_lost_is_no_misfit(change: Event) -> None:
+    windows, alarms = watched(WITHOUT_ANGLE, WITHOUT_ANGLE, 130.0 if change.ramp_s > 30 else 95.0, change)
+    assert (windows[-1].state, alarms) == (HealthState.NOT_EVALUABLE, set())
+    assert "of 12 hops, evaluation limit all of them: the speed left 1056 to 1584 rpm" in windows[-1].reason
+
+
+def test_without_a_phase_reference_another_rotor_is_outside_the_model() -> None:
+    """At a steady speed, and once its rotation is lost."""
+    other = LAB.rotor.model_copy(update={"m2_kg": 1.3 * LAB.rotor.m2_kg})
+    moving = WITHOUT_ANGLE.model_copy(update={"rotor": other})
+    _, alarms = watched(WITHOUT_ANGLE, moving, 95.0, Event(at_s=86.0, speed_rpm=1.05 * RPM))
     assert alarms == {MODEL}
-    assert "from one hop to the next" not in windows[-1].reason
