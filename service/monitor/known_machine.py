@@ -78,7 +78,7 @@ class KnownMachineEvaluator(WindowEvaluator):
 
     def _compare_with(self, machine: Machine) -> None:
         self._machine, bundle = machine, self._bundle
-        self._likelihood = LengthFits(machine)
+        self._likelihood = LengthFits(machine, sized=not self._commissioned)
         others: list[Diagnostician] = []
         if bundle is not None and bundle.amortised is not None:
             others.append(NetworkDiagnostician(machine, bundle.amortised))
@@ -164,11 +164,13 @@ class KnownMachineEvaluator(WindowEvaluator):
 
     def _within(self, decided: Diagnosis) -> Diagnosis:
         """The diagnosis, unexplained where it takes an unbalance that means wrong units, or a wrong e_m."""
-        vector = decided.unbalance
-        if vector is None or decided.unexplained or vector.foreign:
+        vector, e = decided.unbalance, next((one for one in decided.evaluable if one.name == "e"), None)
+        if decided.unexplained or e is None or (vector is not None and vector.foreign):
             return decided
-        times = 1 + vector.magnitude_change
-        if times - _SURELY * vector.magnitude_error < _HEAVIEST:
+        times, error = 1 + (e.relative_change or 0.0), e.standard_error or 0.0
+        if vector is not None:
+            times, error = 1 + vector.magnitude_change, vector.magnitude_error
+        if times - _SURELY * error < _HEAVIEST:
             return decided
         why = f"{self._machine.title}: it would take {times:.1f} times the unbalance of the machine file, the limit is"
         return replace(
@@ -252,7 +254,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         still_open, opposite, in_vain, tried_ns, sought, stood_out = checked(arrays, _SENSE, np.int64, (6,)).tolist()
         directed = bool(checked(arrays, _DIRECTED, np.bool_, ()))
         machine = in_sense(self._given, "opposite" if opposite else "Eq. 27")
-        likelihood = LengthFits(machine)
+        likelihood = LengthFits(machine, sized=not self._commissioned)
         likelihood.restore(unprefixed(_LIKELIHOOD, arrays))
         self._compare_with(machine)
         self._likelihood, self._explained_ns = likelihood, next(iter(explained), None)

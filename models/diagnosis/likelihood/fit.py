@@ -21,7 +21,7 @@ from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Weights,
 from models.diagnosis.likelihood.spectral_model import STRUCTURAL, Expected, SpectralModel, starting_point, usual_force
 from models.diagnosis.likelihood.unbalance import Unbalance, estimate_unbalance, estimate_unbalance_by_hop
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.readings import Diagnosis, parameter_reading
+from models.diagnosis.readings import Diagnosis, no_reading, parameter_reading
 from models.diagnosis.window import WindowStatistics
 from models.errors import CheckpointError, EstimationError, UnexplainedError
 from models.machine import Machine
@@ -41,6 +41,7 @@ _STIFFEST, _SURELY = 0.5, 3.0  # no shaft becomes stiffer by half; in standard e
 _SYNCHRONOUS_BINS, _FEWEST_BINS = 3, 20
 # Standard errors by which latest hops may differ from the window in the unbalance, and in all together from nominal.
 _DIFFERS, _STANDS_OUT = 3.0, 4.0  # a change is named from five on
+_LINE_ERROR = 0.01  # least relative error of an unbalance whose angle is that of a line found in noise
 _FOLLOWED = 12  # windows in a row that may start from one window's units and slopes before a search takes its own
 
 
@@ -54,12 +55,15 @@ class LikelihoodFit:
     ----------
     follow : bool
         Whether windows that follow each other overlap, so that they may be followed.
+    sized : bool
+        Whether the size of the unbalance is read without a phase reference, too.
     """
 
     by = "likelihood"
 
-    def __init__(self, machine: Machine, *, follow: bool = False) -> None:
+    def __init__(self, machine: Machine, *, follow: bool = False, sized: bool = False) -> None:
         self._machine = machine
+        self._sized = sized
         self._usual_cutoff_hz = math.sqrt(machine.condition.cutoff_hz[0] * machine.condition.cutoff_hz[1])
         self._follow = follow
         self._last: FloatArray | None = None
@@ -273,20 +277,29 @@ class LikelihoodFit:
             parameter_reading(name, self.by, float(value), float(error))
             for name, value, error in zip(STRUCTURAL, change, errors, strict=True)
         ]
-        e = None
-        if window.synchronous is not None:
+        e = vector = None
+        if window.synchronous is not None or (self._sized and window.relative_synchronous is not None):
             e = self._unbalance(window, model, point, structural, speed)
+            vector = None if window.synchronous is None else e.vector
+        if e is not None and e.vector.foreign and vector is None:
+            readings.append(no_reading("e", self.by, e.vector.foreign))
+        elif e is not None:
             cross = (e.covariance * ratio)[:, None]
             spread = np.block([[spread, cross], [cross.T, np.array([[e.variance]])]])
-            readings.append(parameter_reading("e", self.by, e.change, math.sqrt(e.variance), e.vector))
-        covariance, vector = np.asarray(spread, dtype=np.float64), None if e is None else e.vector
+            readings.append(parameter_reading("e", self.by, e.change, math.sqrt(e.variance), vector))
+        covariance = np.asarray(spread, dtype=np.float64)
         return Diagnosis(self.by, tuple(readings), covariance=covariance, unbalance=vector), e
 
     def _unbalance(
         self, window: WindowStatistics, model: SpectralModel, point: Expected, structural: FloatArray, speed: float
     ) -> Unbalance:
-        """Change of e; hop by hop where the speed varies."""
+        """Change of e; hop by hop where the speed varies, or is found in the vibration: that has no angle."""
         known = (self._machine, model, point, structural)
+        if window.relative_synchronous is not None:
+            hop_s, found = window.duration_s / window.hop_speed_rad_s.size, np.isfinite(window.hop_speed_rad_s)
+            hops = window.relative_synchronous[found], window.hop_speed_rad_s[found], hop_s
+            e = estimate_unbalance_by_hop(*known, *hops, sized=True)
+            return replace(e, variance=e.variance + (_LINE_ERROR * (1 + e.change)) ** 2)
         if window.removed_by_hop and window.hop_synchronous is not None:
             if not window.hop_synchronous.any(axis=1).all():
                 raise EstimationError(f"{self._machine.name}: the shaft turned by less than a quarter turn in a hop")

@@ -17,9 +17,9 @@ from models.machine import Machine
 class LengthFits:
     """One fit for the window, and one for every shorter length that has news."""
 
-    def __init__(self, machine: Machine) -> None:
-        self._machine = machine
-        self._window = LikelihoodFit(machine, follow=True)
+    def __init__(self, machine: Machine, *, sized: bool = False) -> None:
+        self._machine, self._sized = machine, sized
+        self._window = LikelihoodFit(machine, follow=True, sized=sized)
         self._short: dict[int, LikelihoodFit] = {}
         self._searched: dict[int, int] = {}
         self._hop = 0
@@ -45,9 +45,9 @@ class LengthFits:
         """
         hop = int(checked(arrays, "hop", np.int64, ()))
         searched = dict(checked(arrays, "searched", np.int64, (None, 2)).tolist())
-        window = LikelihoodFit(self._machine, follow=True)
+        window = LikelihoodFit(self._machine, follow=True, sized=self._sized)
         window.restore(unprefixed("window", arrays))
-        short = {hops: LikelihoodFit(self._machine) for hops in searched}
+        short = {hops: LikelihoodFit(self._machine, sized=self._sized) for hops in searched}
         for hops, fit in short.items():
             fit.restore(unprefixed(f"short_{hops}", arrays))
         self._hop, self._searched, self._window, self._short = hop, searched, window, short
@@ -102,7 +102,7 @@ class LengthFits:
         seen = None if closely else self._window.glance(stretch)
         if seen is not None:
             return seen
-        fit = self._short.setdefault(hops, LikelihoodFit(self._machine))
+        fit = self._short.setdefault(hops, LikelihoodFit(self._machine, sized=self._sized))
         if self._searched.get(hops) != self._hop - 1:
             fit.start_near(self._window)
         self._searched[hops] = self._hop

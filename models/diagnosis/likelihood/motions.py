@@ -332,7 +332,7 @@ def integrated(window: WindowStatistics) -> WindowStatistics:
     at_speed = (
         np.where(made, 1 / (1j * window.speed_rad_s), 1.0) if np.isfinite(window.speed_rad_s) else np.ones(made.size)
     )
-    synchronous, by_hop = window.synchronous, window.hop_synchronous
+    synchronous, by_hop, relative = window.synchronous, window.hop_synchronous, window.relative_synchronous
     hops = window.hop_correlation.shape[0]
     return replace(
         window,
@@ -343,4 +343,5 @@ def integrated(window: WindowStatistics) -> WindowStatistics:
         spectrum=spectrum,
         synchronous=None if synchronous is None else synchronous[kept] * at_speed,
         hop_synchronous=None if by_hop is None else by_hop[:, kept] * at_speed,
+        relative_synchronous=None if relative is None else relative[:, kept] * at_speed,
     )

@@ -49,6 +49,7 @@ class UnbalanceRatios:
     foreign: str  # see `UnbalanceVector`
     # (n_states,): real and imaginary part are those of weights @ vector; none for several vectors
     weights: ComplexArray
+    explained: float  # how much of the vector is that of the unbalance, in squared standard errors
 
     def decided(self, *, directed: bool = True) -> Unbalance:
         """Take that of the descriptions which holds, see this module; the size alone where directions say nothing."""
@@ -73,6 +74,9 @@ def estimate_unbalance(
     synchronous: ComplexArray,
     speed_rad_s: float,
     duration_s: float,
+    *,
+    sized: bool = False,
+    backward: bool = False,
 ) -> UnbalanceRatios:
     """Estimate e from q of x_n = Re{q e^{jθ}}; `UnbalanceRatios.decided` makes one answer of it.
 
@@ -87,6 +91,10 @@ def estimate_unbalance(
         Of the logarithmic ratios of the structural parameters.
     synchronous : ndarray of complex, shape (n_states,)
         q, SI.
+    sized : bool
+        Whether the vector is from an unknown angle, so that its size is all there is: it is turned to the heavy spot.
+    backward : bool
+        Whether the shaft turns from z to y although the speed is positive, as one that was found in the vibration is.
 
     Raises
     ------
@@ -96,7 +104,7 @@ def estimate_unbalance(
     rotor = machine.rotor
     w = np.array([speed_rad_s])
     phase = np.exp(1j * machine.operation.unbalance_phase_rad)
-    force = rotor.m2_kg * rotor.e_m * speed_rad_s**2 * phase * np.array([0, 1, 0, 0, -1j, 0])
+    force = rotor.m2_kg * rotor.e_m * speed_rad_s**2 * phase * np.array([0, 1, 0, 0, 1j if backward else -1j, 0])
 
     structural = point.theta[: len(STRUCTURAL)]
     H = model.receptance(structural, speed_rad_s, w)[0]
@@ -109,6 +117,8 @@ def estimate_unbalance(
     weighted = np.linalg.solve(noise, g)
     total_weight = float(np.real(np.vdot(weighted, g)))
     ratio = complex(np.vdot(weighted, q)) / total_weight
+    if sized and ratio:
+        q, ratio = q * (abs(ratio) / ratio), complex(abs(ratio))
     # Real representation: the structural uncertainty moves real and imaginary parts together.
     own = np.block([[noise.real, -noise.imag], [noise.imag, noise.real]]) / 2
     turned = 1j * g
@@ -136,7 +146,8 @@ def estimate_unbalance(
     if foreign:
         foreign = f"{machine.name}: the 1× vibration is not what an unbalance causes on this rotor: {foreign}"
     weights = np.asarray(weighted.conj() @ combined[0] / total_weight, dtype=np.complex128)
-    return UnbalanceRatios(values, variances, between, with_structural, foreign, weights)
+    explained = abs(ratio) ** 2 * total_weight
+    return UnbalanceRatios(values, variances, between, with_structural, foreign, weights, explained)
 
 
 def _contradiction(observed: FloatArray, design: FloatArray, spread: FloatArray, size: FloatArray) -> FloatArray:
@@ -183,6 +194,7 @@ def estimate_unbalance_by_hop(
     hop_s: float,
     *,
     directed: bool = True,
+    sized: bool = False,
 ) -> Unbalance:
     """Estimate e where the speed varies: every hop at its own speed, with its own vector.
 
@@ -196,16 +208,24 @@ def estimate_unbalance_by_hop(
     hop_speed_rad_s : ndarray, shape (n_hops,)
     directed : bool
         See `UnbalanceRatios.decided`.
+    sized : bool
+        Whether the vectors of a hop are from an unknown angle, and so is the way in which the shaft turns: that which
+        explains more of them.
 
     Raises
     ------
     EstimationError
         If a vector says nothing about e.
     """
-    hops = [
-        estimate_unbalance(machine, model, point, covariance, vectors, float(speed), hop_s)
-        for vectors, speed in zip(hop_synchronous, hop_speed_rad_s, strict=True)
+    known = machine, model, point, covariance
+    ways = [
+        [
+            estimate_unbalance(*known, vectors, float(speed), hop_s, sized=sized, backward=backward)
+            for vectors, speed in zip(hop_synchronous, hop_speed_rad_s, strict=True)
+        ]
+        for backward in ((False, True) if sized else (False,))
     ]
+    hops = max(ways, key=lambda way: sum(one.explained for one in way))
     precision = np.linalg.inv(covariance)
     shared = np.array([hop.covariance for hop in hops])
     common = np.einsum("hai,ij,hbj->hab", shared, precision, shared)
@@ -223,7 +243,8 @@ def estimate_unbalance_by_hop(
         together,
         next((hop.foreign for hop in hops if hop.foreign), ""),
         np.empty(0, dtype=np.complex128),
-    ).decided(directed=directed)
+        sum(hop.explained for hop in hops),
+    ).decided(directed=directed and not sized)
 
 
 def _around_rotation(

@@ -186,6 +186,7 @@ def added(stretches: Sequence[Stretch]) -> Stretch:
 
 _VAGUE = 0.2  # a larger standard error of a full window is no longer one: the reading says nothing
 _NO_PHASE = "no phase reference"
+_NO_ROTATION = f"{_NO_PHASE}, and no rotation found in the vibration: measure the shaft angle to have it judged"
 _NO_ROTOR = "cannot be told without the rotor's own parameters"
 _PLANES = {"k_by": "y", "c_by": "y", "k_bz": "z", "c_bz": "z"}  # plane in which a bearing parameter acts
 
@@ -200,7 +201,7 @@ def determined(diagnosis: Diagnosis, window: WindowStatistics, length_s: float) 
     """
     vague = _VAGUE * max(1.0, length_s / window.duration_s) ** 0.5
     found = {reading.name: reading for reading in diagnosis.parameters}
-    stated = tuple(_stated(name, diagnosis, found.get(name), window.states, vague) for name in PARAMETERS)
+    stated = tuple(_stated(name, diagnosis, found.get(name), window, vague) for name in PARAMETERS)
     before = [reading.name for reading in diagnosis.evaluable]
     kept = [before.index(reading.name) for reading in stated if reading.relative_change is not None]
     part = np.ix_(kept, kept)
@@ -241,13 +242,15 @@ def _vector(diagnosis: Diagnosis, name: str) -> UnbalanceVector | None:
 
 
 def _stated(
-    name: str, diagnosis: Diagnosis, reading: Parameter | None, states: tuple[str, ...], vague: float
+    name: str, diagnosis: Diagnosis, reading: Parameter | None, window: WindowStatistics, vague: float
 ) -> Parameter:
     """The reading of one parameter, or why these sensors do not determine it."""
     by, plane = diagnosis.by, _PLANES.get(name)
     if reading is None:
-        return no_reading(name, by, _NO_PHASE if name == "e" else _NO_ROTOR)
-    if plane is not None and not any(state.startswith(plane) for state in states):
+        # Where the rotation is found, its size is judged by its level at least.
+        no_e = _NO_PHASE if window.speed_source == "estimated" else _NO_ROTATION
+        return no_reading(name, by, no_e if name == "e" else _NO_ROTOR)
+    if plane is not None and not any(state.startswith(plane) for state in window.states):
         return no_reading(name, by, f"no displacement or velocity measured in {plane}")
     if reading.relative_change is None:
         return reading

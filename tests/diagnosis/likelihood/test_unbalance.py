@@ -101,6 +101,23 @@ def test_vectors_that_no_unbalance_makes_are_not_read_as_one() -> None:
     assert not verdict.outside
 
 
+def test_without_a_shaft_angle_vectors_at_any_angle_have_a_size() -> None:
+    """Of a shaft that turns either way; of what is no unbalance there is no reading, and no misfit."""
+    window, rng = drawn(2, 0.4), np.random.default_rng(5)
+    seen = sure(window.hop_synchronous) * np.exp(1j * rng.uniform(0, 6, (12, 1)))
+    foreign = np.abs(seen) * np.exp(1j * rng.uniform(0, 6, len(window.states)))
+    blind = replace(window, synchronous=None, hop_synchronous=None)
+    mirror = np.array([-1.0 if state.startswith("z") else 1.0 for state in window.states])
+    for vectors in (seen, seen * mirror, foreign):
+        alone = replace(blind, relative_synchronous=vectors)
+        *others, e = LikelihoodFit(MACHINE, sized=True).diagnose(alone).parameters
+        assert tuple(others) == LikelihoodFit(MACHINE).diagnose(alone).parameters
+        if vectors is foreign:
+            assert "not what an unbalance causes" in e.reason
+        else:
+            assert e.relative_change == pytest.approx(0.4, abs=4 * sure(e.standard_error))
+
+
 @pytest.mark.parametrize(("number", "layout", "e"), [(4, Layout.INDEPENDENT, 0.0), (8, Layout.ONE_SOURCE, 0.4)])
 def test_run_out_is_no_more_of_an_unbalance_than_it_is(number: int, layout: Layout, e: float) -> None:
     """Every sensor shows 1x that is 5 % off, in a direction of its own: weights of chance alone made it 23 and 14 %."""

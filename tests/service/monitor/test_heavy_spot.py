@@ -1,8 +1,10 @@
 """A heavy spot that is not where a machine file without its angle has it looked for."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
+import numpy as np
 import pytest
 
 from models.commissioning.commissioned import Installed
@@ -48,6 +50,23 @@ def test_where_the_file_does_not_say_where_the_heavy_spot_is_its_angle_is_no_unb
     windows, events = feed(restored, parts[750:])
     assert [event.alarm.name for event in events if event.kind == "raised"] == ["e"]
     assert e_of(windows[-1].parameters) == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_without_a_shaft_angle_the_unbalance_is_judged_by_its_size(backward: bool) -> None:
+    """Whichever way the shaft turns; seen in a mirror it turns the other way."""
+    sensors = tuple(one for one in LAB.sensors if one.name != "theta")
+    mirror = np.array([-1.0 if backward and one.direction == "z" else 1.0 for one in sensors], dtype=np.float32)
+    larger = Event(at_s=80.0, parameter="e", relative_change=0.5)
+    parts = [replace(one, samples=one.samples[:, :-1] * mirror) for one in stream(145.0, 2.5, larger)]
+    going = MachineMonitor(Installed(LAB.model_copy(update={"sensors": sensors})))
+    windows, events = feed(going, parts[:750])
+    assert not events
+    assert abs(e_of(windows[-1].parameters)) < 0.05
+    windows, events = feed(going, parts[750:])
+    assert [event.alarm.name for event in events if event.kind == "raised"] == ["e"]
+    assert e_of(windows[-1].parameters) == pytest.approx(0.5, abs=0.1)
+    assert all(one.vector is None for one in windows[-1].parameters)  # it has no direction
 
 
 def test_where_the_file_says_it_another_angle_is_a_change() -> None:
