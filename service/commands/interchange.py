@@ -33,7 +33,8 @@ def import_(
 
     Units, rate and time are checked; what is wrong is named with row and column. Gaps stay gaps. The files of a folder,
     such as snapshots, are joined in the order of their times, which are in their names (20260131T120000), in the files,
-    or follow from the mapping's start and the machine's schedule.
+    or follow from the mapping's start and the machine's schedule. Files of a folder that cannot be read are left out
+    and named, with exit code 1.
 
     [bold]Example[/bold]
 
@@ -48,6 +49,10 @@ def import_(
     done = import_file(source, load_mapping(mapping, described), described, out, overwrite=overwrite)
     for line in summary_lines(done):
         typer.echo(line)
+    for fault in done.unusable:
+        typer.echo(f"left out: {fault}", err=True)
+    if done.unusable:
+        raise typer.Exit(1)
 
 
 @commands.command()

@@ -1,10 +1,10 @@
 """A folder of files, each a snapshot or a stretch of one: in the order of their times, as if they were one file."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
 from itertools import pairwise
 from math import gcd
 from pathlib import Path
@@ -26,7 +26,7 @@ _DATE = re.compile(
     r"(?<!\d)(\d{4})[-_. ]?(\d{2})[-_. ]?(\d{2})"  # day
     r"[-_. T]*(\d{2})[-_.:h ]?(\d{2})(?:[-_.:m ]?(\d{2})(?:[.,_-](\d{1,9}))?)?(?!\d)"  # time of day
 )
-_UNIX = re.compile(r"(?<!\d)(\d{10})(\d{3}|\d{6}|\d{9})?(?!\d)")
+_UNIX = re.compile(r"(?<!\d)(1\d{9})(\d{3}|\d{6}|\d{9})?(?!\d)")  # from 2001 to 2033
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +39,15 @@ class SnapshotFile:
     start_ns: int | None
 
 
-def time_in_name(name: str) -> int | None:
-    """Time that the name of a file holds, UTC: a date with a time of day, or seconds and so on since 1970.
+def time_in_name(name: str, zone: tzinfo = UTC, shared: Container[str] = ()) -> int | None:
+    """Time that the name of a file holds: a date with a time of day, or seconds and so on since 1970.
+
+    Parameters
+    ----------
+    zone : tzinfo
+        Time zone of a date; of an hour that occurs twice, the first is taken.
+    shared : container of str
+        Numbers that all files of a folder have in their names, such as that of a device: no seconds since 1970.
 
     Examples
     --------
@@ -48,18 +55,18 @@ def time_in_name(name: str) -> int | None:
     1066824384000000000
     >>> time_in_name("pump7_20260131T120000.250.csv")
     1769860800250000000
-    >>> time_in_name("acc_00017.csv") is None
-    True
+    >>> time_in_name("acc_00017.csv") is None, time_in_name("4021557791.csv") is None
+    (True, True)
     """
     found = _DATE.search(name)
     if found is not None:
         fields = [int(part) for part in found.groups("0")[:6]]
         try:
-            seconds = int(datetime(*fields, tzinfo=UTC).timestamp())  # type: ignore[arg-type, misc]  # six of them
+            seconds = int(datetime(*fields, tzinfo=zone).timestamp())  # type: ignore[arg-type, misc]  # six of them
         except ValueError:  # digits that are no date
             return None
         return seconds * 10**9 + int((found.group(7) or "0").ljust(9, "0"))
-    since = _UNIX.search(name)
+    since = next((found for found in _UNIX.finditer(name) if found.group() not in shared), None)
     if since is None:
         return None
     return int(since.group(1)) * 10**9 + int((since.group(2) or "0").ljust(9, "0"))
@@ -81,7 +88,7 @@ def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tupl
     if not paths:
         raise SourceError(f"{folder}: no file of a known format in it; say format = ... in the mapping")
     base, schedule = mapping.time, machine.schedule
-    if base.is_absolute or (base.start is None and format_of(paths[0], mapping) in DATED):
+    if base.is_absolute or (base.start is None and any(format_of(path, mapping) in DATED for path in paths)):
         return _by_their_own_times(paths, mapping, machine)
     if base.start_ns is not None:
         if schedule is None and base.column is not None:  # the files' column may run on from one to the next
@@ -96,19 +103,30 @@ def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tupl
             SnapshotFile(path, base.start_ns + place * period_ns)
             for place, path in zip(_places(paths), paths, strict=True)
         )
-    files = [SnapshotFile(path, time_in_name(path.name)) for path in paths]
+    files = [SnapshotFile(path, start_ns) for path, start_ns in zip(paths, _named(paths, mapping), strict=True)]
     return tuple(sorted(files, key=lambda one: one.start_ns or 0))  # those without a time keep their order
 
 
+def _named(paths: Sequence[Path], mapping: Mapping) -> list[int | None]:
+    """Times in the names of files."""
+    numbers = [set(re.findall(r"\d+", path.name)) for path in paths]
+    shared = set.intersection(*numbers) if len(paths) > 1 else set()
+    return [time_in_name(path.name, mapping.time.time_zone, shared) for path in paths]
+
+
 def _by_their_own_times(paths: Sequence[Path], mapping: Mapping, machine: MachineFile) -> tuple[SnapshotFile, ...]:
-    """Files that say themselves when they begin, in that order; of one that does not, its name counts."""
+    """Files that say themselves when they begin, in that order; of one that does not, its name counts.
+
+    One that cannot be read comes first: whoever reads them says what is wrong with it.
+    """
     begun = []
-    for path in paths:
-        with open_source(path, mapping) as source:
+    for path, told_ns in zip(paths, _named(paths, mapping), strict=True):
+        begin_ns, named_ns = -1, None
+        with suppress(SourceError), open_source(path, mapping) as source:
             columns = [one.reference for one in signals_of(source, mapping, machine)]
-            named_ns = time_in_name(path.name) if _has_no_time(source, columns, mapping) else None
-            clock = clock_for(source, columns, mapping.time, machine, named_ns)
-            begun.append((clock.origin_ns, SnapshotFile(path, named_ns)))
+            named_ns = told_ns if _has_no_time(source, columns, mapping) else None
+            begin_ns = clock_for(source, columns, mapping.time, machine, named_ns).origin_ns
+        begun.append((begin_ns, SnapshotFile(path, named_ns)))
     return tuple(file for _, file in sorted(begun, key=lambda one: one[0]))
 
 
@@ -152,6 +170,43 @@ def _steps(numbers: Sequence[int]) -> list[int] | None:
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Key that sorts 2 before 10."""
     return [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"(\d+)", path.name)]
+
+
+def unusable(
+    files: Sequence[SnapshotFile], mapping: Mapping, machine: MachineFile, keyphasor: Keyphasor | None
+) -> dict[Path, SourceError]:
+    """Files that cannot be read to their end, each by itself, and what is wrong with them.
+
+    Raises
+    ------
+    SourceError
+        If the times of the others depend on one of them: their places in a schedule are counted, and its name does not
+        say whether it has such a place.
+    """
+    faults: dict[Path, SourceError] = {}
+    for file in files:
+        try:
+            with open_source(file.path, mapping) as source:
+                signals = signals_of(source, mapping, machine)
+                clock = clock_for(source, [one.reference for one in signals], mapping.time, machine, file.start_ns)
+                for _ in pieces(source, signals, clock, mapping, Read()):
+                    pass
+                if keyphasor is not None:
+                    pulse_times(source, keyphasor, clock, mapping)
+        except SourceError as error:
+            faults[file.path] = error
+    if machine.schedule is not None and isinstance(mapping.time.start, datetime):
+        forms = {_form(file.path) for file in files if file.path not in faults}
+        for path, fault in faults.items():
+            if forms and _form(path) not in forms:
+                raise SourceError(
+                    f"{fault}; whether it counts among the others its name does not say: move it out of the folder"
+                )
+    return faults
+
+
+def _form(path: Path) -> str:
+    return re.sub(r"\d+", "0", path.name)
 
 
 def runs_of_pulses(

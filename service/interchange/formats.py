@@ -49,7 +49,10 @@ def open_source(path: Path, mapping: Mapping) -> Source:
     source = getattr(import_module(f"service.interchange.{module}"), name)
     found: Source
     if kind == "csv":
-        found = source(path, mapping.csv, mapping.time.column, datetimes=mapping.time.is_datetime)
+        base = mapping.time
+        found = source(path, mapping.csv, base.column, datetimes=base.is_datetime, zone=base.zone or "UTC")
+    elif kind == "parquet":
+        found = source(path, zone=mapping.time.zone or "UTC")
     else:
         found = source(path)
     return found

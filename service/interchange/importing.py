@@ -8,7 +8,7 @@
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import floor
 from pathlib import Path
@@ -23,7 +23,7 @@ from models.signals.recording import RecordingWriter
 from service.interchange.angle import AngleColumn, pulse_times, read_pulses
 from service.interchange.blocks import BlockMaker, Written
 from service.interchange.clock import Clock, clock_for
-from service.interchange.folder import SnapshotFile, joined, runs_of_pulses, snapshot_files
+from service.interchange.folder import SnapshotFile, joined, runs_of_pulses, snapshot_files, unusable
 from service.interchange.formats import open_source
 from service.interchange.mapping import Mapping
 from service.interchange.overlap import Integration, Overlap, Resampling
@@ -55,12 +55,14 @@ class Imported:
     angle: AngleColumn
     cut_rows: int  # rows at the ends of stretches where filters are not settled
     left_out: list[str]  # names in a folder that were not read: other formats, folders, links to nothing
+    unusable: list[SourceError]  # what is wrong with files of a folder that were left out for it
+    by_name: bool  # whether the times are those in the names of the files
 
 
 def import_file(
     path: Path, mapping: Mapping, machine: MachineFile, recording: Path, *, overwrite: bool = False
 ) -> Imported:
-    """Import a file, or a folder of files that follow each other.
+    """Import a file, or a folder of files that follow each other: without those of them that cannot be read.
 
     Parameters
     ----------
@@ -72,14 +74,37 @@ def import_file(
     Raises
     ------
     SourceError
-        If the file cannot be used, naming row and column where it is about one.
+        If the file cannot be used, or no file of the folder, naming row and column where it is about one.
     RecordingError
         If the recording cannot be written.
     """
-    files = snapshot_files(path, mapping, machine) if path.is_dir() else (SnapshotFile(path, None),)
+    if not path.is_dir():
+        return _imported(path, (SnapshotFile(path, None),), mapping, machine, recording, overwrite=overwrite)
+    files = snapshot_files(path, mapping, machine)
+    try:
+        return _imported(path, files, mapping, machine, recording, overwrite=overwrite)
+    except SourceError:
+        # Only now is every file read by itself: that takes as long as the import.
+        faults = unusable(files, mapping, machine, mapping.keyphasor)
+        if not faults or len(faults) == len(files):
+            raise
+        rest = tuple(file for file in files if file.path not in faults)
+        done = _imported(path, rest, mapping, machine, recording, overwrite=overwrite)
+        left_out = [name for name in done.left_out if path / name not in faults]
+        return replace(done, left_out=left_out, unusable=list(faults.values()))
+
+
+def _imported(
+    path: Path,
+    files: tuple[SnapshotFile, ...],
+    mapping: Mapping,
+    machine: MachineFile,
+    recording: Path,
+    *,
+    overwrite: bool,
+) -> Imported:
     if any(recording.exists() and file.path.exists() and recording.samefile(file.path) for file in files):
         raise SourceError(f"{recording}: is what is imported, expected another name for the recording")
-    left_out = _left_out(path, files)
     with open_source(files[0].path, mapping) as source:
         signals = signals_of(source, mapping, machine)
         columns = [signal.reference for signal in signals]
@@ -125,7 +150,11 @@ def import_file(
         except BaseException:
             writer.part.unlink(missing_ok=True)
             raise
-    return Imported(path, recording, machine, mapping, clock, read, maker.written, angle, cut_rows, left_out)
+    by_name = path.is_dir() and mapping.time.start is None and files[0].start_ns is not None
+    written = maker.written
+    return Imported(
+        path, recording, machine, mapping, clock, read, written, angle, cut_rows, _left_out(path, files), [], by_name
+    )
 
 
 def _left_out(path: Path, files: tuple[SnapshotFile, ...]) -> list[str]:
@@ -173,10 +202,14 @@ def summary_lines(done: Imported) -> list[str]:
 
 def _folder_lines(done: Imported) -> list[str]:
     names = done.left_out
-    if not names:
-        return []
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return [f"not read in the folder, as no files of a known format: {', '.join(names[:_NAMED])}{more}"]
+    lines = []
+    if done.by_name:
+        zone = done.mapping.time.zone or "UTC (if they are local time, say time.zone in the mapping)"
+        lines.append(f"times: those in the file names, in {zone}")
+    if names:
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        lines.append(f"not read in the folder, as no files of a known format: {', '.join(names[:_NAMED])}{more}")
+    return lines
 
 
 def _gap_lines(done: Imported) -> list[str]:

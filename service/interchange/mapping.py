@@ -3,9 +3,11 @@
 One TOML file; ``docs/interchange.md`` explains each field.
 """
 
-from datetime import UTC, datetime, timedelta
+import re
+from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import Annotated, Literal, Self
+from zoneinfo import ZoneInfo
 
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
@@ -58,6 +60,11 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
         description="time of the first row, or of 0 in the time column; unix if that counts from 1970, datenum if that "
         "counts the days of MATLAB",
     )
+    zone: str | None = Field(
+        default=None,
+        description="time zone of dates and times without one, in the time column and in file names, such as "
+        "Europe/Berlin or +01:00; UTC if left out",
+    )
     rate_hz: float | None = Field(default=None, gt=0, le=1e6, description="samples per second where no column says so")
     rate_from: _Name | None = Field(default=None, description="array of the file with the rate, Hz")
     resample: bool = Field(default=False, description="whether a file at another rate than the machine's is resampled")
@@ -82,7 +89,19 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
                 raise ValueError("start is given although the time column has dates, expected no start")
         else:
             time_unit_ns(self.unit)
+        _ = self.time_zone
         return self
+
+    @property
+    def time_zone(self) -> tzinfo:
+        """Time zone of dates and times that name none."""
+        if self.zone is None:
+            return UTC
+        try:
+            ahead = re.fullmatch(r"[+-]\d\d:\d\d", self.zone)
+            return datetime.strptime(self.zone, "%z").tzinfo or UTC if ahead else ZoneInfo(self.zone)
+        except (ValueError, OSError, LookupError) as error:
+            raise ValueError(f"zone {self.zone!r} is not known, expected such as Europe/Berlin or +01:00") from error
 
     @property
     def is_datetime(self) -> bool:

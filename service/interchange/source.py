@@ -4,6 +4,7 @@ A source hands out columns as the file has them, in pieces, and what the file it
 nothing: units, times and numbers are judged in one place for all formats.
 """
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from models.errors import MachineFileError
+from models.mistakes import did_you_mean
 
 CHUNK_ROWS = 65536
 """Rows that are read at a time."""
@@ -86,7 +88,10 @@ class Source:
         names = self.names()
         if column not in names:
             there = ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "")
-            raise SourceError(f"{self.path}: no {self.entry} {column!r}; there are {there or 'none'}")
+            # What is left out most often is a unit behind the name.
+            near = [name for name in names if _bare(name) == _bare(column)]
+            meant = f"; did you mean {near[0]!r}?" if len(near) == 1 else did_you_mean(column, names)
+            raise SourceError(f"{self.path}: no {self.entry} {column!r}; there are {there or 'none'}{meant}")
         return column
 
     def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002  # others need them
@@ -137,6 +142,11 @@ class Source:
         """Length of a column, and what reads some of its rows."""
         column = self._column(reference)
         return len(column), column.__getitem__
+
+
+def _bare(name: str) -> str:
+    """Name of a column without unit, blanks, and differences between capital and small letters."""
+    return re.sub(r"\s+|[\[(].*", "", name).casefold()
 
 
 def equally_long(path: Path, columns: Sequence[Reference], lengths: Sequence[int]) -> int:

@@ -50,13 +50,17 @@ class CsvSource(_Table):
         Column with the times. Where its first cells are whole numbers it is read as such, because nanoseconds since
         1970 have more digits than a float.
     datetimes : bool
-        Whether it has ISO 8601 times instead of numbers: UTC where a cell names no zone.
+        Whether it has ISO 8601 times instead of numbers.
+    zone : str
+        Time zone of the cells that name none.
     """
 
     kind = "CSV"
 
-    def __init__(self, path: Path, form: CsvFormat, time_column: str | None, *, datetimes: bool) -> None:
-        self._form, self._time_column = form, time_column
+    def __init__(
+        self, path: Path, form: CsvFormat, time_column: str | None, *, datetimes: bool, zone: str = "UTC"
+    ) -> None:
+        self._form, self._time_column, self._zone = form, time_column, zone
         self._time_type = pa.string() if datetimes else pa.float64()
         try:
             with readable(path, self.kind), self._reader(path, None) as reader:
@@ -126,7 +130,7 @@ class CsvSource(_Table):
         )
 
     def _array(self, name: str, column: Any) -> Array:
-        return _array(_utc(column) if self._is_datetime(name) else column)
+        return _array(_utc(column, self._zone) if self._is_datetime(name) else column)
 
     def _label(self, name: str) -> str:
         """Arrow's own name of a column: with the blanks around it, or a number if there is no header."""
@@ -168,7 +172,7 @@ class CsvSource(_Table):
     def _is_value(self, name: str, cell: str) -> bool:
         try:
             if self._is_datetime(name):
-                _utc(pa.array([cell]))
+                _utc(pa.array([cell]), self._zone)
             else:
                 whole, *parts = cell.strip().split(self._form.decimal)
                 float(".".join([whole.replace(".", "x"), *parts]))  # a point in another place makes it no number
@@ -178,11 +182,18 @@ class CsvSource(_Table):
 
 
 class ParquetSource(_Table):
-    """A Parquet file, read row group by row group."""
+    """A Parquet file, read row group by row group.
+
+    Parameters
+    ----------
+    zone : str
+        Time zone of timestamps that name none.
+    """
 
     kind = "Parquet"
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, zone: str = "UTC") -> None:
+        self._zone = zone
         with readable(path, self.kind), pa.parquet.ParquetFile(path) as file:
             self._schema = file.schema_arrow
         super().__init__(path, self._schema.names)
@@ -202,14 +213,23 @@ class ParquetSource(_Table):
         # With pre_buffer Arrow would keep all that it has read of the file.
         with readable(self.path, self.kind), pa.parquet.ParquetFile(self.path, pre_buffer=False) as file:
             for batch in file.iter_batches(batch_size=CHUNK_ROWS, columns=wanted, use_threads=False):
-                yield tuple(_array(batch.column(name)) for name in wanted)
+                yield tuple(_array(_of_zone(batch.column(name), self._zone)) for name in wanted)
 
 
-def _utc(cells: Any) -> Any:
+def _utc(cells: Any, zone: str) -> Any:
     """ISO 8601 times as Arrow's."""
     zoned = pa.compute.match_substring_regex(cells, _ZONED)
     in_utc = pa.compute.binary_join_element_wise(cells, "Z", "")
-    return pa.compute.if_else(zoned, cells, in_utc).cast(pa.timestamp("ns", tz="UTC"))
+    times = pa.compute.if_else(zoned, cells, in_utc).cast(pa.timestamp("ns", tz="UTC"))
+    return times if zone == "UTC" else pa.compute.if_else(zoned, times, _of_zone(times.cast(pa.timestamp("ns")), zone))
+
+
+def _of_zone(times: Any, zone: str) -> Any:
+    """Timestamps without a time zone as those of one; of an hour that occurs twice, the first."""
+    if zone == "UTC" or not pa.types.is_timestamp(times.type) or times.type.tz is not None:
+        return times
+    since = pa.compute.assume_timezone(times, zone, ambiguous="earliest", nonexistent="latest")
+    return since.cast(pa.timestamp("ns", tz="UTC"))
 
 
 def _array(column: Any) -> Array:

@@ -147,6 +147,54 @@ def test_snapshots_that_filters_leave_too_short_are_told(tmp_path: Path, rate_hz
     assert ("the shortest has 1.978 s, the longest of them 1.978 s" in told) == short
 
 
+@pytest.mark.parametrize(("name", "mapping"), [(by_date, NAMED), (by_number, NUMBERED), (by_number, DATED)])
+@pytest.mark.parametrize("number", [0, 5])
+def test_a_file_that_cannot_be_read_is_named_and_the_others_come_in_at_their_times(
+    tmp_path: Path, name: Callable[[int], str], mapping: str, number: int
+) -> None:
+    folder = write(tmp_path / "files", name)
+    whole = dict(np.load(folder / name(8)))
+    np.savez(folder / name(8), **whole | {"v": np.where(np.arange(COUNT) == 3000, np.nan, whole["v"])})
+    (folder / name(number)).write_bytes(b"disk full")
+    done, recording = imported(tmp_path, folder, mapping, KIT)
+    told = {str(fault).removeprefix(f"{folder}/").partition(":")[0]: str(fault) for fault in done.unusable}
+    assert set(told) == {name(number), name(8)}
+    assert "damaged, or no NumPy .npz file" in told[name(number)]
+    assert "row 3001, column v: found nan" in told[name(8)]
+    begun = [one.start_ns for one in stretches(recording, KIT)]
+    assert begun == [START_NS + round(n * EVERY_S * 1e9) for n in range(FILES) if n not in {number, 8}]
+    assert done.left_out == ["notes.docx"]
+
+
+def test_where_places_are_counted_a_file_that_may_not_be_one_of_them_stops_the_import(tmp_path: Path) -> None:
+    folder = write(tmp_path / "files", by_number, range(4))
+    (folder / "Calibration.npz").write_bytes(b"")
+    with pytest.raises(SourceError, match=r"Calibration\.npz: .*move it out of the folder"):
+        imported(tmp_path, folder, NUMBERED, KIT)
+
+
+@pytest.mark.parametrize(("zone", "ahead_h"), [("Europe/Berlin", 1.0), ("+05:30", 5.5), ("UTC", 0.0), (None, 0.0)])
+def test_times_in_names_are_of_the_zone_that_the_mapping_names(
+    tmp_path: Path, zone: str | None, ahead_h: float
+) -> None:
+    mapping = NAMED if zone is None else NAMED.replace("rate_hz", f'zone = "{zone}"\nrate_hz')
+    done, recording = imported(tmp_path, write(tmp_path / "files", by_date, range(3)), mapping, KIT)
+    assert stretches(recording, KIT)[0].start_ns == START_NS - round(ahead_h * 3600e9)
+    (told,) = [line for line in summary_lines(done) if line.startswith("times: ")]
+    assert (zone or "UTC (if they are local time, say time.zone in the mapping)") in told
+
+
+def test_a_serial_number_is_no_time(tmp_path: Path) -> None:
+    def since_1970(number: int) -> str:
+        return f"SN1402155779_{START_NS // 10**9 + round(number * EVERY_S)}.npz"
+
+    _, recording = imported(tmp_path, write(tmp_path / "files", since_1970), NAMED, KIT)
+    begun = [one.start_ns for one in stretches(recording, KIT)]
+    assert begun == [START_NS + round(n * EVERY_S * 1e9) for n in range(FILES)]
+    with pytest.raises(SourceError, match="the time of the first row is not known"):
+        imported(tmp_path, write(tmp_path / "more", lambda number: f"SN1402155779_{number}.npz", range(3)), NAMED, KIT)
+
+
 @pytest.mark.parametrize("name", [by_date, by_number])
 @pytest.mark.parametrize("runs_on", [True, False])
 def test_a_time_column_that_runs_on_from_file_to_file_counts_once(

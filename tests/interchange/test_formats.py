@@ -221,7 +221,18 @@ def test_dates_in_a_parquet_file_are_the_times(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.samples, np.column_stack([x, v, angle]))
 
 
-@pytest.mark.parametrize("written", ["dates", "bare dates", "mixed dates", "nanoseconds", "milliseconds"])
+def test_timestamps_without_a_zone_are_of_that_of_the_mapping(tmp_path: Path) -> None:
+    _, x, v, angle = signals(3000)
+    time = pa.array(START_NS + 500_000 * np.arange(3000), type=pa.timestamp("ns"))
+    pa.parquet.write_table(pa.table({"t": time, "x": x, "v": v, "a": angle}), tmp_path / "run.parquet")
+    mapping = '[time]\ncolumn = "t"\nunit = "datetime"\nzone = "America/New_York"\n' + CHANNELS
+    (found,) = stretches(imported(tmp_path, tmp_path / "run.parquet", mapping)[1])
+    assert found.start_ns == START_NS + 5 * 3600 * 10**9
+
+
+@pytest.mark.parametrize(
+    "written", ["dates", "bare dates", "mixed dates", "local dates", "nanoseconds", "milliseconds"]
+)
 def test_a_text_table_without_names_counts_its_columns(tmp_path: Path, written: str) -> None:
     _, x, v, angle = signals(3000)
     with (tmp_path / "run.csv").open("w", encoding="utf-8") as file:
@@ -234,11 +245,13 @@ def test_a_text_table_without_names_counts_its_columns(tmp_path: Path, written: 
                 "dates": f"{date}Z",
                 "bare dates": date.replace("T", " "),
                 "mixed dates": (date, f"{date}Z", ahead)[row % 3],
+                "local dates": (ahead.removesuffix("+01:00"), ahead, f"{date}Z")[row % 3],
                 "nanoseconds": str(time_ns),
                 "milliseconds": str(row / 2),
             }
             file.write(f"{texts[written]},{float(x[row])!r},{float(v[row])!r},{float(angle[row])!r}\n")
     times = {"nanoseconds": 'unit = "ns"\nstart = "unix"', "milliseconds": f'unit = "ms"\nstart = "{START}"'}
+    times["local dates"] = 'unit = "datetime"\nzone = "Europe/Berlin"'
     told = times.get(written, 'unit = "datetime"')
     mapping = f"[time]\ncolumn = 1\n{told}\n[csv]\nheader = false\n" + CHANNELS.replace('"x"', "2")
     mapping = mapping.replace('"v"', "3").replace('"a"', "4")

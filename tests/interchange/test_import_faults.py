@@ -57,6 +57,9 @@ def test_days_of_a_spreadsheet_are_times(tmp_path: Path) -> None:
     ("rows", "mapping", "header", "said"),
     [
         (GOOD, TEXT, "t,x,speed,a", ("run.csv: no column 'v'; there are t, x, speed, a",)),
+        (GOOD, TEXT.replace('"t"', '"t"\nzone = "CET+1"'), HEADER, ("time: zone 'CET+1' is not known, expected such as",)),
+        (GOOD, TEXT, "t,x,V [mm/s],a", ("there are t, x, V [mm/s], a; did you mean 'V [mm/s]'?",)),
+        (GOOD, TEXT.replace('"v"', '"velocty"'), "t,x,velocity,a", ("did you mean velocity?",)),
         (GOOD, re.sub("y1_dot = .*", "", TEXT), HEADER, (
             "channels.y1_dot: expected [channels.y1_dot] or [acceleration.channels.y1_dot], found nothing",
         )),
@@ -104,7 +107,8 @@ def test_days_of_a_spreadsheet_are_times(tmp_path: Path) -> None:
         )) for year in (1900, 2300, 9999)),
     ],
     ids=[
-        *("missing column", "unmapped channel", "text", "two dots", "no number", "comma", "short row", "other signs"),
+        *("missing column", "zone", "unit in the name", "misspelt", "unmapped channel", "text", "two dots", "no number"),
+        *("comma", "short row", "other signs"),
         *("time goes back", "no second time", "no time", "half the rate", "few decimals"),
         *("other rate", "rate contradicts times", "five decimals", "dates"),
         *("no row", "one row", "no start", "1900", "2300", "9999"),
@@ -304,6 +308,22 @@ def test_the_example_goes_through_import_and_export(tmp_path: Path) -> None:
     assert found.returncode == 0, found.stderr
     assert f"{out}: 4000 rows, 10 columns" in found.stdout
     assert pyarrow.parquet.read_metadata(out).num_rows == 4000
+
+
+def test_a_folder_without_its_bad_file_is_exit_code_1(tmp_path: Path) -> None:
+    folder, mapping, recording = tmp_path / "files", tmp_path / "mapping.toml", tmp_path / "run.mcap"
+    folder.mkdir()
+    sample(folder / "20260101T000000.npz")
+    (folder / "20260101T000100.npz").write_bytes(b"")
+    mapping.write_text(
+        re.sub("start = .*", "", (EXAMPLE / "mapping.toml").read_text(encoding="utf-8")), encoding="utf-8"
+    )
+    machine = EXAMPLE / "machine.toml"
+    found = run("import", folder, "--mapping", mapping, "--machine", machine, "--out", recording)
+    assert found.returncode == 1
+    assert f"{recording}: 20000 samples in 100 blocks" in found.stdout
+    assert found.stderr.startswith(f"left out: {folder}/20260101T000100.npz: damaged, or no NumPy .npz file")
+    assert found.stderr.count("\n") == 1
 
 
 def test_files_that_cannot_be_used_are_exit_code_2(tmp_path: Path) -> None:
