@@ -185,7 +185,7 @@ class Health(OfMachine):
     stream: StreamStatus = Field(description="what is known about the publisher")
     restart: str = Field(
         description="what became of the state from before the latest start of the monitor; empty if there was none",
-        examples=["went on where it stood at 2026-01-01T00:02:55Z"],
+        examples=["resumed at 2026-01-01T00:02:55Z"],
     )
     worker_errors: int = Field(description="blocks lost to an error inside the monitor", examples=[0])
     last_worker_error: str = Field(description="the latest of them; empty if none", examples=[""])

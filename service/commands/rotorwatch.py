@@ -53,8 +53,8 @@ def run(
         typer.Option(
             "--machine",
             metavar="FILE[@BUNDLE]",
-            help="Monitor this machine instead of those in the settings: shipped name or path, and after @ its trained "
-            "networks, if any. Repeatable.",
+            help="Monitor this machine instead of those in the settings: shipped name or path, and after @ its bundle "
+            "(trained or commissioned), if any. Repeatable.",
         ),
     ] = None,
     listen: ListenOption = None,

@@ -1,8 +1,10 @@
 """What the commands share: exit codes, one thread for linear algebra, common options."""
 
 import errno
+import inspect
 import math
 import os
+import re
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -18,6 +20,8 @@ from service.terminal.memory import prepare_memory
 ENDPOINT = "tcp/127.0.0.1:7447"
 """Where a monitor listens unless it is told otherwise."""
 
+_RAGGED = re.compile(r"(?<!\n)(?<!\[/cyan\])\n(?!\n|\[cyan\])")
+"""Ends of lines within a paragraph of a help text, but for those around an example."""
 _FILES = 65_536
 _UNUSABLE = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.EROFS}
 """What the system says of a file that somebody has named, and that this program cannot use."""
@@ -77,6 +81,14 @@ def finite(value: float | None) -> float | None:
 
 class Commands(TyperGroup):
     """The commands of a program, with their exit codes; a refused argument is told like a field of a file."""
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command by its name, with a help text whose lines end where the terminal does."""
+        found = super().get_command(ctx, cmd_name)
+        for one in (found, *getattr(found, "commands", {}).values()):
+            if one is not None and one.help:
+                one.help = _RAGGED.sub(" ", inspect.cleandoc(one.help))
+        return found
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command of the command line."""

@@ -212,7 +212,7 @@ def restored(
         except CheckpointError as error:
             differs = [*differs, f"where first windows are the reference of levels, they are taken again ({error})"]
         return monitor, f"alarms are as they were at {at}; the window is filling anew: {'; '.join(differs)}"
-    return monitor, f"went on where it stood at {at}"
+    return monitor, f"resumed at {at}"
 
 
 def recorded_since_ns(head: CheckpointHead) -> int:

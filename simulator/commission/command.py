@@ -151,7 +151,7 @@ def commission_machine(
         train_for(made.machine, out, n_windows, n_draws, seed, processes)
     typer.echo(f"report: {page}")
     if made.commissioned is not None:
-        typer.echo(f"bundle: {out}   (rotorwatch replay REC --offline --machine {name}@{out})")
+        typer.echo(f"bundle: {out}   (rotorwatch run --machine {name}@{out})")
     return made.commissioned is not None
 
 

@@ -194,7 +194,7 @@ def next_steps(report: CommissioningReport) -> tuple[str, ...]:
     if report.verdict == "refused":
         return (*(_sentence(one) for one in advice), "Nothing was stored: the monitor cannot be started from this.")
     steps = [_sentence(one) for one in advice]
-    steps.append("Start the monitor with the machine file and this folder: rotorwatch run --machine FILE@FOLDER.")
+    steps.append("Start the monitor with the machine file and this bundle: rotorwatch run --machine FILE@BUNDLE.")
     short = [one.name for one in report.parameters if dominant(one) == "commissioning"]
     if short:
         steps.append(

@@ -125,7 +125,7 @@ def link_cut(plant: Plant) -> None:
 
 def start_again(plant: Plant) -> None:
     plant.start()
-    plant.stated(lambda seen: seen.health.restart.startswith("went on where it stood"), "restart")
+    plant.stated(lambda seen: seen.health.restart.startswith("resumed"), "restart")
     plant.recovered()
 
 

@@ -291,7 +291,7 @@ def test_a_refusal_says_why_and_what_to_record_instead(folder: Path, name: str) 
     assert "Nothing was stored" in section(text, "identity")
     assert 'class="verdict refused"' in text
     assert "commissioned range" not in text
-    assert "--machine FILE@FOLDER" not in text
+    assert "--machine FILE@BUNDLE" not in text
 
 
 def test_a_machine_of_whose_motion_nothing_is_measured_is_said_to_be_compared_by_its_levels(folder: Path) -> None:

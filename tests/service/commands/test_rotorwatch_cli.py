@@ -58,6 +58,18 @@ def test_every_command_has_an_example(command: str) -> None:
     assert ("[link]" in found.stdout) == (command in ("run", "watch", "router"))  # names of tables are no markup
 
 
+def test_a_paragraph_of_help_fills_the_lines_and_an_example_has_its_own() -> None:
+    def lines(*command: str) -> list[str]:
+        found = run(*command, "--help", COLUMNS="80")
+        return [" ".join(line.split()) for line in found.stdout.splitlines()]
+
+    told = lines("fleet")
+    assert "that is lost; this process serves HTTP, the page, metrics and webhooks for all" in told
+    assert "RAY_worker_niceness=0 ray start --head --disable-usage-stats" in told
+    assert "Gaps stay gaps. The files of a folder, such as snapshots, are joined in the" in lines("import")
+    assert "rotorwatch run --config plant.toml" in lines("run")
+
+
 def test_a_file_of_somebody_else_is_told_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(typer.Exit) as ended, exit_codes():
         raise PermissionError(errno.EACCES, "Permission denied", "/var/lib/rotorwatch/history.sqlite")

@@ -88,7 +88,7 @@ def test_a_deleted_history_is_written_again_with_all_it_held(tmp_path: Path) -> 
     assert in_file(tmp_path, "SELECT token_id FROM tokens") == [("aaaa",)]
     assert in_file(tmp_path, "SELECT count(*) FROM audit_log") == [(1,)]
     with bench(tmp_path) as at:
-        assert at.worker.restart.startswith("went on where it stood")
+        assert at.worker.restart.startswith("resumed")
         assert at.log()[: len(log)] == log
 
 
@@ -120,7 +120,7 @@ def test_a_history_that_was_replaced_goes_on_with_the_numbers_of_the_alarms(tmp_
             second.machine("demo", "lab")
     assert len(list(tmp_path.glob("history.sqlite.damaged-*"))) == damaged
     with bench(tmp_path) as at:
-        assert at.worker.restart.startswith("went on where it stood")
+        assert at.worker.restart.startswith("resumed")
         at.put(block(90, run=3, sequence=0))
         assert [number for number, _, _ in at.log()][:2] == [last + 1, last + 2]
 

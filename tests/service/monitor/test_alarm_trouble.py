@@ -206,7 +206,7 @@ def test_what_the_history_refused_goes_with_the_next_step(tmp_path: Path, monkey
         assert [kind for _, kind, _ in at.log()] == ["raised", "cleared", "raised", "raised", "acknowledged"]
         assert (at.log()[3], len(at.outlet.events)) == ((3, "raised", FAULT), 5)  # and once
     with bench(tmp_path) as at:
-        assert at.worker.restart.startswith("went on where it stood")
+        assert at.worker.restart.startswith("resumed")
 
 
 def test_a_network_that_is_gone_fails_no_operation(tmp_path: Path) -> None:

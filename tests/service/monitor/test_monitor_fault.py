@@ -178,7 +178,7 @@ def test_a_state_that_cannot_be_built_keeps_no_alarm(tmp_path: Path, monkeypatch
         at.worker.operate(order("acknowledge", GAP))
         assert at.worker.trouble == ""
     with bench(tmp_path) as at:
-        assert at.worker.restart.startswith("went on where it stood")
+        assert at.worker.restart.startswith("resumed")
         assert at.log()[-1][1:] == ("acknowledged", GAP)
         monkeypatch.setattr(MachineMonitor, "state", defective)  # nor does it keep the last step from being made
         at.worker.stop()
@@ -230,7 +230,7 @@ def test_whatever_is_accepted_can_be_restored(headers: list[tuple[int, int, floa
     step = checkpoint_step(identity, monitor.state(), 1)
     again, text = restored(lambda: MachineMonitor(installed), identity, Checkpoint(step.head, step.new_parts), 0)
     assert again.state().state == monitor.state().state
-    assert text.startswith("went on where it stood")
+    assert text.startswith("resumed")
 
 
 def decimal(value: int) -> str:

@@ -106,7 +106,7 @@ def test_a_computer_that_is_lost_and_one_that_comes(cluster: "Cluster", tmp_path
             until(lambda: runtime.readiness().ready, "that it goes on")
             assert computers_of(runtime) == [there[1], there[1]]
             assert "00:42" not in machines[1].health().restart
-            assert machines[0].health().restart.startswith("went on where it stood at 2026-01-01T00:00:42")
+            assert machines[0].health().restart.startswith("resumed at 2026-01-01T00:00:42")
             revived, settled = actors_of(runtime)
             assert revived.placed_s > settled.placed_s
             revived.placed_s, settled.placed_s = math.inf, -math.inf  # however long the rest takes

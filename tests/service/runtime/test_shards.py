@@ -190,7 +190,7 @@ def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -
         started = [one.pid for one in multiprocessing.active_children()]
         assert second in started
         assert len(started) == 2
-        until(lambda: lab.health().restart.startswith("went on"), "that it goes on from where it stood")
+        until(lambda: lab.health().restart.startswith("resumed"), "that it goes on from where it stood")
         assert pump.health().restart == ""
         for block in blocks[440:]:
             feed.put(block)

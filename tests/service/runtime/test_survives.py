@@ -69,9 +69,7 @@ def test_alarms_and_what_operators_did_survive_kill_9(tmp_path: Path) -> None:
         assert log(second) == before
         assert states(second) == {"c_bz": "acknowledged", "model": "shelved", "data-stuck": "out-of-service"}
         health = second.health()
-        assert health.restart.startswith(
-            "went on where it stood at 2026-01-01T00:00:45.000000Z; there is no window until"
-        )
+        assert health.restart.startswith("resumed at 2026-01-01T00:00:45.000000Z; there is no window until")
         assert health.filled == 0.0
         assert health.state in {"alert", "danger"}
         # What no cache holds any more is missing; what comes then raises nothing twice.

@@ -148,7 +148,7 @@ def test_killed_where_the_window_can_be_had_again_all_goes_on_as_if_not(
             first.kill()
         with here.monitor() as second:
             until(lambda: second.health().filled == 1.0, "full window")
-            assert second.health().restart == "went on where it stood at 2026-01-01T00:00:37.500000Z"
+            assert second.health().restart == "resumed at 2026-01-01T00:00:37.500000Z"
             here.put(stream()[FIRST:])
             until_evaluated(second)
             assert second.health().quality.gaps == 0
@@ -204,7 +204,7 @@ def test_stopped_in_order_the_window_is_kept(tmp_path: Path, kept: int) -> None:
             assert first.stop() == 0
         with here.monitor() as second:
             health = second.health()
-            assert (health.filled, health.restart) == (1.0, "went on where it stood at 2026-01-01T00:00:39.000000Z")
+            assert (health.filled, health.restart) == (1.0, "resumed at 2026-01-01T00:00:39.000000Z")
             here.put(stream()[FIRST:])
             until_evaluated(second)
             assert second.health().quality.refused_blocks == {}  # the cache was asked for what it sends again

@@ -1,4 +1,5 @@
 import { svg } from "./markup.js";
+import { GAP, shortest } from "../monitor/figures.js";
 import { monitor } from "../monitor/monitor.js";
 import { MachineElement } from "./machine-element.js";
 
@@ -82,8 +83,15 @@ class SparkLine extends MachineElement {
     const [low, high] = [Math.min(...means), Math.max(...means)];
     const x = (/** @type {number} */ ns) => 2 + ((WIDTH - 4) * (ns - first)) / (last - first);
     const y = (/** @type {number} */ value) => HEIGHT - 3 - ((HEIGHT - 6) * (value - low)) / (high - low || 1);
-    const points = starts.map((start, at) => `${x(start).toFixed(1)},${y(means[at]).toFixed(1)}`).join(" ");
-    this.replaceChildren(svg("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, preserveAspectRatio: "none", "aria-hidden": "true" }, svg("polyline", { points })));
+    const longest = GAP * shortest(starts);
+    /** @type {string[][]} */
+    const parts = [];
+    starts.forEach((start, at) => {
+      if (!at || start - starts[at - 1] > longest) parts.push([]);
+      parts[parts.length - 1].push(`${x(start).toFixed(1)},${y(means[at]).toFixed(1)}`);
+    });
+    const lines = parts.map((points) => svg("polyline", { points: (points[1] ? points : [points[0], points[0]]).join(" ") })); // a point alone is a dot
+    this.replaceChildren(svg("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, preserveAspectRatio: "none", "aria-hidden": "true" }, ...lines));
   }
 }
 

@@ -1,11 +1,10 @@
 import { html, lay } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import { monitor, pathOf } from "../monitor/monitor.js";
-import { stretch, Z95 } from "../monitor/figures.js";
+import { GAP, shortest, stretch, Z95 } from "../monitor/figures.js";
 import "../elements/line-chart.js";
 
 const [POINTS, REFRESH_S, EVENTS] = [240, 15, 200];
-const GAP = 2.5;
 
 /** @typedef {import("../monitor/records.js").Bucket} Bucket */
 /** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
@@ -112,7 +111,7 @@ export class ReadingTrend extends MachineElement {
     const [mean, low, high] = [[], [], []];
     /** @type {{from: number, to: number, text: string}[]} */
     const gaps = [];
-    const step = Math.min(...buckets.slice(1).map((each, at) => each.start_ns - buckets[at].start_ns), Infinity);
+    const step = shortest(buckets.map((each) => each.start_ns));
     let before = buckets[0].start_ns;
     for (const bucket of buckets) {
       if (bucket.start_ns - before > GAP * step) {

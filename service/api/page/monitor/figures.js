@@ -102,6 +102,12 @@ export function ticks(seconds, step_s) {
   return seconds.map((each, at) => (each === null ? "" : (step_s >= 86_400 ? "" : `${time.format(each * 1e3)}`) + (step_s >= 86_400 || at === first ? `\n${day.format(each * 1e3)}` : "")));
 }
 
+/** So many of the shortest step between readings without one are a gap. */
+export const GAP = 2.5;
+
+/** Shortest step between times. @param {number[]} times */
+export const shortest = (times) => Math.min(...times.slice(1).map((each, at) => each - times[at]), Infinity);
+
 /** How large a file or a database is. @param {number} bytes */
 export function size(bytes) {
   const [power, unit] = bytes < 1e6 ? [1e3, "kB"] : bytes < 1e9 ? [1e6, "MB"] : [1e9, "GB"];
