@@ -242,11 +242,13 @@ class PathSamples(Record):
 class PlaceOrbit(Record):
     """Orbit at one place."""
 
-    location: str = Field(description="bearing or disc", examples=["bearing"])
+    location: str = Field(description="bearing, disc, or another place of two displacements", examples=["bearing"])
     unit: str = Field(description="unit of all lengths: that of the y channel, or m", examples=["um"])
     y: RunningSpeedVector | None = Field(description="y channel at running speed; null without a window")
     z: RunningSpeedVector | None = Field(description="z channel at running speed; null without a window")
-    ellipse: OrbitEllipse | None = Field(description="measured in the window; null without one, see `reason`")
+    ellipse: OrbitEllipse | None = Field(
+        description="measured in the window, elsewhere than at bearing and disc in `path`; null without, see `reason`"
+    )
     nominal: OrbitEllipse | None = Field(
         description="what the unbalance of the machine as nominal makes; null without, see `theory`"
     )

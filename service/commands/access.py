@@ -72,7 +72,10 @@ def create(
 def creation_hint(config: Path | None, history: "HistorySettings") -> str:
     """Say how a first token is created for a monitor, from any folder and without its environment."""
     if history.in_memory:
-        return "no tokens can exist for it: the history is in memory, where other programs cannot create them"
+        return (
+            "no tokens can exist for it: the history is in memory, where other programs cannot create them; started "
+            "with ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK=true it answers everybody on this computer"
+        )
     command = ["rotorwatch" if shutil.which("rotorwatch") else sys.argv[0], "token", "create", "operator"]
     command += ["--scope", "read", "--scope", "operate"]
     if config is not None:

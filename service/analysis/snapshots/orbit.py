@@ -50,14 +50,17 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
         If `revolutions` is negative or too large.
     """
     machine, known, window = subject.machine, subject.known, data.window
-    places = [pair for pair in orbit_pairs(machine.sensors) if pair[0].location in MODELLED]
+    pairs = orbit_pairs(machine.sensors)
+    places = [pair for pair in pairs if pair[0].location in MODELLED]
     path = _newest_path(machine, data.blocks, revolutions, None if window is None else window.speed_rad_s)
     changes = read_changes(data.parameters)
     lacking = NO_PARAMETERS if known is None else ""
     estimated_reason = lacking or ("" if changes else data.why_not or NOTHING_READ)
     vectors = None if window is None else _vectors(window)
-    if not places:
+    if not pairs:
         reason = f"{machine.title}: {no_pair(machine.sensors)}"
+    elif not places:
+        reason = ""  # the window holds none of these places; `path_reason` says what there is of them
     elif window is None:
         reason = no_window(machine, data)
     else:
@@ -66,13 +69,15 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
     if known is not None and window is not None and vectors is not None:
         predicted[0] = _predicted(known, known.rotor, window)
         predicted[1] = None if estimated_reason else _predicted(known, changed(known.rotor, changes), window)
+    others = [(pair, _path(machine, path, pair, units)) for pair in pairs if pair not in places]
     head = heading(subject, data)
     return OrbitSnapshot(
         **head,
         speed_source="unknown" if window is None else window.speed_source,
         orbits=tuple(
             _place(pair, window, vectors, predicted, _path(machine, path, pair, units), units) for pair in places
-        ),
+        )
+        + tuple(_elsewhere(pair, path.excerpt, samples, units) for pair, samples in others if samples is not None),
         revolutions=path.count,
         path_start_ns=None if path.excerpt is None else path.excerpt.start_ns,
         pulses_s=known_figures(path.pulses / machine.rate_hz),
@@ -116,6 +121,19 @@ def _place(
         nominal=nominal,
         estimated=estimated,
         path=path,
+    )
+
+
+def _elsewhere(pair: tuple[Channel, Channel], excerpt: Excerpt | None, path: PathSamples, units: Units) -> PlaceOrbit:
+    """Orbit at a place that the model does not have, and the window neither: of the newest revolutions."""
+    ellipse = None
+    if excerpt is not None and excerpt.angle_rad is not None:
+        motion = np.array([path.y, path.z], dtype=np.float64)
+        q = 2 * (motion * np.exp(-1j * excerpt.angle_rad)).mean(axis=1)
+        ellipse = _ellipse(q, _Vectors(q, q[None], -1 if excerpt.speed_rad_s < 0 else 1, absolute=True))
+    unit = "m" if units == "SI" else pair[0].unit
+    return PlaceOrbit(
+        location=pair[0].location, unit=unit, y=None, z=None, ellipse=ellipse, nominal=None, estimated=None, path=path
     )
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from models.machine import Machine
 from service.analysis.snapshots.heading import LatestData
-from tests.commissioning.rotor_kit import LAB, NOTHING, stream
+from tests.commissioning.rotor_kit import LAB, NOTHING, elsewhere, stream
 from tests.service.analysis.snapshotting import (
     SECONDS,
     SEED,
@@ -119,3 +119,20 @@ def test_without_a_phase_reference_size_and_sense_remain() -> None:
     assert blind.path_reason.startswith("the shaft angle is not measured")
     snapshot = snapshots_of(machine).correlations(data)
     assert all(pair.nominal_z is not None and pair.nominal_z < 2.5 for pair in snapshot.pairs)
+
+
+def test_places_that_are_not_of_the_model_have_the_orbit_of_their_newest_revolutions() -> None:
+    data = LatestData(None, 0.0, (), "not asked", quiet()[-20:])
+    casing = elsewhere(LAB)
+    moved = [one.model_copy(update={"location": "NDE"}) if one.name in {"y2", "z2"} else one for one in casing.sensors]
+    snapshot = snapshots_of(casing.model_copy(update={"sensors": tuple(moved)})).orbits(data, 8)
+    there = snapshots_of(LAB).orbits(LatestData(window_of(LAB, quiet()), 1.0, (), "not asked", quiet()[-20:]), 8)
+    assert [one.location for one in snapshot.orbits] == ["casing", "NDE"]
+    assert (snapshot.reason, snapshot.path_reason, snapshot.revolutions) == ("", "", 8)
+    for found, known in zip(snapshot.orbits, there.orbits, strict=True):
+        assert found.path == known.path
+        ellipse, expected = sure(found.ellipse), sure(known.ellipse)
+        assert ellipse.semi_major == pytest.approx(expected.semi_major, rel=0.01)
+        assert ellipse.semi_minor == pytest.approx(expected.semi_minor, rel=0.01)
+        assert (ellipse.sense, ellipse.precession) == ("y to z", "forward")
+    assert not snapshots_of(casing).orbits(data).orbits  # without samples there is nothing to be shown

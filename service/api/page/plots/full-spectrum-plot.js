@@ -2,6 +2,8 @@ import { stretch } from "../monitor/figures.js";
 import { SamplePlot } from "./sample-plot.js";
 import "../elements/line-chart.js";
 
+const ORDERS = 6;
+
 /** @typedef {import("../monitor/records.js").FullSpectrumSnapshot} FullSpectra */
 
 /** What goes round with the rotation, and what against it, at each place with two displacements. @extends {SamplePlot<FullSpectra>} */
@@ -13,6 +15,8 @@ class FullSpectrumPlot extends SamplePlot {
     const known = found.speed_rad_s !== null;
     const turns = Math.abs(found.speed_rad_s ?? 0) / (2 * Math.PI);
     const last = found.frequencies_hz[found.frequencies_hz.length - 1] ?? 0;
+    const cut = turns && ORDERS * turns < last; // of a slow machine the orders would be too close to be told apart
+    const shown = found.frequencies_hz.flatMap((line, at) => (cut && Math.abs(line) > ORDERS * turns ? [] : [at]));
     const orders = [-2, -1, 1, 2].filter((order) => turns && Math.abs(order) * turns < last);
     /** @type {import("../elements/line-chart.js").Mark[]} */
     const marks = [{ at: 0, axis: "x", colour: "ink-2" }, ...orders.map((order) => ({ at: order * turns, axis: /** @type {"x"} */ ("x"), colour: "ink-2", text: `${order < 0 ? "−" : ""}${Math.abs(order)}×`, dash: [2, 3] }))];
@@ -22,8 +26,8 @@ class FullSpectrumPlot extends SamplePlot {
         more: one.channels.join(" and "),
         said: `full spectrum at the ${one.location}`,
         drawing: {
-          x: found.frequencies_hz,
-          lines: [{ label: "diameter", values: one.values }],
+          x: shown.map((at) => found.frequencies_hz[at]),
+          lines: [{ label: "diameter", values: shown.map((at) => one.values[at]) }],
           marks,
           time: false,
           include: [0],
@@ -33,7 +37,7 @@ class FullSpectrumPlot extends SamplePlot {
         },
       })),
     );
-    return found.start_ns && found.end_ns ? `${found.source}, ${stretch(found.start_ns, found.end_ns)}, ${found.averages} averages: circles that add up to the motion of the shaft` : "";
+    return found.start_ns && found.end_ns ? `${found.source}, ${stretch(found.start_ns, found.end_ns)}, ${found.averages} averages${cut ? `, up to ${ORDERS}×` : ""}: circles that add up to the motion of the shaft` : "";
   }
 }
 

@@ -24,7 +24,7 @@ class RecordingTable extends HTMLElement {
 
   #lay() {
     const newest = [...this.#recordings].reverse();
-    const rows = newest.slice(0, this.#shown).map((one) => {
+    const rows = newest.slice(0, this.#shown).map((one, at) => {
       const [from, to] = [one.data_start_ns, one.data_end_ns];
       const able = one.complete && !one.problem && one.messages;
       const name = one.id.split("/").slice(2).join("/");
@@ -38,7 +38,7 @@ class RecordingTable extends HTMLElement {
           html("time", { class: "number" }, clock(one.start_ns)),
           html("span", { class: "number" }, size(one.size_bytes)),
           html("span", {}, one.problem || (one.complete ? (one.messages ? "complete" : "empty") : "being written, or left by a crash")),
-          html("span", { class: "wordy" }, one.kept_because || "no alarm"),
+          html("span", { class: "wordy" }, one.kept_because ? (one.kept_because === newest[at - 1]?.kept_because ? "as above" : one.kept_because) : "no alarm"),
           one.complete ? html("div", {}, html("a", { href: `${API}/recordings/${one.id}/download`, download: name, "aria-label": `Download ${name}` }, "Download")) : "",
         ],
       };
