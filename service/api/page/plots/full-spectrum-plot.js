@@ -2,7 +2,7 @@ import { stretch } from "../monitor/figures.js";
 import { SamplePlot } from "./sample-plot.js";
 import "../elements/line-chart.js";
 
-const ORDERS = 6;
+const ORDERS = 5;
 
 /** @typedef {import("../monitor/records.js").FullSpectrumSnapshot} FullSpectra */
 
