@@ -88,6 +88,13 @@ class LevelWatch:
         """What relative limits refer to; None while there is nothing."""
         return self._first.reference if self._takes_first else self._commissioned
 
+    @property
+    def _several_speeds(self) -> bool:
+        """Whether lines lay in different bands at the speeds of the reference."""
+        states = () if self.reference is None else self.reference.states
+        speeds = [abs(edge) for state in states for edge in state.speed_rad_s or ()]
+        return bool(speeds) and max(speeds) / (1 + NEIGHBOURHOOD) > min(speeds)
+
     def judged(self, levels: WindowLevels) -> tuple[ChannelLevels, ...]:
         """Levels, channel by channel, against what limits there are."""
         return self._judge.judge(levels, self.reference)
@@ -107,10 +114,15 @@ class LevelWatch:
     def _has_moved(self, found: WindowLevels, hops: Sequence[HopMoments]) -> bool:
         """Whether lines lay in other bands for a part of the window, as they did in no healthy one."""
         speeds = found.speeds_rad_s
-        if speeds is not None and abs(speeds[-1]) > STANDS_RAD_S:
-            apart = np.flatnonzero(np.abs(speeds / speeds[-1] - 1) > NEIGHBOURHOOD)
-            if apart.size:  # the hop after them may have begun as they were
-                self._moved_ns = hops[int(apart[-1]) + 1].end_ns
+        if speeds is not None:
+            turns = abs(speeds[-1]) > STANDS_RAD_S
+            apart = np.abs(speeds / speeds[-1] - 1) > NEIGHBOURHOOD if turns else np.full(speeds.shape, False)
+            if self._several_speeds:  # one that is not known, as in a run-up without a shaft angle, may be any of them
+                apart |= np.isnan(speeds)
+            if apart.any():  # the hop after them may have begun as they were
+                self._moved_ns = hops[min(int(np.flatnonzero(apart)[-1]) + 1, len(hops) - 1)].end_ns
+            elif self._moved_ns <= hops[-1].end_ns:  # those that were not known were at this speed but for the oldest
+                self._moved_ns = min(self._moved_ns, hops[0].end_ns)
         if self.reference is not None and self.reference.at(found.speed_rad_s)[0].varied:
             return False
         return hops[0].start_ns < self._moved_ns <= hops[-1].end_ns  # it is later where the clock was set back

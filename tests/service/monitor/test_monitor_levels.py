@@ -204,13 +204,17 @@ def test_levels_are_judged_at_a_speed_that_was_not_commissioned() -> None:
 
 
 def drive(
-    seconds: float, speed_hz: Callable[[FloatArray], FloatArray], line: float = 0.0
+    seconds: float, speed_hz: Callable[[FloatArray], FloatArray], line: float = 0.0, *, by_angle: bool = True
 ) -> tuple[list[tuple[ChannelLevels, ...]], list[tuple[EventKind, str]]]:
-    """Levels and alarms of a drive with a shaft angle and four first windows; a line at 61 Hz comes at 100 s."""
+    """Levels and alarms of a drive with four first windows; a line at 61 Hz comes at 100 s.
+
+    Its speed is known by a shaft angle, or followed in the vibration near 1380 rpm.
+    """
     angle = Sensor(name="angle", quantity="shaft_angle", location="shaft", direction="rotation", unit="rad")
     limits = FAN.levels.model_copy(update={"reference_windows": 4})
     alarms_as_windows = FAN.alarms.model_copy(update={"off_delay_s": 20.0})
-    changes = {"sensors": (*FAN.sensors, angle), "levels": limits, "alarms": alarms_as_windows}
+    known = {"sensors": (*FAN.sensors, angle)} if by_angle else {"operation": Operation(speed_rpm=1380.0)}
+    changes = {**known, "levels": limits, "alarms": alarms_as_windows}
     monitor = MachineMonitor(install(FAN.model_copy(update=changes), None))
     rng, size, turned = np.random.default_rng(92), round(BLOCK_S * RATE_HZ), 0.0
     found, alarms = list[tuple[ChannelLevels, ...]](), list[tuple[EventKind, str]]()
@@ -220,7 +224,7 @@ def drive(
         turned = theta[-1]
         samples = 3.0 * np.cos(theta)[:, None] + 0.3 * rng.standard_normal((size, 2))
         samples += (line * np.sin(2 * np.pi * 61.0 * t) * (t > 100.0))[:, None]
-        every = np.column_stack([samples, theta % (2 * np.pi)]).astype(np.float32)
+        every = (np.column_stack([samples, theta % (2 * np.pi)]) if by_angle else samples).astype(np.float32)
         report = monitor.step(SampleBlock(START_NS + round(number * BLOCK_S * 1e9), number, 1, RATE_HZ, every))
         found += [one.levels for one in report.windows]
         alarms += [(one.kind, one.alarm.name) for one in report.events]
@@ -238,8 +242,19 @@ def test_a_drive_that_goes_to_its_other_set_point_has_not_grown() -> None:
         assert all((one.growth or 1.0) < 1.5 for one in levels)  # up to 150
 
 
-def test_a_line_stays_raised_while_the_set_point_changes() -> None:
-    _, alarms = drive(230, set_points(20.0, (41.0, 81.0), (138.5, 183.5)), line=0.6)
+def test_without_a_shaft_angle_nothing_has_grown_while_the_speed_is_not_known() -> None:
+    found, alarms = drive(165, set_points(20.5, (41.0, 81.0), (106.0, 126.4)), by_angle=False)
+    assert not alarms
+    told = [all(one.growth is not None for one in levels) for levels in found[16:]]  # since there is a reference
+    unknown = [all(one.x1 is None for one in levels) for levels in found[16:]]
+    assert any(unknown)
+    assert not any(growth and lost for growth, lost in zip(told, unknown, strict=True))
+    assert told.count(False) <= unknown.count(True) + 3  # the hop in which a change ended is waited for
+
+
+@pytest.mark.parametrize("by_angle", [True, False])
+def test_a_line_stays_raised_while_the_set_point_changes(by_angle: bool) -> None:
+    _, alarms = drive(230, set_points(20.0, (41.0, 81.0), (138.5, 183.5)), line=0.6, by_angle=by_angle)
     assert alarms == [(EventKind.RAISED, "level:DE-H"), (EventKind.RAISED, "level:NDE-V")]
 
 
