@@ -34,7 +34,8 @@ from models.diagnosis.moments import states_of
 from models.diagnosis.networks.equations import EQUATIONS, Equation, SynchronousEquation, missing
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.check import sensor_findings
-from models.diagnosis.sensors.reference import learn_sensor_reference
+from models.diagnosis.sensors.disagreement import crossed_planes
+from models.diagnosis.sensors.reference import Naming, learn_sensor_reference
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import from_scale, slope, to_scale
 from models.diagnosis.window import WindowStatistics
@@ -273,7 +274,14 @@ def commission(
             one.name: [piece.window for piece in pieces if piece.recording == one.name] for one in recordings
         }
         findings = {
-            name: [f for window in windows for f in sensor_findings(window, None, machine.sensors)]
+            name: [
+                fault
+                for window in windows
+                for fault in (
+                    *sensor_findings(window, None, machine.sensors),
+                    *crossed_planes(window, Naming(machine.sensors)),
+                )
+            ]
             for name, windows in by_recording.items()
         }
         if not states:  # levels of a machine that stands are levels, too

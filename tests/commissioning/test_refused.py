@@ -96,6 +96,38 @@ def test_a_channel_that_reaches_the_end_of_its_range_is_told(bits: int, limit: f
     assert ("y1 is at exactly" in text) == (verdict == "limited")
 
 
+def displacements(exchanged: tuple[str, str] | None = None, sign: str = "") -> Commissioning:
+    """The rotor kit with one sensor per motion, two of them exchanged or one with the wrong sign."""
+    columns = [number for number, channel in enumerate(NOTHING.sensors) if channel.quantity != "velocity"]
+    machine = NOTHING.model_copy(update={"sensors": tuple(NOTHING.sensors[number] for number in columns)})
+    names = [channel.name for channel in machine.sensors]
+    blocks = [replace(block, samples=block.samples[:, columns]) for block in stream(150.0, 58)]
+    samples = samples_of(blocks)
+    if exchanged is not None:
+        first, second = (names.index(name) for name in exchanged)
+        samples[:, [first, second]] = samples[:, [second, first]]
+    if sign:
+        samples[:, names.index(sign)] *= -1
+    return made_of(with_samples(blocks, samples), machine)
+
+
+@pytest.mark.parametrize("place", ["1", "2"])
+def test_planes_that_are_exchanged_at_one_place(place: str) -> None:
+    made = displacements((f"y{place}", f"z{place}"))
+    assert refused(made)
+    _, text, _ = verdict_of(made, "sensors")
+    assert "y1 and z1 are swapped, or y2 and z2: bearing and disc move together across the planes" in text
+    assert verdict_of(displacements(), "sensors")[0] == "passed"
+
+
+@pytest.mark.parametrize(("exchanged", "sign"), [(("y1", "y2"), ""), (None, "y2")])
+def test_bearing_and_disc_exchanged_or_of_opposite_sign(exchanged: tuple[str, str] | None, sign: str) -> None:
+    made = displacements(exchanged, sign)
+    assert refused(made)
+    advised = "make sure that the sensors of bearing and disc are not exchanged and that none has the wrong sign"
+    assert advised in made.report.summary
+
+
 def test_a_stuck_channel() -> None:
     blocks = stream(HEALTHY_S, 52)
     samples = samples_of(blocks)

@@ -352,7 +352,10 @@ _FAR = 3.0  # spreads from what is expected
 _VAGUE = 0.33  # relative standard error beyond which a coefficient is not known
 _LEFT_OVER = 5.0  # times what chance leaves; where there are several conditions, they are compared with each other
 _DISAGREE = 4.0  # standard errors between conditions
-_RECORD = "record a second condition: another speed, another load, or more broadband excitation at the bearing"
+_RECORD = (
+    "make sure that the sensors of bearing and disc are not exchanged and that none has the wrong sign, or record a "
+    "second condition: another speed, another load, or more broadband excitation at the bearing"
+)
 
 
 def undetermined(baseline: Baseline) -> tuple[str, ...]:

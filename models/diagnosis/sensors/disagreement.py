@@ -26,6 +26,7 @@ MOST_LEAD_RAD_S = 7.0
 # Of a disagreement, the channel that accounts for it shows all but this part, and the other one less than it.
 _ALIKE = 1 / 3
 _SAME_SPEED = 0.01
+_TOGETHER = 0.5  # coherence of bearing and disc across the planes, and how much less it must be within them
 _SURE = 0.2  # standard error of a channel's own change, as a part of the disagreement, up to which it may convict
 
 
@@ -331,6 +332,35 @@ def swapped(
         text = f"{either}: {pairs}, but not as they are connected (shared {then:.3f} crossed, {now:.3f} as connected)"
         findings.append(SensorFault(states=states, kind=FaultKind.SWAPPED, text=text, value=now))
     return findings, explained
+
+
+def crossed_planes(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
+    """Find bearing and disc that move together across the planes and not within them; nothing where one source does.
+
+    Bearings and unbalance couple a shaft's planes weakly: what moves the bearing in one moves the disc in the same.
+    """
+    column = {name.split("_")[0]: number for number, name in enumerate(window.states)}
+    if not {"y1", "z1", "y2", "z2"} <= column.keys():
+        return []
+    power = np.einsum("fii->fi", window.spectrum).real
+    if not np.all(power.sum(axis=0) > 0):
+        return []
+
+    def shared(first: str, second: str) -> float:
+        a, b = column[first], column[second]
+        both = power[:, [a, b]]
+        coherence = np.abs(window.spectrum[:, a, b]) ** 2 / np.maximum(both.prod(axis=1), np.finfo(float).tiny)
+        return float(np.mean(both / both.sum(axis=0), axis=1) @ coherence)
+
+    within, crossed = max(shared("y1", "y2"), shared("z1", "z2")), min(shared("y1", "z2"), shared("z1", "y2"))
+    if crossed < _TOGETHER or within > _TOGETHER * crossed:
+        return []
+    states = tuple(window.states[column[name]] for name in ("y1", "z1", "y2", "z2"))
+    text = (
+        f"{naming.names(states[:2])} are swapped, or {naming.names(states[2:])}: bearing and disc move together across "
+        f"the planes and not within them (coherence {crossed:.2f} crossed, {within:.2f} as connected)"
+    )
+    return [SensorFault(states=states, kind=FaultKind.SWAPPED, text=text, value=within)]
 
 
 def _guilty(
