@@ -69,6 +69,8 @@ def routing(folder: Path, link: str) -> Iterator[None]:
     router = started(command, folder / "router", folder / "router_log", environment)
     try:
         while link not in (folder / "router").read_text(encoding="utf-8"):
+            if router.poll() is not None:
+                raise SystemExit(f"the router did not start:\n{(folder / 'router_log').read_text(encoding='utf-8')}")
             time.sleep(0.1)
         yield
     finally:

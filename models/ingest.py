@@ -102,7 +102,7 @@ class Course:
 
     def extended(self, block: SampleBlock) -> "Course":
         """Return the same up to the end of a later block."""
-        return Course(self.run, self.first, self.first_ns, block.sequence + 1, block.end_ns)
+        return replace(self, sequence=block.sequence + 1, start_ns=block.end_ns)
 
     def covers(self, block: SampleBlock) -> bool:
         """Whether a block lies within: it was received, or its place has been passed over."""

@@ -86,9 +86,9 @@ def excluded_lines(
         peaks = np.zeros(frequencies_hz.size + 2 * _LOBE)
         peaks[at + _LOBE] = strength
         highest = peaks[at + np.arange(2 * _LOBE + 1)[:, np.newaxis]].max(axis=0)
+        healthy = _near_known(frequencies_hz, speed_hz, known)
+        hum = _wanted(frequencies_hz, slowest_hz, fastest_hz, ())
         for n in np.flatnonzero((strength > _STANDS_OUT) & (strength == highest)):
-            healthy = _near_known(frequencies_hz, speed_hz, known)  # here: in most windows no bin stands out
-            hum = _wanted(frequencies_hz, slowest_hz, fastest_hz, ())
             own = segments[at[n]] @ motions[n]
             if _keeps_course(own) and (healthy[at[n]] or _share(segments, int(at[n]), own) <= _HUM):
                 line = ExcludedLine(float(frequencies_hz[at[n]]), step_hz * _skirt(strength[n]))

@@ -27,7 +27,7 @@ from models.physics.rotor import PARAMETERS
 from rotorwatch.records.windows import Equation, Opinion
 from service.monitor.evaluation import Evaluation, Newest, WindowEvaluator, opinion_of
 
-_LIKELIHOOD, _EXPLAINED, _SENSE, _DIRECTED = "likelihood", "explained_ns", "sense", "directed"
+_LIKELIHOOD, _EXPLAINED, _SENSE, _DIRECTED, _ROTATION = "likelihood", "explained_ns", "sense", "directed", "rotation"
 _STEADY = 0.15
 """Range of speed within a window, relative, up to which the rotation taken out hop by hop leaves nothing behind: on the
 rotor kit readings stay unbiased at ramps of 5, 10 and 15 % (16 seeds each, ``tests/diagnosis/test_window.py``)."""
@@ -73,7 +73,8 @@ class KnownMachineEvaluator(WindowEvaluator):
         given = "unbalance_phase_rad" in machine.operation.model_fields_set
         self._sought = commissioned is None and not given
         self._tried_ns, self._tried_in_vain = 0, False  # end of the window that the other one was tried on
-        self._stood_out = False  # the rotation, out of the vibration, where there is no shaft angle
+        # Power of the rotation when it stood out of the vibration, where there is no shaft angle.
+        self._rotation = 0.0
         self._compare_with(machine)
 
     def _compare_with(self, machine: Machine) -> None:
@@ -89,8 +90,8 @@ class KnownMachineEvaluator(WindowEvaluator):
         """Evaluate one window, see `WindowEvaluator`."""
         speed = self._speed(window)
         if window.speed_source == "estimated":
-            found = window.hop_strength[np.isfinite(window.hop_speed_rad_s)]
-            self._stood_out |= bool(np.median(found) > STRONG)
+            strength = float(np.median(window.hop_strength[np.isfinite(window.hop_speed_rad_s)]))
+            self._rotation = strength * _noise(window) if strength > STRONG else self._rotation
         window = window if self.directed else replace(window, directed=False)
         deciding = self._explained(window)
         if self._open:
@@ -165,11 +166,14 @@ class KnownMachineEvaluator(WindowEvaluator):
     def _within(self, decided: Diagnosis) -> Diagnosis:
         """The diagnosis, unexplained where it takes an unbalance that means wrong units, or a wrong e_m."""
         vector, e = decided.unbalance, next((one for one in decided.evaluable if one.name == "e"), None)
-        if decided.unexplained or e is None or (vector is not None and vector.foreign):
+        if decided.unexplained:
             return decided
-        times, error = 1 + (e.relative_change or 0.0), e.standard_error or 0.0
-        if vector is not None:
+        if vector is not None and not vector.foreign:
             times, error = 1 + vector.magnitude_change, vector.magnitude_error
+        elif vector is None and e is not None:
+            times, error = 1 + (e.relative_change or 0.0), e.standard_error or 0.0
+        else:
+            return decided
         if times - _SURELY * error < _HEAVIEST:
             return decided
         why = f"{self._machine.title}: it would take {times:.1f} times the unbalance of the machine file, the limit is"
@@ -205,19 +209,19 @@ class KnownMachineEvaluator(WindowEvaluator):
         )
 
     def _lost(self, window: WindowStatistics) -> str:
-        """In how many hops the rotation was found, where that is not all of them and it has stood out before.
+        """In how many hops the rotation was found, where that is not all of them and as much of it would stand out.
 
         A hop in which the shaft came to its speed, or left it, has a line that is much weaker than the others'.
         """
         found, operation = np.isfinite(window.hop_speed_rad_s), self._machine.operation
         if found.any():
             found &= window.hop_strength > _WEAKER * np.median(window.hop_strength[found])
-        if not self._stood_out or found.all():
+        if self._rotation <= STRONG * _noise(window) or found.all():
             return ""
         slowest, fastest = (operation.speed_rpm * (1 + sign * operation.speed_tolerance) for sign in (-1, 1))
         return (
             f"the rotation was found in {np.count_nonzero(found)} of {found.size} hops, evaluation limit all of them: "
-            f"the speed left {slowest:.0f} to {fastest:.0f} rpm, or changed too fast"
+            f"the speed left {slowest:.0f} to {fastest:.0f} rpm or changed too fast, or hardly any unbalance is left"
         )
 
     def _newest(
@@ -244,14 +248,15 @@ class KnownMachineEvaluator(WindowEvaluator):
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Where the likelihood's maximum is followed from, and what is known; networks remember nothing."""
         explained = np.array([] if self._explained_ns is None else [self._explained_ns], dtype=np.int64)
-        sense = [self._open, self._opposite, self._tried_in_vain, self._tried_ns, self._sought, self._stood_out]
+        sense = [self._open, self._opposite, self._tried_in_vain, self._tried_ns, self._sought]
         known = {_EXPLAINED: explained, _SENSE: np.array(sense, dtype=np.int64), _DIRECTED: np.array(self.directed)}
+        known |= {_ROTATION: np.array(self._rotation)}
         return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | known
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called, see `WindowEvaluator`."""
         explained = checked(arrays, _EXPLAINED, np.int64, (None,)).tolist()
-        still_open, opposite, in_vain, tried_ns, sought, stood_out = checked(arrays, _SENSE, np.int64, (6,)).tolist()
+        still_open, opposite, in_vain, tried_ns, sought = checked(arrays, _SENSE, np.int64, (5,)).tolist()
         directed = bool(checked(arrays, _DIRECTED, np.bool_, ()))
         machine = in_sense(self._given, "opposite" if opposite else "Eq. 27")
         likelihood = LengthFits(machine, sized=not self._commissioned)
@@ -260,7 +265,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         self._likelihood, self._explained_ns = likelihood, next(iter(explained), None)
         self._open, self._opposite, self._sought = bool(still_open), bool(opposite), bool(sought)
         self._tried_ns, self._tried_in_vain, self.directed = tried_ns, bool(in_vain), directed
-        self._stood_out = bool(stood_out)
+        self._rotation = float(checked(arrays, _ROTATION, np.float64, ()))
 
     def _speed(self, window: WindowStatistics) -> float | None:
         """Mean speed, if it is one that is evaluated."""
@@ -307,3 +312,9 @@ class KnownMachineEvaluator(WindowEvaluator):
 
 def _misfit_z(diagnosis: Diagnosis) -> float:
     return np.inf if diagnosis.unexplained or diagnosis.misfit_z is None else diagnosis.misfit_z
+
+
+def _noise(window: WindowStatistics) -> float:
+    """How strong a window is without its lines, as a power: over all channels, whatever their units."""
+    power = np.median(np.einsum("fii->fi", window.spectrum).real, axis=0)
+    return float(np.exp(np.log(np.maximum(power, np.finfo(float).tiny)).mean()))

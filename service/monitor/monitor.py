@@ -390,11 +390,11 @@ class MachineMonitor:
         if dropped and verdict.gap_s > 0:
             text = f"{dropped} blocks ({lasting(verdict.gap_s)} of data) were not evaluated: the monitor cannot keep up"
             verdict = replace(verdict, text=f"{self.machine.title}: {text}")
+        self._data_path.judged(verdict, block.start_ns)
         return self._count(verdict)
 
     def _count(self, verdict: Admission) -> Admission:
         self._quality = counted(self._quality, verdict)
-        self._data_path.judged(verdict)
         return verdict
 
     def _evaluate(self, end_ns: int) -> Report:

@@ -22,7 +22,7 @@ _ANSWER_S = 10.0
 _QUESTIONS = 2
 """Without an answer: a link may break by which it was to come."""
 _PUBLISHERS = 64
-"""That are known; of those that are waited for no longer, half as many. Anybody may claim to be another one."""
+"""That are known; of those that are waited for no longer the latest half. Anybody may claim to be another one."""
 _BY_TIME = "uhlc"
 """Stands for the number of a publisher that gives its messages times and no numbers."""
 
@@ -83,14 +83,17 @@ class BlockSubscription:
                 callback(sample)
                 continue
             publisher, number = origin
-            if (kept := self._awaited(publisher)) is None:
-                callback(sample)
-            else:
+            if (kept := self._awaited(publisher)) is not None:
                 kept.new.setdefault(number, sample)
-        for publisher, kept in list(self._publishers.items()):
-            if kept is not None:
-                for sample in self._join(publisher, kept, waits=not last and len(kept.new) <= _WAITING_BLOCKS):
-                    callback(sample)
+                continue
+            if publisher in self._publishers:  # the last to be forgotten
+                self._publishers[publisher] = self._publishers.pop(publisher)
+            callback(sample)
+        awaited = [(publisher, kept) for publisher, kept in self._publishers.items() if kept is not None]
+        waits = not last and sum(len(kept.new) for _, kept in awaited) <= _WAITING_BLOCKS
+        for publisher, kept in awaited:
+            for sample in self._join(publisher, kept, most if waits else _WAITING_BLOCKS, waits=waits):
+                callback(sample)
         answered = [name for name, kept in self._publishers.items() if kept is None or kept.answers is None]
         for publisher in answered[: -_PUBLISHERS // 2]:
             del self._publishers[publisher]
@@ -101,15 +104,15 @@ class BlockSubscription:
             self._ask(publisher, _Kept())
         return self._publishers.get(publisher)
 
-    def _join(self, publisher: str, kept: _Kept, *, waits: bool) -> list[zenoh.Sample]:
-        """What can be handed on of a publisher: what it has kept, and what came meanwhile once that is all there."""
-        joined = _received(kept)
-        if kept.answers is not None and waits:
+    def _join(self, publisher: str, kept: _Kept, most: int, *, waits: bool) -> list[zenoh.Sample]:
+        """What can be handed on of a publisher: what it has kept, and from where that meets it what came meanwhile."""
+        joined, numbered = _received(publisher, kept, most), not publisher.endswith(_BY_TIME)
+        met = bool(kept.new) and min(kept.new) <= kept.reached + numbered
+        if kept.answers is not None and waits and not met:
             return joined
         new = kept.new = {number: sample for number, sample in kept.new.items() if number > kept.reached}
-        # Published while the subscription was on its way to it, or not answered.
-        lacks = bool(new) and min(new) > kept.reached + 1 and not publisher.endswith(_BY_TIME)
-        if lacks and waits and kept.questions:
+        # Published while the subscription was on its way to it, or the link broke by which the answers were to come.
+        if new and numbered and waits and not met and kept.questions:
             self._ask(publisher, kept)
             return joined
         self._publishers[publisher] = None if new or not waits else kept
@@ -134,19 +137,30 @@ class BlockSubscription:
 
     def close(self) -> None:
         """Receive nothing any more."""
+        self._publishers.clear()  # and with them what is still answered
         self._missed.undeclare()  # type: ignore[no-untyped-call]
         self._new.undeclare()  # type: ignore[no-untyped-call]
 
 
-def _received(kept: _Kept) -> list[zenoh.Sample]:
-    """What has been answered since the last time."""
+def _received(publisher: str, kept: _Kept, most: int) -> list[zenoh.Sample]:
+    """What has been answered since the last time, with the new blocks that its cache no longer held in between."""
     received: list[zenoh.Sample] = []
     try:
-        while kept.answers is not None and (reply := kept.answers.try_recv()) is not None:
-            origin = None if reply.ok is None else _origin(reply.ok)
-            if origin is not None and origin[1] > kept.reached:
-                kept.reached, kept.questions = origin[1], _QUESTIONS
-                received.append(reply.ok)
+        for _ in range(most):
+            if kept.answers is None or (reply := kept.answers.try_recv()) is None:
+                break
+            if reply.ok is None:  # the time for an answer is over
+                kept.questions = 0
+                continue
+            by, number = _origin(reply.ok) or ("", -1)
+            if by != publisher or number <= kept.reached:
+                continue
+            while kept.new and (first := next(iter(kept.new))) <= number:
+                sample = kept.new.pop(first)
+                if kept.reached < first < number:
+                    received.append(sample)
+            kept.reached, kept.questions = number, _QUESTIONS
+            received.append(reply.ok)
     except zenoh.ZError:  # no more will come
         kept.answers = None
     return received

@@ -28,7 +28,8 @@ class DataPathAlarms:
         self._silence_ns = round(self._silence_s * 1e9)
         self._hop_ns = round(machine.window.hop_s * 1e9)
         self._whole_ns: int | None = None  # end of the latest hop, or where the first could have begun
-        self._refused = ""  # why the first block after those that were used was refused
+        self._refused = ""  # why the first block after those that were used was refused, and when it begins
+        self._refused_ns = 0
         self._unseen_windows, self._unseen_blocks, self._unseen_s = 0, 0, 0.0
 
     def checkpoint(self) -> dict[str, np.ndarray]:
@@ -39,6 +40,7 @@ class DataPathAlarms:
             "whole_ns": np.array(whole_ns, dtype=np.int64),
             "unseen": np.array(unseen, dtype=np.float64),
             "refused": np.array([self._refused]),
+            "refused_ns": np.array(self._refused_ns),
         }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -53,11 +55,12 @@ class DataPathAlarms:
         self._unseen_windows, self._unseen_blocks = int(windows), int(blocks)
         self._whole_ns = next(iter(checked(arrays, "whole_ns", np.int64, (None,)).tolist()), None)
         self._refused = "".join(texts(arrays, "refused"))
+        self._refused_ns = int(checked(arrays, "refused_ns", np.int64, ()))
 
-    def judged(self, verdict: Admission) -> None:
+    def judged(self, verdict: Admission, start_ns: int) -> None:
         """Remember why data that come are of no use, in case nothing else comes; a repetition says nothing of that."""
-        if verdict.reason is not None and verdict.reason is not Reason.OVERLAP:
-            self._refused = self._refused or verdict.text
+        if verdict.reason is not None and verdict.reason is not Reason.OVERLAP and not self._refused:
+            self._refused, self._refused_ns = verdict.text, start_ns
 
     def accepted(self, verdict: Admission, start_ns: int, dropped: int) -> str:
         """A block was accepted.
@@ -167,7 +170,9 @@ class DataPathAlarms:
 
     def _lost(self, end_ns: int) -> None:
         """Raise the alarm on silence, at the time at which it was due: then live and replay say the same."""
-        refused = f"; blocks are refused: {self._refused}" if self._refused else ""
+        # Not what came later, or just before the alarm was due: live that is not known yet.
+        known = self._refused and end_ns - self._silence_ns < self._refused_ns < end_ns + self._silence_ns // 2
+        refused = f"; the first block since was refused: {self._refused}" if known else ""
         note = f"no usable data for {self._silence_s:g} s; alarms already raised stay raised{refused}"
         due_ns = end_ns + self._silence_ns
         self._book.update_state(

@@ -336,7 +336,21 @@ def test_a_stream_of_which_nothing_is_of_use_says_why() -> None:
     for each in (monitor, after):
         (event,) = each.passed(end_ns + 5 * S)
         assert event.alarm.name == STREAM_LOST
-        assert "blocks are refused: demo/lab: block 1, channel y1_dot: sample 10 is nan" in event.text
+        assert "the first block since was refused: demo/lab: block 1, channel y1_dot: sample 10 is nan" in event.text
+
+
+def test_what_was_refused_after_the_stream_was_lost_is_not_said_then() -> None:
+    """Whether or not time passed meanwhile: an offline replay says what the monitor said."""
+    for live in (True, False):
+        monitor = MachineMonitor(install(machine(), None))
+        monitor.step(block(0))
+        events = [*monitor.passed(block(0).end_ns + 5 * S)] if live else []
+        late = block(16)
+        late.samples[10, 2] = np.nan
+        events += [*monitor.step(late).events, *monitor.step(block(20)).events]
+        texts = [one.text for one in events if (one.kind, one.alarm.name) == ("raised", STREAM_LOST)]
+        assert len(texts) == 1
+        assert "refused" not in texts[0]
 
 
 @pytest.mark.parametrize("start_ns", [-1, 2**63 - 1, 10**30])
