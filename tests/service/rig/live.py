@@ -25,6 +25,8 @@ from rotorwatch.records.health import Health
 from service.runtime.runtime import Runtime, running
 from service.settings.access import AccessSettings, LimitSettings
 from service.settings.service import HistorySettings, HttpSettings, MachineEntry, QueueSettings, ServiceSettings
+from service.stream.inbox import RawBlock
+from service.stream.transport import Link, MachineCallbacks, MachineLink
 from service.stream.worker import MachineWorker
 from simulator.publisher import PublishSettings, publish
 from simulator.scenario import Event, load_scenario
@@ -300,3 +302,31 @@ def program(
         if process.poll() is None:
             process.kill()
         process.wait()
+
+
+def ignore(*_: object) -> None:
+    """Take anything."""
+
+
+def no_events(after: int, limit: int) -> str:
+    """The log of a machine on which nothing has happened."""
+    return "[]"
+
+
+@contextmanager
+def machine_link(
+    where: str | LinkSettings,
+    on_block: Callable[[RawBlock], None],
+    *,
+    wait: bool = False,
+    alarm_events: Callable[[int, int], str] = no_events,
+) -> Iterator[tuple[Link, MachineLink]]:
+    """A machine's link that listens on an address, or connects as it is told."""
+    callbacks = MachineCallbacks(on_block, ignore, ignore, ignore, lambda: '{"h": 1}', lambda: '{"a": 1}', alarm_events)
+    link = Link(LinkSettings(listen=(where,)) if isinstance(where, str) else where)
+    declared = MachineLink(link, LAB.keys, callbacks, wait_when_full=wait)
+    try:
+        yield link, declared
+    finally:
+        declared.close()
+        link.close()
