@@ -25,7 +25,7 @@ class Intake:
         Parameters
         ----------
         take : callable
-            Takes what waits there; neither raises nor waits.
+            Takes what waits there and does not raise; everybody else waits for it.
 
         Returns
         -------

@@ -9,6 +9,7 @@ cache is asked from here as Zenoh's own subscriber would, once, when the publish
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import timedelta
 from typing import Any
 
 import zenoh
@@ -18,11 +19,18 @@ CACHED_BLOCKS = 1200
 """Fewer than a queue takes by default: what comes at once after a restart must not overflow it."""
 _WAITING_BLOCKS = 4096
 """Far more than come between two looks of whoever takes them; beyond, the network waits."""
+_HELD_UP_BLOCKS = 256
+"""Where the network waits anyway: more would only take memory."""
 _ANSWER_S = 10.0
 _QUESTIONS = 2
 """Without an answer: a link may break by which it was to come."""
 _PUBLISHERS = 64
 """That are known; of those that are waited for no longer the latest half. Anybody may claim to be another one."""
+_CACHES = "/@adv/pub/"
+"""Below the key of the stream: what each publisher has kept, and a token that it is there."""
+_WITH_HEARTBEATS = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
+# The period is of no use but to have missing blocks fetched at all.
+_WITHOUT_HEARTBEATS = zenoh.ext.RecoveryConfig(periodic_queries=timedelta(days=365), heartbeat=None)  # type: ignore[arg-type]  # the stub says seconds
 _BY_TIME = "uhlc"
 """Stands for the number of a publisher that gives its messages times and no numbers."""
 
@@ -44,27 +52,29 @@ class BlockSubscription:
     ----------
     on_missed : callable
         Takes what says how many messages were lost on the way and could not be fetched again.
+    holds_up : bool
+        Whoever takes the blocks may wait, which holds up the network, and so the publishers. Their heartbeats are not
+        listened to then: one that overtakes blocks that are held up would make Zenoh skip them.
     """
 
-    def __init__(self, session: zenoh.Session, key: str, on_missed: Callable[[zenoh.ext.Miss], None]) -> None:
+    def __init__(
+        self, session: zenoh.Session, key: str, on_missed: Callable[[zenoh.ext.Miss], None], *, holds_up: bool = False
+    ) -> None:
         self._session = session
         self._key = key
         self._publishers: dict[str, _Kept | None] = {}  # None of those whose new blocks are handed on as they come
-        self._found: deque[zenoh.Reply] = deque()
+        self._found: deque[zenoh.Sample] = deque()
         # New blocks first: what is kept is asked for when none can be overlooked any more.
         self._new: zenoh.ext.AdvancedSubscriber[Any] = zenoh.ext.declare_advanced_subscriber(
             session,
             key,
-            zenoh.handlers.FifoChannel(_WAITING_BLOCKS),
-            recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+            zenoh.handlers.FifoChannel(_HELD_UP_BLOCKS if holds_up else _WAITING_BLOCKS),
+            recovery=_WITHOUT_HEARTBEATS if holds_up else _WITH_HEARTBEATS,
             subscriber_detection=True,
         )
         self._missed = self._new.sample_miss_listener(on_missed)
-        self.find_publishers()
-
-    def find_publishers(self) -> None:
-        """Have those asked for what they have kept that have not said anything yet; from any thread."""
-        self._query("**", "_max=1", self._found.append)
+        there = zenoh.handlers.Callback(self._found.append, indirect=False)
+        self._there = session.liveliness().declare_subscriber(f"{key}{_CACHES}**", there, history=True)
 
     def take(self, callback: Callable[[zenoh.Sample], None], most: int, *, last: bool = False) -> None:
         """Call back for every block that has come, some `most` of them; from one thread at a time.
@@ -72,10 +82,10 @@ class BlockSubscription:
         The `last` time blocks wait no longer for what is kept.
         """
         while self._found:
-            found = self._found.popleft().ok
-            origin = None if found is None else _origin(found)
-            if origin is not None:
-                self._awaited(origin[0])
+            found = self._found.popleft()
+            _, _, cache = str(found.key_expr).partition(_CACHES)
+            if found.kind == zenoh.SampleKind.PUT and "*" not in cache:  # which a hostile one may have said
+                self._awaited("/".join(cache.split("/")[:2]))
         received = iter(self._new.try_recv, None)
         for _, sample in zip(range(most), received, strict=False):
             origin = _origin(sample)
@@ -122,21 +132,19 @@ class BlockSubscription:
         kept.questions -= 1
         numbers = "" if publisher.endswith(_BY_TIME) else f";_sn={kept.reached + 1}.."
         channel: Any = zenoh.handlers.FifoChannel(_WAITING_BLOCKS)
-        kept.answers = self._query(f"{publisher}/**", f"_max={CACHED_BLOCKS}{numbers}", channel)
-        self._publishers[publisher] = kept
-
-    def _query(self, publishers: str, parameters: str, handler: Any) -> Any:
-        return self._session.get(
-            f"{self._key}/@adv/pub/{publishers}?{parameters}",
-            handler,
+        kept.answers = self._session.get(
+            f"{self._key}{_CACHES}{publisher}/**?_max={CACHED_BLOCKS}{numbers}",
+            channel,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=_ANSWER_S,
         )
+        self._publishers[publisher] = kept
 
     def close(self) -> None:
         """Receive nothing any more."""
+        self._there.undeclare()  # type: ignore[no-untyped-call]
         self._publishers.clear()  # and with them what is still answered
         self._missed.undeclare()  # type: ignore[no-untyped-call]
         self._new.undeclare()  # type: ignore[no-untyped-call]

@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
-from datetime import timedelta
 from functools import partial
 from types import MappingProxyType
 from typing import TypeVar
@@ -33,7 +32,7 @@ from models.signals.wire import REPLAY_MARK
 from service.stream.inbox import RawBlock
 from service.stream.intake import Intake
 from service.stream.log_query import read_log_query
-from service.stream.subscription import CACHED_BLOCKS, BlockSubscription
+from service.stream.subscription import BlockSubscription
 from service.terminal.logs import logger
 
 _JSON = "application/json"
@@ -45,7 +44,6 @@ _CACHED_EVENTS = 200
 _QUERY_TIMEOUT_S = 10.0
 _QUICK_CONNECT_S = 3.0
 _CONNECT_S = 10.0
-_NEVER = timedelta(days=365)
 _DROPPED_US = 1_000_000
 _HELD_UP_US = 2_000_000
 """By default five seconds, as long as a silence that is called one: other machines' streams would be called lost."""
@@ -152,8 +150,7 @@ class MachineLink:
     link : Link
         Open session; must outlive this object.
     wait_when_full : bool
-        `on_block` may wait, which slows the publisher down. It then runs on the network's own thread, and heartbeats of
-        the publisher are not listened to: one that overtakes waiting blocks would make Zenoh skip them.
+        `on_block` may wait, which slows the publisher down, and all others that take from the same link.
     """
 
     def __init__(self, link: Link, keys: MachineKeys, callbacks: MachineCallbacks, *, wait_when_full: bool) -> None:
@@ -162,7 +159,6 @@ class MachineLink:
         self._callbacks = callbacks
         self._lock = threading.Lock()
         self._closed = False
-        self._blocks: BlockSubscription | None = None
         with ExitStack() as undo:
             self._declare(link.session, undo, wait_when_full)
             self._undeclare = undo.pop_all()
@@ -197,14 +193,9 @@ class MachineLink:
             ).undeclare
         )
         keep(alive.declare_subscriber(keys.publisher_alive, guarded(self._take_alive), history=True).undeclare)
-        if wait_when_full:
-            stream = _waiting_subscriber(session, keys.stream, guarded(self._take_block))
-            keep(stream.undeclare)
-            keep(stream.sample_miss_listener(guarded(self._take_miss)).undeclare)
-        else:
-            blocks = self._blocks = BlockSubscription(session, keys.stream, guarded(self._take_miss))
-            keep(blocks.close)
-            keep(self._link.intake.add(partial(guarded(partial(blocks.take, guarded(self._take_block))), _AT_ONCE)))
+        blocks = BlockSubscription(session, keys.stream, guarded(self._take_miss), holds_up=wait_when_full)
+        keep(blocks.close)
+        keep(self._link.intake.add(partial(guarded(partial(blocks.take, guarded(self._take_block))), _AT_ONCE)))
         keep(alive.declare_token(keys.monitor_alive).undeclare)
 
     def publish(self, topic: Topic, text: str) -> None:
@@ -238,8 +229,6 @@ class MachineLink:
     def _take_alive(self, sample: zenoh.Sample) -> None:
         alive = sample.kind == zenoh.SampleKind.PUT
         self._callbacks.on_publisher(alive)
-        if alive and self._blocks is not None:
-            self._blocks.find_publishers()
         if alive:
             _ask(self._link, self._keys.descriptor, self._take_descriptor)  # without a cache they answer only queries
 
@@ -271,7 +260,6 @@ def tap(link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], N
 
     def take_alive(sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
-            blocks.find_publishers()
             _ask(link, keys.descriptor, take)
 
     session = link.session
@@ -401,25 +389,6 @@ def _advanced_publisher(session: zenoh.Session, key: str, encoding: str, cache: 
         cache=zenoh.ext.CacheConfig(max_samples=cache),
         sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
         publisher_detection=True,
-    )
-
-
-def _waiting_subscriber(
-    session: zenoh.Session, key: str, callback: Callable[[zenoh.Sample], None]
-) -> zenoh.ext.AdvancedSubscriber[None]:
-    """Subscribe to sample blocks, taken on the network's own thread: it may hold that up, and so the publisher.
-
-    No heartbeat is listened to, but what is missing is fetched all the same: where blocks of the cache and new ones
-    meet, a new one may overtake.
-    """
-    return zenoh.ext.declare_advanced_subscriber(
-        session,
-        key,
-        zenoh.handlers.Callback(callback, indirect=False),
-        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=CACHED_BLOCKS),
-        # The period is of no use but to have missing blocks fetched at all, without heartbeats.
-        recovery=zenoh.ext.RecoveryConfig(periodic_queries=_NEVER, heartbeat=None),  # type: ignore[arg-type]  # the stub says seconds
-        subscriber_detection=True,
     )
 
 
