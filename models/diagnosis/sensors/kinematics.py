@@ -237,7 +237,7 @@ def _across(
     One that is turned, or sensitive across its axis, shows a small part: where one force moves both planes, that is in
     the transfer, large where its own plane hardly moves, and passes for a gain or a delay.
     """
-    if other is None:
+    if other is None or not other.any():  # nor does a sensor that is stuck show anything of it
         return None
     expected = alone.transfer(w)
     aim, seen = h / expected - 1, other / expected

@@ -119,6 +119,13 @@ def test_a_sensor_that_has_just_stuck_is_named_without_a_value_that_it_never_had
     assert "y1: repeated one value for 1.5 s" in only(found_in(samples)).text
 
 
+@pytest.mark.parametrize("state", ["y1", "z1"])
+def test_a_sensor_that_shows_nothing_at_all_is_named(state: str) -> None:
+    samples = recorded("lab", 1).copy()
+    samples[:, column(state)] = 0.0
+    assert ("stuck", (state,)) in [(finding.kind, finding.states) for finding in found_in(samples)]
+
+
 def test_a_channel_that_shows_only_its_quantisation_is_dead() -> None:
     samples = recorded("lab", 1).copy()
     step = 10 * samples[:, column("z1")].std()
