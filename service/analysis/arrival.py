@@ -33,13 +33,7 @@ class Arrival:
 
 
 def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arrival:
-    """Look at the messages that arrived under a machine's keys.
-
-    Parameters
-    ----------
-    messages : sequence of RecordedMessage
-        In the order of their arrival.
-    """
+    """Look at the messages that arrived under a machine's keys, in the order of their arrival."""
     place, keys = machine.title, machine.keys
     troubles: list[str] = []
     announced = [one.payload for one in messages if one.key == keys.descriptor]

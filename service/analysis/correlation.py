@@ -154,13 +154,7 @@ class MeasuredCorrelations:
 def measured_correlations(
     machine: MachineFile, window: WindowStatistics, pairs: list[tuple[int, int]]
 ) -> MeasuredCorrelations:
-    """Correlation functions of a window, from its spectra if it holds them at lag zero alone.
-
-    Parameters
-    ----------
-    pairs : list of (int, int)
-        Reference and response, as columns of the window.
-    """
+    """Correlation functions of pairs of columns (reference, response), from spectra if a window has lag zero alone."""
     reference, response = (np.array(column, dtype=np.intp) for column in zip(*pairs, strict=True))
     if window.lags_s.size > 1:
         hops = window.hop_correlation[:, :, reference, response]

@@ -44,19 +44,10 @@ class Excitation:
     noise: dict[str, FloatArray]
 
     def spectra(self, rotor: RotorParameters, states: tuple[str, ...], frequencies_hz: FloatArray) -> ComplexArray:
-        """Cross-spectra that this excitation gives a rotor, sensor noise included, two-sided, SI²/Hz.
+        """Cross-spectra that this excitation gives a rotor, two-sided, SI²/Hz, shape (n_frequencies, n, n).
 
-        Outside the window's band the forces' low-pass goes on; their colour and the noise stay as at its edge.
-
-        Parameters
-        ----------
-        states : tuple of str
-            Measured states and accelerations.
-        frequencies_hz : ndarray, shape (n_frequencies,)
-
-        Returns
-        -------
-        ndarray, shape (n_frequencies, n, n)
+        Of measured states and accelerations, sensor noise included. Outside the window's band the forces' low-pass goes
+        on; their colour and the noise stay as at its edge.
         """
         low_hz, high_hz = self.machine.window.band_hz
         size = frequencies_hz.size
@@ -94,12 +85,7 @@ class Excitation:
 
 
 def excitation_of(machine: Machine, window: WindowStatistics) -> Excitation:
-    """Find the excitation with which a machine explains a window best.
-
-    Parameters
-    ----------
-    machine : Machine
-        Its rotor is taken as it is.
+    """Find the excitation with which a machine, its rotor taken as it is, explains a window best.
 
     Raises
     ------

@@ -147,13 +147,7 @@ def planes_of(pair: tuple[Channel, Channel]) -> Planes:
 
 
 def in_planes(samples: FloatArray, pairs: Iterable[tuple[Channel, Channel]]) -> tuple[FloatArray, FloatArray]:
-    """Motion in y and in z, µm, shape (n_samples, n_pairs) each.
-
-    Parameters
-    ----------
-    samples : ndarray, shape (n_samples, 2 n_pairs)
-        Of the channels of `pairs`, one pair after the other.
-    """
+    """Motion in y and in z, µm, shape (n_samples, n_pairs) each, of samples of the pairs' channels, pair by pair."""
     found = [
         planes_of(pair).turned(samples[:, 2 * at : 2 * at + 2].T * _UM * np.array([[one.to_si] for one in pair]))
         for at, pair in enumerate(pairs)
@@ -218,12 +212,7 @@ def read_orbits(data: Recorded, revolutions: int) -> Orbits:
 
 
 def orbits_of(excerpt: Excerpt, pairs: list[tuple[Channel, Channel]], revolutions: int) -> Orbits:
-    """Orbits of the latest revolutions of an excerpt.
-
-    Parameters
-    ----------
-    excerpt : Excerpt
-        Its columns are the channels of `pairs`, one pair after the other.
+    """Orbits of the latest revolutions of an excerpt, whose columns are the channels of `pairs`, pair by pair.
 
     Raises
     ------

@@ -39,12 +39,7 @@ class Past(Described):
 
     @classmethod
     def of(cls, machine: MachineFile, log: ReportLog, since_ns: int | None, until_ns: int | None, most: int) -> "Past":
-        """Read the history of a machine that is being monitored, without its alarms.
-
-        Parameters
-        ----------
-        most : int
-            Every so many reports, if there are more.
+        """Read the history of a monitored machine, without its alarms: every so many reports, if there are many.
 
         Raises
         ------

@@ -95,42 +95,25 @@ class Prediction:
         lags_s: FloatArray,
         within_hz: tuple[float, float] | None = None,
     ) -> tuple[FloatArray | None, FloatArray | None]:
-        """Correlation functions R_ij(τ), SI, shape (n_lags, n_pairs).
+        """Correlation functions R_ij(τ), SI, shape (n_lags, n_pairs), nominal and estimated; None where there is none.
 
-        Parameters
-        ----------
-        pairs : list of (int, int)
-            Reference and response, as places in `states`.
-        lags_s : ndarray, shape (n_lags,)
-        within_hz : tuple of float, optional
-            Only what lies between these frequencies; all of them without it.
-
-        Returns
-        -------
-        nominal, estimated : ndarray or None
-            None where there is no prediction.
+        Of pairs of places in `states`, reference and response; `within_hz` leaves out what does not lie between these
+        frequencies.
         """
-        return (
-            self._correlations(self.nominal, states, pairs, lags_s, within_hz),
-            self._correlations(self.estimated, states, pairs, lags_s, within_hz),
-        )
-
-    def _correlations(
-        self,
-        rotor: RotorParameters | None,
-        states: tuple[str, ...],
-        pairs: list[tuple[int, int]],
-        lags_s: FloatArray,
-        within_hz: tuple[float, float] | None,
-    ) -> FloatArray | None:
-        if rotor is None or self.excitation is None or self.machine is None:
-            return None
+        if self.excitation is None or self.machine is None:
+            return None, None
         low_hz, high_hz = within_hz or (0.0, _highest_hz(self.machine, states))
-        frequencies_hz, weights = _nodes(self.excitation, rotor, low_hz, high_hz, float(lags_s[-1]))
-        spectra = self.excitation.spectra(rotor, states, frequencies_hz)
-        of_pairs = np.stack([spectra[:, i, j] for i, j in pairs], axis=1) * weights[:, None]
-        phase = 2 * np.pi * np.outer(lags_s, frequencies_hz)
-        return np.asarray(2 * (np.cos(phase) @ of_pairs.real + np.sin(phase) @ of_pairs.imag), dtype=np.float64)
+        found: list[FloatArray | None] = []
+        for rotor in (self.nominal, self.estimated):
+            if rotor is None:
+                found.append(None)
+                continue
+            frequencies_hz, weights = _nodes(self.excitation, rotor, low_hz, high_hz, float(lags_s[-1]))
+            spectra = self.excitation.spectra(rotor, states, frequencies_hz)
+            of_pairs = np.stack([spectra[:, i, j] for i, j in pairs], axis=1) * weights[:, None]
+            phase = 2 * np.pi * np.outer(lags_s, frequencies_hz)
+            found.append(2 * (np.cos(phase) @ of_pairs.real + np.sin(phase) @ of_pairs.imag))
+        return found[0], found[1]
 
 
 def _highest_hz(machine: Machine, states: tuple[str, ...]) -> float:
@@ -172,12 +155,8 @@ def predict(
 
     Parameters
     ----------
-    known : Machine or None
-        The machine with all its parameters.
     readings : iterable of Parameter
         Of this window, by the diagnostician that decides; empty if it was not evaluated.
-    why_not : str
-        Why it was not evaluated.
     """
     if known is None:
         return Prediction(None, None, {}, NO_PARAMETERS, NO_PARAMETERS)

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -37,11 +38,6 @@ class Described(ABC):
     @abstractmethod
     def descriptor(self) -> ChannelDescriptor:
         """Names and units of the channels."""
-
-    @property
-    def displacements(self) -> tuple[Channel, ...]:
-        """Channels that measure a displacement."""
-        return tuple(channel for channel in self.descriptor.channels if channel.quantity is Quantity.DISPLACEMENT)
 
     @property
     def has_angle(self) -> bool:
@@ -90,13 +86,7 @@ class Sampled(Described):
     def stretches(
         self, channels: Sequence[Channel], longest_s: float | None = None, from_ns: int | None = None
     ) -> Iterator[Excerpt]:
-        """Samples of some channels, cut at gaps and after `longest_s`; what is left before a gap is shorter.
-
-        Parameters
-        ----------
-        longest_s : float, optional
-            Length of a stretch, s; without it only gaps cut.
-        """
+        """Samples of some channels, cut at gaps and, if given, after `longest_s`; what a gap leaves is shorter."""
 
     def latest(self, channels: Sequence[Channel], length_s: float) -> list[Excerpt]:
         """The newest `length_s` of data, in pieces if there are gaps."""
@@ -109,13 +99,7 @@ class Sampled(Described):
 
 
 class Recorded(Sampled):
-    """Recorded data of one machine.
-
-    Parameters
-    ----------
-    from_ns, to_ns : int
-        Only data from `from_ns` up to, and without, `to_ns`.
-    """
+    """Recorded data of one machine, from `from_ns` up to, and without, `to_ns`."""
 
     def __init__(self, source: RecordingSource, keys: MachineKeys, from_ns: int, to_ns: int) -> None:
         self.source, self.keys = source, keys
@@ -197,14 +181,13 @@ class Recorded(Sampled):
         """
         names = [channel.name for channel in self.descriptor.channels]
         columns = [names.index(channel.name) for channel in channels]
-        angle = self.descriptor.states.index("theta") if self.has_angle else None
-        used = columns if angle is None else [*columns, angle]
+        used = [*columns, self.descriptor.states.index("theta")] if self.has_angle else columns
         size = None if longest_s is None else max(1, round(longest_s * self.descriptor.rate_hz))
         pending: list[FloatArray] = []
         start_ns = count = 0
         for block, continues in self._blocks(from_ns, used):
             if pending and not continues:
-                yield self._stretch(start_ns, np.concatenate(pending), angle is not None)
+                yield self._stretch(start_ns, np.concatenate(pending))
                 pending, count = [], 0
             # Anchored anew by every block, as the monitor does: the device's clock is the time.
             start_ns = block.start_ns - round(count * 1e9 / self.descriptor.rate_hz)
@@ -212,17 +195,15 @@ class Recorded(Sampled):
             count += pending[-1].shape[0]
             while size is not None and count >= size:
                 rows = np.concatenate(pending)
-                yield self._stretch(start_ns, rows[:size], angle is not None)
+                yield self._stretch(start_ns, rows[:size])
                 start_ns += round(size * 1e9 / self.descriptor.rate_hz)
                 pending, count = [rows[size:]], count - size
         if count:
-            yield self._stretch(start_ns, np.concatenate(pending), angle is not None)
+            yield self._stretch(start_ns, np.concatenate(pending))
 
-    def _stretch(self, start_ns: int, rows: FloatArray, with_angle: bool) -> Excerpt:
-        rate_hz = self.descriptor.rate_hz
-        if with_angle:
-            return Excerpt(start_ns, rate_hz, rows[:, :-1], rows[:, -1])
-        return Excerpt(start_ns, rate_hz, rows, None)
+    def _stretch(self, start_ns: int, rows: FloatArray) -> Excerpt:
+        samples, angle_rad = (rows[:, :-1], rows[:, -1]) if self.has_angle else (rows, None)
+        return Excerpt(start_ns, self.descriptor.rate_hz, samples, angle_rad)
 
     def _blocks(self, from_ns: int | None, used: list[int]) -> Iterator[tuple[SampleBlock, bool]]:
         """Usable blocks, and whether each continues the one before it."""
@@ -251,17 +232,11 @@ class Recorded(Sampled):
 
 
 class Held(Sampled):
-    """What a monitor holds of the newest samples.
-
-    Parameters
-    ----------
-    blocks : sequence of SampleBlock
-        At least one, without a gap between them.
-    """
+    """The newest samples that a monitor holds, of one block or more, without a gap between them."""
 
     def __init__(self, machine: MachineFile, blocks: Sequence[SampleBlock]) -> None:
         self._descriptor = machine.descriptor
-        self._excerpt = Excerpt.of_blocks(blocks, machine.rate_hz, None)
+        self._excerpt = Excerpt.of_blocks(blocks, machine.descriptor)
         self.name, self.place = machine.title, "the newest samples"
         self.from_ns = self._excerpt.start_ns
         self.to_ns = self.end_ns = self._excerpt.end_ns
@@ -277,10 +252,8 @@ class Held(Sampled):
         """Samples of some channels, cut after `longest_s`."""
         names = [channel.name for channel in self._descriptor.channels]
         columns = [names.index(channel.name) for channel in channels]
-        rows = self._excerpt.samples
-        angle = rows[:, self._descriptor.states.index("theta")] if self.has_angle else None
-        whole = Excerpt(self.from_ns, self._excerpt.rate_hz, rows[:, columns], angle)
+        whole = replace(self._excerpt, samples=self._excerpt.samples[:, columns])
         begin = 0 if from_ns is None else max(0, round((from_ns - self.from_ns) / 1e9 * whole.rate_hz))
-        size = len(rows) if longest_s is None else max(1, round(longest_s * whole.rate_hz))
-        for first in range(begin, len(rows), size):
+        size = len(whole.samples) if longest_s is None else max(1, round(longest_s * whole.rate_hz))
+        for first in range(begin, len(whole.samples), size):
             yield whole.part(first, first + size)

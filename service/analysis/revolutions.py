@@ -1,12 +1,13 @@
 """Samples without a gap, and the revolutions of the shaft in them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from models.signals.block import FloatArray, SampleBlock
+from models.signals.channels import ChannelDescriptor
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,38 +47,29 @@ class Excerpt:
         )
 
     @classmethod
-    def of_blocks(cls, blocks: Sequence[SampleBlock], rate_hz: float, angle_column: int | None) -> "Excerpt":
+    def of_blocks(cls, blocks: Sequence[SampleBlock], described: ChannelDescriptor) -> "Excerpt":
         """All columns of blocks that follow each other."""
-        samples = np.concatenate([block.samples for block in blocks]).astype(np.float64)
-        start_ns = blocks[-1].end_ns - round(samples.shape[0] / rate_hz * 1e9)
-        return cls(start_ns, rate_hz, samples, None if angle_column is None else samples[:, angle_column])
+        samples, states = np.concatenate([block.samples for block in blocks]).astype(np.float64), described.states
+        start_ns = blocks[-1].end_ns - round(samples.shape[0] / described.rate_hz * 1e9)
+        angle_rad = samples[:, states.index("theta")] if "theta" in states else None
+        return cls(start_ns, described.rate_hz, samples, angle_rad)
 
 
 @dataclass(frozen=True, slots=True)
 class Revolutions:
     """Samples of whole revolutions."""
 
-    excerpt: Excerpt | None  # None where there is no whole revolution
-    count: int
-    # (count + 1,), where the shaft angle is 0, in samples from the first one; empty where it is not measured.
-    pulses: FloatArray
     reason: str  # why there are none, or fewer than asked for
+    excerpt: Excerpt | None = None  # None where there is no whole revolution
+    count: int = 0
+    # (count + 1,), where the shaft angle is 0, in samples from the first one; empty where it is not measured.
+    pulses: FloatArray = field(default_factory=lambda: np.empty(0))
 
 
 def pulses(angle_rad: npt.NDArray[np.floating] | None) -> tuple[int, FloatArray]:
     """Direction of rotation, and where the shaft angle passes 0, in samples from the first one, interpolated.
 
-    Parameters
-    ----------
-    angle_rad : ndarray, shape (n_samples,), or None
-        Shaft angle of consecutive samples.
-
-    Returns
-    -------
-    int
-        1 if the angle grows, -1 if it falls.
-    ndarray, shape (n_pulses,)
-        Empty without an angle.
+    1 if the angle grows, -1 if it falls; and shape (n_pulses,), empty without an angle.
     """
     if angle_rad is None or angle_rad.size < 2:
         return 1, np.empty(0)
@@ -111,26 +103,17 @@ def newest_revolutions(
         at = size - 1 - each * np.arange(whole, -1, -1)
         reason = "the shaft angle is not measured: revolutions are as long as at the mean speed, and begin anywhere"
     else:
-        return no_revolutions("neither the shaft angle nor the speed is known, so no revolution can be told")
+        return Revolutions("neither the shaft angle nor the speed is known, so no revolution can be told")
     if not whole:
-        return no_revolutions(f"the newest {excerpt.length_s:.3g} s of samples without a gap hold no whole revolution")
+        return Revolutions(f"the newest {excerpt.length_s:.3g} s of samples without a gap hold no whole revolution")
     fit = whole if most_samples is None else int(np.count_nonzero(at[-1] - at[:-1] < most_samples))
     count = min(wanted, whole, fit)
     if count < wanted:
         limit = f"{excerpt.length_s:.3g} s of samples without a gap" if whole <= fit else f"{most_samples} samples"
         reason = "; ".join(filter(None, (f"{count} of {wanted} revolutions: there are {limit} at most", reason)))
     if not count:
-        return no_revolutions(f"one revolution is longer than {most_samples} samples")
+        return Revolutions(f"one revolution is longer than {most_samples} samples")
     marks = at[-1 - count :]
     first, last = int(np.floor(marks[0])), int(np.ceil(marks[-1]))
-    return Revolutions(
-        excerpt.part(first, last + 1),
-        count,
-        np.asarray(marks - first if excerpt.angle_rad is not None else np.empty(0), dtype=np.float64),
-        reason,
-    )
-
-
-def no_revolutions(reason: str) -> Revolutions:
-    """None, and why."""
-    return Revolutions(None, 0, np.empty(0), reason)
+    seen = np.asarray(marks - first if excerpt.angle_rad is not None else np.empty(0), dtype=np.float64)
+    return Revolutions(reason, excerpt.part(first, last + 1), count, seen)

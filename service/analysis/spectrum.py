@@ -312,18 +312,8 @@ def _mean_power(
 ) -> tuple[FloatArray, int]:
     """Mean power of Hann-windowed segments that overlap by half, each about its mean, and how many there are.
 
-    Parameters
-    ----------
-    pieces : iterable of ndarray, shape (n_samples, n_channels)
-        Samples without a gap, each at least one segment long.
-    scaling : str
-        ``amplitude``: squared amplitude of a sine; ``density``: one-sided power spectral density.
-
-    Returns
-    -------
-    ndarray, shape (n_channels, segment // 2 + 1)
-        Of complex samples, shape (n_channels, segment), in the order of `numpy.fft.fft`.
-    int
+    Of a sine its squared amplitude, else a one-sided power spectral density; shape (n_channels, segment // 2 + 1). Of
+    complex samples (n_channels, segment), in the order of `numpy.fft.fft`. Every piece is one segment long at least.
     """
     from scipy.signal import welch  # noqa: PLC0415  # slow to import; only for these spectra
 

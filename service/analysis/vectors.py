@@ -37,13 +37,7 @@ class Vectors:
 
 
 def vectors_of(excerpt: Excerpt, channels: Sequence[Channel], revolutions: int) -> Vectors:
-    """Vectors of every so many revolutions, as nearly as whole pieces allow.
-
-    Parameters
-    ----------
-    excerpt : Excerpt
-        With shaft angle; its columns are the channels.
-    """
+    """Vectors of every so many revolutions of channels with a shaft angle, as nearly as whole pieces allow."""
     plan = level_plan(channels, excerpt.rate_hz, (0.0, excerpt.rate_hz))
     si = excerpt.samples * np.array([channel.to_si for channel in channels])
     direction, at = pulses(excerpt.angle_rad)

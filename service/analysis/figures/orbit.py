@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from service.analysis.figures.style import COLOURS, GREY, INK, Look, Paint, heading, plane_labels, rotation_text, rpm
+from service.analysis.figures.style import COLOURS, INK, Look, Paint, frame_plane, heading, rotation_text, rpm
 from service.analysis.orbit import Orbit, Orbits, phase_lag_deg, read_orbits
 from service.analysis.recorded import Recorded
 
@@ -40,8 +40,7 @@ def _raw(axes: Axes, orbit: Orbit) -> None:
     axes.plot(*orbit.marks_um.T, "o", color=COLOURS[1], markersize=5, markeredgecolor="white", markeredgewidth=0.6)
     axes.set_title(f"{orbit.location}, as measured", fontweight="bold")
     across = zip(orbit.names, (np.ptp(orbit.y_um), np.ptp(orbit.z_um)), strict=True)
-    _frame(axes, orbit, [f"{name} {length:.4g} µm pp" for name, length in across])
-    _limit(axes, orbit.y_um, orbit.z_um)
+    _frame(axes, orbit, (orbit.y_um, orbit.z_um), [f"{name} {length:.4g} µm pp" for name, length in across])
 
 
 def _running_speed(axes: Axes, orbit: Orbit, found: Orbits) -> None:
@@ -65,24 +64,16 @@ def _running_speed(axes: Axes, orbit: Orbit, found: Orbits) -> None:
         f"{name} {2 * abs(q):.4g} µm pp ∠ {phase_lag_deg(q, found.direction):.0f}° lag"
         for name, q in zip(orbit.names, (ellipse.y, ellipse.z), strict=True)
     ]
-    _frame(axes, orbit, [*lines, f"ellipse {2 * ellipse.semi_major:.4g} × {2 * ellipse.semi_minor:.4g} µm"])
-    _limit(axes, y, z)
+    lines.append(f"ellipse {2 * ellipse.semi_major:.4g} × {2 * ellipse.semi_minor:.4g} µm")
+    _frame(axes, orbit, (y, z), lines)
 
 
-def _frame(axes: Axes, orbit: Orbit, lines: list[str]) -> None:
-    axes.axhline(0, color=GREY, linewidth=0.6)
-    axes.axvline(0, color=GREY, linewidth=0.6)
-    across, up = plane_labels(orbit.names)
-    axes.set_xlabel(f"{across}, µm")
-    axes.set_ylabel(f"{up}, µm")
+def _frame(axes: Axes, orbit: Orbit, path: tuple[np.ndarray, np.ndarray], lines: list[str]) -> None:
+    """Both axes as far as the path, and room above for the text."""
+    frame_plane(axes, orbit.names, "µm")
     axes.text(
         0.02, 0.985, "\n".join(lines), transform=axes.transAxes, ha="left", va="top", fontsize=8, color=INK, zorder=5
     )
-
-
-def _limit(axes: Axes, y: np.ndarray, z: np.ndarray) -> None:
-    """The same length on both axes, and room above for the text."""
-    reach = 1.12 * max(float(np.max(np.abs(y))), float(np.max(np.abs(z))), 1e-6)
+    reach = 1.12 * max(float(np.max(np.abs(path))), 1e-6)
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-reach, 1.35 * reach)
-    axes.set_aspect("equal")

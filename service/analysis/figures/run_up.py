@@ -27,10 +27,10 @@ from service.analysis.figures.style import (
     Look,
     Paint,
     along_path,
+    frame_plane,
     heading,
     mark_text,
     place_text,
-    plane_labels,
     rotation_text,
     speeds_text,
     spread_marks,
@@ -82,18 +82,17 @@ def _paint_bode(found: RunUp, name: str, look: Look) -> Figure:
         row, column = 3 * (number // columns), number % columns
         lower = figure.add_subplot(grid[row + 1, column])
         amplitude, lag = found.amplitude[:, number], found.lag_deg[:, number]
-        panels, text = [lower], ""
+        top, panels, text = int(np.argmax(amplitude)), [lower], ""
         if not found.estimated:
             panels.append(figure.add_subplot(grid[row, column], sharex=lower))
             _lag(panels[-1], speed, lag, amplitude)
             panels[-1].tick_params(labelbottom=False)
-            text = f", {lag[np.argmax(amplitude)]:.0f}° lag"
+            text = f", {lag[top]:.0f}° lag"
         panels[-1].set_title(f"{channel.name}   {place_text(channel)}", fontweight="bold")
         lower.plot(speed, amplitude, "." if found.estimated else ".-", color=COLOURS[0], markersize=3, linewidth=0.7)
         lower.set_ylim(0, 1.15 * float(np.max(amplitude)) or 1.0)
         lower.set_ylabel(f"{found.order}× amplitude, {found.units[number]}")
         lower.set_xlabel("speed, rpm")
-        top = int(np.argmax(amplitude))
         for axes in panels:
             axes.axvline(speed[top], color=COLOURS[1], linewidth=0.9, linestyle=(0, (3, 2)), zorder=1)
         lower.set_title(
@@ -167,14 +166,11 @@ def _trace(axes: PolarAxes, found: RunUp, number: int) -> None:
 def _heading(figure: Figure, look: Look, found: RunUp, title: str) -> None:
     span = int(found.time_ns[0]), int(found.time_ns[-1])
     slow_roll = "" if found.slow_roll_rpm is None else f"less slow roll up to {found.slow_roll_rpm:g} rpm"
-    turns = "" if found.estimated else rotation_text(found.direction)
-    heading(figure, look, title, span, speeds_text(found.speed_rad_s), _points_text(found), slow_roll, turns)
-
-
-def _points_text(found: RunUp) -> str:
+    points = "windows of the monitor" if found.revolutions is None else f"{found.revolutions} revolutions a point"
+    turns = rotation_text(found.direction)
     if found.estimated:
-        return "speed found in the vibration, no phase"
-    return "windows of the monitor" if found.revolutions is None else f"{found.revolutions} revolutions a point"
+        points, turns = "speed found in the vibration, no phase", ""
+    heading(figure, look, title, span, speeds_text(found.speed_rad_s), points, slow_roll, turns)
 
 
 def centreline(data: Recorded | Past, place: str | None, each_s: float, clearance_um: float | None) -> Paint:
@@ -218,11 +214,7 @@ def _frame(
 ) -> None:
     """The same length on both axes."""
     names = planes_of(found.pairs[number]).names
-    across, up = plane_labels(names)
-    axes.set_xlabel(f"{across}, µm from the start")
-    axes.set_ylabel(f"{up}, µm from the start")
-    axes.axhline(0, color=GREY, linewidth=0.6)
-    axes.axvline(0, color=GREY, linewidth=0.6)
+    frame_plane(axes, names, "µm from the start")
     start = f"start: {names[0]} {found.y_um[0, number]:.4g} µm, {names[1]} {found.z_um[0, number]:.4g} µm"
     if clearance_um is not None:
         start += f"\ncircle: clearance of {clearance_um:g} µm, if the shaft lies at its bottom to begin with"
@@ -237,4 +229,3 @@ def _frame(
     (left, right), (bottom, top) = ends
     axes.set_xlim((left + right) / 2 - reach, (left + right) / 2 + reach)
     axes.set_ylim((bottom + top) / 2 - reach, (bottom + top) / 2 + 1.15 * reach)
-    axes.set_aspect("equal")

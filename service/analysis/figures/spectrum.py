@@ -92,13 +92,7 @@ def paint_spectrum(found: Spectrum, name: str, look: Look, lines: Lines) -> Figu
         axes.plot(frequency, values, color=COLOURS[0], linewidth=0.9)
         axes.set_title(f"{channel.name}   {place_text(channel)}", fontweight="bold")
         axes.set_ylabel(shown_as(channel, found.scaling)[0])
-        top = float(values.max()) or 1.0
-        if lines.log:
-            axes.set_yscale("log")
-            floor = max(float(values[values > 0].min(initial=top)), top * _depth(found))
-            axes.set_ylim(0.7 * floor, 2.5 * top)
-        else:
-            axes.set_ylim(0, 1.15 * top)
+        _heights(axes, values, _depth(found) if lines.log else None, 1.15)
         _orders(axes, found, values, frequency, channel)
     panels[-1].set_xlim(limits_hz)
     panels[-1].set_xlabel("frequency, Hz")
@@ -269,9 +263,20 @@ def _shown(found: Spectrum | Waterfall, to_hz: float | None) -> tuple[tuple[floa
     return (low, high), (found.frequencies_hz >= low - slack) & (found.frequencies_hz <= high + slack)
 
 
-def _depth(found: Spectrum | Waterfall) -> float:
-    """Smallest height that is shown, over the greatest: 80 dB below."""
-    return float(10.0 ** (-_DECADES if found.scaling == "amplitude" else -2 * _DECADES))
+def _depth(found: Spectrum | Waterfall | FullSpectrum) -> float:
+    """Smallest height that is shown on a logarithmic scale, over the greatest: 80 dB below."""
+    density = not isinstance(found, FullSpectrum) and found.scaling == "density"
+    return float(10.0 ** (-2 * _DECADES if density else -_DECADES))
+
+
+def _heights(axes: Axes, values: np.ndarray, depth: float | None, room: float) -> None:
+    """Ends of the axis of heights: of a logarithmic one from `depth` on, otherwise with `room` above for names."""
+    top = float(values.max()) or 1.0
+    if depth is None:
+        axes.set_ylim(0, room * top)
+        return
+    axes.set_yscale("log")
+    axes.set_ylim(0.7 * max(float(values[values > 0].min(initial=top)), depth * top), 2.5 * top)
 
 
 def full_spectrum(data: Recorded, place: str | None, lines: Lines, *, orders: bool) -> Paint:
@@ -293,15 +298,10 @@ def _paint_full(found: FullSpectrum, name: str, lines: Lines, look: Look) -> Fig
     clear = shown & (np.abs(found.lines) >= lowest_hz(found.resolution) * (1 - 1e-9))
     for axes, pair, values in zip(panels, found.pairs, found.values_um, strict=True):
         axes.plot(found.lines[shown], np.where(clear, values, np.nan)[shown], color=COLOURS[0], linewidth=0.9)
-        top = float(values[clear].max()) or 1.0
         axes.axvline(0, color=INK, linewidth=0.8)
         axes.set_title(f"{pair[0].location}   {' and '.join(one.name for one in pair)}", fontweight="bold")
         axes.set_ylabel("µm p-p")
-        if lines.log:
-            axes.set_yscale("log")
-            axes.set_ylim(max(float(values[clear & (values > 0)].min(initial=top)), 1e-4 * top) * 0.7, 2.5 * top)
-        else:
-            axes.set_ylim(0, 1.22 * top)
+        _heights(axes, values[clear], _depth(found) if lines.log else None, 1.22)
         _sides(axes, known=known)
         _marks(axes, found, values, shown)
     panels[-1].set_xlim(-to, to)

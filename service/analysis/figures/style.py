@@ -131,10 +131,13 @@ def place_text(channel: Channel) -> str:
     return f"{channel.quantity.replace('_', ' ')}, {channel.location}, {channel.way}"
 
 
-def plane_labels(names: tuple[str, str]) -> tuple[str, str]:
-    """What stands at the axes y and z: sensors in them, or what two others are turned to."""
-    y, z = (name if " of " in name else f"{way}: {name}" for way, name in zip("yz", names, strict=True))
-    return y, z
+def frame_plane(axes: Axes, names: tuple[str, str], unit: str) -> None:
+    """Axes y and z to one scale, named after the sensors in them, or what two others are turned to."""
+    for axis, way, name in zip((axes.xaxis, axes.yaxis), "yz", names, strict=True):
+        axis.set_label_text(f"{name if ' of ' in name else f'{way}: {name}'}, {unit}")
+    axes.axhline(0, color=GREY, linewidth=0.6)
+    axes.axvline(0, color=GREY, linewidth=0.6)
+    axes.set_aspect("equal")
 
 
 def rotation_text(direction: int) -> str:
@@ -170,15 +173,7 @@ def mark_text(value: float, unit: str) -> str:
 
 
 def spread_marks(along: FloatArray, places: npt.NDArray[Any], apart: float) -> list[int]:
-    """Points of a path to be labelled: the ends, and those near round numbers that are as far from each other.
-
-    Parameters
-    ----------
-    along : ndarray, shape (n,)
-        Numbers on the labels.
-    places : ndarray of complex, shape (n,)
-        Where the points are on the picture.
-    """
+    """Points of a path to be labelled: its ends, and others near round numbers `along` it that are so far `apart`."""
     step = next(one for one in _ROUND if np.ptp(along) / one <= _MOST_MARKS)
     off = np.abs(along - step * np.round(along / step))
     passed = [int(at) for at in np.flatnonzero(np.diff(np.floor(along / step)))]

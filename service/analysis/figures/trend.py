@@ -133,12 +133,9 @@ def _states(axes: Axes, trend: TrendSeries, step_ns: int, rows: int) -> None:
 
 
 def _name_alarms(axes: Axes, alarms: list[AlarmEventData]) -> int:
-    """Events of a parameter in the line of its title, those of the model over the states, in as many rows as it takes.
+    """Events of a parameter in the line of its title, those of the model over the states; returns in how many rows.
 
-    Returns
-    -------
-    int
-        How many rows: side by side, texts of events that are close to each other could not be read.
+    Side by side, texts of events that are close to each other could not be read.
     """
     letter = _LETTER_IN * axes.figure.dpi / axes.bbox.width
     first, last = axes.get_xlim()

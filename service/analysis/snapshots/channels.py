@@ -24,11 +24,6 @@ class SnapshotError(RotorwatchError):
 def chosen_channels(machine: MachineFile, names: Sequence[str], field: str = "channel") -> tuple[Channel, ...]:
     """Channels by name; without names all of the first quantity measured, displacements before velocities.
 
-    Parameters
-    ----------
-    field : str
-        What the names were given as.
-
     Raises
     ------
     SnapshotError
@@ -46,11 +41,8 @@ def chosen_channels(machine: MachineFile, names: Sequence[str], field: str = "ch
             )
     if names:
         return tuple(there[name] for name in dict.fromkeys(names))
-    for quantity in Quantity:
-        found = tuple(channel for channel in there.values() if channel.quantity is quantity)
-        if found:
-            return found
-    return ()
+    first = min((channel.quantity for channel in there.values()), key=list(Quantity).index, default=None)
+    return tuple(channel for channel in there.values() if channel.quantity is first)
 
 
 def chosen_pairs(
@@ -87,12 +79,7 @@ def chosen_pairs(
 
 
 def check_held(machine: MachineFile, channels: Sequence[Channel], states: Sequence[str]) -> None:
-    """Refuse channels at places of which only levels are watched.
-
-    Parameters
-    ----------
-    states : sequence of str
-        What the window holds correlations and spectra of.
+    """Refuse channels that are not among the states of a window: at their places only levels are watched.
 
     Raises
     ------

@@ -16,7 +16,7 @@ from models.signals.channels import Channel
 from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector, Units
 from service.analysis.orbit import MODELLED, Ellipse, no_pair, orbit_pairs, phase_lag_deg, planes_of
 from service.analysis.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
-from service.analysis.revolutions import Excerpt, Revolutions, newest_revolutions, no_revolutions
+from service.analysis.revolutions import Excerpt, Revolutions, newest_revolutions
 from service.analysis.snapshots.channels import SnapshotError, figures, known_figures
 from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
 
@@ -37,12 +37,7 @@ class _Vectors:
 
 
 def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, units: Units = "channel") -> OrbitSnapshot:
-    """Orbits at every place where displacements are measured in both directions.
-
-    Parameters
-    ----------
-    revolutions : int
-        Whole revolutions to be shown as measured; none with 0.
+    """Orbits at every place with displacements in both directions, and so many whole revolutions as measured.
 
     Raises
     ------
@@ -181,12 +176,10 @@ def _newest_path(
     if not 0 <= revolutions <= MOST_REVOLUTIONS:
         raise SnapshotError(f"{machine.title}: revolutions is {revolutions}, expected 0 to {MOST_REVOLUTIONS}")
     if not revolutions:
-        return no_revolutions("none were asked for")
+        return Revolutions("none were asked for")
     if not blocks:
-        return no_revolutions("no samples have come in")
-    states = machine.descriptor.states
-    excerpt = Excerpt.of_blocks(blocks, machine.rate_hz, states.index("theta") if "theta" in states else None)
-    return newest_revolutions(excerpt, revolutions, speed_rad_s, _MOST_SAMPLES)
+        return Revolutions("no samples have come in")
+    return newest_revolutions(Excerpt.of_blocks(blocks, machine.descriptor), revolutions, speed_rad_s, _MOST_SAMPLES)
 
 
 def _path(machine: MachineFile, path: Revolutions, pair: tuple[Channel, Channel], units: Units) -> PathSamples | None:

@@ -41,13 +41,7 @@ _CENTRELINE_S = 1.0
 def waveform_snapshot(
     data: Sampled, channels: tuple[Channel, ...], revolutions: int, speed_rad_s: float | None
 ) -> WaveformSnapshot:
-    """The newest whole revolutions of some channels, with the phase reference's pulses.
-
-    Parameters
-    ----------
-    speed_rad_s : float or None
-        Mean speed: how long revolutions are where there is no shaft angle.
-    """
+    """The newest whole revolutions of some channels, and pulses of the phase reference; without it, of a mean speed."""
     excerpt = data.latest(channels, _SOON_S)[-1]
     found = newest_revolutions(excerpt, revolutions, speed_rad_s, _MOST_SAMPLES)
     shown = found.excerpt or _newest(excerpt)

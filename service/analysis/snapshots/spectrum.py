@@ -1,7 +1,6 @@
 """Power spectral densities of the latest window beside what theory predicts, and coherence of pairs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -32,15 +31,8 @@ _SHARED = (1 + 2 / 36, 4 / 9 + 2 * 0.0200, 1 / 36 + 2 * 0.0069)
 """Squared correlations of half-overlapping Hann segments' power in one line, and in lines one and two apart."""
 _OUTER = (0.025, 0.975)
 _Array = TypeVar("_Array", FloatArray, ComplexArray)
-
-
-@dataclass(frozen=True, slots=True)
-class _Spectra:
-    """Two-sided cross-spectra, SI²/Hz, each of shape (n_lines, n, n) with the states in one order."""
-
-    measured: ComplexArray
-    nominal: ComplexArray | None
-    estimated: ComplexArray | None
+_Spectra = tuple[ComplexArray, ComplexArray | None, ComplexArray | None]
+"""Two-sided cross-spectra, SI²/Hz: measured, nominal, estimated; shape (n_lines, n, n), states in one order."""
 
 
 def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
@@ -103,14 +95,10 @@ def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
     group = -(-frequencies_hz.size // MOST_LINES)
     of_theory, parts = seen_by(used)
     nominal, estimated = (
-        one if one is None or parts is None else np.asarray(parts @ one @ parts.T, dtype=np.complex128)
+        one if one is None else _grouped(one if parts is None else np.asarray(parts @ one @ parts.T), group)
         for one in prediction.spectra(of_theory, frequencies_hz)
     )
-    spectra = _Spectra(
-        _grouped(window.spectrum[lines][:, columns][:, :, columns], group),
-        None if nominal is None else _grouped(nominal, group),
-        None if estimated is None else _grouped(estimated, group),
-    )
+    spectra = _grouped(window.spectrum[lines][:, columns][:, :, columns], group), nominal, estimated
     averages = _averages(window.n_segments, group)
     freedom = 2 * averages
     speed = head["speed_rad_s"]
@@ -170,11 +158,8 @@ def _averages(n_segments: int, group: int) -> float:
 
 def _density(channel: Channel, at: int, spectra: _Spectra, spacing_hz: float, units: Units) -> ChannelDensity:
     unit, factor = product_unit(channel, channel, units)
-    measured = 2 * factor * spectra.measured[:, at, at].real
-    nominal, estimated = (
-        None if one is None else figures(2 * factor * one[:, at, at].real)
-        for one in (spectra.nominal, spectra.estimated)
-    )
+    measured = 2 * factor * spectra[0][:, at, at].real
+    nominal, estimated = (None if one is None else figures(2 * factor * one[:, at, at].real) for one in spectra[1:])
     return ChannelDensity(
         channel=channel.name,
         quantity=channel.quantity.value,
@@ -188,17 +173,18 @@ def _density(channel: Channel, at: int, spectra: _Spectra, spacing_hz: float, un
 
 def _cross(pair: tuple[Channel, Channel], i: int, j: int, spectra: _Spectra, units: Units) -> CrossSpectrum:
     unit, factor = product_unit(*pair, units)
+    measured = spectra[0]
     (nominal, nominal_coherence), (estimated, estimated_coherence) = (
         (None, None) if one is None else (figures(2 * factor * np.abs(one[:, i, j])), figures(_coherence(one, i, j)))
-        for one in (spectra.nominal, spectra.estimated)
+        for one in spectra[1:]
     )
     return CrossSpectrum(
         first=pair[0].name,
         second=pair[1].name,
         unit=f"{unit}/Hz",
-        magnitude=figures(2 * factor * np.abs(spectra.measured[:, i, j])),
-        phase_deg=figures(np.degrees(np.angle(spectra.measured[:, j, i]))),
-        coherence=figures(_coherence(spectra.measured, i, j)),
+        magnitude=figures(2 * factor * np.abs(measured[:, i, j])),
+        phase_deg=figures(np.degrees(np.angle(measured[:, j, i]))),
+        coherence=figures(_coherence(measured, i, j)),
         nominal_magnitude=nominal,
         nominal_coherence=nominal_coherence,
         estimated_magnitude=estimated,

@@ -224,12 +224,12 @@ def test_a_waterfall_follows_a_run_up_over_time_and_speed(tmp_path: Path) -> Non
 
 def test_a_speed_axis_needs_a_speed_that_changes(faulty: Path) -> None:
     stream = recorded(faulty, seconds=(0, 20))
-    found = read_waterfall(stream, stream.displacements[0], 4.0, 0.5, "amplitude")
+    found = read_waterfall(stream, stream.chosen(())[0], 4.0, 0.5, "amplitude")
     assert found.values.shape[0] == 5
     with pytest.raises(RotorwatchError, match=r"the speed stays at 1320 rpm"):
         found.over_speed()
     with pytest.raises(RotorwatchError, match="1 spectra of demo/lab over 20 s without a gap, expected at least 2"):
-        read_waterfall(stream, stream.displacements[0], 20.0, 0.5, "amplitude")
+        read_waterfall(stream, stream.chosen(())[0], 20.0, 0.5, "amplitude")
 
 
 @pytest.mark.parametrize("nth", [-1, 3])
