@@ -286,13 +286,7 @@ def check_determined(reasons: Sequence[str], *, only_shapes: bool = False) -> Ch
 
 
 def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows: int) -> Check:
-    """Whether a change of a channel's shape would be called one, where nothing else is compared.
-
-    Parameters
-    ----------
-    windows : int
-        Healthy windows that the shapes were learned from.
-    """
+    """Whether a change of a shape learned from so many windows would be called one, where nothing else is compared."""
     told = partial(Check, name="changes would be seen")
     names = {state: with_channel_names(state, machine.sensors) for state in powers}
     seen = {names[state]: one.growth for state, one in powers.items() if one.growth <= SEEN_GROWTH}

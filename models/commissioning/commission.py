@@ -41,7 +41,7 @@ from models.diagnosis.verdict.stretch import from_scale, slope, to_scale
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.levels.gains import learn_gains, place_of
-from models.levels.limits import alerts_of
+from models.levels.limits import GrowthToAlert, alerts_of
 from models.levels.reference import learn_levels
 from models.machine import Machine, MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETER_TEXT, PARAMETERS
@@ -88,19 +88,6 @@ class ParameterSummary(BaseModel, extra="forbid", frozen=True):
     window_s_for_wished: float | None = Field(default=None, description="window that this takes")
     healthy_s_for_wished: float | None = Field(default=None, description="healthy data that this takes in addition")
     readings: tuple[HealthyReading, ...] = ()
-
-
-class GrowthToAlert(BaseModel, extra="forbid", frozen=True):
-    """What growth of one level of one channel raises an alert relative to the healthy machine."""
-
-    speed_rpm: tuple[float, float] | None = Field(description="slowest and fastest window of the operating state")
-    windows: int = Field(description="healthy windows in it")
-    channel: str
-    measure: str
-    unit: str
-    healthy: float = Field(description="mean level of the healthy windows")
-    alert: float = Field(description="alert from here on")
-    growth: float | None = Field(description="of the mean healthy level, relative; none where that is nothing")
 
 
 class CommissioningReport(BaseModel, extra="forbid", frozen=True):
@@ -435,21 +422,7 @@ def _growths(machine: MachineFile, commissioned: Commissioned | None) -> tuple[G
     """What growth of each level raises an alert; none where limits refer to the first windows instead."""
     if commissioned is None or commissioned.levels is None or machine.levels.reference == "first windows":
         return ()
-    return tuple(
-        GrowthToAlert(
-            speed_rpm=None
-            if one.state.speed_rad_s is None
-            else tuple(sorted(abs(speed) * 30 / math.pi for speed in one.state.speed_rad_s)),
-            windows=one.state.windows,
-            channel=one.channel.name,
-            measure=one.measure,
-            unit=one.unit,
-            healthy=one.healthy,
-            alert=one.alert,
-            growth=one.growth,
-        )
-        for one in alerts_of(commissioned.levels, machine.sensors, machine.levels, machine.window.hops)
-    )
+    return tuple(alerts_of(commissioned.levels, machine.sensors, machine.levels, machine.window.hops))
 
 
 def _told(machine: MachineFile, evaluable: Sequence[str]) -> str:

@@ -52,14 +52,9 @@ class HealthyRecording:
 def healthy_from_blocks(
     name: str, machine: MachineFile, blocks: Iterable[tuple[SampleBlock, str]], until_s: float | None = None
 ) -> HealthyRecording:
-    """Cut a stream into hops.
+    """Cut a stream into hops, up to so long after its first sample.
 
-    Parameters
-    ----------
-    blocks : iterable of (SampleBlock, str)
-        Blocks in their order, each with the hash of the channel descriptor that its sender named, or "".
-    until_s : float, optional
-        Use only data from before this time after the first sample.
+    Each block comes with the hash of the channel descriptor that its sender named, or "".
     """
     plan = plan_for(machine, levels=True)
     gate, window = Gate(machine), SlidingWindow(replace(plan, hops=1))
@@ -122,14 +117,7 @@ def _without_stops(plan: Plan, stretch: list[HopMoments]) -> list[list[HopMoment
 
 
 def read_healthy(path: Path, machine: MachineFile, until_s: float | None = None) -> HealthyRecording:
-    """Read a recording of the machine.
-
-    Parameters
-    ----------
-    path : Path
-        Recording (MCAP); of several machines in it, the one with the machine file's site and name is taken.
-    until_s : float, optional
-        Use only data from before this time after the first sample.
+    """Read a recording (MCAP) of the machine, up to so long after its first sample; there may be others in it.
 
     Raises
     ------
@@ -156,11 +144,8 @@ def _blocks(path: Path, machine: MachineFile) -> Iterator[tuple[SampleBlock, str
 
 def foreign_lines(recording: HealthyRecording) -> tuple[Line, ...]:
     """Lines that are neither noise nor a multiple of the speed, strongest first."""
-    hops = recording.hops
-    if not hops:
-        return ()
-    window = window_statistics(recording.plan, hops, lagged=False)
-    return steady_lines(recording.plan, hops, window)
+    plan, hops = recording.plan, recording.hops
+    return steady_lines(plan, hops, window_statistics(plan, hops, lagged=False)) if hops else ()
 
 
 def known_lines(recordings: Iterable[HealthyRecording]) -> tuple[KnownLine, ...] | None:

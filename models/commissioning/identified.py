@@ -48,14 +48,7 @@ def identify(
     progress: Callable[[int, int], None] = lambda *_: None,
     sense: Gyroscopic = "Eq. 27",
 ) -> Identified:
-    """Identify stiffness, damping and unbalance.
-
-    Parameters
-    ----------
-    machine : MachineFile
-        With masses and shaft in its ``[rotor]``.
-    windows : sequence of WindowStatistics
-        Healthy ones that do not overlap.
+    """Identify stiffness, damping and unbalance, given masses and shaft, in healthy windows that do not overlap.
 
     Raises
     ------

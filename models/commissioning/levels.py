@@ -254,12 +254,10 @@ def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progre
 
 
 def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[str]) -> Baseline:
-    """What healthy windows teach, without the rows that they do not determine well enough.
+    """What healthy windows that do not overlap teach, without the rows that they do not determine well enough.
 
     Parameters
     ----------
-    windows : sequence of WindowStatistics
-        They do not overlap.
     conditions : sequence of str
         What each belongs to, for example its recording.
 

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from scipy.special import fdtri
 
 from models.signals.block import FloatArray
@@ -58,10 +58,8 @@ class BandLevels:
     freedom: FloatArray  # (n_bands,), degrees of freedom of a mean square of Gaussian noise
 
 
-class BandReference(BaseModel):
+class BandReference(BaseModel, extra="forbid", frozen=True, strict=True):
     """Healthy levels of one channel in bands, SI units."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     edges_hz: tuple[_Level, ...]
     mean: tuple[_Level, ...]

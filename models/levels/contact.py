@@ -50,14 +50,8 @@ def contact(
         Displacements or velocities in two directions, from their mean.
     turning : ndarray, shape (2, n_samples)
         Cosine and sine of the shaft angle.
-    revolutions : float
-        How many there are.
-    rate_hz : float
-        Sampling rate.
     skew : float
         Cosine of the angle between the directions.
-    velocity : bool
-        Whether they are velocities.
 
     Returns
     -------
@@ -109,25 +103,14 @@ def contact(
 
 
 class LatestContact:
-    """What the latest hops have of a contact, of more than a window: a light one takes minutes to stand out.
-
-    Parameters
-    ----------
-    hops : int
-        Of how many.
-    """
+    """What so many latest hops have of a contact, more than a window: a light one takes minutes to stand out."""
 
     def __init__(self, hops: int) -> None:
         self._hops: deque[_Hop] = deque(maxlen=hops)
         self._state = 0
 
     def take(self, hop: FloatArray, state: int) -> FloatArray:
-        """Go on with a hop, shape (n,), in the operating state of this number; those of another are forgotten.
-
-        Returns
-        -------
-        ndarray, shape (n_hops, n)
-        """
+        """Go on with a hop, shape (n,); all of its operating state, shape (n_hops, n): others are forgotten."""
         if state != self._state:
             self._hops.clear()
         self._state = state

@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from models.levels.bands import BandLevels
 from models.signals.block import FloatArray
@@ -29,10 +29,8 @@ _FITS, _EXPLAINED = 4.0, 0.25
 windows leave up to 2.4; of changed stiffness and damping, what looks most like a gain of 6 % leaves 0.3 of it."""
 
 
-class GainReference(BaseModel):
+class GainReference(BaseModel, extra="forbid", frozen=True, strict=True):
     """Levels of the places of a healthy machine side by side."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     places: tuple[str, ...] = Field(min_length=_FEWEST_PLACES)
     edges_hz: tuple[float, ...] = Field(min_length=_FEWEST_THIRDS)  # lower edges of the third octaves that are compared
@@ -52,12 +50,7 @@ def place_of(channel: Channel) -> str:
 def learn_gains(places: Sequence[str], recordings: Sequence[Sequence[BandLevels]]) -> GainReference | None:
     """Learn from healthy recordings of one steady condition each; None where there is too little to compare.
 
-    Parameters
-    ----------
-    places : sequence of str
-        Of the columns, see `place_of`.
-    recordings : sequence of sequence of BandLevels
-        Windows that do not overlap.
+    `places` are those of the columns, see `place_of`; windows do not overlap.
     """
     names, windows = tuple(dict.fromkeys(places)), [one for recording in recordings for one in recording]
     freedom = len(windows) - len(recordings)
@@ -79,13 +72,7 @@ def learn_gains(places: Sequence[str], recordings: Sequence[Sequence[BandLevels]
 
 
 def wrong_gain(levels: BandLevels, places: Sequence[str], reference: GainReference) -> tuple[str, float] | None:
-    """Place whose sensors show too much or too little, and by which factor; None where no gain explains the window.
-
-    Parameters
-    ----------
-    places : sequence of str
-        Of the columns.
-    """
+    """Place whose sensors show too much or too little, and by which factor; None where no gain explains the window."""
     low = _edges(levels)
     at = np.abs(low[:, None] - np.array(reference.edges_hz)).argmin(axis=0)
     if tuple(dict.fromkeys(places)) != reference.places or not np.allclose(low[at], reference.edges_hz, rtol=1e-3):
@@ -119,8 +106,6 @@ def left_of_1x(logs: FloatArray, errors: FloatArray, places: Sequence[str], plac
     ----------
     logs, errors : ndarray, shape (n_channels,)
         Logarithm of 1x over that of the healthy machine, and its standard error.
-    places : sequence of str
-        Of the channels.
     """
     names = tuple(dict.fromkeys(places))
     own = np.array([[one == name for one in places] for name in names]) / [[places.count(name)] for name in names]

@@ -2,6 +2,7 @@
 
 import cmath
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -81,13 +82,7 @@ class Foreign(NamedTuple):
 
 
 class LevelJudge:
-    """Says what the levels of a machine's windows are, and on which side of their limits.
-
-    Parameters
-    ----------
-    channels : sequence of Channel
-        Of its columns.
-    """
+    """Says what the levels of a machine's windows are, and on which side of their limits; `channels` are the plan's."""
 
     def __init__(self, plan: LevelPlan, channels: Sequence[Channel], settings: LevelSettings) -> None:
         self._plan = plan
@@ -294,29 +289,19 @@ class LevelJudge:
         zone: str,
         edge: float | None,
     ) -> dict[str, _Nearest]:
-        """The limits of a channel, but for those of bands.
-
-        Parameters
-        ----------
-        zone : str
-            In which the channel is, of the standard.
-        edge : float or None
-            Limit of 1x where its vector is out of its acceptance region.
-        """
-        channel, limits = self._channels[column], dict[str, tuple[Limit, ...]]()
+        """Limits of a channel, but for those of bands; `edge` is that of a 1x vector out of its acceptance region."""
+        limits = defaultdict[str, list[Limit]](list)
         for own in self._settings.limits:
-            if own.channel == channel.name:
-                given = Limit("own limit", True, own.alert, own.danger)
-                limits[own.measure] = (*limits.get(own.measure, ()), given)
+            if own.channel == self._channels[column].name:
+                limits[own.measure].append(Limit("own limit", True, own.alert, own.danger))
         if standard is not None:
             name, measure, boundaries = standard
-            judged = Limit(f"{name}, zone {zone}", True, boundaries[1], boundaries[2], zones=boundaries)
-            limits[measure] = (*limits.get(measure, ()), judged)
+            limits[measure].append(Limit(f"{name}, zone {zone}", True, boundaries[1], boundaries[2], zones=boundaries))
         if alike is not None:
             for measure, limit in self._relatives[alike].limits[column].items():
-                limits[measure] = (*limits.get(measure, ()), limit)
+                limits[measure].append(limit)
         if edge is not None:
-            limits["x1"] = (*limits.get("x1", ()), Limit(_TURNED_OUT, False, alert=edge))
+            limits["x1"].append(Limit(_TURNED_OUT, False, alert=edge))
         return {name: _nearest_limits(name, found) for name, found in limits.items()}
 
     def _standard(self, channel: Channel, speed_rad_s: float | None) -> _Standard | None:
@@ -346,13 +331,7 @@ class LevelJudge:
     def _limited(
         self, channel: Channel, name: str, value: float, nearest: _Nearest, words: str, out: str
     ) -> LevelLimits:
-        """On which side of its limits a level is that is not well within them.
-
-        Parameters
-        ----------
-        out : str
-            What is said of a 1x vector that is out of its acceptance region.
-        """
+        """On which side of its limits a level is; `out` is said of a 1x vector out of its acceptance region."""
         danger, alert, fall = nearest.danger, nearest.alert, nearest.fall
         if danger is not None and value >= (danger.danger or math.inf):
             state, decided, what = "danger", danger, f"danger limit {danger.danger:.3g} ({danger.source})"
@@ -389,10 +368,10 @@ def _blank(plan: LevelPlan, channel: Channel) -> ChannelLevels:
 
 
 def _growth_limit(source: str, alert: float) -> _Nearest:
-    return _nearest_limits("growth", (Limit(source, False, alert),))
+    return _nearest_limits("growth", [Limit(source, False, alert)])
 
 
-def _nearest_limits(name: str, limits: tuple[Limit, ...]) -> _Nearest:
+def _nearest_limits(name: str, limits: Sequence[Limit]) -> _Nearest:
     danger = min((one for one in limits if one.danger is not None), key=lambda one: one.danger or 0.0, default=None)
     alert = min((one for one in limits if one.alert is not None), key=lambda one: one.alert or 0.0, default=None)
     fall = max((one for one in limits if one.fall is not None), key=lambda one: one.fall or 0.0, default=None)
@@ -453,13 +432,7 @@ _NO_GROWTH = {"mean", "crest", "kurtosis"}
 
 
 def growth_seen(levels: Sequence[ChannelLevels]) -> LevelGrowth:
-    """By how much every channel would have had to grow to raise an alert; the one that needs most decides.
-
-    Parameters
-    ----------
-    levels : sequence of ChannelLevels
-        Of one window, at least one.
-    """
+    """Growth that every channel of a window would need to raise an alert; the one that needs most decides."""
     nearest = [(one, _nearest(one)) for one in levels]
     unlimited = [one.channel for one, found in nearest if found is None]
     if unlimited:

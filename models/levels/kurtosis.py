@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from models.levels.bands import BEYOND_RANGE, LINE, OF_BIN, BandLevels, BandReference
 from models.signals.block import FloatArray
@@ -57,10 +57,8 @@ def random_kurtosis(square: FloatArray, fourth: FloatArray, lines: npt.NDArray[n
     return np.asarray(found, dtype=np.float64)
 
 
-class HopReference(BaseModel):
+class HopReference(BaseModel, extra="forbid", frozen=True, strict=True):
     """What a channel's hops have in the healthy windows: kurtosis, or contact (`models.levels.contact`)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     mean: float = Field(allow_inf_nan=False)
     scatter: float = Field(ge=0, allow_inf_nan=False)  # standard deviation of one hop
@@ -157,15 +155,10 @@ def without_lines(healthy: HopReference) -> HopReference:
 
 
 def departure(hops: FloatArray, reference: HopReference, n_errors: float) -> float:
-    """Difference from the healthy mean, of the newest half of a window or of all of it; 0 within its limit.
+    """Difference from the healthy mean of the newest half of a window, or all of it; 0 within so many standard errors.
 
     It has to hold without the hop that departs most: one in which the level steps, or the machine stops, holds two
     vibrations and has a large kurtosis of its own, and one knock is no state of a machine.
-
-    Parameters
-    ----------
-    n_errors : float
-        No limit is nearer than so many standard errors.
     """
 
     def beyond(kept: FloatArray) -> float:

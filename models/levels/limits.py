@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from models.levels.bands import BEYOND_RANGE, ERRORS, BandLimits, band_limits
 from models.levels.measures import WindowLevels
@@ -126,40 +127,39 @@ def _alert_from(one: ReferenceLevel, given: LevelSettings, shorter: float) -> fl
     return max(given.alert_ratio * one.mean, loudest, one.mean + ERRORS * one.error * shorter)
 
 
-@dataclass(frozen=True, slots=True)
-class AlertFrom:
-    """From where on a level of a channel raises an alert relative to its reference, as shown."""
+class GrowthToAlert(BaseModel, extra="forbid", frozen=True):
+    """What growth of one level of one channel raises an alert relative to the healthy machine."""
 
-    state: OperatingState
-    channel: Channel
+    speed_rpm: tuple[float, float] | None = Field(description="slowest and fastest window of the operating state")
+    windows: int = Field(description="healthy windows in it")
+    channel: str
     measure: str
     unit: str
-    healthy: float  # mean of the healthy windows
-    alert: float
-
-    @property
-    def growth(self) -> float | None:
-        """Of the mean healthy level, relative; None where that is nothing."""
-        return self.alert / self.healthy - 1 if self.healthy > 0 else None
+    healthy: float = Field(description="mean level of the healthy windows")
+    alert: float = Field(description="alert from here on")
+    growth: float | None = Field(description="of the mean healthy level, relative; none where that is nothing")
 
 
 def alerts_of(
     reference: LevelReference, channels: Sequence[Channel], settings: LevelSettings, hops: int
-) -> Iterator[AlertFrom]:
-    """Alert limits relative to a reference, state by state.
-
-    Parameters
-    ----------
-    hops : int
-        In the windows that are judged.
-    """
+) -> Iterator[GrowthToAlert]:
+    """Alert limits relative to a reference, for windows of so many hops, state by state."""
     for state in reference.states:
+        slowest, fastest = sorted(abs(speed) * 30 / math.pi for speed in state.speed_rad_s or (0.0, 0.0))
         for channel in channels:
             for name, one in state.levels.get(channel.name, {}).items():
-                alert = _alert_from(one, settings, _shorter(state, hops))
-                healthy, limit = (shown_level(channel, name, value) for value in (one.mean, alert))
-                peak_to_peak = channel.quantity in PEAK_TO_PEAK
-                yield AlertFrom(state, channel, name, unit_of(channel.unit, name, peak_to_peak), healthy, limit)
+                limit = _alert_from(one, settings, _shorter(state, hops))
+                healthy, alert = (shown_level(channel, name, value) for value in (one.mean, limit))
+                yield GrowthToAlert(
+                    speed_rpm=None if state.speed_rad_s is None else (slowest, fastest),
+                    windows=state.windows,
+                    channel=channel.name,
+                    measure=name,
+                    unit=unit_of(channel.unit, name, channel.quantity in PEAK_TO_PEAK),
+                    healthy=healthy,
+                    alert=alert,
+                    growth=alert / healthy - 1 if healthy > 0 else None,
+                )
 
 
 def shown_level(channel: Channel, name: str, value: float) -> float:

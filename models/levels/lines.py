@@ -55,12 +55,9 @@ def learn_lines(windows: Sequence[FloatArray], bands: BandLevels, hops: float, u
 
 
 def expected_lines(bands: BandLevels, hops: float, modes: Sequence[tuple[float, float]]) -> FloatArray:
-    """The same of a linear machine that is shaken at random, by theory; shape (n_bands,).
+    """The same by theory of a linear machine that is shaken at random; shape (n_bands,).
 
-    Parameters
-    ----------
-    modes : sequence of tuple of float
-        Natural frequency, Hz, and damping ratio of each.
+    Modes are natural frequency, Hz, and damping ratio.
     """
     bins = _bins(bands, hops)
     parts, bin_hz = np.maximum(_of_noise(bins), _OTHERS), np.diff(bands.edges_hz) / bins
@@ -93,8 +90,6 @@ def new_line(
 
     Parameters
     ----------
-    channels : sequence of str
-        Names of the columns.
     healthy_parts : mapping of str to sequence of float, shape (n_bands,)
         By channel, see `learn_lines`.
     healthy_bands : mapping of str to BandReference

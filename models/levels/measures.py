@@ -67,34 +67,17 @@ _Number = TypeVar("_Number", np.float64, np.complex128)
 
 @dataclass(frozen=True)
 class LevelPlan:
-    """Which levels a machine's channels have.
-
-    Attributes
-    ----------
-    rate_hz : float
-    quantities : tuple of Quantity
-        Of the columns that levels are taken of.
-    band_hz : tuple of float
-        Of velocities, from and to.
-    pairs : tuple of (int, int)
-        Columns of two displacements of one place.
-    skew : tuple of float
-        Cosine of the angle between their axes: 0 at right angles, as nearly all are.
-    runout : ndarray of complex, shape (n,), or None
-        What is taken out of 1x: q of x = Re{q e^{jθ}} at slow roll, for an angle that grows.
-    lines : bool
-        Whether the strongest line of every narrow band is wanted.
-    contacts : tuple of (int, int, float)
-        Columns that show a contact and their skew: the pairs, and velocities of the rotor where there is none.
-    """
+    """Which levels a machine's channels have."""
 
     rate_hz: float
-    quantities: tuple[Quantity, ...]
-    band_hz: tuple[float, float]
-    pairs: tuple[tuple[int, int], ...]
-    skew: tuple[float, ...]
+    quantities: tuple[Quantity, ...]  # of the columns that levels are taken of
+    band_hz: tuple[float, float]  # of velocities, from and to
+    pairs: tuple[tuple[int, int], ...]  # columns of two displacements of one place
+    skew: tuple[float, ...]  # cosine of the angle between their axes: 0 at right angles, as nearly all are
+    # (n,), what is taken out of 1x: q of x = Re{q e^{jθ}} at slow roll, for an angle that grows.
     runout: _ComplexArray | None = None
-    lines: bool = False
+    lines: bool = False  # whether the strongest line of every narrow band is wanted
+    # Columns that show a contact and their skew: the pairs, and velocities of the rotor where there is none.
     contacts: tuple[tuple[int, int, float], ...] = ()
 
     @property
@@ -140,10 +123,6 @@ def level_plan(
         In the order of the columns; none of them a shaft angle.
     band_hz : tuple of float
         Of velocities; cut off where the sampling rate ends it.
-    runout : ndarray of complex, optional
-        See `LevelPlan`.
-    lines : bool
-        See `LevelPlan`.
     """
     pairs = _pairs(channels, Quantity.DISPLACEMENT)
     unseen = {"bearing", "disc"} - {channels[first].location for first, _ in pairs}
@@ -179,40 +158,24 @@ def _skew(first: Channel, second: Channel) -> float:
 
 @dataclass(frozen=True, slots=True)
 class HopLevels:
-    """What one hop adds to the levels of a window.
-
-    Attributes
-    ----------
-    n_samples : int
-    sums : ndarray, shape (11, n)
-        Mean, largest deviation from it, peak to peak, fourth moment, at the first channel of a pair the largest
-        distance from the mean position; at the two of a pair the two numbers of `models.levels.contact`, where it is
-        looked for; `swell`, mean square about the mean, mean square velocity in the band, mean squares of the
-        high-frequency band and of its envelope about its mean. Nan where a quantity has none.
-    orders : ndarray of complex, shape (4, n)
-        q of x = Re{q e^{jkθ}} for the orders k of `ORDERS`; nan without a rotation. At half running speed its angle
-        means nothing: the shaft angle is known to a whole turn.
-    bands : ndarray, shape (n_bands, n)
-        Mean squares in the bands of `models.levels.bands`.
-    lines : ndarray, shape (n_bands, n)
-        Of the strongest bin of each; without rows where lines are not wanted.
-    """
+    """What one hop adds to the levels of a window."""
 
     n_samples: int
+    # (11, n): mean, largest deviation from it, peak to peak, fourth moment, at the first channel of a pair the largest
+    # distance from the mean position; at the two of a pair the two numbers of `models.levels.contact`, where it is
+    # looked for; `swell`, mean square about the mean, mean square velocity in the band, mean squares of the
+    # high-frequency band and of its envelope about its mean. Nan where a quantity has none.
     sums: FloatArray
+    # (4, n), q of x = Re{q e^{jkθ}} for the orders k of `ORDERS`; nan without a rotation. At half running speed its
+    # angle means nothing: the shaft angle is known to a whole turn.
     orders: _ComplexArray
-    bands: FloatArray
-    lines: FloatArray
+    bands: FloatArray  # (n_bands, n), mean squares in the bands of `models.levels.bands`
+    lines: FloatArray  # (n_bands, n), of the strongest bin of each; without rows where lines are not wanted
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything as named arrays."""
-        return {
-            "n_samples": np.array(self.n_samples, dtype=np.int64),
-            "sums": self.sums,
-            "orders": self.orders,
-            "bands": self.bands,
-            "lines": self.lines,
-        }
+        arrays = {name: getattr(self, name) for name in ("sums", "orders", "bands", "lines")}
+        return {"n_samples": np.array(self.n_samples, dtype=np.int64), **arrays}
 
     @classmethod
     def restored(cls, arrays: Mapping[str, np.ndarray]) -> "HopLevels":
@@ -335,40 +298,21 @@ def _acceleration_squares(
 
 @dataclass(frozen=True, slots=True)
 class WindowLevels:
-    """Levels of one window, SI units.
+    """Levels of one window, SI units."""
 
-    Attributes
-    ----------
-    values : dict of str to ndarray, shape (n,)
-        By measure; nan where a quantity has none, or the rotation is not known.
-    errors : dict of str to ndarray, shape (n,)
-        Standard errors by the scatter of the hops, of the measures that are compared with a reference (`COMPARED`);
-        empty if not asked for.
-    vectors : ndarray of complex, shape (4, n), or None
-        Mean of q of the hops at the orders, with a phase reference.
-    speed_rad_s : float or None
-        Mean speed; None where it is not known.
-    bands : BandLevels or None
-    lines : ndarray, shape (n_hops, n_bands, n), or None
-        Mean squares of the strongest bin of each band, where lines are looked for.
-    speeds_rad_s : ndarray, shape (n_hops,), or None
-        Of each hop; nan where it is not known.
-    moments : tuple of ndarray, or None
-        Of each hop, what `random_kurtosis` is made of, and the mean squares in the bands.
-    contact : ndarray, shape (n_hops, n), or None
-        Of each hop, see `models.levels.contact`.
-    """
-
-    values: Mapping[str, FloatArray]
+    values: Mapping[str, FloatArray]  # (n,) by measure; nan where a quantity has none, or the rotation is not known
+    # (n,), standard errors by the scatter of the hops, of the measures that are compared with a reference (`COMPARED`);
+    # empty if not asked for.
     errors: Mapping[str, FloatArray]
-    vectors: _ComplexArray | None
-    speed_rad_s: float | None = None
+    vectors: _ComplexArray | None  # (4, n), mean of q of the hops at the orders, with a phase reference
+    speed_rad_s: float | None = None  # mean; None where it is not known
     hops: int = 1
     bands: BandLevels | None = None
-    lines: FloatArray | None = None
-    speeds_rad_s: FloatArray | None = None
+    lines: FloatArray | None = None  # (n_hops, n_bands, n), mean squares of each band's strongest bin, if looked for
+    speeds_rad_s: FloatArray | None = None  # (n_hops,), nan where it is not known
+    # Of each hop, what `random_kurtosis` is made of, and the mean squares in the bands.
     moments: tuple[FloatArray, FloatArray, _ComplexArray, FloatArray] | None = None
-    contact: FloatArray | None = None
+    contact: FloatArray | None = None  # (n_hops, n), see `models.levels.contact`
 
     @property
     def unsteady(self) -> float:
@@ -398,8 +342,6 @@ def window_levels(
 
     Parameters
     ----------
-    hops : sequence of HopLevels
-        At least one.
     speeds_rad_s : ndarray, shape (n_hops,)
         Nan where the rotation is not known.
     phase_reference : bool

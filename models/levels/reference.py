@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Annotated, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from models.checkpoint import checked, texts
 from models.errors import CheckpointError
@@ -17,7 +17,6 @@ from models.levels.lines import expected_lines, learn_lines
 from models.levels.measures import COMPARED, WindowLevels
 from models.signals.block import FloatArray
 
-_STORED = ConfigDict(extra="forbid", frozen=True, strict=True)
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Level = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _SAME_SPEED = 0.03
@@ -29,10 +28,8 @@ QUIET = 0.25
 """Part of the running vibration below which a machine may stand; what its neighbours shake it with should be less."""
 
 
-class ReferenceLevel(BaseModel):
+class ReferenceLevel(BaseModel, extra="forbid", frozen=True, strict=True):
     """One measure of one channel over the healthy windows of an operating state, SI units."""
-
-    model_config = _STORED
 
     mean: _Level
     # Smallest and largest of them.
@@ -44,10 +41,8 @@ class ReferenceLevel(BaseModel):
     turned: _Level = 0.0  # largest distance of a window's vector from that
 
 
-class OperatingState(BaseModel):
+class OperatingState(BaseModel, extra="forbid", frozen=True, strict=True):
     """Levels at one speed."""
-
-    model_config = _STORED
 
     windows: int = Field(ge=1)
     speed_rad_s: tuple[_Finite, _Finite] | None  # slowest and fastest window; None where the speed is not known
@@ -63,10 +58,8 @@ class OperatingState(BaseModel):
     contact: dict[str, HopReference] = Field(default={}, exclude_if=lambda found: not found)
 
 
-class LevelReference(BaseModel):
+class LevelReference(BaseModel, extra="forbid", frozen=True, strict=True):
     """Healthy levels, state by state."""
-
-    model_config = _STORED
 
     source: str  # where they are from, as operators will read it
     states: tuple[OperatingState, ...] = Field(min_length=1)
@@ -112,15 +105,7 @@ def learn_levels(
     gains: GainReference | None = None,
     lines: tuple[tuple[float, float], ...] | None = None,
 ) -> LevelReference:
-    """Learn from healthy windows that do not overlap.
-
-    Parameters
-    ----------
-    channels : sequence of str
-        Names of the columns.
-    windows : sequence of WindowLevels
-        At least one.
-    """
+    """Learn from one healthy window or more that do not overlap."""
     groups: list[list[WindowLevels]] = []
     for levels in sorted(windows, key=_speed):
         if groups and _speed(levels) - _speed(groups[-1][-1]) <= _SAME_SPEED * _speed(levels):
@@ -140,18 +125,8 @@ def expected_levels(
 ) -> LevelReference:
     """What theory says of a machine with these modes that is shaken at random: no levels, for they depend on the force.
 
-    Its shaft touches nothing, and there are no lines in its bands but what is narrow of its modes.
-
-    Parameters
-    ----------
-    channels : sequence of str
-        Names of the columns.
-    levels : WindowLevels
-        Of any window of the machine.
-    speeds_rad_s : tuple of float
-        Between which it runs.
-    modes : sequence of tuple of float
-        Natural frequency, Hz, and damping ratio of each.
+    Its shaft, which runs between these speeds, touches nothing, and there are no lines in its bands but what is narrow
+    of its modes (natural frequency, Hz, and damping ratio). `levels` are those of any window of the machine.
     """
     bands, parts, nothing = {}, {}, HopReference(mean=0.0, scatter=1.0, hops=_BY_THEORY, range=_OF_MEANS)
     if levels.bands is not None and levels.lines is not None:

@@ -2,20 +2,17 @@
 
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from models.levels.zones import ZONES
 from models.mistakes import did_you_mean
 from rotorwatch.records.levels import LEVEL_MEASURES
 
-_STRICT = ConfigDict(extra="forbid", frozen=True)
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
-class LevelLimit(BaseModel):
+class LevelLimit(BaseModel, extra="forbid", frozen=True):
     """Limits of one measure of one channel, in the unit in which it is shown."""
-
-    model_config = _STRICT
 
     channel: str = Field(description="name of the channel")
     measure: str = Field(default="overall", description="which level of it")
@@ -34,10 +31,8 @@ class LevelLimit(BaseModel):
         return self
 
 
-class LevelSettings(BaseModel):
+class LevelSettings(BaseModel, extra="forbid", frozen=True):
     """Vibration levels and their limits."""
-
-    model_config = _STRICT
 
     band_hz: tuple[_Positive, _Positive] | None = Field(
         default=None,

@@ -45,7 +45,7 @@ def reference(*scales: float, speed_rad_s: float = 150.0, error: float = 0.01) -
 def test_the_growth_that_is_stated_is_the_one_that_raises_an_alert(scales: tuple[float, ...], error: float) -> None:
     healthy, settings = reference(*scales, error=error), LevelSettings()
     stated = list(alerts_of(healthy, CHANNELS, settings, 12))
-    assert {(one.channel.name, one.measure) for one in stated} == {
+    assert {(one.channel, one.measure) for one in stated} == {
         ("A", "overall"), ("A", "velocity"), ("A", "x2"), ("V", "overall"), ("V", "x2"), ("D", "overall"), ("D", "x2"),
     }  # fmt: skip
     mean = sum(scales) / len(scales)
@@ -53,13 +53,13 @@ def test_the_growth_that_is_stated_is_the_one_that_raises_an_alert(scales: tuple
         assert one.growth is not None
         for factor, state in ((0.999, "normal"), (1.001, "alert")):
             now = judged(window(mean * (1 + one.growth) * factor), healthy)
-            (channel,) = [levels for levels in now if levels.channel == one.channel.name]
+            (channel,) = [levels for levels in now if levels.channel == one.channel]
             limit = sure(channel.limit(one.measure))
             assert (limit.state == "normal") == (state == "normal")
         assert one.alert == pytest.approx(one.healthy * (1 + one.growth))
-    units = {(one.channel.name, one.measure): one.unit for one in stated}
+    units = {(one.channel, one.measure): one.unit for one in stated}
     assert (units["A", "velocity"], units["D", "x2"]) == ("mm/s rms", "um pp")
-    assert next(one for one in stated if one.channel.name == "D").healthy == pytest.approx(40 * mean)
+    assert next(one for one in stated if one.channel == "D").healthy == pytest.approx(40 * mean)
 
 
 def test_every_operating_state_has_growths_of_its_own() -> None:
@@ -68,8 +68,8 @@ def test_every_operating_state_has_growths_of_its_own() -> None:
         window(scale, speed) for speed in (100.0, 200.0) for scale in ((1.0, 1.1) if speed < 150 else (1.0, 3.0))
     ]
     found = list(alerts_of(learn_levels("commissioned", names, windows), CHANNELS, LevelSettings(), 12))
-    overall = [one for one in found if (one.channel.name, one.measure) == ("V", "overall")]
-    assert [one.state.windows for one in overall] == [2, 2]
+    overall = [one for one in found if (one.channel, one.measure) == ("V", "overall")]
+    assert [one.windows for one in overall] == [2, 2]
     assert [one.growth for one in overall] == pytest.approx([0.6, 1.25 * 3 / 2 - 1])
 
 
