@@ -52,13 +52,7 @@ class Visit:
 
 
 class AuditTrail:
-    """Writes the audit log.
-
-    Parameters
-    ----------
-    refusals_per_minute : int
-        Refused requests of one address that are written down.
-    """
+    """Writes the audit log; of refused requests so many of an address in a minute."""
 
     def __init__(
         self, log: AuditLog, refusals_per_minute: int, *, monotonic: Callable[[], float] = time.monotonic

@@ -21,7 +21,7 @@ import secrets
 import time
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from fastapi import Depends, FastAPI, Request
 from fastapi.responses import JSONResponse, Response
@@ -58,13 +58,6 @@ _SEATS_RETRY_S = 5
 
 class AccessError(RotorwatchError):
     """An application cannot be guarded the way it is built."""
-
-
-class _Known(NamedTuple):
-    """A token that was valid when it was looked up."""
-
-    record: TokenRecord
-    looked_up_s: float
 
 
 class Guard:
@@ -115,7 +108,7 @@ class Guard:
         self._secret = secrets.token_bytes(32)
         self._monotonic = monotonic
         self._limiter = Limiter(monotonic)
-        self._known: OrderedDict[bytes, _Known] = OrderedDict()
+        self._known: OrderedDict[bytes, tuple[TokenRecord, float]] = OrderedDict()  # valid ones, and when looked up
 
     def protect(self, app: FastAPI) -> None:
         """Put the middleware around an application all of whose routes are there, and serve its ``/openapi.json``.
@@ -250,15 +243,15 @@ class Guard:
             record = await run_in_threadpool(self.tokens.find, presented.token_id)
         except RotorwatchError as error:
             # Just when the database fails, operators want to look at their machines.
-            if known is not None and method in SAFE_METHODS and now_s - known.looked_up_s <= _WITHOUT_DATABASE_S:
-                return known.record
+            if known is not None and method in SAFE_METHODS and now_s - known[1] <= _WITHOUT_DATABASE_S:
+                return known[0]
             # Who asks is not known, and where the database is only concerns those who read the log.
             self._limiter.say("look-up", _log.error, "tokens cannot be looked up", why=str(error))
             raise HTTPException(
                 503, "tokens cannot be looked up in the history: nothing was done; the log says why"
             ) from error
         if record is not None and token_is_valid(record, presented, time.time_ns()):
-            self._known[presented.secret_hash] = _Known(record, now_s)
+            self._known[presented.secret_hash] = record, now_s
             self._known.move_to_end(presented.secret_hash)
             if len(self._known) > _KNOWN_TOKENS:
                 self._known.popitem(last=False)

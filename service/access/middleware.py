@@ -37,13 +37,7 @@ _log = logger(part="access")
 
 
 class AccessMiddleware:
-    """Lets requests in, or answers them with the problem.
-
-    Parameters
-    ----------
-    admit : callable
-        Gives the caller of a request, or raises `HTTPException`.
-    """
+    """Lets requests in, or answers them with the problem; `admit` gives the caller, or raises `HTTPException`."""
 
     def __init__(
         self, app: ASGIApp, *, admit: Callable[[Request], Awaitable[Caller]], trail: AuditTrail, body_bytes: int

@@ -1,6 +1,5 @@
 """Errors of the HTTP API as problem details (RFC 9457), and how OpenAPI tells of them."""
 
-from collections.abc import Awaitable, Callable
 from difflib import SequenceMatcher
 from http import HTTPStatus
 from typing import Any
@@ -118,9 +117,8 @@ def problem_answer(request: Request, status: int, detail: str, more: dict[str, A
 def add_problems(app: FastAPI) -> None:
     """Answer every error with problem details."""
 
-    async def on_http(request: Request, error: Exception) -> JSONResponse:
-        if not isinstance(error, StarletteHTTPException):
-            raise error
+    @app.exception_handler(StarletteHTTPException)
+    async def on_http(request: Request, error: StarletteHTTPException) -> JSONResponse:
         detail, headers = str(error.detail), dict(error.headers or {})
         if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
             headers["Allow"] = ", ".join(_methods(request))
@@ -135,23 +133,16 @@ def add_problems(app: FastAPI) -> None:
         response.headers.update(headers)
         return response
 
-    async def on_invalid(request: Request, error: Exception) -> JSONResponse:
-        if not isinstance(error, RequestValidationError):
-            raise error
+    @app.exception_handler(RequestValidationError)
+    async def on_invalid(request: Request, error: RequestValidationError) -> JSONResponse:
         faults = [{"field": _field(fault["loc"]), "message": masked(plainly(fault))} for fault in error.errors()]
         detail = "; ".join(f"{fault['field']}: {fault['message']}" for fault in faults)
         return problem_answer(request, 422, detail, {"errors": faults})
 
-    async def on_history(request: Request, error: Exception) -> JSONResponse:
+    @app.exception_handler(StoreError)
+    async def on_history(request: Request, error: StoreError) -> JSONResponse:
         return problem_answer(request, 503, f"the history cannot be used: {error}")
 
-    handlers: dict[type[Exception], Callable[[Request, Exception], Awaitable[JSONResponse]]] = {
-        StarletteHTTPException: on_http,
-        RequestValidationError: on_invalid,
-        StoreError: on_history,
-    }
-    for kind, handler in handlers.items():
-        app.add_exception_handler(kind, handler)
     app.add_middleware(_LastResort)
 
 

@@ -16,14 +16,7 @@ _KEYS = 10_000
 
 
 class MovingWindow:
-    """At most so many hits of a key within any minute.
-
-    Parameters
-    ----------
-    amount : int
-        Hits that are admitted in a minute.
-    keys : int
-        Keys that are remembered; beyond that, the one used longest ago is forgotten.
+    """At most `amount` hits of a key within any minute; beyond `keys`, the key used longest ago is forgotten.
 
     Examples
     --------
@@ -71,13 +64,7 @@ class TooManyStreamsError(RotorwatchError):
 
 
 class StreamSeats:
-    """Open event streams: so many of one caller, so many in all.
-
-    Parameters
-    ----------
-    per_caller, total : int
-        Most that are open at once.
-    """
+    """Open event streams: at most so many of one caller, and so many in all."""
 
     def __init__(self, per_caller: int, total: int) -> None:
         self._per_caller = per_caller

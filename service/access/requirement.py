@@ -70,13 +70,7 @@ _BASIC = _Shown(
 
 
 def requires(scope: Scope, *, in_browsers: bool = False) -> Any:
-    """Dependency that gives a `Caller` with a scope.
-
-    Parameters
-    ----------
-    in_browsers : bool
-        Whether OpenAPI shows that the token may also come as a password.
-    """
+    """Dependency that gives a `Caller` with a scope; OpenAPI shows if the token may be a password, `in_browsers`."""
     requirement = Requirement(scope)
 
     def with_token(

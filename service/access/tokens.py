@@ -16,8 +16,7 @@ from service.history.records import TokenRecord
 LONGEST_DAYS = 3650
 _ALPHABET = string.digits + string.ascii_uppercase + string.ascii_lowercase
 _ID_LENGTH = 12
-_SECRET_LENGTH = 43  # the fewest digits to base 62 that hold 256 bits
-_SECRET_BITS = 256
+_SECRET_LENGTH = 43  # the fewest of these characters that hold 256 bits
 _TOKEN = re.compile(f"rw_([0-9A-Za-z]{{{_ID_LENGTH}}})_([0-9A-Za-z]{{{_SECRET_LENGTH}}})")
 _ANY_SECRET = re.compile(f"rw_([0-9A-Za-z]{{{_ID_LENGTH}}})_[0-9A-Za-z]+")  # one that was cut off is a secret as well
 _LONGEST_NAME = 64
@@ -78,8 +77,9 @@ def new_token(name: str, scopes: Iterable[Scope], *, now_ns: int, days: int | No
         raise MachineFileError(f"scope: none is given, expected one or more of {', '.join(Scope)}")
     if days is not None and not 1 <= days <= LONGEST_DAYS:
         raise MachineFileError(f"days is {days}, expected 1 to {LONGEST_DAYS}")
-    token_id = "".join(secrets.choice(_ALPHABET) for _ in range(_ID_LENGTH))
-    secret = _base_62(secrets.randbits(_SECRET_BITS))
+    token_id, secret = (
+        "".join(secrets.choice(_ALPHABET) for _ in range(length)) for length in (_ID_LENGTH, _SECRET_LENGTH)
+    )
     record = TokenRecord(
         token_id=token_id,
         name=name,
@@ -142,11 +142,3 @@ def masked(text: str) -> str:
 
 def _hash(secret: str) -> bytes:
     return hashlib.sha256(secret.encode("ascii")).digest()
-
-
-def _base_62(number: int) -> str:
-    digits = []
-    for _ in range(_SECRET_LENGTH):
-        number, digit = divmod(number, len(_ALPHABET))
-        digits.append(_ALPHABET[digit])
-    return "".join(reversed(digits))

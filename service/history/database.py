@@ -60,19 +60,6 @@ class _Use:
 class Database:
     """Connections to one database, of the URL and time limit of a `service.history.store.Store`; for any thread.
 
-    Attributes
-    ----------
-    file : HistoryFile or None
-        None if it is no file.
-    shown : str
-        The address without the password.
-    generation : int
-        Goes up each time the history is gone on with in another file than before.
-    news : str
-        What happened to the file then.
-    lost : str
-        The same, where something of the history is not in the present file; empty if all of it is.
-
     Raises
     ------
     StoreError
@@ -85,10 +72,11 @@ class Database:
         self.is_sqlite = self._url.get_backend_name() == "sqlite"
         self.in_memory = self.is_sqlite and self._url.database == ":memory:"
         self.file = HistoryFile(Path(self._url.database or "")) if self.is_sqlite and not self.in_memory else None
-        self.shown = self._url.render_as_string(hide_password=True)
+        self.shown = self._url.render_as_string(hide_password=True)  # the address without the password
         self.answer_s = max(_ANSWER_S, 10.0 * timeout_s)
-        self.generation = 0
-        self.news = self.lost = ""
+        self.generation = 0  # goes up each time the history is gone on with in another file than before
+        self.news = ""  # what happened to the file then
+        self.lost = ""  # the same, where something of the history is not in the present file; empty if all of it is
         self._engine: Engine | None = None
         self._uses: set[_Use] = set()
         self._changed = threading.Condition()
@@ -273,12 +261,7 @@ class Database:
     def begin_anew(self, why: str, source: Connection | None) -> None:
         """Go on in the file that is at the path now, or in a new one; `lost` says what is not in it.
 
-        Parameters
-        ----------
-        why : str
-            From `astray`.
-        source : Connection or None
-            To the former file, of which all is saved if it was deleted.
+        `why` is from `astray`. All of a file that was deleted is saved by `source`, a connection to it.
 
         Raises
         ------

@@ -20,17 +20,11 @@ _HEADER = b"SQLite format 3\0"
 
 
 class HistoryFile:
-    """One file and what SQLite keeps beside it.
-
-    Attributes
-    ----------
-    damage : str
-        What SQLite found wrong with it while it was in use; whoever finds it sets it.
-    """
+    """One file and what SQLite keeps beside it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.damage = ""
+        self.damage = ""  # what SQLite found wrong with it while it was in use; whoever finds it sets it
         self._opened: dict[str, tuple[int, int] | None] = {}
 
     def make(self) -> None:
@@ -69,10 +63,7 @@ class HistoryFile:
     def rescue(self, source: Connection | None) -> bool:
         """Write what a deleted file holds into a new one at its path; say whether that is done.
 
-        Parameters
-        ----------
-        source : Connection or None
-            Opened before the file was deleted.
+        `source` was connected to it before it was deleted.
         """
         if source is None or _identity(self.path) is not None:
             return False
@@ -90,13 +81,7 @@ class HistoryFile:
         return True
 
     def set_aside(self, why: str, *, only_opened: bool = False) -> Path:
-        """Rename the file and what SQLite keeps beside it; return the new name.
-
-        Parameters
-        ----------
-        only_opened : bool
-            Leave what belongs to another file than was opened.
-        """
+        """Rename the file and what SQLite keeps beside it, or only what was opened of them; return the new name."""
         kept = self._beside(f".{why}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}")
         for end in _COMPANIONS:
             found = _identity(self._beside(end))

@@ -48,12 +48,8 @@ def write_group(
 
     Parameters
     ----------
-    claims : sequence of Claim
-        Each with an attempt.
     known : dict
         Numbers of series by machine, quantity and name, as far as they have been looked up.
-    bucket_ns : int
-        Length of the buckets that readings are added to.
 
     Returns
     -------

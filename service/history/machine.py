@@ -165,17 +165,7 @@ class MachineStore:
         limit: int = 100,
         newest_first: bool = False,
     ) -> tuple[StoredEvent, ...]:
-        """Alarm events in the order of their sequence.
-
-        Parameters
-        ----------
-        after, before : int, optional
-            Only those with a sequence greater than `after`, less than `before`.
-        since_ns, until_ns : int, optional
-            Only those with since_ns ≤ time_ns < until_ns.
-        limit, newest_first : int, bool
-            At most so many, in this order.
-        """
+        """Alarm events with after < sequence < before and since_ns ≤ time_ns < until_ns, in order, at most `limit`."""
         log = alarm_events.c
         query = select(*EVENT).where(
             log.machine_id == self._claim.machine_id,
@@ -185,7 +175,7 @@ class MachineStore:
                 for column, value in ((log.alarm, alarm), (log.kind, kind), (log.severity, severity))
                 if value is not None
             ),
-            *_past(log.sequence, after, before),
+            *_between(log.sequence, None if after is None else after + 1, before),
         )
         query = query.order_by(log.sequence.desc() if newest_first else log.sequence).limit(_checked(limit))
         return tuple(StoredEvent(*row) for row in self._database.rows(query))
@@ -193,20 +183,15 @@ class MachineStore:
     def reports(
         self, *, since_ns: int | None = None, until_ns: int | None = None, before: int | None = None, limit: int = 100
     ) -> tuple[tuple[int, StoredReport], ...]:
-        """Reports in the order of arrival, newest first, each with its number.
+        """Reports with their numbers, the latest to arrive first, of windows with since_ns ≤ end_ns < until_ns.
 
-        Parameters
-        ----------
-        since_ns, until_ns : int, optional
-            Only windows with since_ns ≤ end_ns < until_ns.
-        before, limit : int
-            At most so many reports with a smaller number: the last number of the page before.
+        At most `limit` with a number less than `before`, which is the last number of the page before.
         """
         report = reports.c
         query = select(report.number, report.start_ns, report.end_ns, report.state, report.filled, report.text)
         with self._database.reading() as connection:
             chosen = self._windows(connection, report, since_ns, until_ns)
-            query = query.where(*chosen, *_past(report.number, None, before)).order_by(report.number.desc())
+            query = query.where(*chosen, *_between(report.number, None, before)).order_by(report.number.desc())
             rows = connection.execute(query.limit(_checked(limit))).all()
         return tuple((row.number, StoredReport(*row[1:-1], unpack(row.text))) for row in rows)
 
@@ -220,14 +205,9 @@ class MachineStore:
         after: int | None = None,
         limit: int = 1000,
     ) -> tuple[Reading, ...]:
-        """Single readings in the order of arrival, oldest first.
+        """Single readings in the order of arrival, oldest first, of windows with since_ns ≤ end_ns < until_ns.
 
-        Parameters
-        ----------
-        since_ns, until_ns : int, optional
-            Only windows with since_ns ≤ end_ns < until_ns.
-        after, limit : int
-            At most so many windows with a greater number: the last number of the page before.
+        At most `limit` with a number greater than `after`, which is the last number of the page before.
         """
         window, of, found = windows.c, series.c, list[Reading]()
         named = (of.machine_id == self._claim.machine_id, of.quantity == quantity, of.name == name)
@@ -235,7 +215,8 @@ class MachineStore:
         query = query.execution_options(yield_per=min(_checked(limit), _AT_ONCE))
         with self._database.reading() as connection:
             series_id = connection.scalar(select(of.series_id).where(*named))
-            chosen = [*self._windows(connection, window, since_ns, until_ns), *_past(window.number, after, None)]
+            chosen = self._windows(connection, window, since_ns, until_ns)
+            chosen += [] if after is None else [window.number > after]
             with connection.execute(query.where(*chosen)) as windows_found:
                 for rows in windows_found.partitions():
                     places, readings = unpacked([row.readings for row in rows], READING)
@@ -283,13 +264,7 @@ class MachineStore:
             return trend(*of, quantity, names, since_ns, until_ns, _checked(points))
 
     def latest(self, quantity: str, name: str, *, span_ns: int, points: int) -> tuple[StoredBucket, ...]:
-        """Readings of one name up to the newest window, reduced like those of `downsampled`.
-
-        Parameters
-        ----------
-        span_ns : int
-            How long before the end of the newest window.
-        """
+        """Readings of one name in the last `span_ns` up to the newest window, reduced like those of `downsampled`."""
         window = windows.c
         newest = select(window.end_ns).where(window.machine_id == self._claim.machine_id)
         with self._database.reading() as connection:
@@ -325,14 +300,9 @@ class MachineStore:
         return [*chosen, column.number.between(*bounds)]
 
 
-def _between(column: ColumnElement[int], since_ns: int | None, until_ns: int | None) -> list[ColumnElement[bool]]:
-    since = [] if since_ns is None else [column >= since_ns]
-    return since if until_ns is None else [*since, column < until_ns]
-
-
-def _past(column: ColumnElement[int], after: int | None, before: int | None) -> list[ColumnElement[bool]]:
-    greater = [] if after is None else [column > after]
-    return greater if before is None else [*greater, column < before]
+def _between(column: ColumnElement[int], first: int | None, end: int | None) -> list[ColumnElement[bool]]:
+    since = [] if first is None else [column >= first]
+    return since if end is None else [*since, column < end]
 
 
 def _checked(limit: int) -> int:

@@ -16,12 +16,7 @@ _TIMEOUT_S = 5.0
 
 
 def alarms_since(database: Database, site: str, name: str, recorded_ns: int) -> tuple[StoredEvent, ...]:
-    """The latest events that a monitor committed to a machine's log, at most 10 000, in the order of their sequence.
-
-    Parameters
-    ----------
-    site, name : str
-        The machine; of one that has no history there are none.
+    """The latest events that a monitor committed to a machine's log, if any, at most 10 000, by their sequence.
 
     Raises
     ------
@@ -98,16 +93,9 @@ class AuditLog:
     def entries(
         self, before: int | None = None, limit: int = 100, *, machine: str | None = None, actor: str | None = None
     ) -> tuple[AuditRecord, ...]:
-        """Entries, newest first.
+        """Entries, newest first: at most `limit` before this number, which is the last one of the page before.
 
-        Parameters
-        ----------
-        before : int, optional
-            Only entries with a smaller number: the last number of the page before.
-        limit : int
-            At most this many, 1 or more.
-        machine, actor : str, optional
-            Only entries about this ``site/name``, by this actor.
+        Only those about this ``site/name``, and by this actor, if given.
         """
         if limit < 1:
             raise StoreError(f"audit log: {limit} entries were asked for, expected 1 or more")

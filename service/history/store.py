@@ -122,10 +122,7 @@ class Store:
     def open(self, *, set_aside: bool = False) -> None:
         """Connect, and bring the tables up to date; a store is opened once.
 
-        Parameters
-        ----------
-        set_aside : bool
-            Whether an SQLite file that is damaged is renamed and a new one begun; `lost` says so.
+        An SQLite file that is damaged is renamed and a new one begun, if it may be `set_aside`; `lost` says so.
 
         Raises
         ------

@@ -34,11 +34,6 @@ class Writer:
 
     In PostgreSQL the same connection holds the locks on the machines, so that they are let go when it breaks; then
     the mark of the owner in the table says whether another monitor has come in between.
-
-    Parameters
-    ----------
-    bucket_ns : int
-        Length of the buckets that readings are added to.
     """
 
     def __init__(

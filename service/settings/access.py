@@ -72,11 +72,6 @@ class AccessSettings(BaseModel, extra="forbid", frozen=True):
 def check_access(place: str, access: AccessSettings, host: str) -> None:
     """Check that the API is open to everybody only where everybody is on this computer.
 
-    Parameters
-    ----------
-    place : str
-        Settings file, for the message.
-
     Raises
     ------
     MachineFileError
