@@ -90,11 +90,14 @@ def excluded_lines(
         hum = _wanted(frequencies_hz, slowest_hz, fastest_hz, ())
         for n in np.flatnonzero((strength > _STANDS_OUT) & (strength == highest)):
             own = segments[at[n]] @ motions[n]
-            if _keeps_course(own) and (healthy[at[n]] or _share(segments, int(at[n]), own) <= _HUM):
-                line = ExcludedLine(float(frequencies_hz[at[n]]), step_hz * _skirt(strength[n]))
-                found.append(
-                    _with_power(line, segments, frequencies_hz, *_course(own, line, step_hz)) if hum[at[n]] else line
-                )
+            if not _keeps_course(own):
+                continue
+            line = ExcludedLine(float(frequencies_hz[at[n]]), step_hz * _skirt(strength[n]))
+            phases, centre_hz = _course(own, line, step_hz)
+            # In one lobe with a multiple of the speed, the phase says which of the two it is.
+            is_hum = hum[at[n]] and _beside_multiples(centre_hz, slowest_hz, fastest_hz, step_hz / 2)
+            if healthy[at[n]] or (is_hum and _share(segments, int(at[n]), own) <= _HUM):
+                found.append(_with_power(line, segments, frequencies_hz, phases, centre_hz) if is_hum else line)
         if turning is None:
             return tuple(found)
         rotation = _unit(turning[:, np.abs(frequencies_hz - speed_hz).argmin()])
@@ -119,21 +122,23 @@ def excluded_lines(
 def _wanted(
     frequencies_hz: FloatArray, slowest_hz: float, fastest_hz: float, known: Sequence[KnownLine] | None
 ) -> npt.NDArray[np.bool_]:
-    """Bins that are looked at: where a known line may be, or hum that is no multiple of the speed; not the rotation."""
-    near_hz = _LOBE * (frequencies_hz[1] - frequencies_hz[0])
-
-    def away_hz(order: float) -> FloatArray:
-        return np.abs(frequencies_hz - np.clip(frequencies_hz, order * slowest_hz, order * fastest_hz))
-
+    """Bins that are looked at: where a known line may be, or hum; not the rotation."""
+    step_hz = frequencies_hz[1] - frequencies_hz[0]
     if known is None:
         wanted = np.ones(frequencies_hz.size, dtype=np.bool_)
     else:
         mains = np.array(_MAINS_HZ)[:, np.newaxis]
         off = np.abs(frequencies_hz - mains * np.maximum(np.round(frequencies_hz / mains), 1.0)).min(axis=0)
-        wanted = off <= _MAINS_VARY * frequencies_hz + near_hz / (2 * _LOBE)
-        wanted &= np.minimum.reduce([away_hz(order) for order in (*_HALVES, *_ORDERS)]) > near_hz
+        wanted = off <= _MAINS_VARY * frequencies_hz + step_hz / 2
         wanted |= _near_known(frequencies_hz, (slowest_hz + fastest_hz) / 2, known)
-    return np.asarray(wanted & (away_hz(1) > near_hz))
+    away_hz = np.abs(frequencies_hz - np.clip(frequencies_hz, slowest_hz, fastest_hz))
+    return np.asarray(wanted & (away_hz > _LOBE * step_hz))
+
+
+def _beside_multiples(line_hz: float, slowest_hz: float, fastest_hz: float, by_hz: float) -> bool:
+    """Whether a line is at least so far from what multiples of the speed, and a rub, make."""
+    orders = np.array([*_HALVES, *_ORDERS])
+    return bool((np.abs(line_hz - np.clip(line_hz, orders * slowest_hz, orders * fastest_hz)) >= by_hz).all())
 
 
 def _near_known(

@@ -128,5 +128,5 @@ def new_line(
         without = " without its 1x"
     return (
         f"a line within {band_in_words((low_hz, high_hz))} ({times}{part:.0%} of the vibration of {channels[column]}"
-        f"{without}) that {unlike}: gears, blades, a bearing or a neighbouring machine"
+        f"{without}) that {unlike}: gears, blades, a bearing, mains hum or a neighbouring machine"
     )

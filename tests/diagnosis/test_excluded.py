@@ -70,6 +70,14 @@ def test_a_multiple_of_the_speed_is_no_hum_but_may_be_known() -> None:
     assert not lines_of(found, 0.0, None)
 
 
+@pytest.mark.parametrize("order", [1.5, 2.0, 4.0])
+def test_hum_in_one_lobe_with_a_multiple_of_the_speed_is_told_from_it(order: float) -> None:
+    """A motor of four poles at full load runs at 1480 rpm, and twice its speed is 0.7 Hz beside the mains."""
+    for multiple_hz in (99.7, 100.25):
+        assert lines_of(with_line(100.0), multiple_hz / order) == [100.0]
+        assert not lines_of(with_line(multiple_hz), multiple_hz / order)
+
+
 def test_what_shakes_the_machine_at_the_mains_is_no_more_hum() -> None:
     """A stator at fault, a neighbour at 3000 rpm: where the healthy machine had none, it is told as any other line."""
     for size, hum in ((0.2, [50.0]), (1.5, [50.0]), (3.0, []), (30.0, [])):
