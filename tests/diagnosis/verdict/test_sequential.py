@@ -180,6 +180,16 @@ def test_two_changes_at_once_and_one_after_the_other() -> None:
     assert abs(c_bz.since_ns / 5e9 - 50) <= 4
 
 
+def test_what_had_changed_before_the_data_is_dated_to_their_beginning() -> None:
+    """It was said to have come in the newest hops of the first window, ten seconds ago."""
+    for change in ({"k_by": -0.25}, {"c_bz": -0.3}, {"e": 1.0}):
+        test, hops = SequentialTest(SETTINGS), gaussian(SEED + 61)
+        verdicts = play(test, hops, (16, true(**change)))
+        assert [[(one.name, one.since_ns) for one in found.changed] for _, found in verdicts] == [
+            [(name, 0) for name in change]
+        ] * len(verdicts)
+
+
 def test_a_repair_is_noticed_within_seconds() -> None:
     verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 5), (20, true()), (30, true(k_by=-0.25)), (20, true()))
     late = [verdict for number, verdict in verdicts if number >= 50 + 4]
