@@ -353,8 +353,9 @@ _VAGUE = 0.33  # relative standard error beyond which a coefficient is not known
 _LEFT_OVER = 5.0  # times what chance leaves; where there are several conditions, they are compared with each other
 _DISAGREE = 4.0  # standard errors between conditions
 _RECORD = (
-    "make sure that the sensors of bearing and disc are not exchanged and that none has the wrong sign, or record a "
-    "second condition: another speed, another load, or more broadband excitation at the bearing"
+    "make sure that the sensors of bearing and disc are not exchanged, that none has the wrong sign, and that all are "
+    "sampled at once and AC-coupled alike (or state delay_us and high_pass_hz), or record a second condition: another "
+    "speed, another load, or more broadband excitation at the bearing"
 )
 
 
