@@ -7,7 +7,7 @@ from service.interchange.mapping import Format, Mapping
 from service.interchange.source import Source, SourceError
 
 _SOURCES: dict[Format, tuple[str, tuple[str, ...]]] = {
-    "csv": ("tables.CsvSource", (".csv", ".txt", ".tsv")),
+    "csv": ("tables.CsvSource", (".csv", ".txt", ".tsv", ".csv.gz", ".txt.gz")),
     "parquet": ("tables.ParquetSource", (".parquet", ".pq")),
     "npz": ("arrays.NumpySource", (".npz",)),
     "mat": ("arrays.MatlabSource", (".mat", ".h5", ".hdf5")),
@@ -24,8 +24,8 @@ DATED: tuple[Format, ...] = ("tdms", "mf4")
 
 def format_of(path: Path, mapping: Mapping) -> Format | None:
     """Format that the mapping or the end of a file's name says; None if neither does."""
-    suffixes = {suffix: kind for kind, (_, those) in _SOURCES.items() for suffix in those}
-    return mapping.format or suffixes.get(path.suffix.lower())
+    named = (kind for kind, (_, suffixes) in _SOURCES.items() if path.name.lower().endswith(suffixes))
+    return mapping.format or next(named, None)
 
 
 def open_source(path: Path, mapping: Mapping) -> Source:

@@ -15,6 +15,9 @@ from service.interchange.mapping import CsvFormat
 from service.interchange.source import CHUNK_ROWS, Array, Reference, Source, SourceError, readable
 
 _BYTES = 4 << 20
+_NUMBER = r"[-+]?[\d.,]+([eE][-+]?\d+)?"
+_GROUPED = r"[-+]?\d{1,3}([.,' ]\d{3})+([.,]\d+)?"
+"""A number such as 1,899.62, with separators of thousands."""
 _ZONED = r"(Z|[T ].*[+-]\d\d(:?\d\d)?)$"
 
 
@@ -88,6 +91,18 @@ class CsvSource(_Table):
                 return name[name.rindex(opening) + 1 : -1].strip()
         return ""
 
+    def named(self, column: str) -> str:
+        """Return the name of a column that there is; where numbers stand in its place, say so."""
+        try:
+            return super().named(column)
+        except SourceError as error:
+            if not self._form.header or not all(re.fullmatch(_NUMBER, name) for name in self.names()):
+                raise
+            raise SourceError(
+                f"{error}; the first line has numbers: without names, write header = false in [csv], and columns are "
+                "1, 2, ..."
+            ) from error
+
     def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
         """Rows, some megabytes of text at a time."""
         wanted = self._checked(columns)
@@ -155,8 +170,16 @@ class CsvSource(_Table):
                                     what += ', or ISO 8601 times with time.unit = "datetime" in the mapping'
                                 if self._form.decimal == "." and re.fullmatch(r"[-+]?\d+,\d+", cell.strip()):
                                     what += ", or decimal commas with csv.decimal in the mapping"
+                                elif re.fullmatch(_GROUPED, cell.strip()):
+                                    what += " without separators of thousands"
                                 elif name != self._time_column:
                                     what += ", or csv.missing in the mapping has what stands where there is none"
+                                if row + offset == 0 and re.search(r"[^\W\d_]", cell):
+                                    what += (
+                                        ", or csv.skip_lines_after_header in the mapping leaves lines of text out"
+                                        if self._form.header
+                                        else ", or names with csv.header = true in the mapping"
+                                    )
                                 return (
                                     f"{self.path}: row {row + offset + 1}, column {name!r}: found {cell!r}, "
                                     f"expected {what}"

@@ -2,6 +2,7 @@
 
 import csv
 import gc
+import gzip
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -34,6 +35,11 @@ def write_csv(path: Path, columns: Columns) -> None:
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+
+
+def write_packed_csv(path: Path, columns: Columns) -> None:
+    write_csv(path.with_suffix(""), columns)
+    path.write_bytes(gzip.compress(path.with_suffix("").read_bytes(), 1))
 
 
 def write_german_csv(path: Path, columns: Columns) -> None:
@@ -160,6 +166,7 @@ GERMAN = '[csv]\ndelimiter = ";"\ndecimal = ","\nskip_lines = 1\nskip_lines_afte
 TABLE = named('"table", index = 0', '"table", index = 1', '"table", index = 2')
 CASES: dict[str, tuple[str, Callable[[Path, Columns], None], str]] = {
     "csv": ("run.csv", write_csv, TIME_COLUMN + CHANNELS),
+    "csv-packed": ("run.csv.gz", write_packed_csv, TIME_COLUMN + CHANNELS),
     "csv-german": ("run.txt", write_german_csv, TIME_COLUMN + GERMAN + CHANNELS),
     "parquet": ("run.parquet", write_parquet, TIME_COLUMN + CHANNELS),
     "npz": ("run.npz", write_npz, f'{BEGIN}rate_from = "fs"\n{CHANNELS}'),
