@@ -408,9 +408,17 @@ def unit_factor(quantity: str, unit: str) -> float:
 
 
 def same_unit(quantity: str, one: str, other: str) -> bool:
-    """Whether two spellings mean one unit; a spelling that is not understood contradicts nothing."""
+    """Whether two spellings mean one unit; a spelling that is not understood contradicts nothing.
+
+    Of an overall value's unit, which may stand on a waveform by mistake, the unit itself counts.
+
+    Examples
+    --------
+    >>> same_unit("displacement", "mil", "mil pp"), same_unit("displacement", "um", "mil pp")
+    (True, False)
+    """
     known = _UNITS[quantity]
-    first, second = _spelled(one), _spelled(other)
+    first, second = _spelled(one), _spelled(_DETECTED.sub("", _spelled(other)))
     if any(second in units for units in _UNITS.values()):
         return known.get(first) == known.get(second)
     return True

@@ -89,6 +89,13 @@ class MatlabSource(_Arrays):
                 own = (_arrays_in(name, value) for name, value in content.items() if not name.startswith("__"))
                 super().__init__(path, dict(chain.from_iterable(own)))
 
+    def unit(self, column: Reference) -> str:
+        """Attribute ``unit`` or ``units`` of an HDF5 data set; MATLAB writes none."""
+        attributes = getattr(self._columns[column.column], "attrs", {})
+        stated = np.ravel(attributes.get("unit", attributes.get("units", "")))
+        one = stated[0] if stated.size == 1 else ""
+        return one.decode(errors="replace") if isinstance(one, bytes) else str(one)
+
     def close(self) -> None:
         """Close the file, if it is still open."""
         if self._file is not None:
@@ -146,6 +153,10 @@ class WavSource(_Arrays):
         """Return the rate in the header; WAV knows no start time."""
         return Timing(rate_hz=self._rate_hz)
 
+    def unit(self, column: Reference) -> str:
+        """Say that whole numbers have none, so that nobody takes them for the unit's without a word."""
+        return "of full scale" if self._columns[column.column].dtype.kind in "iu" else ""
+
     def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
         """Rows, `CHUNK_ROWS` at a time, whole numbers over full scale."""
         for chunk in super().chunks(columns):
@@ -198,6 +209,6 @@ def _collect_hdf5(found: dict[str, Any], name: str, item: Any, within: tuple[str
             if hasattr(inner, "visititems"):
                 inner.visititems(partial(_collect_within, found, place, inside))
         return
-    is_array = item.ndim in (1, 2) and item.size > 0 and item.dtype.kind in "fiu"
+    is_array = item.ndim <= 2 and item.size > 0 and item.dtype.kind in "fiu"
     if is_array and item.attrs.get("MATLAB_class", b"") != b"char":
         found[name.replace("/", ".")] = item

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -17,6 +18,8 @@ from service.interchange.source import Array, Reference, Source, SourceError, Ti
 
 _MOST_RATIO = 2000
 _LATEST_NS = 9_214_646_400 * 10**9  # 2262: nanoseconds since 1970 fill 64 bits soon after
+_ROUNDED = 1e-4
+"""How far the mapping's rate may be from the file's: WAV rounds it to whole Hz, UFF the step to six digits."""
 _YEAR_NS = 31_556_952e9
 
 
@@ -82,6 +85,7 @@ def clock_for(
     column, unit_ns = timing.time, 1e9
     if base.column is not None:
         column, unit_ns = Reference(base.column, base.index), 1.0 if base.is_datetime else time_unit_ns(base.unit)
+        _check_unit(source, column, base)
     declared = _declared_rate(source, base, timing)
     if column is None:
         if declared is None:
@@ -117,6 +121,17 @@ def clock_for(
     return Clock(path, column, unit_ns, origin_ns, first, rate_hz, ratio)
 
 
+def _check_unit(source: Source, column: Reference, base: TimeBase) -> None:
+    """Refuse a unit of time other than the file's: where it resamples, another rate would go unnoticed."""
+    stated = source.unit(column) if column.column in source.names() else ""
+    with suppress(ValueError):  # what is not understood contradicts nothing
+        if not base.is_datetime and time_unit_ns(stated) != time_unit_ns(base.unit):
+            raise SourceError(
+                f"{source.path}: column {column} is in {stated!r} according to the file, but time.unit in the mapping "
+                f"is {base.unit!r}; expected the same"
+            )
+
+
 def _declared_rate(source: Source, base: TimeBase, timing: Timing) -> float | None:
     """Rate that the mapping or the file states; both together must agree."""
     told = base.rate_hz
@@ -127,7 +142,7 @@ def _declared_rate(source: Source, base: TimeBase, timing: Timing) -> float | No
                 f"{source.path}: {base.rate_from} is {found[:5]}, expected one rate above 0 and at most 1e6 Hz"
             )
         told = float(found[0])
-    if told is not None and timing.rate_hz is not None and abs(told / timing.rate_hz - 1) > 1e-6:
+    if told is not None and timing.rate_hz is not None and abs(told / timing.rate_hz - 1) > _ROUNDED:
         raise SourceError(
             f"{source.path}: the file says {timing.rate_hz:.9g} samples per second, the mapping {told:.9g}; expected "
             "the same"

@@ -88,15 +88,16 @@ def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tupl
     if not paths:
         raise SourceError(f"{folder}: no file of a known format in it; say format = ... in the mapping")
     base, schedule = mapping.time, machine.schedule
-    if base.is_absolute or (base.start is None and any(format_of(path, mapping) in DATED for path in paths)):
+    # The files' column may run on from one to the next.
+    runs_on = base.start is not None and base.column is not None and schedule is None
+    dated = base.start is None and any(format_of(path, mapping) in DATED for path in paths)
+    if base.is_absolute or runs_on or dated:
         return _by_their_own_times(paths, mapping, machine)
     if base.start_ns is not None:
-        if schedule is None and base.column is not None:  # the files' column may run on from one to the next
-            return tuple(SnapshotFile(path, base.start_ns) for path in paths)
         if schedule is None:
             raise SourceError(
                 f"{folder}: time.start is that of the first file; expected [schedule] every_s in the machine file, "
-                "from which the times of the others follow"
+                f"from which the times of the others follow{_or_named(paths, mapping)}"
             )
         period_ns = round(schedule.every_s * 1e9)
         return tuple(
@@ -105,6 +106,12 @@ def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tupl
         )
     files = [SnapshotFile(path, start_ns) for path, start_ns in zip(paths, _named(paths, mapping), strict=True)]
     return tuple(sorted(files, key=lambda one: one.start_ns or 0))  # those without a time keep their order
+
+
+def _or_named(paths: Sequence[Path], mapping: Mapping) -> str:
+    """What else to do where a start is given and names have times."""
+    named = isinstance(mapping.time.start, datetime) and None not in _named(paths, mapping)
+    return "; or leave out time.start, and the times in their names count" if named else ""
 
 
 def _named(paths: Sequence[Path], mapping: Mapping) -> list[int | None]:
@@ -270,6 +277,7 @@ def joined(
     for piece in begun:
         end_ns = float(piece.time_ns[-1]) + step_ns
         yield piece
+    read.shortest = read.longest = read.rows
     for file in files:
         own = Read()
         with _following(first, file, mapping, machine) as (source, signals, clock):
@@ -282,7 +290,7 @@ def joined(
             if offset_ns < end_ns - step_ns / 2:
                 raise SourceError(
                     f"{file.path}: begins {lasting((end_ns - offset_ns) / 1e9)} before the end of {before.name}, "
-                    "expected the files of a folder one after the other"
+                    f"expected the files of a folder one after the other{_or_named([file.path], mapping)}"
                 )
             if offset_ns > end_ns + step_ns / 2:
                 read.gaps.append(Gap(end_ns, offset_ns, 0, file.path.name))
@@ -294,6 +302,7 @@ def joined(
         before = file.path
         read.files += 1
         read.rows += own.rows
+        read.shortest, read.longest = min(read.shortest, own.rows), max(read.longest, own.rows)
         read.filled += own.filled
         read.left_out += own.left_out
         read.gaps += [replace(gap, from_ns=gap.from_ns + offset_ns, to_ns=gap.to_ns + offset_ns) for gap in own.gaps]

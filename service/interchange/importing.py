@@ -57,6 +57,7 @@ class Imported:
     left_out: list[str]  # names in a folder that were not read: other formats, folders, links to nothing
     unusable: list[SourceError]  # what is wrong with files of a folder that were left out for it
     by_name: bool  # whether the times are those in the names of the files
+    doubts: list[str]  # units in the file that are not understood
 
 
 def import_file(
@@ -152,8 +153,9 @@ def _imported(
             raise
     by_name = path.is_dir() and mapping.time.start is None and files[0].start_ns is not None
     written = maker.written
+    left_out, doubts = _left_out(path, files), [signal.doubt for signal in signals if signal.doubt]
     return Imported(
-        path, recording, machine, mapping, clock, read, written, angle, cut_rows, _left_out(path, files), [], by_name
+        path, recording, machine, mapping, clock, read, written, angle, cut_rows, left_out, [], by_name, doubts
     )
 
 
@@ -176,11 +178,14 @@ def summary_lines(done: Imported) -> list[str]:
     """Describe an import; every gap, filled row, cut end and limit of validity is stated."""
     machine, read, written = done.machine, done.read, done.written
     several = f"{read.files} files, " if read.files > 1 else ""
+    if read.shortest < read.longest:
+        several = f"{read.files} files of {read.shortest} to {read.longest} rows, "
     lines = [
         f"{done.source}: {several}{read.rows} rows at {done.clock.rate_hz:.9g} Hz, "
         f"{len(machine.sensors)} channels of {machine.title}",
         f"{done.recording}: {written.samples} samples in {written.blocks} blocks, {rfc3339(written.start_ns)} to "
         f"{rfc3339(written.end_ns)}",
+        *done.doubts,
         *_folder_lines(done),
         *_gap_lines(done),
         *_filter_lines(done),

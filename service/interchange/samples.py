@@ -24,6 +24,7 @@ class Signal:
     integrations: int  # how often it is integrated: 0, or 1 or 2 for an accelerometer
     is_angle: bool  # whether it runs in circles
     largest: float = float(np.finfo(np.float64).max)  # what the samples of the machine can hold
+    doubt: str = ""  # that the unit in the file is not understood, and what its numbers are taken for
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +52,9 @@ class Read:
 
     files: int = 1
     rows: int = 0  # of all files together
+    # Rows of the shortest and longest of several files; 0 of one.
+    shortest: int = 0
+    longest: int = 0
     gaps: list[Gap] = field(default_factory=list)
     filled: int = 0  # rows that were put into short gaps
     left_out: int = 0  # rows left out for an empty cell, NaN, infinity or a number beyond the dtype
@@ -82,6 +86,7 @@ def signals_of(source: Source, mapping: Mapping, machine: MachineFile) -> list[S
                 (1 if channel.quantity is Quantity.VELOCITY else 2) if integrated else 0,
                 channel.quantity is Quantity.SHAFT_ANGLE,
                 float(np.finfo(machine.dtype).max),
+                _doubt(source, reference, column, channel.name, quantity),
             )
         )
     return found
@@ -208,9 +213,29 @@ class _Splitter:
         return Piece(False, time_ns, last.samples[-1] + part * change)
 
 
+def _stated(source: Source, reference: Reference) -> str:
+    return source.unit(reference) if reference.column in source.names() else ""
+
+
+def _is_raw(column: Column) -> bool:
+    return column.scale == 1 and column.scale_from is None
+
+
+def _doubt(source: Source, reference: Reference, column: Column, name: str, quantity: str) -> str:
+    """Point out a unit in the file, such as volts, that is not one of the quantity, where nothing converts it."""
+    stated = _stated(source, reference)
+    if column.unit is None or not stated or not _is_raw(column):
+        return ""
+    try:
+        unit_factor(quantity, stated)
+    except ValueError:
+        return f"note: column {reference}: the file says {stated!r}, channel {name} takes its numbers as {column.unit}"
+    return ""
+
+
 def _unit(source: Source, reference: Reference, column: Column, name: str, quantity: str) -> str:
     """Unit of a column; what the mapping says must not contradict what the file says."""
-    stated = source.unit(reference) if reference.column in source.names() else ""
+    stated = _stated(source, reference)
     if column.unit is None:
         source.named(reference.column)
         if not stated:
@@ -223,8 +248,7 @@ def _unit(source: Source, reference: Reference, column: Column, name: str, quant
         except ValueError as error:
             raise SourceError(f"{source.path}: column {reference}, channel {name}: {error}") from error
         return stated
-    raw = column.scale == 1 and column.scale_from is None
-    if stated and raw and not same_unit(quantity, column.unit, stated):
+    if stated and _is_raw(column) and not same_unit(quantity, column.unit, stated):
         raise SourceError(
             f"{source.path}: column {reference} is in {stated!r} according to the file, but in {column.unit!r} "
             f"according to the mapping of channel {name}"

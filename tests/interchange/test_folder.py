@@ -216,7 +216,8 @@ def test_a_start_alone_is_enough_where_the_time_column_runs_on(tmp_path: Path) -
     mapping = NUMBERED.replace("rate_hz = 2000.0", 'column = "t"\nunit = "ns"')
     for number in range(4):
         arrays = dict(np.load(folder / by_number(number)))
-        np.savez(folder / by_number(number), **arrays | {"t": arrays["t"] - START_NS})
+        np.savez(folder / f"{'dbca'[number]}.npz", **arrays | {"t": arrays["t"] - START_NS})
+        (folder / by_number(number)).unlink()
     _, recording = imported(tmp_path, folder, mapping)
     (found,) = stretches(recording)
     assert found.start_ns == START_NS
@@ -237,6 +238,26 @@ def test_files_that_follow_each_other_are_one_stretch(tmp_path: Path) -> None:
     _, recording = imported(tmp_path, folder, DATED)
     (found,) = stretches(recording)
     np.testing.assert_allclose(found.samples[:, 0], _COLUMNS[0][: 4 * COUNT], atol=1e-9)
+
+
+def test_files_of_different_lengths_are_told(tmp_path: Path) -> None:
+    folder = write(tmp_path / "files", by_date, range(3))
+    told = summary_lines(imported(tmp_path, folder, NAMED)[0])[0]
+    assert f"files: 3 files, {3 * COUNT} rows" in told
+    arrays = dict(np.load(folder / by_date(1)))
+    np.savez(folder / by_date(1), **{name: column[:3000] for name, column in arrays.items()})
+    told = summary_lines(imported(tmp_path, folder, NAMED)[0])[0]
+    assert f"files: 3 files of 3000 to {COUNT} rows, {2 * COUNT + 3000} rows" in told
+
+
+@pytest.mark.parametrize("rate", ["rate_hz = 2000.0", 'column = "t"\nunit = "ns"'])
+def test_where_names_have_times_a_start_that_is_too_much_is_told(tmp_path: Path, rate: str) -> None:
+    folder = write(tmp_path / "files", by_date, range(3))
+    for number in range(3):
+        arrays = dict(np.load(folder / by_date(number)))
+        np.savez(folder / by_date(number), **arrays | {"t": arrays["t"] - arrays["t"][0]})
+    with pytest.raises(SourceError, match=r"; or leave out time\.start, and the times in their names count"):
+        imported(tmp_path, folder, NUMBERED.replace("rate_hz = 2000.0", rate))
 
 
 @pytest.mark.parametrize(

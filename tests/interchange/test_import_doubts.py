@@ -1,15 +1,28 @@
 """What looks wrong in a file, though it can be read, is told: units, dates, turns, cells without a number."""
 
 import re
+import wave
 from pathlib import Path
 
+import h5py
 import nptdms
 import numpy as np
 import pytest
 
 from models.errors import MachineFileError
 from service.interchange.importing import summary_lines
-from tests.interchange.material import CHANNELS, GOOD, TEXT, fault, imported, signals, stretches, table, with_cell
+from tests.interchange.material import (
+    CHANNELS,
+    GOOD,
+    START,
+    TEXT,
+    fault,
+    imported,
+    signals,
+    stretches,
+    table,
+    with_cell,
+)
 
 
 def test_numbers_where_dates_are_told_are_named(tmp_path: Path) -> None:
@@ -84,7 +97,8 @@ def test_pulses_outside_of_the_rows_are_doubted(tmp_path: Path, unit: str, doubt
 
 
 @pytest.mark.parametrize(
-    ("header", "refused"), [("x (mil)", True), ("x [mil]", True), ("x (um)", False), ("x (1)", False)]
+    ("header", "refused"),
+    [("x (mil)", True), ("x [mil]", True), ("x (um)", False), ("x (1)", False), ("x (um pp)", False)],
 )
 def test_a_unit_in_a_header_that_is_not_the_mappings_is_refused(tmp_path: Path, header: str, refused: bool) -> None:
     mapping = TEXT.replace('"x"', f'"{header}"')
@@ -100,3 +114,59 @@ def test_a_unit_in_round_brackets_may_be_left_out_of_the_mapping(tmp_path: Path)
     source = table(tmp_path / "run.csv", GOOD, "t,x (mil),v,a")
     _, recording = imported(tmp_path, source, mapping)
     np.testing.assert_allclose(stretches(recording)[0].samples[:, 0], signals(1000)[1] * 25.4, rtol=1e-9)
+
+
+def test_an_overall_values_unit_that_is_not_the_mappings_is_refused(tmp_path: Path) -> None:
+    mapping = TEXT.replace('"x"', '"x (mil pp)"')
+    says = "is in 'mil pp' according to the file, but in 'um' according to the mapping of channel y1"
+    assert says in fault(tmp_path, GOOD, mapping, "t,x (mil pp),v,a")
+
+
+@pytest.mark.parametrize(
+    ("header", "wish", "noted"),
+    [("Volts", "", True), ("um pp", "", True), ("Volts", ", scale = 5", False), ("um", "", False)],
+)
+def test_a_unit_in_the_file_that_is_none_of_samples_is_told(
+    tmp_path: Path, header: str, wish: str, noted: bool
+) -> None:
+    source = table(tmp_path / "run.csv", GOOD, f"t,x ({header}),v,a")
+    mapping = TEXT.replace('column = "x", unit = "um"', f'column = "x ({header})", unit = "um"{wish}')
+    told = summary_lines(imported(tmp_path, source, mapping)[0])
+    says = f"note: column x ({header}): the file says {header!r}, channel y1 takes its numbers as um"
+    assert (says in told) == noted
+
+
+def test_whole_numbers_of_a_wav_file_without_a_scale_are_told(tmp_path: Path) -> None:
+    with wave.open(str(tmp_path / "run.wav"), "wb") as file:
+        file.setnchannels(3)
+        file.setsampwidth(3)
+        file.setframerate(2000)
+        file.writeframes(bytes(9 * 1000))
+    mapping = f'[time]\nstart = "{START}"\n{CHANNELS}'
+    for number, name in enumerate("xva"):
+        mapping = mapping.replace(f'"{name}"', f'"{number + 1}"')
+    told = summary_lines(imported(tmp_path, tmp_path / "run.wav", mapping)[0])
+    assert "note: column 1: the file says 'of full scale', channel y1 takes its numbers as um" in told
+
+
+def test_a_time_column_in_another_unit_than_the_mappings_is_refused(tmp_path: Path) -> None:
+    mapping = TEXT.replace('"t"', '"t (ms)"\nresample = true')
+    assert "column t (ms) is in 'ms' according to the file, but time.unit in the mapping is 's'" in fault(
+        tmp_path, GOOD, mapping, "t (ms),x,v,a"
+    )
+    imported(tmp_path, table(tmp_path / "run.csv", GOOD, "t (UTC),x,v,a"), TEXT.replace('"t"', '"t (UTC)"'))
+
+
+@pytest.mark.parametrize(("attribute", "refused"), [("mil", True), (np.bytes_(b"um"), False)])
+def test_rates_and_units_of_an_hdf5_file_are_read(tmp_path: Path, attribute: str, refused: bool) -> None:
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        for name, column in zip("xva", signals(1000)[1:], strict=True):
+            file[name] = column
+        file["x"].attrs["units"] = attribute
+        file["fs"] = 2000.0
+    mapping = TEXT.replace('column = "t"', 'rate_from = "fs"')
+    if refused:
+        with pytest.raises(MachineFileError, match="column x is in 'mil' according to the file, but in 'um'"):
+            imported(tmp_path, tmp_path / "run.h5", mapping)
+    else:
+        assert imported(tmp_path, tmp_path / "run.h5", mapping)[0].clock.rate_hz == 2000.0

@@ -65,6 +65,12 @@ def test_days_of_a_spreadsheet_are_times(tmp_path: Path) -> None:
         )),
         *((with_cell(cell), TEXT, HEADER, (f"row 737, column 'v': found {cell!r}, expected a number",))
           for cell in ("OVERLOAD", "1.2.3", "--")),
+        (with_cell('"1,899.62"'), TEXT, HEADER, ("found '1,899.62', expected a number without separators of thou",)),
+        (["s,um,mm/s,rad", *GOOD], TEXT, HEADER, ("row 1, column 't': found 's'", "csv.skip_lines_after_header in",)),
+        (GOOD, "[csv]\nheader = false\n" + TIME.replace('"t"', '"1"') + IN_ORDER, HEADER, (
+            "row 1, column '1': found 't', expected a number", "or names with csv.header = true",
+        )),
+        (GOOD[1:], TEXT, GOOD[0], ("no column 't'", "the first line has numbers", "header = false in [csv]")),
         ([row.replace(",", ";").replace(".", ",") for row in GOOD], '[csv]\ndelimiter = ";"\n' + TEXT, "t;x;v;a", (
             "row 1, column 't': found '0,0'", "or decimal commas with csv.decimal in the mapping",
         )),
@@ -108,7 +114,7 @@ def test_days_of_a_spreadsheet_are_times(tmp_path: Path) -> None:
     ],
     ids=[
         *("missing column", "zone", "unit in the name", "misspelt", "unmapped channel", "text", "two dots"),
-        *("no number", "comma", "short row", "other signs"),
+        *("no number", "thousands", "unit line", "names", "no names", "comma", "short row", "other signs"),
         *("time goes back", "no second time", "no time", "half the rate", "few decimals"),
         *("other rate", "rate contradicts times", "five decimals", "dates"),
         *("no row", "one row", "no start", "1900", "2300", "9999"),
@@ -185,6 +191,13 @@ def test_a_rate_of_the_header_that_is_none_is_refused(tmp_path: Path, rate_hz: i
     wavfile.write(tmp_path / "run.wav", rate_hz, np.zeros((1000, 3), dtype=np.float32))
     with pytest.raises(MachineFileError, match=said):
         imported(tmp_path, tmp_path / "run.wav", f'[time]\n{wish}\nstart = "{START}"\n{IN_ORDER}')
+
+
+def test_a_rate_that_the_header_rounds_is_that_of_the_mapping(tmp_path: Path) -> None:
+    wavfile.write(tmp_path / "run.wav", 17067, np.zeros((20_000, 3), dtype=np.float32))
+    mapping = f'[time]\nrate_hz = {51200 / 3!r}\nstart = "{START}"\n{IN_ORDER}'
+    done, _ = imported(tmp_path, tmp_path / "run.wav", mapping, machine(rate_hz=51200 / 3, window={}))
+    assert done.clock.rate_hz == 51200 / 3
 
 
 def test_an_index_outside_the_table_is_named(tmp_path: Path) -> None:
