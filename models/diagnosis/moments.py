@@ -27,7 +27,7 @@ from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.equaliser import Equaliser, equaliser_of
 from models.diagnosis.lagged import lagged_products
 from models.diagnosis.motion import MotionPair, motion_pairs, pair_powers
-from models.diagnosis.rotation import RotationLine, followed_speeds, rotation_line
+from models.diagnosis.rotation import RotationLine, followed_speeds, rotation_line, settled_hops
 from models.levels.contact import contact
 from models.levels.measures import CONTACT, HopLevels, LevelPlan, hop_levels, level_plan
 from models.machine import MachineFile
@@ -365,6 +365,7 @@ class Rotation:
     source: SpeedSource
     hop_speed_rad_s: FloatArray  # (n_hops,), nan where unknown
     by_hop: bool  # whether every hop has its own coefficients
+    settled: npt.NDArray[np.bool_]  # (n_hops,), whether it had one speed in each, see `settled_hops`
 
 
 @dataclass(frozen=True, slots=True)
@@ -377,19 +378,21 @@ class HopCoefficients:
 
 def rotation_of(plan: Plan, hops: tuple[HopMoments, ...]) -> Rotation:
     """Tell how fast the machine turned in each hop, and whether that was steady."""
-    hop_s = plan.hop / plan.rate_hz
+    hop_s, settled = plan.hop / plan.rate_hz, np.full(len(hops), True)
     if plan.angle_column is not None:
         speeds = [hop.turned_rad / hop_s for hop in hops]
         by_hop = max(speeds) - min(speeds) > STEADY * abs(sum(speeds) / len(speeds))
-        return Rotation("phase reference", np.array(speeds), by_hop)
+        return Rotation("phase reference", np.array(speeds), by_hop, settled)
     followed = None
     if plan.speed_rad_s is not None:
-        followed = followed_speeds(tuple(hop.line for hop in hops), hop_s)
+        lines = tuple(hop.line for hop in hops)
+        followed = followed_speeds(lines, hop_s)
     if followed is None:
-        return Rotation("unknown", np.full(len(hops), np.nan), by_hop=False)
+        return Rotation("unknown", np.full(len(hops), np.nan), by_hop=False, settled=settled)
     # The line is known in the middle of all samples of the hop; the hop's own middle comes later.
     sweep = np.array([0.0 if hop.line is None else hop.line.sweep_rad_s2 for hop in hops])
-    return Rotation("estimated", followed + sweep * plan.preamble / 2 / plan.rate_hz, by_hop=True)
+    speeds_rad_s = followed + sweep * plan.preamble / 2 / plan.rate_hz
+    return Rotation("estimated", speeds_rad_s, by_hop=True, settled=settled_hops(lines, followed, hop_s))
 
 
 def regression(zero_lag: FloatArray, n: int) -> FloatArray:

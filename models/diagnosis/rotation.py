@@ -28,6 +28,10 @@ _RESOLVED = 0.25  # part of a hop's frequency resolution below which no differen
 _COURSE = 0.03
 _FOLLOWED_PART = 0.8
 _FEW_HOPS = 6  # a stretch of as few needs lines that stand out by themselves
+# Hops in a row that one set point of a drive is held for at least, and part of a window that such rows make up.
+_HELD, _HELD_PART = 4, 0.5
+WEAKER = 0.25
+"""Strength of a hop's line over that of the window's others, up to which its speed was another one in a part of it."""
 STRONG = 15.0
 """Strength from which a line stands out by itself: noise has none like it."""
 
@@ -127,6 +131,8 @@ def _top(values: list[float]) -> float:
 def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> FloatArray | None:
     """Speed of each hop if the lines are those of one shaft; nan where a hop's largest peak was another one.
 
+    A drive that goes from one set point to another is followed at each of them.
+
     Parameters
     ----------
     lines : tuple of RotationLine or None
@@ -138,15 +144,14 @@ def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> Flo
         None if no line can be followed.
     """
     speed = np.array([np.nan if line is None else line.speed_rad_s for line in lines])
-    sweep = np.array([np.nan if line is None else line.sweep_rad_s2 for line in lines])
     strength = np.array([0.0 if line is None else line.strength for line in lines])
     with np.errstate(invalid="ignore"):
         if len(lines) < _FEW_HOPS:
             near = np.abs(speed / np.median(speed) - 1) < _NEIGHBOUR * len(lines)
             return speed if np.all(strength > STRONG) and np.all(near) else None
-        expected = (sweep[1:] + sweep[:-1]) / 2 * hop_s
-        near = np.maximum(_NEIGHBOUR * speed, _RESOLVED * 2 * np.pi / hop_s)
-        together = np.abs(np.diff(speed) - expected) < near[1:]
+        near = _near(speed, hop_s)
+        steps, swept = np.diff(speed), _swept(lines, hop_s)
+        together = np.abs(steps - swept) < near[1:]
     followed = np.append(together, False) | np.insert(together, 0, False)
     if followed.sum() > 1:
         number = np.flatnonzero(followed)
@@ -156,9 +161,46 @@ def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> Flo
         # is worse than one taken out of noise, and noise does not keep to a straight course.
         steady = np.abs(speed - _course(speed, number)) < near
         followed |= steady & (steady.mean() >= _FOLLOWED_PART)
-    if followed.mean() < _FOLLOWED_PART:
-        return None
-    return np.where(followed, speed, np.nan)
+    apart = ~(together | (np.abs(steps) < near[1:]))
+    lengths = np.diff(np.flatnonzero(np.concatenate([[True], apart, [True]])))
+    held = np.repeat(lengths >= _HELD, lengths)
+    followed = followed | held if followed.mean() >= _FOLLOWED_PART else held
+    return np.where(followed, speed, np.nan) if followed.mean() >= _HELD_PART else None
+
+
+def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, hop_s: float) -> npt.NDArray[np.bool_]:
+    """Which hops had one speed from beginning to end; all where a line does not stand out enough to tell.
+
+    Of a hop beside one with another speed a part may have had that already.
+
+    Parameters
+    ----------
+    lines : tuple of RotationLine or None
+        As for `followed_speeds`.
+    followed : ndarray, shape (n_hops,)
+        What that made of them.
+    """
+    strength = np.array([0.0 if line is None else line.strength for line in lines])
+    found = np.isfinite(followed)
+    usual = float(np.median(strength[found])) if found.any() else 0.0
+    if usual <= STRONG:
+        return np.full(found.shape, True)
+    settled = found & (strength > WEAKER * usual)
+    steps = np.diff(followed)
+    off = np.minimum(np.abs(steps), np.abs(steps - _swept(lines, hop_s)))
+    held = settled[1:] & settled[:-1] & (off < _near(followed, hop_s)[1:])
+    return np.asarray(settled & np.append(held, True) & np.insert(held, 0, True), dtype=np.bool_)
+
+
+def _near(speed: FloatArray, hop_s: float) -> FloatArray:
+    """Up to which difference two hops may be of one shaft."""
+    return np.asarray(np.maximum(_NEIGHBOUR * speed, _RESOLVED * 2 * np.pi / hop_s), dtype=np.float64)
+
+
+def _swept(lines: tuple[RotationLine | None, ...], hop_s: float) -> FloatArray:
+    """By how much the speed changes from hop to hop as their lines sweep."""
+    sweep = np.array([np.nan if line is None else line.sweep_rad_s2 for line in lines])
+    return np.asarray((sweep[1:] + sweep[:-1]) / 2 * hop_s, dtype=np.float64)
 
 
 def _course(speed: FloatArray, number: npt.NDArray[np.intp]) -> FloatArray:

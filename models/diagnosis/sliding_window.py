@@ -286,6 +286,10 @@ class SlidingWindow:
         lagged = lagged or hops is None
         return window_statistics(self.plan, tuple(self._hops)[-count:], lagged=lagged, lines=self._lines)
 
+    def settled(self) -> WindowStatistics:
+        """Statistics of the hops in which the shaft had one speed, see `WindowStatistics.settled`; there are some."""
+        return window_statistics(self.plan, tuple(self._hops), lines=self._lines, settled=True)
+
     def again(self) -> Callable[[], WindowStatistics] | None:
         """What makes the statistics of the window as it is now when they are asked for; None before it is full.
 

@@ -31,6 +31,7 @@ from models.signals.block import FloatArray
 from models.signals.waveform import Waveform, stacked_waveform
 
 _DRIFT = 0.1  # rms of a channel by which its mean may drift before that of every hop is taken out of it
+_VARIED = 0.06  # relative range of a speed found in the vibration up to which levels at its multiples are taken
 _BESIDE = 3  # bins beside a line whose mean is where the spectra go over it
 _SMOOTH = 0.5  # squares of a drift's steps from hop to hop over those about its mean, at most; of chance 2
 
@@ -69,6 +70,7 @@ class WindowStatistics:
     hop_speed_rad_s: FloatArray  # (n_hops,), mean speed of each hop (nan if unknown)
     # (n_hops,), by how much the most likely rotation stands out of each (`RotationLine.strength`); nan with an angle
     hop_strength: FloatArray
+    settled: npt.NDArray[np.bool_]  # (n_hops,), whether each had one speed that was taken out, see `settled_hops`
     hop_jump_rad: FloatArray  # (n_hops,), by which the shaft angle jumped in each (nan if unknown)
     removed_by_hop: bool  # whether the rotation was taken out hop by hop, each with its own amplitude
     # (n_bins, n): squared coherence of each bin with the angle or, where the rotation was taken out hop by hop, with
@@ -156,12 +158,17 @@ class WindowStatistics:
 
 
 def window_statistics(
-    plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool = True, lines: Sequence[KnownLine] | None = ()
+    plan: Plan,
+    hops: tuple[HopMoments, ...],
+    *,
+    lagged: bool = True,
+    lines: Sequence[KnownLine] | None = (),
+    settled: bool = False,
 ) -> WindowStatistics:
     """Add hops up to a window and take out its mean and its rotation-synchronous part.
 
     Without `lagged`, correlations are at lag zero alone, and no lines are looked for: the spectra are all that is asked
-    for. For `lines` see `excluded_lines`.
+    for. For `lines` see `excluded_lines`. With `settled`, hops that are not (see `settled_hops`) are left out.
 
     With a = (x, n) and β the least-squares coefficients of x on n over the window, the sum of
     (x - βn)(t-τ) (x - βn)ᵀ(t) is the product sum seen through the matrix (I, -β) from both sides.
@@ -169,6 +176,7 @@ def window_statistics(
     n = len(plan.states)
     n_lags = plan.lags_s.size if lagged else 1
     rotation = rotation_of(plan, hops)
+    hops, rotation = _settled(hops, rotation) if settled else (hops, rotation)
     products = np.stack([hop.products[:n_lags] for hop in hops])
     segments = np.concatenate([hop.segments.swapaxes(0, 1) for hop in hops], axis=1, dtype=np.complex128)  # bin by bin
     if rotation.source == "unknown":  # a line may ride along, but it is not the shaft's
@@ -233,6 +241,7 @@ def window_statistics(
         speed_range=speed_range,
         hop_speed_rad_s=rotation.hop_speed_rad_s,
         hop_strength=np.array([np.nan if hop.line is None else hop.line.strength for hop in hops]),
+        settled=rotation.settled,
         hop_jump_rad=angle_jumps(hops),
         removed_by_hop=rotation.by_hop,
         phase_kept=phase_kept,
@@ -248,6 +257,13 @@ def window_statistics(
         else (),
     )
     return _of_the_shaft(found, plan, by_bin)
+
+
+def _settled(hops: tuple[HopMoments, ...], rotation: Rotation) -> tuple[tuple[HopMoments, ...], Rotation]:
+    """The hops in which the shaft had one speed, and how fast it turned in them as all have told."""
+    kept, speeds = rotation.settled, rotation.hop_speed_rad_s
+    found = replace(rotation, hop_speed_rad_s=speeds[kept], settled=kept[kept])
+    return tuple(hop for hop, there in zip(hops, kept, strict=True) if there), found
 
 
 def _of_the_shaft(window: WindowStatistics, plan: Plan, by_bin: ComplexArray) -> WindowStatistics:
@@ -322,10 +338,13 @@ def levels_of(plan: Plan, hops: tuple[HopMoments, ...], *, errors: bool = True) 
     if plan.levels is None:
         raise ValueError("no levels are planned")
     rotation = rotation_of(plan, hops)
+    speeds, (slowest, fastest) = rotation.hop_speed_rad_s, _speeds(rotation, hops, plan)[1]
+    if rotation.source == "estimated" and not (rotation.settled.all() and fastest < (1 + _VARIED) * slowest):
+        speeds = np.full(len(hops), np.nan)  # what turns while the speed changes is at no multiple of what is found
     return window_levels(
         plan.levels,
         [hop.levels for hop in hops if hop.levels is not None],
-        rotation.hop_speed_rad_s,
+        speeds,
         phase_reference=rotation.source == "phase reference",
         errors=errors,
     )

@@ -7,20 +7,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from models.diagnosis.readings import Diagnosis, no_reading
+from models.diagnosis.rotation import STRONG, WEAKER
 from models.diagnosis.sensors.level import at_range_end
 from models.diagnosis.sensors.reference import Naming
 from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.verdict.calibration import agreements
 from models.diagnosis.verdict.sequential import SequentialTest
 from models.diagnosis.window import WindowStatistics
-from models.errors import CheckpointError
+from models.errors import CheckpointError, EstimationError
 from models.levels.judgement import Foreign
+from models.machine import Operation
 from models.signals.channels import Channel, with_channel_names
 from rotorwatch.records.health import HealthState
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import Equation, Opinion, Parameter, SensorFault, Shape
 
 _INSIDE = 2.0  # standard deviations of the misfit within which nothing has to be explained
+_LEAST_SETTLED = 0.5  # part of a window that is left where a drive goes from one set point to another
 
 Newest = tuple[SlidingWindow, SequentialTest]
 """Where the window is the latest, and what wants its latest hops evaluated."""
@@ -175,6 +178,62 @@ class WindowEvaluator(ABC):
         """
         if arrays:
             raise CheckpointError(f"{', '.join(sorted(arrays))} is of another diagnostician")
+
+
+def settled(place: str, window: WindowStatistics, newest: Newest | None) -> tuple[WindowStatistics, int]:
+    """The window without the hops in which a drive went from one set point to another, and how many came after them.
+
+    Without a shaft angle the rotation cannot be taken out of those. `place` is what the machine is called.
+
+    Raises
+    ------
+    EstimationError
+        If too little is left.
+    """
+    passed = np.flatnonzero(~window.settled)
+    if newest is None or not passed.size:
+        return window, window.settled.size
+    if window.settled.mean() < _LEAST_SETTLED:
+        raise EstimationError(
+            f"{place}: the speed was found and steady in {np.count_nonzero(window.settled)} of {window.settled.size} "
+            f"hops, evaluation limit {_LEAST_SETTLED:.0%}: without a shaft angle the rotation is taken out of no others"
+        )
+    return newest[0].settled(), window.settled.size - 1 - int(passed[-1])
+
+
+class LatestRotation:
+    """How strong the rotation was when it last stood out of the vibration, where there is no shaft angle."""
+
+    def __init__(self, power: float = 0.0) -> None:
+        self.power = power
+
+    def take(self, window: WindowStatistics) -> None:
+        """Go on with a window."""
+        if window.speed_source == "estimated":
+            strength = float(np.median(window.hop_strength[np.isfinite(window.hop_speed_rad_s)]))
+            self.power = strength * _noise(window) if strength > STRONG else self.power
+
+    def lost(self, window: WindowStatistics, operation: Operation) -> str:
+        """In how many hops it was found, where that is not all of them and as much of it would stand out.
+
+        A hop in which the shaft came to its speed, or left it, has a line that is much weaker than the others'.
+        """
+        found = np.isfinite(window.hop_speed_rad_s)
+        if found.any():
+            found &= window.hop_strength > WEAKER * np.median(window.hop_strength[found])
+        if window.speed_source == "phase reference" or self.power <= STRONG * _noise(window) or found.all():
+            return ""
+        slowest, fastest = (operation.speed_rpm * (1 + sign * operation.speed_tolerance) for sign in (-1, 1))
+        return (
+            f"the rotation was found in {np.count_nonzero(found)} of {found.size} hops, evaluation limit all of them: "
+            f"the speed left {slowest:.0f} to {fastest:.0f} rpm or changed too fast, or hardly any unbalance is left"
+        )
+
+
+def _noise(window: WindowStatistics) -> float:
+    """How strong a window is without its lines, as a power: over all channels, whatever their units."""
+    power = np.median(np.einsum("fii->fi", window.spectrum).real, axis=0)
+    return float(np.exp(np.log(np.maximum(power, np.finfo(float).tiny)).mean()))
 
 
 def opinion_of(deciding: Diagnosis, other: Diagnosis) -> Opinion:

@@ -5,11 +5,13 @@ which only healthy recordings are known is compared with its baseline (`Baseline
 no equation, each channel with its own healthy form.
 """
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
+from models.checkpoint import checked
 from models.commissioning.commissioned import Commissioned, Installed
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.rows import evaluable_rows
@@ -24,10 +26,10 @@ from models.errors import EstimationError
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETERS
 from rotorwatch.records.windows import Equation
-from service.monitor.evaluation import Evaluation, Newest, WindowEvaluator
+from service.monitor.evaluation import Evaluation, LatestRotation, Newest, WindowEvaluator, settled
 from service.monitor.known_machine import KnownMachineEvaluator
 
-_SHAPE = "shape"
+_SHAPE, _ROTATION = "shape", "rotation"
 # Standard deviations of the misfit: up to which a window holds no change and a shorter stretch is explained, and by how
 # many one must leave less than its share of what the window does, to be of another machine than the rest.
 _INSIDE, _LESS = 2.0, 3.0
@@ -69,7 +71,8 @@ class BaselineEvaluator(WindowEvaluator):
     needs_lags = True  # relations hold between correlation functions
 
     def __init__(self, machine: MachineFile, commissioned: Commissioned) -> None:
-        self._place = machine.title
+        self._place, self._operation = machine.title, machine.operation
+        self._rotation = LatestRotation()
         self._conditions = commissioned.conditions
         self._naming = Naming(machine.sensors)
         self._diagnosed = states_of(machine) != ()
@@ -83,6 +86,7 @@ class BaselineEvaluator(WindowEvaluator):
 
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`; outside the commissioned conditions it is not evaluable."""
+        window, latest = settled(self._place, window, newest)
         outside = self._conditions.outside(window, self._naming)
         if outside:
             here = "not evaluable here" if self._diagnosed else "levels are judged as at the nearest commissioned speed"
@@ -91,22 +95,34 @@ class BaselineEvaluator(WindowEvaluator):
         short: dict[int, Diagnosis] = {}
         if self._baselines:
             deciding = self._read(window)
+            self._rotation.take(window)
+            unfit = deciding.unexplained != "" or not deciding.evaluable or (deciding.misfit_z or 0.0) > _INSIDE
+            if unfit and self._operation is not None and (lost := self._rotation.lost(window, self._operation)):
+                raise EstimationError(f"{self._place}: {lost}")
             if newest is not None:
-                deciding, short = self._newest(*newest, deciding)
+                deciding, short = self._newest(*newest, deciding, latest)
         else:
             nothing = tuple(no_reading(name, _SHAPE, _NO_EQUATION) for name in PARAMETERS)
             deciding = Diagnosis(_SHAPE, nothing, covariance=np.zeros((0, 0)))
         shapes = () if self._shape is None or deciding.evaluable else self._shape.judge(window, self._shape_rate)
         return Evaluation(deciding, short, _row_readings(deciding, window), (), speed, shapes, alone=not short)
 
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """How strong the rotation was."""
+        return {_ROTATION: np.array(self._rotation.power)}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called, see `WindowEvaluator`."""
+        self._rotation.power = float(checked(arrays, _ROTATION, np.float64, ()))
+
     def _read(self, window: WindowStatistics) -> Diagnosis:
         clear = window.without_lines if self._lines else window
         return determined(self._baseline_for(window).diagnose(clear), window, self._length_s)
 
     def _newest(
-        self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis
+        self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int
     ) -> tuple[Diagnosis, dict[int, Diagnosis]]:
-        """What the window and its latest hops say, by how many, where it may be astride a change.
+        """What the window and its latest hops, at most so many, say, by how many, where it may be astride a change.
 
         A short stretch has little power: of a machine that no parameter describes it leaves as much less as it is
         shorter, and is then no witness for a change of parameters. So it is heard only where it is well inside and
@@ -122,7 +138,7 @@ class BaselineEvaluator(WindowEvaluator):
         before = [one for one in test.state.sums.get(1, ()) if one.end_ns > start_ns and not one.unexplained]
         if outside and not any((one.misfit_z or 0.0) <= limit for one in before):
             return deciding, found
-        for hops in test.wanted():
+        for hops in filter(latest.__ge__, test.wanted()):
             with suppress(EstimationError):  # too little data for itself, or outside the commissioned conditions
                 if (statistics := sliding.statistics(hops, lagged=True)) is not None:
                     read = self._read(statistics)

@@ -15,7 +15,6 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading
-from models.diagnosis.rotation import STRONG
 from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.verdict.calibration import beside
 from models.diagnosis.verdict.sequential import SequentialTest
@@ -25,7 +24,7 @@ from models.errors import EstimationError, UnexplainedError
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS
 from rotorwatch.records.windows import Equation, Opinion
-from service.monitor.evaluation import Evaluation, Newest, WindowEvaluator, opinion_of
+from service.monitor.evaluation import Evaluation, LatestRotation, Newest, WindowEvaluator, opinion_of, settled
 
 _LIKELIHOOD, _EXPLAINED, _SENSE, _DIRECTED, _ROTATION = "likelihood", "explained_ns", "sense", "directed", "rotation"
 _STEADY = 0.15
@@ -38,8 +37,6 @@ than another, and of what is outside the model by something else than its spectr
 _HEAVIEST, _SURELY = 20.0, 3.0
 """Times the unbalance of the machine file, in standard errors: a lost blade makes ten of it, millimetres in place of
 micrometres a thousand."""
-_WEAKER = 0.25
-"""Strength of a hop's line over that of the window's others, up to which its speed was another one in a part of it."""
 _OUTSIDE = 4.0
 """Standard deviations of the misfit from which the short stretches of a window are tested for themselves."""
 
@@ -73,8 +70,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         given = "unbalance_phase_rad" in machine.operation.model_fields_set
         self._sought = commissioned is None and not given
         self._tried_ns, self._tried_in_vain = 0, False  # end of the window that the other one was tried on
-        # Power of the rotation when it stood out of the vibration, where there is no shaft angle.
-        self._rotation = 0.0
+        self._rotation = LatestRotation()
         self._compare_with(machine)
 
     def _compare_with(self, machine: Machine) -> None:
@@ -88,10 +84,9 @@ class KnownMachineEvaluator(WindowEvaluator):
 
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`."""
+        window, latest = settled(self._machine.title, window, newest)
         speed = self._speed(window)
-        if window.speed_source == "estimated":
-            strength = float(np.median(window.hop_strength[np.isfinite(window.hop_speed_rad_s)]))
-            self._rotation = strength * _noise(window) if strength > STRONG else self._rotation
+        self._rotation.take(window)
         window = window if self.directed else replace(window, directed=False)
         deciding = self._explained(window)
         if self._open:
@@ -100,7 +95,7 @@ class KnownMachineEvaluator(WindowEvaluator):
             self.directed, window = False, replace(window, directed=False)
             deciding = self._explained(window)
         deciding = self._judged(window, self._within(deciding))
-        short = {} if newest is None else self._newest(window, *newest, deciding)
+        short = {} if newest is None else self._newest(window, *newest, deciding, latest)
         if not deciding.unexplained:
             self._explained_ns = window.end_ns
         elif self._explained_ns is None and not self._commissioned:
@@ -194,7 +189,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         """
         if not decided.unexplained and (decided.misfit_z or 0.0) <= _INSIDE:
             return decided
-        if window.speed_source != "phase reference" and (lost := self._lost(window)):
+        if lost := self._rotation.lost(window, self._machine.operation):
             raise EstimationError(f"{self._machine.title}: {lost}")
         adjoin = np.isfinite(window.hop_jump_rad[1:])  # and the shaft angle is measured
         steps = np.abs(np.diff(window.hop_speed_rad_s))[adjoin] / self._machine.operation.speed_rad_s
@@ -208,27 +203,11 @@ class KnownMachineEvaluator(WindowEvaluator):
             f"limit {most} %"
         )
 
-    def _lost(self, window: WindowStatistics) -> str:
-        """In how many hops the rotation was found, where that is not all of them and as much of it would stand out.
-
-        A hop in which the shaft came to its speed, or left it, has a line that is much weaker than the others'.
-        """
-        found, operation = np.isfinite(window.hop_speed_rad_s), self._machine.operation
-        if found.any():
-            found &= window.hop_strength > _WEAKER * np.median(window.hop_strength[found])
-        if self._rotation <= STRONG * _noise(window) or found.all():
-            return ""
-        slowest, fastest = (operation.speed_rpm * (1 + sign * operation.speed_tolerance) for sign in (-1, 1))
-        return (
-            f"the rotation was found in {np.count_nonzero(found)} of {found.size} hops, evaluation limit all of them: "
-            f"the speed left {slowest:.0f} to {fastest:.0f} rpm or changed too fast, or hardly any unbalance is left"
-        )
-
     def _newest(
-        self, window: WindowStatistics, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis
+        self, window: WindowStatistics, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int
     ) -> dict[int, Diagnosis]:
-        """What the latest hops say for themselves, by how many."""
-        wanted, evaluated = test.wanted(), {}
+        """What the latest hops, at most so many, say for themselves, by how many."""
+        wanted, evaluated = tuple(hops for hops in test.wanted() if hops <= latest), {}
         # Where the window is outside the model it may be astride a change: then its newest hops are inside.
         closely = deciding.misfit_z is not None and deciding.misfit_z > _OUTSIDE
         if deciding.unexplained:
@@ -250,7 +229,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         explained = np.array([] if self._explained_ns is None else [self._explained_ns], dtype=np.int64)
         sense = [self._open, self._opposite, self._tried_in_vain, self._tried_ns, self._sought]
         known = {_EXPLAINED: explained, _SENSE: np.array(sense, dtype=np.int64), _DIRECTED: np.array(self.directed)}
-        known |= {_ROTATION: np.array(self._rotation)}
+        known |= {_ROTATION: np.array(self._rotation.power)}
         return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | known
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -265,7 +244,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         self._likelihood, self._explained_ns = likelihood, next(iter(explained), None)
         self._open, self._opposite, self._sought = bool(still_open), bool(opposite), bool(sought)
         self._tried_ns, self._tried_in_vain, self.directed = tried_ns, bool(in_vain), directed
-        self._rotation = float(checked(arrays, _ROTATION, np.float64, ()))
+        self._rotation.power = float(checked(arrays, _ROTATION, np.float64, ()))
 
     def _speed(self, window: WindowStatistics) -> float | None:
         """Mean speed, if it is one that is evaluated."""
@@ -312,9 +291,3 @@ class KnownMachineEvaluator(WindowEvaluator):
 
 def _misfit_z(diagnosis: Diagnosis) -> float:
     return np.inf if diagnosis.unexplained or diagnosis.misfit_z is None else diagnosis.misfit_z
-
-
-def _noise(window: WindowStatistics) -> float:
-    """How strong a window is without its lines, as a power: over all channels, whatever their units."""
-    power = np.median(np.einsum("fii->fi", window.spectrum).real, axis=0)
-    return float(np.exp(np.log(np.maximum(power, np.finfo(float).tiny)).mean()))

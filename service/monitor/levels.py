@@ -129,8 +129,9 @@ class LevelWatch:
 
     def foreign(self, window: SlidingWindow, statistics: WindowStatistics, *, named: bool) -> Foreign:
         """What the latest window shows that no change of a parameter makes: a new line, or see `LevelJudge.foreign`."""
-        if self._found is None:
-            return Foreign()
+        turned = self.reference is not None and any(state.speed_rad_s for state in self.reference.states)
+        if self._found is None or not statistics.settled.all() or (turned and statistics.speed_source == "unknown"):
+            return Foreign()  # what turns with the shaft is in all that is compared
         healthy, speed_rad_s = self.reference, statistics.speed_rad_s
         if healthy is not None and healthy.lines is not None and math.isfinite(speed_rad_s) and speed_rad_s:
             lines = steady_lines(window.plan, window.hops, statistics)

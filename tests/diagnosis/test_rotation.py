@@ -1,8 +1,10 @@
 """Which hops' lines are those of one shaft."""
 
 import numpy as np
+import pytest
 
-from models.diagnosis.rotation import RotationLine, followed_speeds
+from models.diagnosis.rotation import RotationLine, followed_speeds, settled_hops
+from tests.sure import sure
 
 HOP_S, HOPS, SPEED_HZ = 5.0, 12, 15.0
 SEED = 51_900
@@ -33,3 +35,32 @@ def test_a_hop_with_another_peak_is_left_out() -> None:
 def test_what_wanders_like_the_peak_of_a_resonance_is_no_shaft() -> None:
     followed = [followed_speeds(lines(seed, 0.15, 0.02), HOP_S) is not None for seed in range(200)]
     assert np.mean(followed) < 0.05
+
+
+@pytest.mark.parametrize("to", [0.7, 0.97, 1.3])
+def test_a_drive_is_followed_at_each_set_point(to: float) -> None:
+    """Between them one hop holds no line, and its neighbours may have a part of the change."""
+    turning, lost = lines(3, 0.01, 0.02), RotationLine(2 * np.pi * 16.1, 0.0, 2.0)
+    other = tuple(RotationLine(to * one.speed_rad_s, one.sweep_rad_s2, one.strength) for one in turning)
+    drive = (*turning[:6], lost, *other[7:])
+    speeds = sure(followed_speeds(drive, HOP_S))
+    hz = np.delete(speeds, 6) / (2 * np.pi)
+    assert np.all(np.abs(hz - np.repeat([SPEED_HZ, to * SPEED_HZ], [6, 5])) < 0.06)
+    assert np.flatnonzero(~settled_hops(drive, speeds, HOP_S)).tolist() == [5, 6, 7]
+
+
+def test_a_ramp_that_the_sweeps_tell_of_is_settled_and_one_that_they_do_not_is_not() -> None:
+    rng = np.random.default_rng(SEED)
+    hz = SPEED_HZ + 0.25 * np.clip(np.arange(HOPS) - 3.5, 0.0, 6.0)  # from the fifth hop to the tenth
+    sweeps = np.repeat([0.0, 0.05, 0.0], [4, 6, 2]) + 0.001 * rng.standard_normal(HOPS)
+    ramp = tuple(RotationLine(2 * np.pi * f, 2 * np.pi * s, 30.0) for f, s in zip(hz, sweeps, strict=True))
+    speeds = sure(followed_speeds(ramp, HOP_S))
+    assert settled_hops(ramp, speeds, HOP_S).all()
+    stairs = tuple(RotationLine(one.speed_rad_s, 0.0, one.strength) for one in ramp)
+    assert not settled_hops(stairs, speeds, HOP_S)[4:10].any()
+
+
+def test_lines_that_do_not_stand_out_tell_of_no_change() -> None:
+    weak = lines(4, 0.01, 0.02, strength=8.0)
+    speeds = sure(followed_speeds((*weak[:5], None, *weak[6:]), HOP_S))
+    assert settled_hops((*weak[:5], None, *weak[6:]), speeds, HOP_S).all()
