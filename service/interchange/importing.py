@@ -37,6 +37,8 @@ _MOST_ALONE = 0.1
 """Part of the rows that may have a gap on either side."""
 _LISTED = 10
 _NAMED = 5
+_VARIED = 1.05
+"""Ratio of speeds in a file from which on both are told."""
 _FEW_SAMPLES = 4.0
 """Samples for each pulse of the keyphasor below which it may be one that comes faster."""
 
@@ -294,18 +296,22 @@ def _angle_lines(done: Imported) -> list[str]:
     operation = done.machine.operation
     if operation is not None and abs(speed_rpm / operation.speed_rpm - 1) > operation.speed_tolerance:
         lines.append(
-            f"note: the machine file says speed_rpm = {operation.speed_rpm:g}; at this speed nothing is evaluated"
+            f"note: the machine file says speed_rpm = {operation.speed_rpm:g}; at this speed nothing is diagnosed"
         )
     return lines
 
 
 def _pulse_lines(done: Imported, train: PulseTrain) -> tuple[list[str], float]:
-    passed_ns = float(np.diff(train.times)[train.known].sum())
-    turns = float(np.diff(train.counts)[train.known].sum()) / train.pulses_per_turn
+    took_ns = np.diff(train.times)[train.known]
+    turned = np.diff(train.counts)[train.known] / train.pulses_per_turn
+    passed_ns, turns = float(took_ns.sum()), float(turned.sum())
     speed_rpm = turns / passed_ns * 60e9 if turns else float("nan")
+    # Of several files or a run-up, the mean alone would be a speed at which the machine never ran.
+    least_rpm, most_rpm = np.percentile(turned / took_ns * 60e9, [1, 99]) if turns else (speed_rpm, speed_rpm)
+    between = f" mostly {least_rpm:.0f} to {most_rpm:.0f}," if most_rpm > _VARIED * least_rpm else ""
     lines = [
-        f"keyphasor: {train.times.size} pulses, {speed_rpm:.6g} rpm on average, {train.missing} missing ones bridged, "
-        f"{train.extra} extra ones left out, {train.interruptions} interruptions"
+        f"keyphasor: {train.times.size} pulses, {speed_rpm:.6g} rpm on average,{between} {train.missing} missing ones "
+        f"bridged, {train.extra} extra ones left out, {train.interruptions} interruptions"
     ]
     if done.angle.unknown:
         lines.append(f"rows left out because the shaft angle is not known: {done.angle.unknown}")

@@ -165,7 +165,9 @@ class CsvSource(_Table):
                     for name in wanted:
                         for offset, cell in enumerate(batch.column(self._label(name)).to_pylist()):
                             if cell is not None and not self._is_value(name, cell):
-                                what = "an ISO 8601 time" if self._is_datetime(name) else "a number"
+                                what = "a number"
+                                if self._is_datetime(name):
+                                    what = "an ISO 8601 time, or no time column but time.start and time.rate_hz"
                                 if name == self._time_column and not self._is_datetime(name):
                                     what += ', or ISO 8601 times with time.unit = "datetime" in the mapping'
                                 if self._form.decimal == "." and re.fullmatch(r"[-+]?\d+,\d+", cell.strip()):

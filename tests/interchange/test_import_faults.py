@@ -103,6 +103,9 @@ def test_days_of_a_spreadsheet_are_times(tmp_path: Path) -> None:
         ([f"{number / 1980.2:.5f},1.0,2.0,3.0" for number in range(1000)], TEXT, HEADER, (
             "run.csv: has 1980.22 samples per second",
         )),
+        (["31.01.2026 12:00:00,1.0,2.0,3.0"], TEXT.replace(f'start = "{START}"', 'unit = "datetime"'), HEADER, (
+            "found '31.01.2026 12:00:00', expected an ISO 8601 time, or no time column but time.start and time.rate_hz",
+        )),
         ([f"2026-01-31T12:00:{number / 2000:09.6f},1.0,2.0,3.0" for number in range(1000)], TEXT, HEADER, (
             "row 1, column 't': found '2026-01-31T12:00:00.000000', expected a number", 'time.unit = "datetime"',
         )),
@@ -116,7 +119,7 @@ def test_days_of_a_spreadsheet_are_times(tmp_path: Path) -> None:
         *("missing column", "zone", "unit in the name", "misspelt", "unmapped channel", "text", "two dots"),
         *("no number", "thousands", "unit line", "names", "no names", "comma", "short row", "other signs"),
         *("time goes back", "no second time", "no time", "half the rate", "few decimals"),
-        *("other rate", "rate contradicts times", "five decimals", "dates"),
+        *("other rate", "rate contradicts times", "five decimals", "days first", "dates"),
         *("no row", "one row", "no start", "1900", "2300", "9999"),
     ],
 )  # fmt: skip
