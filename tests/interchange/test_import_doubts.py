@@ -172,12 +172,13 @@ def test_rates_and_units_of_an_hdf5_file_are_read(tmp_path: Path, attribute: str
         assert imported(tmp_path, tmp_path / "run.h5", mapping)[0].clock.rate_hz == 2000.0
 
 
-@pytest.mark.parametrize(("faster_hz", "says"), [(20.0, ", 0 missing"), (40.0, ", mostly 1200 to 2400, 0 missing")])
-def test_speeds_that_differ_are_told_beside_their_mean(tmp_path: Path, faster_hz: float, says: str) -> None:
+@pytest.mark.parametrize("marks", [1, 15])
+@pytest.mark.parametrize(("faster_hz", "says"), [(20.3, ", 0 missing"), (40.0, ", mostly 1200 to 2400, 0 missing")])
+def test_speeds_that_differ_are_told_beside_their_mean(tmp_path: Path, faster_hz: float, says: str, marks: int) -> None:
     time, x, v, _ = signals(8000)
     turns = np.where(time < 2, 20.0, faster_hz) * (time - 2) + 0.253
-    np.savez(tmp_path / "run.npz", x=x, v=v, k=np.mod(turns, 1.0) < 0.5)
+    np.savez(tmp_path / "run.npz", x=x, v=v, k=np.mod(marks * turns, 1.0) < 0.5)
     mapping = TEXT.replace('column = "t"', "rate_hz = 2000.0").replace("theta =", "# theta =")
-    mapping += '[keyphasor]\ncolumn = "k"\nthreshold = 0.5\n'
+    mapping += f'[keyphasor]\ncolumn = "k"\nthreshold = 0.5\npulses_per_revolution = {marks}\n'
     told = "\n".join(summary_lines(imported(tmp_path, tmp_path / "run.npz", mapping)[0]))
     assert f"rpm on average{says}" in told
