@@ -355,6 +355,7 @@ def _report(
     knowledge = knowledge_of(machine)
     healthy_s = sum(one.duration_s for one in recordings)
     rotor = None if learned.identified is None or learned.machine is None else learned.machine.rotor
+    names = () if learned.identified is None else learned.identified.names
     parameters = (
         parameter_summaries(
             machine,
@@ -363,7 +364,7 @@ def _report(
             healthy_s,
             float(np.median([piece.window.duration_s for piece in pieces])),
             wished=machine.alarms.limits.raise_above if wished is None else wished,
-            identified={} if rotor is None else {name: getattr(rotor, FAULT_FIELDS[name]) for name in PARAMETERS},
+            identified={} if rotor is None else {name: getattr(rotor, FAULT_FIELDS[name]) for name in names},
         )
         if learned.diagnoses
         else ()

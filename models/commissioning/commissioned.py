@@ -222,7 +222,9 @@ class Commissioned(BaseModel, extra="forbid", frozen=True):
     why: str = Field(default="", description="why it was commissioned again")
     recordings: tuple[HealthyEntry, ...] = Field(min_length=1)
     conditions: OperatingRange
-    identified: IdentifiedRecord | None = Field(default=None, description="level partial")
+    identified: IdentifiedRecord | None = Field(
+        default=None, description="level partial; level full without a shaft angle, of the unbalance alone"
+    )
     # Left out where there is none: bundles that were made without it keep their identity.
     misfit: HealthyMisfit | None = Field(
         default=None,
@@ -262,10 +264,8 @@ class Commissioned(BaseModel, extra="forbid", frozen=True):
 
     def completed(self, machine: MachineFile) -> Machine | None:
         """The machine with its identified parameters filled in; None where nothing but a baseline is known."""
-        if isinstance(machine, Machine) and self.level is KnowledgeLevel.FULL:
-            return machine
         if self.identified is None:
-            return None
+            return machine if isinstance(machine, Machine) and self.level is KnowledgeLevel.FULL else None
         return Machine.model_validate(machine.model_dump(mode="json") | self.identified.machine)
 
 

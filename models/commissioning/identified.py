@@ -2,6 +2,9 @@
 
 The likelihood reads changes relative to a nominal rotor. Started from a guess and moved to what it reads, again and
 again, it identifies the rotor itself; what is left uncertain is shared by every later reading relative to it.
+
+Without a shaft angle the unbalance is identified by its size, where all windows are of one: of a rotor that is known
+too, for its file tells no more of the unbalance than somebody has supposed.
 """
 
 import math
@@ -23,10 +26,13 @@ from models.signals.block import FloatArray
 
 _ROUNDS = 8
 _SETTLED = 0.02  # largest relative move of a parameter in the last round
+_ONE_SIZE = 0.1  # relative difference of one unbalance from itself, at another speed or load
+_MOST_LESS = 0.9  # relative move of the unbalance in a round
 _START_DAMPING = 0.05
 _LEAST_TOLERANCE = 0.05
 _CUTOFF_HZ = (20.0, 300.0)
 _NO_STIFFNESS = 1e5  # N/m, in a plane without any sensor: nothing will be read of it
+_E = PARAMETERS.index("e")
 _SCALES = tuple(np.geomspace(0.1, 10.0, 9).tolist())
 
 
@@ -35,7 +41,7 @@ class Identified:
     """A rotor identified on healthy windows."""
 
     machine: Machine  # the machine file with every parameter filled in
-    names: tuple[str, ...]  # parameters that were identified
+    names: tuple[str, ...]  # parameters that were identified; none, or e alone, of a rotor that is known
     # (6, 6): of the identified values, in the scale of the errors (`models.diagnosis.verdict.stretch`), in the order of
     # `PARAMETERS`; zero where nothing was identified
     covariance: FloatArray
@@ -47,23 +53,30 @@ def identify(
     windows: Sequence[WindowStatistics],
     progress: Callable[[int, int], None] = lambda *_: None,
     sense: Gyroscopic = "Eq. 27",
+    *,
+    sized: bool = False,
 ) -> Identified:
     """Identify stiffness, damping and unbalance, given masses and shaft, in healthy windows that do not overlap.
+
+    Parameters
+    ----------
+    sized : bool
+        Whether the unbalance is identified without a shaft angle, too.
 
     Raises
     ------
     EstimationError
-        If no start leads to a rotor that explains the windows.
+        If no start leads to a rotor that explains the windows, or `sized` ones are not of one unbalance.
     MachineFileError
         If masses or shaft are missing.
     """
     whole = in_sense(_first_guess(machine, windows), sense)
-    diagnoses = [diagnosis for _, diagnosis in _read(whole, windows)]
+    diagnoses = [diagnosis for _, diagnosis in _read(whole, windows, sized=sized)]
     for number in range(_ROUNDS):
         together = added([stretch_of(each, w.start_ns, w.end_ns) for each, w in zip(diagnoses, windows, strict=True)])
         values, covariance = together.estimate()
         moves = dict(zip(together.names, values.tolist(), strict=True))
-        whole, diagnoses = _moved(whole, moves, windows)
+        whole, diagnoses = _moved(whole, moves, windows, sized=sized)
         progress(number + 1, _ROUNDS)
         if max(abs(value) for value in moves.values()) < _SETTLED:
             break
@@ -75,31 +88,102 @@ def identify(
         )
     total = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     total[np.ix_(together.known, together.known)] = covariance
+    if sized and not has_angle(windows):
+        total[_E, _E] = max(total[_E, _E], _size(machine, diagnoses)[1])
     as_described = in_sense(whole, sense)  # the opposite of the opposite
     return Identified(as_described, together.names, total, tuple(diagnoses))
 
 
-def _read(machine: Machine, windows: Sequence[WindowStatistics]) -> list[tuple[LikelihoodFit, Diagnosis]]:
+def compare(
+    machine: Machine,
+    windows: Sequence[WindowStatistics],
+    progress: Callable[[int, int], None] = lambda *_: None,
+    sense: Gyroscopic = "Eq. 27",
+    *,
+    sized: bool = False,
+) -> Identified:
+    """Read healthy windows of a rotor that is known; without a shaft angle, identify the size of its unbalance.
+
+    Parameters
+    ----------
+    windows : sequence of WindowStatistics
+        Healthy ones that do not overlap.
+    sized : bool
+        As for `identify`.
+
+    Raises
+    ------
+    EstimationError
+        As `identify`.
+    """
+    whole, covariance = in_sense(machine, sense), np.zeros((len(PARAMETERS), len(PARAMETERS)))
+    read = _read(whole, windows, progress, sized=sized)
+    diagnoses = tuple(diagnosis for _, diagnosis in read)
+    if not sized or has_angle(windows):
+        return Identified(machine, (), covariance, diagnoses)
+    size, covariance[_E, _E] = _size(machine, diagnoses)
+    found = whole.model_copy(update={"rotor": changed(whole.rotor, {"e": size - 1})})
+    relative = [fit.balanced(found, window, diagnosis) for (fit, diagnosis), window in zip(read, windows, strict=True)]
+    return Identified(in_sense(found, sense), ("e",), covariance, tuple(relative))
+
+
+def has_angle(windows: Sequence[WindowStatistics]) -> bool:
+    """Whether a shaft angle was measured."""
+    return any(window.synchronous is not None for window in windows)
+
+
+def _size(machine: MachineFile, diagnoses: Sequence[Diagnosis]) -> tuple[float, float]:
+    """Size of the unbalance, over the one that it was read against, and the relative variance of a later one.
+
+    Raises
+    ------
+    EstimationError
+        If it is not read in all windows, or is another one in some.
+    """
+    read = [reading for each in diagnoses for reading in each.evaluable if reading.name == "e"]
+    sizes = np.array([1 + (reading.relative_change or 0.0) for reading in read])
+    variances = np.array([(reading.standard_error or 0.0) ** 2 for reading in read])
+    if len(read) < len(diagnoses) or not np.all(sizes > 0):
+        raise EstimationError(f"{machine.title}: the unbalance is not read in all windows")
+    weights = 1 / variances
+    size = float(weights @ sizes / weights.sum())
+    if np.any(np.abs(sizes - size) > _ONE_SIZE * size):
+        raise EstimationError(f"{machine.title}: the unbalance is not of one size in all windows")
+    scatter = max(0.0, float(np.mean((sizes - size) ** 2 - variances)))
+    return size, (float(1 / weights.sum()) + scatter) / size**2
+
+
+def _read(
+    machine: Machine,
+    windows: Sequence[WindowStatistics],
+    progress: Callable[[int, int], None] = lambda *_: None,
+    *,
+    sized: bool,
+) -> list[tuple[LikelihoodFit, Diagnosis]]:
     found = []
     for window in windows:
-        fit = LikelihoodFit(machine)  # each from a cold start: healthy windows may be of different conditions
+        fit = LikelihoodFit(machine, sized=sized)  # each from a cold start: conditions may differ
         try:
             found.append((fit, fit.diagnose(window)))
         except np.linalg.LinAlgError as error:
             raise EstimationError(f"{machine.name}: {error} in a healthy window") from error
+        progress(len(found), len(windows))
     return found
 
 
 def _moved(
-    machine: Machine, moves: dict[str, float], windows: Sequence[WindowStatistics]
+    machine: Machine, moves: dict[str, float], windows: Sequence[WindowStatistics], *, sized: bool
 ) -> tuple[Machine, list[Diagnosis]]:
     """The machine with its parameters where they were read, and what is read relative to it.
 
-    Moves are in the scale of the errors; the unbalance is moved to the vectors that are read in the windows.
+    Moves are in the scale of the errors; the unbalance is moved to the vectors that are read in the windows, or, where
+    there are none, to its size.
     """
     steps = {name: math.expm1(min(1.5, max(-1.5, value))) for name, value in moves.items() if name != "e"}
+    if "e" in moves and not has_angle(windows):
+        steps["e"] = max(-_MOST_LESS, moves["e"])
     moved = machine.model_copy(update={"rotor": changed(machine.rotor, steps)})
-    read = _read(moved, windows)
+    read = _read(moved, windows, sized=sized)
     vectors = [diagnosis.unbalance for _, diagnosis in read if diagnosis.unbalance is not None]
     if "e" not in moves or not vectors:
         return moved, [diagnosis for _, diagnosis in read]

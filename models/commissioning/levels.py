@@ -26,10 +26,9 @@ from models.commissioning.commissioned import (
     IdentifiedRecord,
     KnowledgeLevel,
     OperatingRange,
-    in_sense,
 )
 from models.commissioning.healthy import HealthyRecording
-from models.commissioning.identified import identify
+from models.commissioning.identified import Identified, compare, has_angle, identify
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.lag_moments import LONGEST_LAG_STEP_S, passband_hz
 from models.diagnosis.baseline.learned import (
@@ -43,7 +42,6 @@ from models.diagnosis.baseline.learned import (
 )
 from models.diagnosis.baseline.rows import COUPLED_ROWS, ROWS, Row, evaluable_rows, formation_of, not_measured
 from models.diagnosis.baseline.stored import BaselineRecord
-from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.shape import HealthyShape, learn_shape
 from models.diagnosis.verdict.sequential import SequentialSettings
@@ -109,18 +107,37 @@ def pieces_of(recordings: Sequence[HealthyRecording]) -> list[HealthyPiece]:
     return found
 
 
-def _read_known(machine: Machine, pieces: Sequence[HealthyPiece], progress: Progress) -> tuple[Read, ...]:
-    found = []
-    for number, piece in enumerate(pieces):
-        diagnosis = LikelihoodFit(machine).diagnose(piece.window)
-        found.append((piece.recording, piece.window.end_ns, determined(diagnosis, piece.window, machine.window_data_s)))
-        progress("comparing with theory", number + 1, len(pieces))
-    return tuple(found)
+def _by_theory(
+    machine: MachineFile, pieces: Sequence[HealthyPiece], identified: Callable[..., Identified]
+) -> tuple[Identified, tuple[Read, ...], IdentifiedRecord | None]:
+    """What theory makes of the windows, with what was identified; with the unbalance unless they are not of one."""
+    try:
+        found = identified(sized=True)
+    except EstimationError:
+        if has_angle([piece.window for piece in pieces]):
+            raise
+        found = identified(sized=False)
+    stated = [
+        determined(diagnosis, piece.window, machine.window_data_s)
+        for piece, diagnosis in zip(pieces, found.diagnoses, strict=True)
+    ]
+    record = None
+    if found.names:
+        stated = [with_shared_error(each, found.covariance) for each in stated]
+        record = IdentifiedRecord(
+            machine=found.machine.model_dump(mode="json", include=set(_TABLES)),
+            names=found.names,
+            covariance=tuple(tuple(row) for row in found.covariance.tolist()),
+        )
+    read = ((piece.recording, piece.window.end_ns, each) for piece, each in zip(pieces, stated, strict=True))
+    return found, tuple(read), record
 
 
 def _learn_full(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress, sense: Gyroscopic) -> Learned:
     assert isinstance(machine, Machine)  # noqa: S101  # the level says so
-    read = _read_known(in_sense(machine, sense), pieces, progress)
+    windows = [piece.window for piece in pieces]
+    read_by = partial(compare, machine, windows, partial(progress, "comparing with theory"), sense)
+    found, read, record = _by_theory(machine, pieces, read_by)
     check = check_agreement(machine, [each for _, _, each in read], "the parameters in the machine file")
     if check.verdict == "refused":
         check = check.model_copy(
@@ -130,7 +147,7 @@ def _learn_full(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
                 "out of [rotor] what is not known for certain, so that it is identified"
             }
         )
-    return Learned((check,), read, read, machine, gyroscopic=sense, notes=_integrated(pieces, machine))
+    return Learned((check,), read, read, found.machine, record, sense, notes=_integrated(pieces, machine))
 
 
 def _elsewhere(machine: Machine, read: Sequence[Diagnosis]) -> str:
@@ -158,16 +175,8 @@ def _learn_partial(
     machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress, sense: Gyroscopic
 ) -> Learned:
     windows = [piece.window for piece in pieces]
-    identified = identify(machine, windows, partial(progress, "identifying the rotor"), sense)
-    read = tuple(
-        (piece.recording, piece.window.end_ns, with_shared_error(stated, identified.covariance))
-        for piece, diagnosis in zip(pieces, identified.diagnoses, strict=True)
-        for stated in [determined(diagnosis, piece.window, machine.window_data_s)]
-    )
-    filled = identified.machine.model_dump(mode="json", include=set(_TABLES))
-    record = IdentifiedRecord(
-        machine=filled, names=identified.names, covariance=tuple(tuple(row) for row in identified.covariance.tolist())
-    )
+    read_by = partial(identify, machine, windows, partial(progress, "identifying the rotor"), sense)
+    identified, read, record = _by_theory(machine, pieces, read_by)
     check = check_agreement(machine, [each for _, _, each in read], "the identified rotor")
     if check.verdict == "refused":
         check = check.model_copy(update={"advice": f"{check.advice}; {NO_SUCH_ROTOR}"})
@@ -361,7 +370,7 @@ def _halves(pieces: Sequence[HealthyPiece], rows: Sequence[Row]) -> tuple[Read, 
     return tuple(sorted(found, key=lambda read: read[1]))
 
 
-_BY_THEORY = MappingProxyType({KnowledgeLevel.FULL: _learn_full, KnowledgeLevel.PARTIAL: _learn_partial})
+_OF_LEVEL = MappingProxyType({KnowledgeLevel.FULL: _learn_full, KnowledgeLevel.PARTIAL: _learn_partial})
 
 
 def learn(level: KnowledgeLevel, machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
@@ -376,7 +385,7 @@ def learn(level: KnowledgeLevel, machine: MachineFile, pieces: Sequence[HealthyP
     errors: list[EstimationError] = []
     for sense in get_args(Gyroscopic):
         try:
-            found.append(_BY_THEORY[level](machine, pieces, progress, sense))
+            found.append(_OF_LEVEL[level](machine, pieces, progress, sense))
         except EstimationError as error:
             errors.append(error)
             continue

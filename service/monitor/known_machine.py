@@ -60,6 +60,8 @@ class KnownMachineEvaluator(WindowEvaluator):
         identified = None if commissioned is None else commissioned.identified
         self._shared = None if identified is None else identified.matrix()
         self._commissioned = commissioned is not None
+        # Of a machine that was commissioned, too, where that has found how large its unbalance is.
+        self._sized = commissioned is None or (identified is not None and "e" in identified.names)
         self._healthy_misfit = None if commissioned is None else commissioned.misfit
         self.needs_lags = bundle is not None  # only the networks look at lags
         self._explained_ns: int | None = None
@@ -75,7 +77,7 @@ class KnownMachineEvaluator(WindowEvaluator):
 
     def _compare_with(self, machine: Machine) -> None:
         self._machine, bundle = machine, self._bundle
-        self._likelihood = LengthFits(machine, sized=not self._commissioned)
+        self._likelihood = LengthFits(machine, sized=self._sized)
         others: list[Diagnostician] = []
         if bundle is not None and bundle.amortised is not None:
             others.append(NetworkDiagnostician(machine, bundle.amortised))
@@ -238,7 +240,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         still_open, opposite, in_vain, tried_ns, sought = checked(arrays, _SENSE, np.int64, (5,)).tolist()
         directed = bool(checked(arrays, _DIRECTED, np.bool_, ()))
         machine = in_sense(self._given, "opposite" if opposite else "Eq. 27")
-        likelihood = LengthFits(machine, sized=not self._commissioned)
+        likelihood = LengthFits(machine, sized=self._sized)
         likelihood.restore(unprefixed(_LIKELIHOOD, arrays))
         self._compare_with(machine)
         self._likelihood, self._explained_ns = likelihood, next(iter(explained), None)

@@ -74,6 +74,20 @@ def with_samples(stream_: Sequence[SampleBlock], samples: FloatArray) -> list[Sa
     return found
 
 
+def without_angle(stream_: Sequence[SampleBlock]) -> list[SampleBlock]:
+    column = LAB.descriptor.states.index("theta")
+    return [replace(block, samples=np.delete(block.samples, column, axis=1)) for block in stream_]
+
+
+def blind(machine: MachineFile, times: float = 1.0) -> MachineFile:
+    """The machine without its shaft angle, and with a file that is wrong about the unbalance."""
+    assert machine.rotor is not None
+    e_m = machine.rotor.e_m
+    rotor = machine.rotor.model_copy(update={"e_m": None if e_m is None else times * e_m})
+    sensors = tuple(one for one in LAB.sensors if one.name != "theta")
+    return machine.model_copy(update={"sensors": sensors, "rotor": rotor, "operation": LAB.operation})
+
+
 def humming(stream_: Sequence[SampleBlock], line_hz: float, bearing_m: float = 60e-6) -> list[SampleBlock]:
     """The same on a floor that another machine shakes: the disc moves by 60 um."""
     samples = samples_of(stream_)

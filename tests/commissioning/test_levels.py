@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from models.alarm_names import LEVEL
 from models.commissioning.commission import Commissioning
 from models.commissioning.commissioned import (
     FILE,
@@ -27,11 +28,13 @@ from models.errors import BundleError
 from models.machine import MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETERS
 from service.monitor.evaluators import evaluator_for
+from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import (
     LAB,
     NOTHING,
     PARTIAL,
+    blind,
     commissioned,
     elsewhere,
     healthy,
@@ -41,7 +44,9 @@ from tests.commissioning.rotor_kit import (
     windows_of,
     with_lines,
     with_samples,
+    without_angle,
 )
+from tests.service.monitor.test_monitor import feed
 from tests.sure import sure
 
 HEALTHY_S = 90.0
@@ -100,6 +105,31 @@ def test_lines_of_the_healthy_machine_hide_no_rotor() -> None:
         known, true = (getattr(machine.rotor, FAULT_FIELDS[name]) for machine in (sure(made.machine), LAB))
         assert abs(np.log(known / true)) < 4 * error, name
     assert Commissioned.model_validate_json(found.model_dump_json()) == found
+
+
+@pytest.mark.parametrize("machine", [blind(LAB, 1.5), pytest.param(blind(PARTIAL), marks=pytest.mark.slow)])
+def test_without_a_shaft_angle_the_unbalance_is_identified_by_its_size(machine: MachineFile) -> None:
+    """Whatever the file says of it; what grows later is named."""
+    made = commissioned(machine, recording(machine, without_angle(stream(130.0, 5_570_010))))
+    identified = sure(sure(made.commissioned).identified)
+    error = np.sqrt(identified.matrix()[PARAMETERS.index("e"), PARAMETERS.index("e")])
+    assert "e" in identified.names
+    assert 0.002 < error < 0.03
+    assert sure(made.machine).rotor.e_m == pytest.approx(LAB.rotor.e_m, rel=4 * error)
+    doubled = without_angle(stream(100.0, 5_570_011, Event(at_s=65.0, parameter="e", relative_change=1.0)))
+    windows, events = feed(MachineMonitor(Installed(machine, None, made.commissioned)), doubled)
+    assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {"e"}
+    first = next(window for window in windows if window.filled == 1.0)
+    assert abs(sure(next(one for one in first.parameters if one.name == "e").z)) < 4
+
+
+def test_without_a_shaft_angle_windows_of_two_unbalances_identify_none() -> None:
+    machine = blind(LAB)
+    sizes = [(), (Event(at_s=0.0, parameter="e", relative_change=0.5),)]
+    two = [recording(machine, without_angle(stream(70.0, 5_570_020 + n, *one))) for n, one in enumerate(sizes)]
+    made = commissioned(machine, *two)
+    assert sure(made.commissioned).identified is None
+    assert "e" not in [one.name for one in made.report.parameters if one.evaluable]
 
 
 @pytest.mark.slow

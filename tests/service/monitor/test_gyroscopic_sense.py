@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from models.commissioning.commissioned import Installed, in_sense
+from models.machine import MachineFile
 from models.physics.rotor import PARAMETERS, system_A
 from models.signals.block import SampleBlock
 from rotorwatch.records.health import HealthState
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
-from tests.commissioning.rotor_kit import LAB, PARTIAL, commissioned, healthy, recording
+from tests.commissioning.rotor_kit import LAB, PARTIAL, blind, commissioned, healthy, recording, without_angle
 from tests.service.monitor.test_monitor import feed
 
 SEED = 4_900_001
@@ -61,10 +62,12 @@ def test_what_has_changed_from_the_beginning_is_named() -> None:
     assert windows[-1].misfit_z < 4.0
 
 
-@pytest.mark.parametrize("level", ["full", "partial"])
-def test_a_commissioning_finds_the_sense(level: str) -> None:
-    machine = LAB if level == "full" else PARTIAL
-    made = commissioned(machine, recording(machine, stream(75.0, SEED + 2)))
+@pytest.mark.parametrize("machine", [LAB, PARTIAL, blind(LAB)])
+def test_a_commissioning_finds_the_sense(machine: MachineFile) -> None:
+    """With a shaft angle or without, where the size of the unbalance is identified."""
+    seen = stream(75.0, SEED + 2)
+    seen = seen if "theta" in machine.descriptor.states else tuple(without_angle(seen))
+    made = commissioned(machine, recording(machine, seen))
     assert made.commissioned is not None, made.report.summary
     assert made.commissioned.gyroscopic == "opposite"
     assert "rise with the speed" in made.report.notes[-1]
