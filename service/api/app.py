@@ -79,13 +79,7 @@ _Change = Annotated[_Sizeable | None, Query(description="relative change to be f
 
 
 def create_app(service: ServiceView, guard: Guard) -> FastAPI:
-    """Build the application.
-
-    Parameters
-    ----------
-    service : ServiceView
-        Where the answers come from; called from the server's worker threads.
-    """
+    """Build the application; its answers come from `service`, called from the server's worker threads."""
     app = DescribedApp(
         title="rotorwatch",
         version=__version__,

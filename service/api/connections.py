@@ -130,15 +130,10 @@ class HttpConnections:
         Addresses and networks of whom only the connections in all count.
     plain : bool
         Whether a refusal can be said in plain HTTP.
-
-    Attributes
-    ----------
-    exhausted : int
-        How often a connection could not be accepted because the process or the system has no file left.
     """
 
     def __init__(self, settings: HttpSettings, most: int, proxies: Sequence[str], *, plain: bool = True) -> None:
-        self.exhausted = 0
+        self.exhausted = 0  # how often none could be accepted because the process or the system has no file left
         self._most = most
         self._per_address = settings.connections_per_address
         self._longest_s = {

@@ -19,7 +19,7 @@ from service.analysis.recorded_window import recorded_window
 from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.machine import MachineSnapshots
 from service.api.routes.recordings import found_recording
-from service.api.views import ServiceView
+from service.api.views import ServiceView, time_query
 from service.monitor.evaluators import evaluator_for
 from service.monitor.reports import identity_of
 from service.recordings.replay.source import RecordingSource
@@ -50,17 +50,9 @@ _Replay = Annotated[
         description="id of a replay of this machine, for its recordings, machine file and what it read",
     ),
 ]
-_From = Annotated[
-    int | None,
-    Query(ge=0, le=2**63 - 1, description="of recorded samples, those from this time on, ns since 1970-01-01 UTC"),
-]
-_To = Annotated[
-    int | None,
-    Query(ge=0, le=2**63 - 1, description="of recorded samples, those before this time, ns since 1970-01-01 UTC"),
-]
-_End = Annotated[
-    int | None, Query(ge=0, le=2**63 - 1, description="of recorded samples, what ends then, ns since 1970-01-01 UTC")
-]
+_From = Annotated[int | None, time_query("of recorded samples, those from this time on")]
+_To = Annotated[int | None, time_query("of recorded samples, those before this time")]
+_End = Annotated[int | None, time_query("of recorded samples, what ends then")]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """What the HTTP API needs to know about the service and its machines, and the arguments its routes share."""
 
 import re
-from typing import Annotated, Protocol
+from typing import Annotated, Any, Protocol
 
 from fastapi import Depends, HTTPException, Path, Query, Request
 from pydantic import AfterValidator
@@ -19,8 +19,15 @@ _LATEST_NS = 2**63 - 1
 
 SiteName = Annotated[str, Path(description="site of the machine", examples=["demo"])]
 MachineName = Annotated[str, Path(description="name of the machine", examples=["lab"])]
-SinceNs = Annotated[int | None, Query(ge=0, le=_LATEST_NS, description="from this time on, ns since 1970-01-01 UTC")]
-UntilNs = Annotated[int | None, Query(ge=0, le=_LATEST_NS, description="before this time, ns since 1970-01-01 UTC")]
+
+
+def time_query(text: str) -> Any:
+    """A query argument that is a time, of which `text` says what it is for."""
+    return Query(ge=0, le=_LATEST_NS, description=f"{text}, ns since 1970-01-01 UTC")
+
+
+SinceNs = Annotated[int | None, time_query("from this time on")]
+UntilNs = Annotated[int | None, time_query("before this time")]
 Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many")]
 
 
@@ -73,8 +80,8 @@ def check_alarm(view: Monitored, name: str, status: int) -> None:
     """
     levels = [f"{LEVEL}{channel.name}" for channel in view.machine.sensors if channel.quantity != "shaft_angle"]
     if name not in ALARMS and name not in levels:
-        place = f"{view.machine.site}/{view.machine.name}"
-        raise HTTPException(status, f"{place}: no alarm {name[:80]}; there are: {', '.join((*ALARMS, *levels))}")
+        there = ", ".join((*ALARMS, *levels))
+        raise HTTPException(status, f"{view.machine.title}: no alarm {name[:80]}; there are: {there}")
 
 
 async def _in_path(request: Request, site: SiteName, machine: MachineName) -> Monitored:

@@ -56,15 +56,7 @@ class Placement(Protocol):
 
 
 class OneComputer:
-    """Processes of this computer; streams come to them through this process.
-
-    Parameters
-    ----------
-    link : LinkSettings
-        Where streams come in.
-    waits : bool
-        A shard that does not keep up slows down the source.
-    """
+    """Processes of this computer; streams come in through this one, which, if it `waits`, slows sources down."""
 
     def __init__(self, link: LinkSettings, *, waits: bool) -> None:
         self._link, self._waits = link, waits

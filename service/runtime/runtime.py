@@ -201,18 +201,8 @@ def readiness_of(
 ) -> Readiness:
     """Judge.
 
-    Recordings and webhooks are stated and no reason: machines are monitored, and alarms kept, all the same.
-
-    Parameters
-    ----------
-    history_open : bool
-        The database is connected and its tables are up to date.
-    history_trouble : str
-        Why it cannot be written; empty if it can.
-    history_lost : str
-        Why something of it is gone; empty if nothing is.
-    failing_webhooks : sequence of str
-        Name, and what is wrong.
+    Recordings and webhooks are stated and no reason: machines are monitored, and alarms kept, all the same. What is
+    wrong with the history is empty if nothing is.
     """
     reasons = []
     if not session_open:

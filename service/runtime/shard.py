@@ -34,15 +34,10 @@ _log = logger(part="shard")
 def run_shard(settings: ServiceSettings, inner: LinkSettings, connection: Connection) -> None:
     """Monitor machines until something comes over the connection, or its other end is closed.
 
+    The settings are those of this process alone; by `inner` it connects to the one that serves its machines.
+
     Says over it, once it is ready, what its answers and news are known by, or else the kind of an error and, after a
     line break, what is wrong; and at its end what was lost.
-
-    Parameters
-    ----------
-    settings : ServiceSettings
-        With the machines of this process alone.
-    inner : LinkSettings
-        How to connect to the process that serves them.
     """
     prepare_memory()
     configure_logging(settings.log)

@@ -169,13 +169,7 @@ class _Shard:
 
 
 class Shards:
-    """All of the processes.
-
-    Parameters
-    ----------
-    store : Store
-        Opened by whoever has it, between `connect` and `open`.
-    """
+    """All of the processes; the store is opened by whoever has it, between `connect` and `open`."""
 
     def __init__(
         self, settings: ServiceSettings, count: int, placement: Placement, store: Store, listener: Listener

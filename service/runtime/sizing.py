@@ -166,15 +166,7 @@ def sized(
     cores: int,
     busy: float,
 ) -> Size:
-    """Size of a plant.
-
-    Parameters
-    ----------
-    cores : int
-        Of a computer.
-    busy : float
-        How much of them may be used in the mean, up to 1.
-    """
+    """Size of a plant, on computers of so many cores, of which a part `busy`, up to 1, may be used in the mean."""
     a_day = _DAY_S / kind.hop_s
     stream_mb_s = kind.channels * kind.rate_hz * _SAMPLE_BYTES / 1e6
     recorded_gb_day = stream_mb_s * costs.recording.compressed * _DAY_S / 1e3

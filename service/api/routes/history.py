@@ -261,9 +261,8 @@ def _check_read(view: Monitored, quantity: str, names: Sequence[str], field: str
     expected = f"one of {', '.join(known)}"
     if quantity == "level":
         expected = f"CHANNEL:MEASURE of the channels {', '.join(channels)} and measures {', '.join(LEVEL_MEASURES)}"
-    place = f"{view.machine.site}/{view.machine.name}"
     asked = f"{field} is {min(unknown)!r}, but it has no such {quantity}"
-    raise HTTPException(422, f"{place}: {asked}; expected {expected}")
+    raise HTTPException(422, f"{view.machine.title}: {asked}; expected {expected}")
 
 
 def _listed(name: str, texts: Sequence[str], **cursors: int | None) -> Response:

@@ -40,10 +40,7 @@ def add_recording_routes(
 ) -> None:
     """Add the routes; without an index they answer with a problem that names the setting.
 
-    Parameters
-    ----------
-    monitored : callable
-        The machines, as site/machine, of which there may be no recordings yet.
+    Of machines that are `monitored`, as site/machine, there may be no recordings yet.
     """
     common: dict[str, Any] = {"tags": ["recordings"], "dependencies": [guard.read]}
 

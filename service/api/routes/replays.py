@@ -58,15 +58,7 @@ class NoOrder(Record):
 
 
 class ReplayRequests:
-    """Takes requests for replays and turns them into jobs.
-
-    Parameters
-    ----------
-    settings : ServiceSettings
-        Machines that may be named, endpoints for paced replays, and whether replays may be started.
-    index : Catalogue or None
-        Recordings; None if no directory for them is set.
-    """
+    """Takes requests for replays of what is in the index, if there is one, and turns them into jobs."""
 
     def __init__(self, settings: ServiceSettings, index: Catalogue | None) -> None:
         self._settings = settings

@@ -60,10 +60,7 @@ class WindowAnswers:
     ) -> Response:
         """What is kept if it still holds, else what is made.
 
-        Parameters
-        ----------
-        of_samples : bool
-            Whether the newest samples are in it: then it holds for a second only, and not across a gap.
+        With the newest samples in it an answer holds for a second only, and not across a gap.
         """
         with self._lock:
             kept = self._kept[question] = self._kept.pop(question) if question in self._kept else _Kept()

@@ -35,12 +35,7 @@ class Answer:
 
 
 def answer_of(status: int, headers: Mapping[str, str], now_s: float) -> Answer:
-    """The meaning of an HTTP answer.
-
-    Parameters
-    ----------
-    headers : mapping
-        With ``retry-after``, if the receiver has sent it.
+    """The meaning of an HTTP answer; of its headers, ``retry-after`` counts.
 
     Examples
     --------

@@ -63,8 +63,6 @@ class Dispatcher:
         told from a new one (-1).
     now_ns : callable
         Time of day, nanoseconds since 1970 UTC; only for the status.
-    chance : callable
-        Random numbers between 0 and 1.
     """
 
     def __init__(
@@ -140,13 +138,7 @@ class Dispatcher:
         )
 
     def turn(self) -> float:
-        """Make the next attempt, if one is due.
-
-        Returns
-        -------
-        float
-            Seconds until there is something to do again, unless there is news before; 0 if there may be at once.
-        """
+        """Make the next attempt, if one is due; seconds until there is something to do, 0 if there may be at once."""
         now_s = self._clock()
         if self._disabled:
             return _QUIET_S
@@ -168,22 +160,18 @@ class Dispatcher:
         try:
             while not self._stopping:
                 self._news.clear()
-                pause_s = self._guarded_turn()
+                try:
+                    pause_s = self.turn()
+                except Exception as error:
+                    # Nothing narrower: an error in one attempt must not be the end of telling anybody of alarms.
+                    self._failures += 1
+                    pause_s, self._due_s = _QUIET_S, self._clock() + _QUIET_S
+                    self._note(f"an error inside the service: {type(error).__name__}")
+                    self._log.exception("an attempt failed with an error inside the service")
                 if not self._stopping:
                     self._news.wait(pause_s)
         finally:
             self._receiver.close()
-
-    def _guarded_turn(self) -> float:
-        try:
-            return self.turn()
-        except Exception as error:
-            # Nothing narrower: an error in one attempt must not be the end of telling anybody of alarms.
-            self._failures += 1
-            self._due_s = self._clock() + _QUIET_S
-            self._note(f"an error inside the service: {type(error).__name__}")
-            self._log.exception("an attempt failed with an error inside the service")
-            return _QUIET_S
 
     def _pause_s(self, now_s: float) -> float:
         """Until something is due; what is not committed yet, or not saved, is looked after every second."""

@@ -18,15 +18,10 @@ _MOST_READ = 65_536
 
 
 class Receiver:
-    """Where one webhook's events go.
+    """Where one webhook's events go; secrets and certificates are read at once.
 
     All but `interrupt` are for one thread. The connection is kept open between events. Proxies of the environment
     (``HTTPS_PROXY``, ``NO_PROXY``) are used, but not for receivers on this computer.
-
-    Parameters
-    ----------
-    settings : WebhookSettings
-        Secrets and certificates are read at once.
 
     Raises
     ------

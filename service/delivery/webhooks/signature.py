@@ -74,16 +74,9 @@ def signing_keys(settings: WebhookSettings) -> tuple[bytes, ...]:
 
 
 def signature(keys: Sequence[bytes], identifier: str, timestamp_s: int, body: bytes) -> str:
-    """Value of the header ``webhook-signature``.
+    """Value of the header ``webhook-signature``, with one signature for each key.
 
-    Parameters
-    ----------
-    keys : sequence of bytes
-        One signature for each.
-    identifier : str
-        ``webhook-id``.
-    timestamp_s : int
-        ``webhook-timestamp``, seconds since 1970 UTC.
+    Of ``webhook-id``, ``webhook-timestamp`` (seconds since 1970 UTC) and the body.
     """
     signed = f"{identifier}.{timestamp_s}.".encode() + body
     digests = (hmac.new(key, signed, hashlib.sha256).digest() for key in keys)

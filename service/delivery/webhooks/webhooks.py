@@ -30,15 +30,7 @@ class Webhooks:
         self._dispatchers: tuple[Dispatcher, ...] = ()
 
     def start(self, logs: Mapping[str, MachineStore], cursors: WebhookCursors) -> None:
-        """Begin to send.
-
-        Parameters
-        ----------
-        logs : mapping of str to MachineStore
-            Of all machines, by ``site/machine``; webhooks that are new get what comes after this moment.
-        cursors : WebhookCursors
-            How far the others have been served.
-        """
+        """Begin to send from logs by ``site/machine``; webhooks without cursors get what comes after this moment."""
         self._dispatchers = tuple(
             Dispatcher(settings, receiver, logs, cursors) for settings, receiver in self._receivers
         )
