@@ -15,6 +15,7 @@ from models.levels.contact import LatestContact
 from models.levels.gains import left_of_1x, place_of, wrong_gain
 from models.levels.kurtosis import GAUSSIAN, departure, fallen_by_lines, without_lines
 from models.levels.limits import (
+    MEASURE_WORDS,
     PEAK_TO_PEAK,
     Limit,
     RelativeLimits,
@@ -45,11 +46,6 @@ _ERRORS_OF_DOUBT = 4.0
 _TURNED_OUT = "1x vector"
 _MOST_KEPT = 16  # sets of limits of a channel: of its zones, of operating states, of a window that fills
 _DEADBAND = 0.9
-_WORDS = {
-    "overall": "overall", "velocity": "velocity", "s_max": "S_max", "x_half": "0.5x", "x1": "1x", "x2": "2x",
-    "x3": "3x", "not_x1": "not 1x", "high": "high frequency", "peak": "peak", "mean": "gap", "envelope": "envelope",
-    "crest": "crest factor", "kurtosis": "kurtosis", "growth": "growth",
-}  # fmt: skip
 
 
 _MEASURED = tuple(name for name in LEVEL_MEASURES if name != "growth")
@@ -261,7 +257,7 @@ class LevelJudge:
                     f"phase lag {values[_ROW['x1_phase_lag_deg']]:.0f}°: outside its acceptance region around "
                     f"{shown_level(channel, 'x1', region.mean):.3g} {unit_in_text(channel.unit)} at {was_deg:.0f}°"
                 )
-        key, words = (column, alike, standard, zone, edge), _WORDS
+        key, words = (column, alike, standard, zone, edge), MEASURE_WORDS
         limits = self._limits.get(key)
         if limits is None:
             if len(self._limits) >= _MOST_KEPT * len(self._channels):
@@ -269,7 +265,7 @@ class LevelJudge:
             limits = self._limits[key] = self._limits_of(column, alike, standard, zone, edge)
         if grown is not None and relative is not None:
             limits = limits | {"growth": self._growth(relative.source, grown.limit)}
-            words = {**_WORDS, "growth": band_in_words(grown.band_hz)}
+            words = {**MEASURE_WORDS, "growth": band_in_words(grown.band_hz)}
         record["zone"] = zone
         record["limits"] = tuple(
             [
@@ -443,7 +439,7 @@ def growth_seen(levels: Sequence[ChannelLevels]) -> LevelGrowth:
     one, (growth, measure, value, limit) = max(
         ((one, found) for one, found in nearest if found), key=lambda each: each[1]
     )
-    word, unit = _WORDS[measure], unit_of(one.unit, measure, one.detection == "peak to peak")
+    word, unit = MEASURE_WORDS[measure], unit_of(one.unit, measure, one.detection == "peak to peak")
     if measure == "growth":
         word = "strongest band"
     text = (

@@ -174,6 +174,14 @@ def unit_size(channel: Channel, name: str) -> float:
     return 1e-3 if name == "velocity" else channel.to_si
 
 
+MEASURE_WORDS = {
+    "overall": "overall", "velocity": "velocity", "s_max": "S_max", "x_half": "0.5x", "x1": "1x", "x2": "2x",
+    "x3": "3x", "not_x1": "not 1x", "high": "high frequency", "peak": "peak", "mean": "gap", "envelope": "envelope",
+    "crest": "crest factor", "kurtosis": "kurtosis", "growth": "growth",
+}  # fmt: skip
+"""What each measure is called."""
+
+
 def unit_of(unit: str, name: str, peak_to_peak: bool) -> str:
     """The unit in which a measure is shown, of a channel in `unit`."""
     if name in {"crest", "kurtosis"}:

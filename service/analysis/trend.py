@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from models.commissioning.commissioned import Installed
 from models.errors import MachineFileError, RotorwatchError
+from models.levels.limits import MEASURE_WORDS, unit_of
 from models.machine import AlarmSettings
 from models.physics.rotor import PARAMETER_TEXT
 from models.signals.block import FloatArray
@@ -17,6 +18,7 @@ from models.signals.channels import unit_in_text
 from models.signals.keys import MachineKeys
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, EventKind
 from rotorwatch.records.health import MEASURES, HealthState, Report
+from rotorwatch.records.levels import LEVEL_MEASURES
 from service.analysis.past import Past, parsed_reports
 from service.analysis.recorded import Recorded
 from service.monitor.reports import machine_hash
@@ -41,7 +43,7 @@ class ParameterTrend:
 
 @dataclass(frozen=True, slots=True)
 class LevelTrend:
-    """Overall level of one channel, window by window; nan where there was none."""
+    """One level of one channel, window by window; nan where there was none."""
 
     title: str  # channel, what of it, and unit
     # (n_reports,), in that unit; the limits that held, nan without.
@@ -175,22 +177,24 @@ def trend_of(
 
 
 def _level_trends(reports: Sequence[Report]) -> Iterator[LevelTrend]:
-    """Velocity of accelerometers where there is a limit for it; otherwise the overall level of each channel."""
+    """Velocity of accelerometers where it has a limit, else the overall level; and what was ever beyond its limit."""
     by_report = [{one.channel: one for one in report.levels} for report in reports]
     for channel in dict.fromkeys(name for levels in by_report for name in levels):
         there = [levels.get(channel) for levels in by_report]
         known = [one for one in there if one is not None]
         as_velocity = any(one.velocity is not None and one.limit("velocity") is not None for one in known)
-        measure = "velocity" if as_velocity else "overall"
-        detection = "pp" if known[-1].detection == "peak to peak" else "rms"
-        unit = "velocity, mm/s rms" if as_velocity else f"overall, {unit_in_text(known[-1].unit)} {detection}"
-        limits = [None if one is None else one.limit(measure) for one in there]
-        yield LevelTrend(
-            f"{channel}   {unit}",
-            np.array([None if one is None else getattr(one, measure) for one in there], dtype=np.float64),
-            np.array([None if one is None else one.alert for one in limits], dtype=np.float64),
-            np.array([None if one is None else one.danger for one in limits], dtype=np.float64),
-        )
+        out = {limit.measure for one in known for limit in one.limits if limit.state != "normal"}
+        for measure in LEVEL_MEASURES:
+            if measure not in out and measure != ("velocity" if as_velocity else "overall"):
+                continue
+            unit = unit_of(unit_in_text(known[-1].unit), measure, known[-1].detection == "peak to peak")
+            limits = [None if one is None else one.limit(measure) for one in there]
+            yield LevelTrend(
+                f"{channel}   {MEASURE_WORDS[measure]}" + (f", {unit}" if unit else ""),
+                np.array([None if one is None else getattr(one, measure) for one in there], dtype=np.float64),
+                np.array([None if one is None else one.alert for one in limits], dtype=np.float64),
+                np.array([None if one is None else one.danger for one in limits], dtype=np.float64),
+            )
 
 
 def _slim(report: Report) -> Report:

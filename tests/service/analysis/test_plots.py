@@ -19,6 +19,7 @@ from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData
 from rotorwatch.records.example import example
 from rotorwatch.records.health import MEASURES, Report
+from rotorwatch.records.levels import LevelLimits
 from service.analysis.correlation import correlations_of, latest_window
 from service.analysis.figures.spectrum import Lines, paint_spectrum, paint_waterfall
 from service.analysis.figures.style import Look, draw
@@ -304,6 +305,17 @@ def test_a_trend_of_a_publisher_started_again_earlier_shows_the_later_run(lines:
     before = [one.end_ns for one in reports if one.end_ns < again[0].end_ns]
     found = trend_of([*reports, *again, again[-1]], (), None, "")
     assert found.end_ns.tolist() == [*before, *(one.end_ns for one in again)]
+
+
+def test_a_trend_shows_levels_beyond_their_limits_beside_the_overall_one(lines: list[dict[str, object]]) -> None:
+    *reports, last = reports_of(lines)
+    limit = LevelLimits(measure="x2", alert=3.5, source="commissioned", state="alert", text="2x 4")
+    first = last.levels[0].model_copy(update={"x2": 4.0, "limits": (limit,)})
+    found = trend_of(
+        [*reports, last.model_copy(update={"levels": (first, *last.levels[1:])})], (), None, "", levels=True
+    )
+    assert [one.title for one in found.levels[:3]] == ["y1   overall, µm pp", "y1   2x, µm pp", "y2   overall, µm pp"]
+    assert (found.levels[1].level[-1], found.levels[1].alert[-1]) == (4.0, 3.5)
 
 
 def test_a_trend_of_recorded_reports_needs_no_samples(
