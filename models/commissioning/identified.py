@@ -243,7 +243,7 @@ def _first_e(windows: Sequence[WindowStatistics]) -> float:
 def _from_forces(m2_kg: float, windows: Sequence[WindowStatistics]) -> dict[str, float]:
     """Stiffness and damping from the relation between bearing and disc: its coefficients are -c/k and -m2/k."""
     try:
-        baseline = learn_baseline(windows)
+        baseline = learn_baseline([window.without_lines for window in windows])
     except EstimationError:
         return {}
     found = {}

@@ -1,16 +1,21 @@
 """Steady lines of the healthy machine, such as hum, are taken out of what relations are learned on and read in."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 
 from models.commissioning.commissioned import Commissioned
+from models.commissioning.identified import identify
 from models.commissioning.levels import pieces_of
 from models.diagnosis.window import WindowStatistics, window_statistics
 from models.signals.block import SampleBlock
 from service.monitor.evaluators import BaselineEvaluator
-from tests.commissioning.rotor_kit import NOTHING, commissioned, recording, stream, with_lines
+from simulator.scenario import load_scenario
+from simulator.stream import blocks
+from tests.commissioning.rotor_kit import NOTHING, PARTIAL, commissioned, recording, stream, with_lines
 from tests.sure import sure
 
 HUM = {50.02: 0.03, 100.04: 0.02, 150.06: 0.02}
@@ -65,3 +70,20 @@ def test_later_windows_are_read_without_them_where_the_relations_were_learned_so
     now = BaselineEvaluator(NOTHING, made(lines=True)).evaluate(window)
     assert now.deciding.parameters == without.deciding.parameters
     assert now.deciding.parameters != with_them.deciding.parameters
+
+
+def test_a_rotor_is_identified_from_a_guess_without_them() -> None:
+    """Of displacements alone the guess was far off, and commissioning at level partial was refused for it."""
+    known = {"m1_kg": 2.5, "m2_kg": 4.0, "I2_kg_m2": 9e-3, "I2p_kg_m2": 0.0162, "shaft_length_m": 0.22}
+    known |= {"shaft_diameter_m": 0.018}
+    own = {"k_by_N_per_m": 4.5e5, "k_bz_N_per_m": 6e5, "c_by_N_s_per_m": 180.0, "c_bz_N_s_per_m": 200.0}
+    scenario, kit = load_scenario("healthy")
+    rotor = kit.model_copy(update={"rotor": kit.rotor.model_copy(update=known | own)})
+    columns = [number for number, channel in enumerate(kit.sensors) if channel.quantity != "velocity"]
+    told = {"sensors": tuple(kit.sensors[number] for number in columns)}
+    machine = PARTIAL.model_copy(update=told | {"rotor": sure(PARTIAL.rotor).model_copy(update=known)})
+    shown = [block for block, _ in blocks(scenario.overridden(duration_s=130.0, seed=5_270_042), rotor)]
+    lines = with_lines(shown, {50.02: 0.1, 100.04: 0.06, 150.06: 0.1})
+    seen = [replace(block, samples=block.samples[:, columns]) for block in lines]
+    windows = [piece.window for piece in pieces_of([recording(machine, seen)])]
+    assert identify(machine, windows).machine.rotor.c_by_N_s_per_m == pytest.approx(180, rel=0.1)
