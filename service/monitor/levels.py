@@ -3,6 +3,7 @@
 import hashlib
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -130,9 +131,13 @@ class LevelWatch:
     def foreign(self, window: SlidingWindow, statistics: WindowStatistics, *, named: bool) -> Foreign:
         """What the latest window shows that no change of a parameter makes: a new line, or see `LevelJudge.foreign`."""
         turned = self.reference is not None and any(state.speed_rad_s for state in self.reference.states)
-        if self._found is None or not statistics.settled.all() or (turned and statistics.speed_source == "unknown"):
-            return Foreign()  # what turns with the shaft is in all that is compared
+        if self._found is None:
+            return Foreign()
         healthy, speed_rad_s = self.reference, statistics.speed_rad_s
+        if not statistics.settled.all() or (turned and statistics.speed_source == "unknown"):
+            # What turns with the shaft is in the random part, too, and in lines: what pushes it back is told by hop.
+            bare = replace(self._found, moments=None, lines=None)
+            return self._judge.foreign(bare, self.latest, healthy, self._contact, named=named)
         if healthy is not None and healthy.lines is not None and math.isfinite(speed_rad_s) and speed_rad_s:
             lines = steady_lines(window.plan, window.hops, statistics)
             if healthy.faint:
