@@ -265,8 +265,8 @@ class Senders:
         ]
         if self._disputed:
             run, sequence = next(iter(self._disputed))
-            count = len(self._disputed)
-            said.append(f"{count} blocks arrived in two versions, block {sequence} of run {run} first; neither is used")
+            more = f", and {len(self._disputed) - 1} after it" if len(self._disputed) > 1 else ""
+            said.append(f"block {sequence} of run {run}{more} arrived in two versions; neither is used")
         return "; ".join(said)
 
     def _follow(self, block: SampleBlock) -> None:
