@@ -7,6 +7,7 @@ Universal File Format data set 58 (functions at nodal degrees of freedom), time 
 import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +46,7 @@ class TdmsSource(Source):
         """Rate and start of the waveforms (``wf_increment``, ``wf_start_time``, ``wf_start_offset``)."""
         found: Timing | None = None
         for reference in columns:
-            properties = self._column(reference).properties
-            timing = Timing(_tdms_rate_hz(properties), _tdms_start_ns(properties))
+            timing = _waveform(self._column(reference).properties)
             if found is not None and timing != found:
                 raise SourceError(
                     f"{self.path}: channel {reference} has {_told(timing)}, channel {columns[0]} has {_told(found)}; "
@@ -75,25 +75,17 @@ def _told(timing: Timing) -> str:
     return f"{rate} from {'no time' if timing.start_ns is None else rfc3339(timing.start_ns)} on"
 
 
-def _tdms_rate_hz(properties: Any) -> float | None:
-    """Rate of a waveform; a text that is no number says nothing, and the mapping has to."""
-    try:
+def _waveform(properties: Any) -> Timing:
+    """Rate and start of a waveform; a text that is no number or ISO 8601 time says nothing, and the mapping has to."""
+    rate_hz = start_ns = None
+    with suppress(TypeError, ValueError):
         increment_s = float(properties.get("wf_increment") or 0.0)
-    except (TypeError, ValueError):
-        return None
-    return 1 / increment_s if increment_s > 0 else None
-
-
-def _tdms_start_ns(properties: Any) -> int | None:
-    """Start of a waveform; the same of a text that is no ISO 8601 time."""
-    start = properties.get("wf_start_time")
-    if start is None:
-        return None
-    try:
-        offset_ns = round(float(properties.get("wf_start_offset") or 0.0) * 1e9)
-        return int(np.datetime64(start, "ns").astype(np.int64)) + offset_ns
-    except (TypeError, ValueError):
-        return None
+        rate_hz = 1 / increment_s if increment_s > 0 else None
+    if (start := properties.get("wf_start_time")) is not None:
+        with suppress(TypeError, ValueError):
+            offset_ns = round(float(properties.get("wf_start_offset") or 0.0) * 1e9)
+            start_ns = int(np.datetime64(start, "ns").astype(np.int64)) + offset_ns
+    return Timing(rate_hz, start_ns)
 
 
 class MdfSource(Source):
@@ -114,8 +106,6 @@ class MdfSource(Source):
             # What it has half read of a damaged file it cannot close, and says so with a traceback beside ours.
             MDF4.__del__ = lambda _: None  # type: ignore[method-assign]
             logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # its errors come as exceptions as well
-            if not path.is_file():
-                raise SourceError(f"{path}: no such file")
             self._file: Any = MDF(path)
             for name, found in self._file.channels_db.items():
                 for group, index in found:
@@ -127,7 +117,11 @@ class MdfSource(Source):
 
     def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002
         """Start of the measurement; every row has its own time."""
-        return Timing(start_ns=self._start_ns(), time=Reference("time"))
+        began = self._file.header.start_time
+        offset = began.utcoffset()
+        start_ns = int(np.datetime64(began.replace(tzinfo=None), "ns").astype(np.int64))
+        start_ns -= 0 if offset is None else round(offset.total_seconds() * 1e9)
+        return Timing(start_ns=start_ns, time=Reference("time"))
 
     def unit(self, column: Reference) -> str:
         """Unit of the channel."""
@@ -169,11 +163,6 @@ class MdfSource(Source):
     def _read(self, place: tuple[int, int], first: int) -> Any:
         return self._file.get(group=place[0], index=place[1], record_offset=first, record_count=CHUNK_ROWS)
 
-    def _start_ns(self) -> int:
-        start = np.datetime64(self._file.header.start_time.replace(tzinfo=None), "ns")
-        offset = self._file.header.start_time.utcoffset()
-        return int(start.astype(np.int64)) - (0 if offset is None else round(offset.total_seconds() * 1e9))
-
 
 class UniversalSource(Source):
     """A UFF file, read whole. A data set is named by its first line where that is unique, and by number: ``set 1``."""
@@ -184,8 +173,6 @@ class UniversalSource(Source):
         with readable(path, self.kind, self.package):
             import pyuff  # noqa: PLC0415  # an extra
 
-            if not path.is_file():
-                raise SourceError(f"{path}: no such file")
             file = pyuff.UFF(str(path))
             numbers = [number for number, kind in enumerate(file.get_set_types()) if kind == 58]
             read = file.read_sets(numbers) if numbers else []

@@ -48,14 +48,7 @@ def pulse_times(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: Map
 
 
 def read_pulses(path: Path, runs: Sequence[FloatArray], keyphasor: Keyphasor) -> PulseTrain:
-    """Judge the pulses of a file, or of the files of a folder, each by those of its own run.
-
-    Parameters
-    ----------
-    path : Path
-        What errors name.
-    runs : sequence of ndarray
-        Times of the pulses between which nothing is missing.
+    """Judge the pulses of a file, or of the files of a folder, each by those of its own run, which has no gaps.
 
     Raises
     ------

@@ -186,15 +186,12 @@ def _arrays_in(name: str, value: Any) -> Iterator[tuple[str, Array]]:
         yield name, np.atleast_1d(array)
 
 
-def _collect_within(found: dict[str, Any], place: str, within: tuple[str, ...], name: str, item: Any) -> None:
-    _collect_hdf5(found, f"{place}/{name}", item, within)
-
-
-def _collect_hdf5(found: dict[str, Any], name: str, item: Any, within: tuple[str, ...] = ()) -> None:
+def _collect_hdf5(found: dict[str, Any], name: str, item: Any, within: tuple[str, ...] = (), place: str = "") -> None:
     """Take numeric data sets; MATLAB's table (n, m) is stored as (m, n), which the longer side settles.
 
     Cells, and fields of several structs, are references to what is stored elsewhere in the file.
     """
+    name = place + name
     if name.startswith("#") or not hasattr(item, "shape"):
         return
     if item.dtype.kind == "O" and item.dtype.metadata and "ref" in item.dtype.metadata:
@@ -207,7 +204,7 @@ def _collect_hdf5(found: dict[str, Any], name: str, item: Any, within: tuple[str
             inside = (*within, inner.name)
             _collect_hdf5(found, place, inner, inside)
             if hasattr(inner, "visititems"):
-                inner.visititems(partial(_collect_within, found, place, inside))
+                inner.visititems(partial(_collect_hdf5, found, within=inside, place=f"{place}/"))
         return
     is_array = item.ndim <= 2 and item.size > 0 and item.dtype.kind in "fiu"
     if is_array and item.attrs.get("MATLAB_class", b"") != b"char":

@@ -33,12 +33,7 @@ class BlockMaker:
     """Cuts pieces into blocks of 0.1 s, as a publisher would have sent them.
 
     A block's time is the mean of its rows' times, each less its place in the block: jitter of single rows averages out
-    and a clock that runs a little fast or slow is followed.
-
-    Parameters
-    ----------
-    origin_ns : int
-        Time of the first row of the file.
+    and a clock that runs a little fast or slow is followed. The first row of the file is at `origin_ns`.
     """
 
     def __init__(self, machine: MachineFile, origin_ns: int) -> None:

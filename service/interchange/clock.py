@@ -36,14 +36,9 @@ class Clock:
     ratio: Fraction  # the machine's rate over `rate_hz`; other than 1 if the file is to be resampled
 
     def times(self, entries: Array | None, first_row: int, count: int) -> FloatArray:
-        """Times of rows, nanoseconds since the first row of the file; nan where there is none.
+        """Times of `count` rows, nanoseconds since the first row of the file; nan where there is none.
 
-        Parameters
-        ----------
-        entries : ndarray or None
-            The time column of these rows.
-        first_row, count : int
-            Number of the first of them, and how many they are.
+        `entries` is the time column of these rows, if there is one.
         """
         if entries is None:
             return np.asarray((first_row + np.arange(count)) * (1e9 / self.rate_hz))
@@ -69,12 +64,7 @@ class Clock:
 def clock_for(
     source: Source, columns: list[Reference], base: TimeBase, machine: MachineFile, start_ns: int | None = None
 ) -> Clock:
-    """Find out how fast the rows come, and check it against the machine.
-
-    Parameters
-    ----------
-    start_ns : int, optional
-        Start of the rows, where neither the file nor the mapping tells it.
+    """Find out how fast the rows come, and check it against the machine; `start_ns` is the start of the rows, if known.
 
     Raises
     ------
@@ -151,14 +141,13 @@ def _declared_rate(source: Source, base: TimeBase, timing: Timing) -> float | No
 
 
 def _start_ns(path: Path, base: TimeBase, timing: Timing, known_ns: int | None) -> int:
-    told = (found for found in (known_ns, base.start_ns, timing.start_ns) if found is not None)
-    start_ns = next(told, None)
-    if start_ns is None:
-        raise SourceError(
-            f"{path}: the time of the first row is not known; give time.start in the mapping, such as "
-            'start = "2026-01-31T12:00:00Z"; files of a folder may have it in their names, such as 20260131T120000'
-        )
-    return start_ns
+    for told_ns in (known_ns, base.start_ns, timing.start_ns):
+        if told_ns is not None:
+            return told_ns
+    raise SourceError(
+        f"{path}: the time of the first row is not known; give time.start in the mapping, such as "
+        'start = "2026-01-31T12:00:00Z"; files of a folder may have it in their names, such as 20260131T120000'
+    )
 
 
 def _first_times(source: Source, column: Reference, columns: list[Reference]) -> Array:
@@ -200,9 +189,7 @@ def check_order(path: Path, column: Reference | None, times: FloatArray, first_r
         at = int(wrong[0]) + 1
         back_ns = times[at - 1] - times[at]
         what = "repeats the time of the row before" if back_ns == 0 else f"goes back by {lasting(back_ns / 1e9)}"
-        hint = (
-            "; times written with too few decimals? Leave the column out and give time.rate_hz" if back_ns == 0 else ""
-        )
+        hint = "" if back_ns else "; times written with too few decimals? Leave the column out and give time.rate_hz"
         raise SourceError(f"{path}: row {first_row + at + 1}, column {column}: {what}, expected ascending times{hint}")
 
 

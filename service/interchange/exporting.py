@@ -26,21 +26,11 @@ _TABLES = {"stream": stream_table, "reports": report_table, "alarms": alarm_tabl
 def export(
     selection: Selection, what: ExportSubject, kind: ExportFormat, out: Path, *, overwrite: bool = False
 ) -> Table:
-    """Write a table.
+    """Write a table, and return it: it says how many rows there were and what was left out.
 
     Parquet has ``unit`` and ``description`` in the metadata of its fields; CSV has ``name [unit]`` in its header; .mat
     has a struct per column with its samples, unit and description. Parquet and CSV are written as the recordings are
-    read; a .mat file is put together in memory.
-
-    Parameters
-    ----------
-    out : Path
-        What is written; nothing is left of it if that fails.
-
-    Returns
-    -------
-    Table
-        Written to its end; says how many rows there were and what was left out.
+    read; a .mat file is put together in memory. Nothing is left of a file that cannot be completed.
 
     Raises
     ------

@@ -1,6 +1,7 @@
 """A folder of files, each a snapshot or a stretch of one: in the order of their times, as if they were one file."""
 
 import re
+from collections import deque
 from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -42,12 +43,8 @@ class SnapshotFile:
 def time_in_name(name: str, zone: tzinfo = UTC, shared: Container[str] = ()) -> int | None:
     """Time that the name of a file holds: a date with a time of day, or seconds and so on since 1970.
 
-    Parameters
-    ----------
-    zone : tzinfo
-        Time zone of a date; of an hour that occurs twice, the first is taken.
-    shared : container of str
-        Numbers that all files of a folder have in their names, such as that of a device: no seconds since 1970.
+    Of an hour that occurs twice, the first is taken. Numbers that all files of a folder have in their names, such as
+    that of a device, are no seconds since 1970: those `shared`.
 
     Examples
     --------
@@ -179,9 +176,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"(\d+)", path.name)]
 
 
-def unusable(
-    files: Sequence[SnapshotFile], mapping: Mapping, machine: MachineFile, keyphasor: Keyphasor | None
-) -> dict[Path, SourceError]:
+def unusable(files: Sequence[SnapshotFile], mapping: Mapping, machine: MachineFile) -> dict[Path, SourceError]:
     """Files that cannot be read to their end, each by itself, and what is wrong with them.
 
     Raises
@@ -193,13 +188,10 @@ def unusable(
     faults: dict[Path, SourceError] = {}
     for file in files:
         try:
-            with open_source(file.path, mapping) as source:
-                signals = signals_of(source, mapping, machine)
-                clock = clock_for(source, [one.reference for one in signals], mapping.time, machine, file.start_ns)
-                for _ in pieces(source, signals, clock, mapping, Read()):
-                    pass
-                if keyphasor is not None:
-                    pulse_times(source, keyphasor, clock, mapping)
+            with _opened(file, mapping, machine) as (source, signals, clock):
+                deque(pieces(source, signals, clock, mapping, Read()), maxlen=0)
+                if mapping.keyphasor is not None:
+                    pulse_times(source, mapping.keyphasor, clock, mapping)
         except SourceError as error:
             faults[file.path] = error
     if machine.schedule is not None and isinstance(mapping.time.start, datetime):
@@ -233,7 +225,7 @@ def runs_of_pulses(
     """
     runs = [begun]
     for file in files:
-        with _following(first, file, mapping, machine) as (source, _, clock):
+        with _opened(file, mapping, machine, first) as (source, _, clock):
             own = pulse_times(source, keyphasor, clock, mapping) + float(clock.origin_ns - first.origin_ns)
         before = runs[-1]
         if before.size > 1 and own.size and own[0] - before[-1] < 1.5 * float(np.median(np.diff(before[-9:]))):
@@ -244,13 +236,13 @@ def runs_of_pulses(
 
 
 @contextmanager
-def _following(
-    first: Clock, file: SnapshotFile, mapping: Mapping, machine: MachineFile
+def _opened(
+    file: SnapshotFile, mapping: Mapping, machine: MachineFile, first: Clock | None = None
 ) -> Iterator[tuple[Source, list[Signal], Clock]]:
     with open_source(file.path, mapping) as source:
         signals = signals_of(source, mapping, machine)
         clock = clock_for(source, [one.reference for one in signals], mapping.time, machine, file.start_ns)
-        yield source, signals, clock if file.start_ns is None else clock.after(first)
+        yield source, signals, clock if first is None or file.start_ns is None else clock.after(first)
 
 
 def joined(
@@ -261,12 +253,7 @@ def joined(
     machine: MachineFile,
     read: Read,
 ) -> Iterator[Piece]:
-    """Pieces of a first file, and then those of others, on its clock.
-
-    Parameters
-    ----------
-    read : Read
-        What was met, all files together; is kept up to date.
+    """Pieces of a first file, and then those of others, on its clock; `read` is kept up to date for all together.
 
     Raises
     ------
@@ -280,7 +267,7 @@ def joined(
     read.shortest = read.longest = read.rows
     for file in files:
         own = Read()
-        with _following(first, file, mapping, machine) as (source, signals, clock):
+        with _opened(file, mapping, machine, first) as (source, signals, clock):
             if clock.ratio != first.ratio:
                 raise SourceError(
                     f"{file.path}: has {clock.rate_hz:.9g} samples per second, {first.path.name} has "

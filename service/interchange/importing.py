@@ -67,12 +67,7 @@ def import_file(
 ) -> Imported:
     """Import a file, or a folder of files that follow each other: without those of them that cannot be read.
 
-    Parameters
-    ----------
-    path : Path
-        CSV, Parquet, .npz, .mat, WAV, UFF 58, TDMS or MF4; or a folder of such files.
-    recording : Path
-        What is written; nothing is left of it if the import fails.
+    Nothing is left of the recording if the import fails.
 
     Raises
     ------
@@ -88,7 +83,7 @@ def import_file(
         return _imported(path, files, mapping, machine, recording, overwrite=overwrite)
     except SourceError:
         # Only now is every file read by itself: that takes as long as the import.
-        faults = unusable(files, mapping, machine, mapping.keyphasor)
+        faults = unusable(files, mapping, machine)
         if not faults or len(faults) == len(files):
             raise
         rest = tuple(file for file in files if file.path not in faults)

@@ -195,7 +195,8 @@ class Mapping(BaseModel, extra="forbid", frozen=True):
             Naming the field.
         """
         known = {channel.name: channel for channel in machine.sensors}
-        for table, columns in (("channels", self.channels), ("acceleration.channels", self.accelerations)):
+        tables = {"channels": self.channels, "acceleration.channels": self.accelerations}
+        for table, columns in tables.items():
             for name in columns:
                 if name not in known:
                     raise ValueError(
@@ -204,10 +205,9 @@ class Mapping(BaseModel, extra="forbid", frozen=True):
                     )
         for name, channel in known.items():
             self._check_channel(name, channel)
-        for table, columns in (("channels", self.channels), ("acceleration.channels", self.accelerations)):
+        for table, columns in tables.items():
             self._check_double(table, columns, known)
-        angle = next((name for name, channel in known.items() if channel.quantity is Quantity.SHAFT_ANGLE), None)
-        if self.keyphasor is not None and angle is None:
+        if self.keyphasor is not None and Quantity.SHAFT_ANGLE not in [one.quantity for one in machine.sensors]:
             raise ValueError("keyphasor: the machine has no shaft_angle channel for it")
 
     def _check_double(self, table: str, columns: dict[str, Column], known: dict[str, Sensor]) -> None:

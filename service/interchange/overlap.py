@@ -87,16 +87,9 @@ class Integration:
 
 
 class Resampling:
-    """Changes the rate by a ratio of whole numbers (`scipy.signal.resample_poly`, its Kaiser window 5.0).
+    """Changes the rate by a ratio, new over old (`scipy.signal.resample_poly`, its Kaiser window 5.0).
 
-    Angles go as cosine and sine.
-
-    Parameters
-    ----------
-    ratio : Fraction
-        New rate over old.
-    angles : list of int
-        Columns with angles.
+    Columns with angles go as cosine and sine.
     """
 
     def __init__(self, ratio: Fraction, angles: list[int]) -> None:

@@ -74,31 +74,25 @@ def signals_of(source: Source, mapping: Mapping, machine: MachineFile) -> list[S
         column = mapping.accelerations.get(channel.name) or mapping.channels.get(channel.name)
         if column is None:
             continue
-        reference = Reference(column.column, column.index)
         quantity = Quantity.ACCELERATION if integrated else channel.quantity
-        unit = _unit(source, reference, column, channel.name, quantity)
+        unit, doubt = _unit(source, column, channel.name, quantity)
         si = unit_factor(quantity, unit) / channel.to_si
         found.append(
             Signal(
-                reference,
+                Reference(column.column, column.index),
                 column.sign * _scale(source, column) * si,
                 column.sign * column.offset * si,
                 (1 if channel.quantity is Quantity.VELOCITY else 2) if integrated else 0,
                 channel.quantity is Quantity.SHAFT_ANGLE,
                 float(np.finfo(machine.dtype).max),
-                _doubt(source, reference, column, channel.name, quantity),
+                doubt,
             )
         )
     return found
 
 
 def pieces(source: Source, signals: Sequence[Signal], clock: Clock, mapping: Mapping, read: Read) -> Iterator[Piece]:
-    """Read the file once, cut at its gaps.
-
-    Parameters
-    ----------
-    read : Read
-        Is kept up to date.
+    """Read the file once, cut at its gaps; `read` is kept up to date.
 
     Raises
     ------
@@ -136,7 +130,8 @@ class _Splitter:
         self._check_times(time_ns, entries, first_row)
         finite = (np.abs(samples) <= self._largest).all(axis=1)
         if not finite.all():
-            self._judge_missing(samples, first_row)
+            if self._base.not_finite == "refuse":
+                self._refuse_missing(samples, first_row)
             self._read.left_out += int(np.count_nonzero(~finite))
             time_ns, samples, rows = time_ns[finite], samples[finite], rows[finite]
         if not time_ns.size:
@@ -161,9 +156,7 @@ class _Splitter:
         if self._last is not None and time_ns.size:
             check_order(path, column, np.array([self._last.time_ns[-1], time_ns[0]]), first_row - 1)
 
-    def _judge_missing(self, samples: FloatArray, first_row: int) -> None:
-        if self._base.not_finite == "gap":
-            return
+    def _refuse_missing(self, samples: FloatArray, first_row: int) -> None:
         row, number = (int(where) for where in np.argwhere(~(np.abs(samples) <= self._largest))[0])
         most = f" up to {self._largest[number]:.3g}" if np.isfinite(samples[row, number]) else ""
         raise SourceError(
@@ -213,29 +206,14 @@ class _Splitter:
         return Piece(False, time_ns, last.samples[-1] + part * change)
 
 
-def _stated(source: Source, reference: Reference) -> str:
-    return source.unit(reference) if reference.column in source.names() else ""
+def _unit(source: Source, column: Column, name: str, quantity: str) -> tuple[str, str]:
+    """Unit of a column, and a doubt about it, or an empty string.
 
-
-def _is_raw(column: Column) -> bool:
-    return column.scale == 1 and column.scale_from is None
-
-
-def _doubt(source: Source, reference: Reference, column: Column, name: str, quantity: str) -> str:
-    """Point out a unit in the file, such as volts, that is not one of the quantity, where nothing converts it."""
-    stated = _stated(source, reference)
-    if column.unit is None or not stated or not _is_raw(column):
-        return ""
-    try:
-        unit_factor(quantity, stated)
-    except ValueError:
-        return f"note: column {reference}: the file says {stated!r}, channel {name} takes its numbers as {column.unit}"
-    return ""
-
-
-def _unit(source: Source, reference: Reference, column: Column, name: str, quantity: str) -> str:
-    """Unit of a column; what the mapping says must not contradict what the file says."""
-    stated = _stated(source, reference)
+    What the mapping says must not contradict what the file says. A unit in the file, such as volts, that is not one of
+    the quantity is pointed out where nothing converts it.
+    """
+    reference = Reference(column.column, column.index)
+    stated = source.unit(reference) if reference.column in source.names() else ""
     if column.unit is None:
         source.named(reference.column)
         if not stated:
@@ -247,13 +225,20 @@ def _unit(source: Source, reference: Reference, column: Column, name: str, quant
             unit_factor(quantity, stated)
         except ValueError as error:
             raise SourceError(f"{source.path}: column {reference}, channel {name}: {error}") from error
-        return stated
-    if stated and _is_raw(column) and not same_unit(quantity, column.unit, stated):
+        return stated, ""
+    if not stated or column.scale != 1 or column.scale_from is not None:
+        return column.unit, ""
+    if not same_unit(quantity, column.unit, stated):
         raise SourceError(
             f"{source.path}: column {reference} is in {stated!r} according to the file, but in {column.unit!r} "
             f"according to the mapping of channel {name}"
         )
-    return column.unit
+    try:
+        unit_factor(quantity, stated)
+    except ValueError:
+        told = f"the file says {stated!r}, channel {name} takes its numbers as {column.unit}"
+        return column.unit, f"note: column {reference}: {told}"
+    return column.unit, ""
 
 
 def _scale(source: Source, column: Column) -> float:

@@ -53,13 +53,8 @@ class Source:
     """An open file of named columns; a context manager.
 
     A format says how its columns are found, and of these methods what is otherwise than here: columns that have a
-    length and can be sliced, in a file that knows neither time nor units. Opening a file that is not of the format
-    raises `SourceError`.
-
-    Parameters
-    ----------
-    columns : mapping of str to object
-        What the format's library has for each column, by name.
+    length and can be sliced, in a file that knows neither time nor units. `columns` are what the format's library has
+    for each, by name. Opening a file that is not of the format raises `SourceError`.
     """
 
     kind: ClassVar[str]

@@ -45,17 +45,8 @@ class _Table(Source):
 class CsvSource(_Table):
     """A text table. Columns without a header are named ``1``, ``2`` and so on.
 
-    Parameters
-    ----------
-    form : CsvFormat
-        Delimiter, decimal sign and which lines to leave out.
-    time_column : str or None
-        Column with the times. Where its first cells are whole numbers it is read as such, because nanoseconds since
-        1970 have more digits than a float.
-    datetimes : bool
-        Whether it has ISO 8601 times instead of numbers.
-    zone : str
-        Time zone of the cells that name none.
+    The time column has ISO 8601 times if these are `datetimes`, in `zone` where they name none. Where its first cells
+    are whole numbers it is read as such, because nanoseconds since 1970 have more digits than a float.
     """
 
     kind = "CSV"
@@ -66,7 +57,7 @@ class CsvSource(_Table):
         self._form, self._time_column, self._zone = form, time_column, zone
         self._time_type = pa.string() if datetimes else pa.float64()
         try:
-            with readable(path, self.kind), self._reader(path, None) as reader:
+            with readable(path, self.kind), self._reader(path, ()) as reader:
                 schema = reader.schema
                 labels = list(schema.names)
         except SourceError as error:
@@ -80,6 +71,7 @@ class CsvSource(_Table):
         names = [label.strip() if form.header else str(number + 1) for number, label in enumerate(labels)]
         if not datetimes and time_column in names and schema.field(names.index(time_column)).type == pa.int64():
             self._time_type = pa.int64()
+        # Arrow's own names: with the blanks around them, or numbers if there is no header.
         self._labels: dict[str, str] = dict(zip(names, labels, strict=True))
         super().__init__(path, names)
 
@@ -112,18 +104,18 @@ class CsvSource(_Table):
                 with self._reader(self.path, wanted) as reader:
                     for batch in reader:
                         count += batch.num_rows
-                        yield tuple(self._array(name, batch.column(self._label(name))) for name in wanted)
+                        yield tuple(self._array(name, batch.column(self._labels[name])) for name in wanted)
             except pa.ArrowInvalid as error:
                 raise SourceError(
                     self._fault(wanted) or f"{self.path}: after row {count}: {self._told(error)}"
                 ) from error
 
-    def _reader(self, path: Path, wanted: list[str] | None, *, as_text: bool = False) -> Any:
+    def _reader(self, path: Path, wanted: Sequence[str], *, as_text: bool = False) -> Any:
         form = self._form
         types: dict[str, Any] = {}
-        for name in wanted or ():
+        for name in wanted:
             kind = self._time_type if name == self._time_column else pa.float64()
-            types[self._label(name)] = pa.string() if as_text else kind
+            types[self._labels[name]] = pa.string() if as_text else kind
         return pa.csv.open_csv(
             path,
             pa.csv.ReadOptions(
@@ -147,10 +139,6 @@ class CsvSource(_Table):
     def _array(self, name: str, column: Any) -> Array:
         return _array(_utc(column, self._zone) if self._is_datetime(name) else column)
 
-    def _label(self, name: str) -> str:
-        """Arrow's own name of a column: with the blanks around it, or a number if there is no header."""
-        return self._labels[name]
-
     def _told(self, error: Exception) -> str:
         """What Arrow says, with rows counted from 1, without header lines."""
         before = self._form.skip_lines + self._form.header + self._form.skip_lines_after_header
@@ -163,7 +151,7 @@ class CsvSource(_Table):
             try:
                 for batch in reader:
                     for name in wanted:
-                        for offset, cell in enumerate(batch.column(self._label(name)).to_pylist()):
+                        for offset, cell in enumerate(batch.column(self._labels[name]).to_pylist()):
                             if cell is not None and not self._is_value(name, cell):
                                 what = "a number"
                                 if self._is_datetime(name):
@@ -207,13 +195,7 @@ class CsvSource(_Table):
 
 
 class ParquetSource(_Table):
-    """A Parquet file, read row group by row group.
-
-    Parameters
-    ----------
-    zone : str
-        Time zone of timestamps that name none.
-    """
+    """A Parquet file, read row group by row group; timestamps that name no time zone are of `zone`."""
 
     kind = "Parquet"
 
