@@ -153,10 +153,7 @@ class Outcome:
 def run_demo(options: DemoOptions) -> int:
     """Run the demo until it was seen what is named (`once`) or until interrupted.
 
-    Returns
-    -------
-    int
-        Exit code: 0 if exactly the injected parameter was named, 1 otherwise. Interrupted: 130.
+    The exit code is 0 if exactly the injected parameter was named, 1 otherwise; interrupted, 130.
 
     Raises
     ------
@@ -190,10 +187,9 @@ class _Show:
         self._base = f"{self._url}/api/v1/machines/{self._machine.title}"
         names = list(FAULTS)
         first = names.index(options.fault) if options.fault in FAULTS else 0
-        self._faults = islice(cycle(names[first:] + names[:first]), _ROUNDS)
         self._rounds = [
             (name if options.fault in FAULTS else None, _HEALTHY_S + number * (_BROKEN_S + _REPAIRED_S))
-            for number, name in enumerate(self._faults)
+            for number, name in enumerate(islice(cycle(names[first:] + names[:first]), _ROUNDS))
         ]
         self._round = 0
         self._start_ns: int | None = None
@@ -240,10 +236,10 @@ class _Show:
         return True
 
     def _injections(self) -> list[str]:
-        changes = [(name, at_s) for name, at_s in self._rounds if name is not None]
         return [
             text
-            for name, at_s in changes
+            for name, at_s in self._rounds
+            if name is not None
             for text in ("--fault", f"{name}={FAULTS[name]:g}@{at_s:g}", "--fault", f"{name}=0@{at_s + _BROKEN_S:g}")
         ]
 

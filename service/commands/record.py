@@ -208,11 +208,8 @@ def _recover(file: Path, out: Path | None) -> None:
     if not partial and inspect_recording(file).complete:
         typer.echo(f"{file}: complete, nothing to recover")
         return
-    target = out
-    if target is None:
-        target = (
-            file.with_suffix("") if partial else file.with_name(f"{file.name.removesuffix('.mcap')}.recovered.mcap")
-        )
+    own_name = file.with_suffix("") if partial else file.with_name(f"{file.name.removesuffix('.mcap')}.recovered.mcap")
+    target = out or own_name
     salvage = salvage_recording(file, target)
     typer.echo(f"{file}: {salvage.count} messages recovered into {target}")
     for line in _contents(salvage):

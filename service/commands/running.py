@@ -17,8 +17,7 @@ from typer.core import TyperGroup
 from models.errors import BundleError, MachineFileError, PictureError, RecordingError, RotorwatchError
 from service.terminal.memory import prepare_memory
 
-ENDPOINT = "tcp/127.0.0.1:7447"
-"""Where a monitor listens unless it is told otherwise."""
+ENDPOINT = "tcp/127.0.0.1:7447"  # where a monitor listens unless it is told otherwise
 
 _RAGGED = re.compile(r"(?<!\n)(?<!\[/cyan\])\n(?!\n|\[cyan\])")
 """Ends of lines within a paragraph of a help text, but for those around an example."""
@@ -28,8 +27,7 @@ _UNUSABLE = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.EROFS}
 _NO_THREAD = "can't start new thread"
 _MB = 1_000_000
 _ADDRESS_SPACE_MB = 2_000
-_OF_A_MACHINE_MB = 100
-"""Little of it is memory: stacks of threads and what libraries set aside."""
+_OF_A_MACHINE_MB = 100  # little of it is memory: stacks of threads and what libraries set aside
 
 HistoryOption = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor; \\[history] counts.")

@@ -102,8 +102,7 @@ class MatlabSource(_Arrays):
             self._file.close()
 
 
-_UNKNOWN_SIZE = 0xFFFFFFFF
-"""Of samples that a program wrote without knowing how many there would be."""
+_UNKNOWN_SIZE = 0xFFFFFFFF  # of samples that a program wrote without knowing how many there would be
 
 
 class WavSource(_Arrays):

@@ -18,8 +18,7 @@ _SOURCES: dict[Format, tuple[str, tuple[str, ...]]] = {
 }
 """Class in this package, imported when it is needed with the library that only it needs, and how files are named."""
 
-DATED: tuple[Format, ...] = ("tdms", "mf4")
-"""Formats whose files say when they were recorded."""
+DATED: tuple[Format, ...] = ("tdms", "mf4")  # formats whose files say when they were recorded
 
 
 def format_of(path: Path, mapping: Mapping) -> Format | None:

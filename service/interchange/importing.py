@@ -31,16 +31,12 @@ from service.interchange.samples import Piece, Read, pieces, signals_of
 from service.interchange.source import Reference, SourceError
 from service.monitor.alarm_conversion import rfc3339
 
-_NOTED = 0.01
-"""Part of the rows whose loss is pointed out."""
-_MOST_ALONE = 0.1
-"""Part of the rows that may have a gap on either side."""
+_NOTED = 0.01  # part of the rows whose loss is pointed out
+_MOST_ALONE = 0.1  # part of the rows that may have a gap on either side
 _LISTED = 10
 _NAMED = 5
-_VARIED = 1.1
-"""Ratio of speeds in a file from which on both are told."""
-_FEW_SAMPLES = 4.0
-"""Samples for each pulse of the keyphasor below which it may be one that comes faster."""
+_VARIED = 1.1  # ratio of speeds in a file from which on both are told
+_FEW_SAMPLES = 4.0  # samples for each pulse of the keyphasor below which it may be one that comes faster
 
 
 @dataclass(frozen=True, slots=True)

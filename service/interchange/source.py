@@ -17,8 +17,7 @@ import numpy.typing as npt
 from models.errors import MachineFileError
 from models.mistakes import did_you_mean
 
-CHUNK_ROWS = 65536
-"""Rows that are read at a time."""
+CHUNK_ROWS = 65536  # rows that are read at a time
 
 Array = npt.NDArray[Any]
 
@@ -57,12 +56,9 @@ class Source:
     for each, by name. Opening a file that is not of the format raises `SourceError`.
     """
 
-    kind: ClassVar[str]
-    """What the format is called."""
-    package: ClassVar[str] = ""
-    """Package of the extra ``io`` that reads it."""
-    entry: ClassVar[str] = "column"
-    """What the format calls a column."""
+    kind: ClassVar[str]  # what the format is called
+    package: ClassVar[str] = ""  # package of the extra ``io`` that reads it
+    entry: ClassVar[str] = "column"  # what the format calls a column
 
     def __init__(self, path: Path, columns: Mapping[str, Any]) -> None:
         self.path = path

@@ -16,8 +16,7 @@ from service.interchange.source import CHUNK_ROWS, Array, Reference, Source, Sou
 
 _BYTES = 4 << 20
 _NUMBER = r"[-+]?[\d.,]+([eE][-+]?\d+)?"
-_GROUPED = r"[-+]?\d{1,3}([.,' ]\d{3})+([.,]\d+)?"
-"""A number such as 1,899.62, with separators of thousands."""
+_GROUPED = r"[-+]?\d{1,3}([.,' ]\d{3})+([.,]\d+)?"  # a number such as 1,899.62, with separators of thousands
 _ZONED = r"(Z|[T ].*[+-]\d\d(:?\d\d)?)$"
 
 

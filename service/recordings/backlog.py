@@ -14,18 +14,11 @@ class Backlog:
 
     When it is full, all waiting messages of the stream are thrown away at once and counted: one long gap costs the
     evaluation less than many short ones. The few and small messages on other keys stay, unless they alone fill it.
-
-    Parameters
-    ----------
-    bound_bytes : int
-        Most that waits.
-    stream : str
-        Key of the sample blocks.
     """
 
     def __init__(self, bound_bytes: int, stream: str) -> None:
         self._bound = bound_bytes
-        self._stream = stream
+        self._stream = stream  # key of the sample blocks
         self._messages: deque[RecordedMessage] = deque()
         self._bytes = 0
         self._changed = threading.Condition()

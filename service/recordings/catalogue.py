@@ -46,14 +46,9 @@ class Recording(RecordingEntry):
 
 
 class Catalogue:
-    """Recordings below a directory.
+    """Recordings below a directory, which need not exist yet.
 
     What a file's index says is read once and remembered until the file changes. May be asked from several threads.
-
-    Parameters
-    ----------
-    directory : Path
-        As `rotorwatch record --out`; need not exist yet.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -74,11 +69,8 @@ class Catalogue:
     def find(self, recording_id: str) -> Recording | None:
         """Find a recording by its id; None if there is none, or if the id does not name a file of this directory.
 
-        Parameters
-        ----------
-        recording_id : str
-            As in `Recording.id`. Only names made of letters, digits, ``_``, ``-`` and ``.`` are looked up, and symbolic
-            links are not followed, so that no id reaches a file outside the directory.
+        Only names made of letters, digits, ``_``, ``-`` and ``.`` are looked up, and symbolic links are not followed,
+        so that no id reaches a file outside the directory.
         """
         match = _ID.fullmatch(recording_id)
         if match is None:
@@ -132,10 +124,7 @@ class Catalogue:
 def name_of(start_ns: int, number: int = 1) -> str:
     """File name for a recording that starts at a time, UTC to the second.
 
-    Parameters
-    ----------
-    number : int
-        2 and more for further files of the same second; the names still sort in the order of writing.
+    Further files of the same second have numbers from 2 on; the names still sort in the order of writing.
 
     Examples
     --------
@@ -195,12 +184,9 @@ def recorded_files(folder: Path) -> tuple[Path, ...]:
 
 
 def recent_messages(files: Sequence[Path], key: str, since_ns: int) -> Iterator[RecordedMessage]:
-    """Messages on a key, replays left out, in the order in which they came.
+    """Messages on a key, replays left out, in the order in which they came, of files in this order.
 
-    Parameters
-    ----------
-    files : sequence of Path
-        Oldest first. What a crash left may be completed, and so get another name, at the same time.
+    What a crash left may be completed, and so get another name, at the same time.
     """
     for path in files:
         try:

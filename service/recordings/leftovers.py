@@ -12,8 +12,7 @@ from service.recordings.catalogue import PART, SUFFIX
 
 DAMAGED = ".damaged"
 LOCK = ".lock"
-_LONGEST_S = 60.0
-"""From the last message to the last writing of it: a recorder writes every second."""
+_LONGEST_S = 60.0  # from the last message to the last writing of it: a recorder writes every second
 
 
 def lock(folder: Path) -> int:

@@ -65,15 +65,9 @@ class RecorderStatus:
 class MachineRecorder:
     """Records whatever is put into it.
 
-    Parameters
-    ----------
-    settings : RecordingSettings
-        With a directory.
-    committed : callable
-        Takes a time of this computer and returns the alarm events that the machine's monitor has recorded since then:
-        what lies around them is kept longer. Called on the recorder's thread; may raise `RotorwatchError`.
-    now_ns : callable
-        This computer's time, nanoseconds since 1970-01-01 UTC; only for the age of files.
+    `committed` takes a time of this computer and returns the alarm events that the machine's monitor has recorded since
+    then: what lies around them is kept longer. It is called on the recorder's thread and may raise `RotorwatchError`.
+    `now_ns` is this computer's time, nanoseconds since 1970-01-01 UTC; only for the age of files.
 
     Raises
     ------

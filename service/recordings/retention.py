@@ -41,12 +41,9 @@ class Decision:
 def decide(
     recordings: Iterable[Recording], marks: Sequence[AlarmMark], settings: RecordingSettings, now_ns: int
 ) -> Decision:
-    """Decide which complete recordings of one machine are kept.
+    """Decide which recordings of one machine are kept.
 
-    Parameters
-    ----------
-    recordings : iterable of Recording
-        Of one machine; incomplete ones are left alone, and so are those with names of somebody else's making.
+    Incomplete ones are left alone, and so are those with names of somebody else's making.
     """
     own = [one for one in recordings if one.complete and start_of(one.path.name) is not None]
     reasons = {one.id: reason for one in own if (reason := _reason(one, marks, settings) or one.kept_because)}

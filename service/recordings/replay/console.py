@@ -26,13 +26,7 @@ _ARROWS = {b"\x1b[C": _STEP_S, b"\x1b[D": -_STEP_S, b"\x1bOC": _STEP_S, b"\x1bOD
 
 @contextmanager
 def show(kind: Literal["auto", "json", "none"]) -> Iterator[Show]:
-    """Show progress, now and then and at the end.
-
-    Yields
-    ------
-    callable
-        Takes the progress, as often as it likes.
-    """
+    """Show the progress that it is told, as often as one likes, now and then and at the end."""
     if kind == "json":
         with _seldom(_print_line) as take:
             yield take
@@ -54,16 +48,11 @@ def show(kind: Literal["auto", "json", "none"]) -> Iterator[Show]:
 def orders(control: Control, *, lines: bool, keyboard: bool) -> Iterator[None]:
     """Obey what comes on standard input, until the block is left.
 
-    Parameters
-    ----------
-    lines : bool
-        Orders are lines, see `obey`; when the input ends, because whoever gave the orders is gone, the replay stops.
-    keyboard : bool
-        If standard input is a terminal, obey single keys: space pauses and goes on, arrows seek, q stops.
+    With `lines` each is an order, see `obey`; when the input ends, because whoever gave the orders is gone, the replay
+    stops. With `keyboard`, if standard input is a terminal, space pauses and goes on, arrows seek, q stops.
     """
     if lines:
-        thread = threading.Thread(target=_read_lines, args=(control,), name="orders", daemon=True)
-        thread.start()
+        threading.Thread(target=_read_lines, args=(control,), name="orders", daemon=True).start()
         yield
     elif keyboard and sys.stdin.isatty():
         with _single_keys():

@@ -74,17 +74,9 @@ class Control:
             self.position_ns = position_ns
 
     def wait_until(self, deadline_s: float | None, on_pause: Callable[[], None] | None = None) -> bool:
-        """Wait until a moment of `now_s`, or not at all; while paused, wait on.
+        """Wait until a moment of `now_s`, or not at all; return False as soon as the replay is to stop or to seek.
 
-        Parameters
-        ----------
-        on_pause : callable, optional
-            Called once when the replay is found paused.
-
-        Returns
-        -------
-        bool
-            False as soon as the replay is to stop or to seek.
+        While paused, wait on; `on_pause` is called once when the replay is found paused.
         """
         with self._changed:
             while not (self.stopped or self._seek_ns is not None):

@@ -49,18 +49,9 @@ class JobPlan:
 
 
 class ReplayJobs:
-    """Starts, watches and ends the processes.
+    """Starts, watches and ends the processes: `limit` at once, as nice as told.
 
-    Parameters
-    ----------
-    folder : Path or None
-        Where results go, a folder per job; without one there are no jobs.
-    limit : int
-        Most jobs that run at once.
-    nice : int
-        How far they give way to others.
-    kept : int
-        Most folders that are kept; the oldest are removed.
+    Results go to a folder per job in `folder`; without it there are no jobs. Beyond `kept`, the oldest are removed.
     """
 
     def __init__(self, folder: Path | None, *, limit: int, nice: int, kept: int) -> None:
@@ -133,22 +124,15 @@ class ReplayJobs:
 
 
 class RunningJob:
-    """One process and the thread that listens to it; goes on to tell what came of it when that has ended.
-
-    Attributes
-    ----------
-    results : Path
-        File with the result lines; it may not be there yet.
-    machine_file : str or None
-        Machine file that was sent with it, where it was put, with what it is evaluated with; None if none was.
-    """
+    """One process and the thread that listens to it; goes on to tell what came of it when that has ended."""
 
     def __init__(self, plan: JobPlan, folder: Path, nice: int) -> None:
         self.folder = folder
-        self.results = folder / _RESULTS
+        self.results = folder / _RESULTS  # result lines; may not be there yet
         self._lock = threading.Lock()
         self._stop_asked = False
         self.view = plan.job  # what the API says of the job
+        # Machine file that was sent with it, where it was put, with what it is evaluated with; None if none was.
         bundle = "" if plan.bundle is None else f"@{plan.bundle}"
         self.machine_file = f"{folder / _MACHINE}{bundle}" if plan.machine_file else None
         with (folder / _MESSAGES).open("wb") as messages:

@@ -49,16 +49,9 @@ def skipped_windows(source: RecordingSource, keys: MachineKeys) -> frozenset[int
 
 
 class OfflineReplay:
-    """One run of recordings through a monitor.
+    """One run of recordings through a monitor: blocks from `from_ns` up to, and without, `to_ns`, as data time.
 
-    Parameters
-    ----------
-    installed : Installed
-        The machine file to evaluate it with, and what was trained and commissioned for it.
-    write : callable
-        Takes each result line, without its line end.
-    from_ns, to_ns : int, optional
-        Only blocks from `from_ns` up to, and without, `to_ns`, in the time of the data.
+    `write` takes each result line, without its line end.
     """
 
     def __init__(

@@ -31,11 +31,6 @@ class RecordingSource:
     Times are those of the data, see `service.recordings.replay.data_time`, whenever and however fast these were
     recorded. For a machine without blocks or reports that can be read, the time of recording stands in.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Complete recordings.
-
     Raises
     ------
     RecordingError
@@ -79,14 +74,9 @@ class RecordingSource:
         return tuple(dict.fromkeys(found))
 
     def machine(self, wanted: str | None = None, *, reports: bool = False) -> MachineKeys:
-        """Keys of one machine.
+        """Keys of the machine ``SITE/MACHINE``, which may be left out if the recordings hold one machine.
 
-        Parameters
-        ----------
-        wanted : str, optional
-            ``SITE/MACHINE``; may be left out if the recordings hold one machine.
-        reports : bool
-            Whether reports will do where the samples were not kept.
+        With `reports`, these will do where the samples were not kept.
 
         Raises
         ------
@@ -128,14 +118,7 @@ class RecordingSource:
         )
 
     def between(self, from_: str | None, to: str | None, *machines: MachineKeys) -> tuple[int, int]:
-        """From when up to, and without, when the options ``--from`` and ``--to`` ask for data.
-
-        Parameters
-        ----------
-        from_, to : str or None
-            As `parse_moment` takes them.
-        *machines : MachineKeys
-            Whose data; without any, of all.
+        """From when up to, and without, when ``--from`` and ``--to`` ask for data of these machines, or of all.
 
         Raises
         ------
@@ -178,13 +161,9 @@ class RecordingSource:
     def timed(
         self, keys: Collection[str] | None = None, *, from_ns: int | None = None, to_ns: int | None = None
     ) -> Iterator[tuple[int, RecordedMessage]]:
-        """Read messages, each with the time that the data had reached.
+        """Read messages from `from_ns` up to, and without, `to_ns`, each with the time that the data had reached.
 
-        Parameters
-        ----------
-        from_ns, to_ns : int, optional
-            Only from `from_ns` up to, and without, `to_ns`. A block is where its first sample is; what was recorded
-            between two blocks of a machine goes with the first of them.
+        A block is where its first sample is; what was recorded between two blocks of a machine goes with the first.
 
         Raises
         ------
@@ -290,13 +269,8 @@ def _once(messages: Iterator[RecordedMessage]) -> Iterator[RecordedMessage]:
 def parse_moment(text: str, start_ns: int, option: str) -> int:
     """Time that an option names: seconds after the start of the data, or a date and time.
 
-    Parameters
-    ----------
-    text : str
-        ``90``, ``+90`` or ``90s``; or ``2026-01-01T00:02:30Z`` (UTC if it has no zone); or nanoseconds since 1970 as
-        ``1767225750000000000ns``.
-    option : str
-        Name of the option, for the message.
+    That is ``90``, ``+90`` or ``90s``; or ``2026-01-01T00:02:30Z`` (UTC if it has no zone); or nanoseconds since 1970
+    as ``1767225750000000000ns``.
 
     Raises
     ------
