@@ -70,13 +70,7 @@ def bars(*, remaining: bool = False) -> Progress:
 
 @contextmanager
 def labelled_bars(*, remaining: bool = False) -> Iterator[Callable[[str, int, int], None]]:
-    """Show a bar for every label that progress is told of.
-
-    Yields
-    ------
-    callable
-        Takes what is being done, how much of it is done, and how much there is.
-    """
+    """Show a bar for every label that it is told of: what is being done, how much of it is done, how much there is."""
     with bars(remaining=remaining) as shown:
         tasks: dict[str, TaskID] = {}
 

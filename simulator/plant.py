@@ -52,16 +52,9 @@ class PlantSamples:
 class Plant:
     """Rotor, coloured excitation and unbalance, advanced sample by sample with an exact discretisation.
 
-    The first sample is a draw from the stationary distribution, at shaft angle 0.
-
-    Parameters
-    ----------
-    machine : Machine
-        The original machine, its rate, and the angle of the heavy spot from the phase reference.
-    condition : Condition
-        What holds from the first sample on.
-    rng : numpy.random.Generator
-        Used by nothing else, so that the realisation depends on the seed alone.
+    The first sample is a draw from the stationary distribution, at shaft angle 0. The machine is the original one, the
+    condition holds from the first sample on; `rng` is used by nothing else, so that the realisation depends on the seed
+    alone.
     """
 
     def __init__(self, machine: Machine, condition: Condition, rng: np.random.Generator) -> None:

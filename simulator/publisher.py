@@ -63,14 +63,9 @@ def publish(
 ) -> RunSummary:
     """Publish descriptor, truth and blocks of one machine until the stream ends or `stop` is set.
 
-    Blocks go out when their last sample would have been taken, so that pace 1 behaves like a real machine.
-
-    Parameters
-    ----------
-    stream : iterator of (SampleBlock, tuple of TruthRecord)
-        From `simulator.stream.blocks`; not advanced before a subscriber is there, if one is waited for.
-    stop : threading.Event, optional
-        When set, publishing ends before the next block and the session closes at once.
+    Blocks go out when their last sample would have been taken, so that pace 1 behaves like a real machine. The stream
+    is not advanced before a subscriber is there, if one is waited for. When `stop` is set, publishing ends before the
+    next block and the session closes at once.
 
     Raises
     ------
@@ -116,7 +111,8 @@ def _session(settings: PublishSettings) -> Iterator[zenoh.Session]:
         except zenoh.ZError as error:
             # Only endpoints are text of the user's that Zenoh may refuse; a password is never shown.
             shown = f" = {value}" if path.endswith("endpoints") else ""
-            raise MachineFileError(f"link setting {path}{shown} is refused: {_reason(error)}") from error
+            reason = re.sub(r"\s*at \S+\.rs:\d+\.?", "", str(error))  # without the source lines of the library
+            raise MachineFileError(f"link setting {path}{shown} is refused: {reason}") from error
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
@@ -129,11 +125,6 @@ def _session(settings: PublishSettings) -> Iterator[zenoh.Session]:
         session.close()  # type: ignore[no-untyped-call]  # the stub says nothing of what it returns
 
 
-def _reason(error: zenoh.ZError) -> str:
-    """Error text without the source lines of the library."""
-    return re.sub(r"\s*at \S+\.rs:\d+\.?", "", str(error))
-
-
 @contextmanager
 def _declared(session: zenoh.Session, machine: MachineFile, pace: float | None) -> Iterator[_Outlets]:
     keys, descriptor = machine.keys, descriptor_payload(machine)
@@ -142,13 +133,13 @@ def _declared(session: zenoh.Session, machine: MachineFile, pace: float | None) 
     # overflow: there, a slow subscriber slows the publisher down instead.
     congestion = zenoh.CongestionControl.BLOCK if pace is None else zenoh.CongestionControl.DROP
 
-    def outlet(key: str, priority: zenoh.Priority, cache: int) -> zenoh.ext.AdvancedPublisher:
+    def outlet(key: str, cache: int) -> zenoh.ext.AdvancedPublisher:
         return zenoh.ext.declare_advanced_publisher(
             session,
             key,
             encoding=JSON_ENCODING,
             congestion_control=congestion,
-            priority=priority,
+            priority=zenoh.Priority.DATA_HIGH,
             cache=zenoh.ext.CacheConfig(max_samples=cache),
             sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None),
             publisher_detection=True,
@@ -158,9 +149,9 @@ def _declared(session: zenoh.Session, machine: MachineFile, pace: float | None) 
         query.reply(keys.descriptor, descriptor, encoding=JSON_ENCODING)
 
     outlets = _Outlets(
-        stream=outlet(keys.stream, zenoh.Priority.DATA_HIGH, _CACHE_BLOCKS),
-        descriptor=outlet(keys.descriptor, zenoh.Priority.DATA_HIGH, 1),
-        truth=outlet(keys.truth, zenoh.Priority.DATA_HIGH, _CACHE_TRUTH),
+        stream=outlet(keys.stream, _CACHE_BLOCKS),
+        descriptor=outlet(keys.descriptor, 1),
+        truth=outlet(keys.truth, _CACHE_TRUTH),
     )
     declared: list[zenoh.ext.AdvancedPublisher | zenoh.Queryable[None] | zenoh.LivelinessToken]
     declared = [outlets.stream, outlets.descriptor, outlets.truth, session.declare_queryable(keys.descriptor, answer)]

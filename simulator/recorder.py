@@ -23,14 +23,8 @@ def record(
     """Record descriptor, truth and blocks under the keys a publisher would use.
 
     All times in the file are data time: a block is logged at the time of the sample after its last one, which is when a
-    real machine could first have sent it.
-
-    Parameters
-    ----------
-    path : Path
-        Name of the recording; it is ``.part`` until complete.
-    stop : threading.Event, optional
-        When set, the recording ends after the current block and is complete.
+    real machine could first have sent it. The file is ``.part`` until complete; when `stop` is set, it ends after the
+    current block and is complete.
 
     Raises
     ------

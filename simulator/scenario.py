@@ -280,18 +280,9 @@ def shipped_scenarios() -> tuple[str, ...]:
 
 
 def load_scenario(name_or_path: str | Path) -> tuple[Scenario, Machine]:
-    """Load a scenario by path, or a shipped one by name, together with its machine.
+    """Load a scenario by path, or a shipped one by name, together with the machine it names.
 
-    Parameters
-    ----------
-    name_or_path : str or Path
-        "healthy", "k_by", ... (shipped), or the path of a TOML file.
-
-    Returns
-    -------
-    scenario : Scenario
-    machine : Machine
-        The one the scenario names; a path is relative to the scenario file.
+    A path of a machine file is relative to the scenario file.
 
     Raises
     ------

@@ -29,15 +29,9 @@ class SimulatedSensor:
     The value goes through the high-pass and the delay that the machine file states. A delay that is a fault shifts it
     by whole samples, the nearest number; before the first sample it was what it is then.
 
-    Parameters
-    ----------
-    rms_SI : float
-        What ``noise_relative`` refers to: the channel's own theoretical rms, one revolution for a shaft angle.
-    late_s : float
-        How much later its signal comes than that of the machine's first.
-    rng : numpy.random.Generator
-        Of this sensor alone. One number per sample is drawn whatever the settings are, so that a noise level can
-        change without changing the noise.
+    ``noise_relative`` refers to `rms_SI`: the channel's own theoretical rms, one revolution for a shaft angle. Its
+    signal comes `late_s` later than that of the machine's first. `rng` is of this sensor alone: one number per sample
+    is drawn whatever the settings are, so that a noise level can change without changing the noise.
     """
 
     def __init__(
@@ -85,13 +79,7 @@ class SimulatedSensor:
         return np.asarray(coloured, dtype=np.float64)
 
     def measure(self, value_SI: FloatArray, noise: FloatArray, faults: SensorFaults) -> FloatArray:
-        """Return samples in the channel's unit while the same faults are active; NaN after a dropout.
-
-        Parameters
-        ----------
-        value_SI : ndarray, shape (n,)
-            True values, n ≥ 1.
-        """
+        """Samples, in the channel's unit, of true values while the same faults are active; NaN after a dropout."""
         settings = self._settings
         level = _value(faults, "noise_relative", settings.noise_relative) * self._rms_SI
         seen = self._delayed(self._passed(value_SI), round(_value(faults, "delay", 0.0) * self._rate_hz))
@@ -129,13 +117,7 @@ class SimulatedSensor:
 
 
 class SensorBank:
-    """All channels of a machine, in the order of its file.
-
-    Parameters
-    ----------
-    moments : ndarray, shape (12, 12)
-        Theoretical mean products of the states at the start, SI.
-    """
+    """All channels of a machine, in the order of its file; `moments` as of `simulator.plant.theoretical_moments`."""
 
     def __init__(
         self,

@@ -100,25 +100,11 @@ _PIECE = 4000  # samples that are simulated at a time
 
 def blocks(
     scenario: Scenario, machine: Machine, block_s: float = 0.1, start_ns: int = DEFAULT_START_NS, run: int = 1
-) -> Iterator[tuple[SampleBlock, tuple[TruthRecord, ...]]]:
-    """Simulate a scenario, block by block.
+) -> BlockStream:
+    """Simulate a scenario with the original machine: each block, and the truth records that begin within it, ascending.
 
-    Parameters
-    ----------
-    machine : Machine
-        The original machine; its channels, rate and number format shape the blocks.
-    block_s : float
-        Length of a block, s; the last one may be shorter.
-    start_ns : int
-        Acquisition time of the first sample, ns since 1970-01-01 UTC.
-    run : int
-        Run number in every block, 0 to 65535.
-
-    Yields
-    ------
-    block : SampleBlock
-    truth : tuple of TruthRecord
-        Records that begin within the block, ascending.
+    The last block may be shorter than `block_s`. The first sample is acquired at `start_ns`, ns since 1970-01-01 UTC;
+    the run number in every block is 0 to 65535.
 
     Raises
     ------
@@ -134,9 +120,7 @@ def blocks(
     return _cut(scenario, machine, n_block, start_ns, run)
 
 
-def _cut(
-    scenario: Scenario, machine: Machine, n_block: int, start_ns: int, run: int
-) -> Iterator[tuple[SampleBlock, tuple[TruthRecord, ...]]]:
+def _cut(scenario: Scenario, machine: Machine, n_block: int, start_ns: int, run: int) -> BlockStream:
     simulation = _Simulation(scenario, machine, start_ns, run)
     for sequence, (first, last) in enumerate(_spans(machine, simulation.n_samples, n_block)):
         simulation.skip(first)

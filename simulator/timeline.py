@@ -52,10 +52,7 @@ class Timeline:
 def compile_timeline(scenario: Scenario, machine: Machine) -> Timeline:
     """Turn a scenario's events into conditions by sample number.
 
-    Parameters
-    ----------
-    machine : Machine
-        Its nominal speed holds until an event changes it; events start at the nearest sample of its rate.
+    The machine's nominal speed holds until an event changes it; events start at the nearest sample of its rate.
     """
     rate_hz = machine.rate_hz
     events = sorted(scenario.events, key=lambda event: event.at_s)  # stable: equal times keep the file's order

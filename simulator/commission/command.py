@@ -35,13 +35,7 @@ _WIDE = 100
 
 
 def print_report(report: CommissioningReport, console: Console | None = None) -> None:
-    """Print verdict, checks and parameters.
-
-    Parameters
-    ----------
-    console : rich.console.Console, optional
-        The terminal without it. 80 columns suffice.
-    """
+    """Print verdict, checks and parameters, by default on the terminal, for which 80 columns suffice."""
     console = Console(highlight=False) if console is None else console
     verdict = Text(headline(report))
     verdict.highlight_words([VERDICT_TEXT[report.verdict]], style=_COLOURS[report.verdict])
@@ -118,14 +112,8 @@ def commission_machine(
 ) -> bool:
     """Commission a machine, write its bundle, and say whether it was commissioned; if not, the report says why.
 
-    Parameters
-    ----------
-    first_s : float, optional
-        Use only the first seconds of every recording.
-    why : str
-        Why the machine is commissioned again; needed where `out` holds a commissioning already.
-    networks : bool
-        Whether to train networks, too, where the parameters are known.
+    Only the first seconds of every recording are used, if `first_s` is given. Where `out` holds a commissioning
+    already, it must be said `why` it is made again. Networks are trained only where the parameters are known.
 
     Raises
     ------

@@ -42,15 +42,7 @@ class ReportPicture:
 def pictures_of(
     report: CommissioningReport, names: Sequence[str], portraits: Sequence[Portrait]
 ) -> tuple[ReportPicture, ...]:
-    """Draw all that there is something to draw of.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Of the recordings, in the order in which they are numbered.
-    portraits : sequence of Portrait
-        Of those that hold usable data.
-    """
+    """Draw all that there is something to draw of: names of all recordings, portraits of those with usable data."""
     drawn: list[tuple[str, str, Callable[[], Figure | None], str]] = [
         (
             "readings",
@@ -132,21 +124,10 @@ def write_report(
     machine: MachineFile | None = None,
     commissioned: Commissioned | None = None,
 ) -> Path:
-    """Write ``report.html`` and ``report.json``.
+    """Write ``report.html``, whose path is returned, and ``report.json``.
 
-    Parameters
-    ----------
-    directory : Path
-        Made if it is not there.
-    recordings : sequence of HealthyRecording
-        What it was made from: for the pictures and the table of recordings.
-    commissioned : Commissioned, optional
-        What was stored: for what it replaces and why, and the hash of each file.
-
-    Returns
-    -------
-    Path
-        The page. The same arguments give the same page, to the last byte.
+    What was stored as `commissioned` says what it replaces and why, and the hash of each file. The same arguments give
+    the same page, to the last byte.
 
     Raises
     ------
@@ -185,21 +166,15 @@ def _render(
         report=report,
         description=description,
         commissioned=commissioned,
-        headline=verdict.headline(report),
-        steps=verdict.next_steps(report),
-        budget=verdict.budget_sentences(report),
+        verdict=verdict,
         identified=any(one.identified is not None for one in report.parameters),
         wished=sorted({one.wished for one in report.parameters if one.wished is not None}),
-        dominant=verdict.dominant,
-        smallest_change=verdict.smallest_change,
-        parameter_value=verdict.parameter_value,
         equations_text=_EQUATIONS[report.level],
         symbols=_symbols(report),
         pictures=pictures_of(report, [one.name for one in recordings], [one for one in portraits if one is not None]),
         speed_range="" if turned is None else _speeds(turned),
         levels=_levels(report),
         growths=_growths(report),
-        growth_sentence=verdict.growth_sentence(report),
         recordings=[_row(*pair) for pair in zip(recordings, portraits, strict=True)],
         hashes=hashes,
     )

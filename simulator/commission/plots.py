@@ -58,16 +58,9 @@ _NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
 
 def inline_svg(name: str, label: str, paint: Callable[[], Figure | None]) -> Markup | None:
-    """Draw a picture in the house style, as an element of an HTML page.
+    """Draw a picture in the house style, of width `WIDTH_IN`, as an element of an HTML page; None if there is nothing.
 
-    Parameters
-    ----------
-    name : str
-        Unique on the page: every identifier in the picture begins with it.
-    label : str
-        What it shows, for those who cannot see it.
-    paint : callable
-        Makes the figure, of width `WIDTH_IN`, or None if there is nothing to draw.
+    Every identifier in the picture begins with the name, unique on the page. The label is for those who cannot see it.
     """
     written = StringIO()
     with style.context(["default", _STYLE]):
@@ -102,13 +95,7 @@ _MOST_LABELS = 24
 
 
 def draw_readings(report: CommissioningReport, recordings: Sequence[str]) -> Figure | None:
-    """Each parameter's healthy readings with 95 % intervals against zero, by recording; None without readings.
-
-    Parameters
-    ----------
-    recordings : sequence of str
-        Names, in the order in which they are numbered.
-    """
+    """Each parameter's healthy readings with 95 % intervals against zero, by recording; None without readings."""
     read = [one for one in report.parameters if one.readings]
     if not read:
         return None

@@ -91,13 +91,7 @@ def _number(place: str) -> int:
 
 
 def draw_spectra(portraits: Sequence[Portrait]) -> Figure:
-    """Spectra of every channel, all recordings in each.
-
-    Parameters
-    ----------
-    portraits : sequence of Portrait
-        At least one.
-    """
+    """Spectra of every channel, all recordings in each; at least one."""
     states = ordered(portraits[0].statistics.states)
     columns = min(2, len(states))
     rows = -(-len(states) // columns)
@@ -171,13 +165,7 @@ def _mark_rotation(axes: Axes, portraits: Sequence[Portrait], highest_hz: float)
 
 
 def draw_levels(portraits: Sequence[Portrait]) -> Figure:
-    """Speed and level of random vibration hop by hop, the recordings one after the other.
-
-    Parameters
-    ----------
-    portraits : sequence of Portrait
-        At least one.
-    """
+    """Speed and level of random vibration hop by hop, the recordings one after the other; at least one."""
     speeds_known = any(np.isfinite(one.statistics.hop_speed_rad_s).any() for one in portraits)
     heights = [1.0, 1.8] if speeds_known else [1.8]
     figure = Figure(figsize=(WIDTH_IN, 0.7 + 1.4 * sum(heights)), layout="constrained")

@@ -45,12 +45,7 @@ def calibrate_for(
     out: Path,
     processes: int,
 ) -> None:
-    """Calibrate networks of a machine and write the bundle.
-
-    Parameters
-    ----------
-    made : Training
-        How they were trained: seed and number of windows are those of the calibration, too.
+    """Calibrate networks of a machine, with the seed and number of windows of their training, and write the bundle.
 
     Raises
     ------
@@ -125,9 +120,8 @@ def _held_out(draw: Draw, count: int, processes: int, progress: Callable[[int], 
 
 def _changes(draw: Draw, number: int) -> dict[str, float]:
     """True relative changes of a drawn window."""
-    events = draw_condition(draw, number).events
     return {
         event.parameter: event.relative_change
-        for event in events
+        for event in draw_condition(draw, number).events
         if event.parameter is not None and event.relative_change is not None
     }

@@ -29,12 +29,8 @@ _CONDITIONS_PER_BATCH = 480
 def train_for(machine: Machine, out: Path, n_windows: int, n_draws: int, seed: int, processes: int) -> None:
     """Train every equation's relation network and amortised network for the machine and write the bundle.
 
-    Parameters
-    ----------
-    n_windows : int
-        Simulated training windows per relation network; those of the calibration go with them.
-    n_draws : int
-        Random machines and conditions for the first reading of the amortised networks, half as many for the second.
+    `n_windows` are simulated for the training of each relation network; those of the calibration go with them.
+    `n_draws` are random machines and conditions for the first reading of the amortised networks, half for the second.
 
     Raises
     ------

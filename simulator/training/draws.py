@@ -282,13 +282,7 @@ def simulate_scenario(scenario: Scenario, machine: Machine) -> WindowStatistics:
 def windows(
     draw: Draw, numbers: Sequence[int], processes: int, progress: Callable[[int], None] = lambda _: None
 ) -> Iterator[WindowStatistics]:
-    """Simulate windows over worker processes, in order.
-
-    Parameters
-    ----------
-    processes : int
-        1 stays in this process.
-    """
+    """Simulate windows over worker processes, in order; with one, in this process."""
     make = partial(simulate_window, draw)
     if processes == 1:
         for number in numbers:

@@ -92,13 +92,9 @@ class SpectralDraws:
     def realisations(
         self, rng: np.random.Generator, expected: ComplexArray, speed_rad_s: FloatArray, count: int
     ) -> Iterator[npt.NDArray[np.complex64]]:
-        """Realisations of the averaged cross-spectra, each of the shape of `expected`.
+        """Realisations of the averaged cross-spectra, each of the shape of `expected`, (n_windows, n_bins, n, n).
 
-        Parameters
-        ----------
-        expected : ndarray of complex, shape (n_windows, n_bins, n, n)
-            Expected cross-spectra of any linear combinations of the measured states.
-        speed_rad_s : ndarray, shape (n_windows,)
+        They may be those of any linear combinations of the measured states; speeds have shape (n_windows,).
         """
         n_windows, n_bins, n, _ = expected.shape
         # What the regression on the shaft angle takes out of the bins around the rotation: one coefficient's worth.
