@@ -32,13 +32,9 @@ class AlarmMessage:
 class AlarmTopics:
     """Subscriptions to the alarms of some machines, and questions to their monitors.
 
-    A connection that is lost comes back by itself; what was published in between is not heard.
-
-    Parameters
-    ----------
-    hear : callable
-        Takes each message, on a thread of Zenoh's: be short. Latest states and events that monitors still have come at
-        once, possibly out of order and more than once.
+    A connection that is lost comes back by itself; what was published in between is not heard. `hear` takes each
+    message, on a thread of Zenoh's: be short. Latest states and events that monitors still have come at once, possibly
+    out of order and more than once.
     """
 
     def __init__(self, session: zenoh.Session, machines: Sequence[str], hear: Callable[[AlarmMessage], None]) -> None:
@@ -56,14 +52,7 @@ class AlarmTopics:
     def ask(self, place: str, after: int, limit: int) -> str | None:
         """Ask a monitor for an alarm log, JSON of an `AlarmLogPage`; None if nobody answers within five seconds.
 
-        Parameters
-        ----------
-        place : str
-            ``<site>/<machine>``.
-        after : int
-            Sequence number after which; -1 for the beginning.
-        limit : int
-            At most so many events, up to 1000.
+        It has at most `limit` events, up to 1000, after this sequence number; -1 for the beginning.
 
         Raises
         ------

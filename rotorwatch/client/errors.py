@@ -26,15 +26,7 @@ class NoAnswer(ClientError):  # noqa: N818
 
 
 class RequestRefused(ClientError):  # noqa: N818
-    """The service refused a request; the message is the detail of its problem.
-
-    Parameters
-    ----------
-    status : int
-        HTTP status.
-    detail : str
-        What went wrong, in the service's words.
-    """
+    """The service refused a request with this HTTP status; the message is the detail of its problem."""
 
     def __init__(self, status: int, detail: str) -> None:
         super().__init__(detail)

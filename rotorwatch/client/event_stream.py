@@ -14,8 +14,7 @@ from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import Health
 
 _PATH = "/api/v1/events"
-_SILENCE_S = 60.0
-"""The service says something every 15 s, if only that it is there."""
+_SILENCE_S = 60.0  # the service says something every 15 s, if only that it is there
 _FIRST_PAUSE_S = 0.5
 _LONGEST_PAUSE_S = 30.0
 
@@ -34,14 +33,7 @@ class ServiceEvent:
 def service_events(http: httpx.Client, parameters: Mapping[str, str | list[str]], after: str) -> Iterator[ServiceEvent]:
     """Listen for ever; a connection that is lost is made again, and goes on right after the last event.
 
-    Parameters
-    ----------
-    http : httpx.Client
-        Knows address and token.
-    parameters : mapping
-        Of the first request.
-    after : str
-        Cursor of the last event that was taken; empty for none.
+    `after` is the cursor of the last event that was taken; empty for none.
 
     Raises
     ------

@@ -15,19 +15,11 @@ _MOST_WAITING = 2000
 
 
 class LogOrder:
-    """How far one machine's alarm log has been followed.
-
-    Parameters
-    ----------
-    place : str
-        ``<site>/<machine>``, for messages.
-    last : int
-        Sequence number of the last event that was taken; -1 for none.
-    """
+    """How far one machine's alarm log has been followed."""
 
     def __init__(self, place: str, last: int) -> None:
-        self.place = place
-        self.last = last
+        self.place = place  # ``<site>/<machine>``
+        self.last = last  # sequence number of the last event that was taken; -1 for none
         self._latest = last
         self._newest: AlarmCloudEvent | None = None
         self._waiting: dict[int, AlarmCloudEvent] = {}

@@ -22,8 +22,7 @@ def finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
-Number = Annotated[float | None, AfterValidator(finite)]
-"""A finite number or null, whatever it is made of."""
+Number = Annotated[float | None, AfterValidator(finite)]  # a finite number or null, whatever it is made of
 
 Site = Annotated[str, Field(description="site of the machine", examples=["demo"])]
 
