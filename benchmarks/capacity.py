@@ -42,8 +42,7 @@ from models.signals.link import LinkSettings
 from models.signals.wire import encode_block
 
 BLOCK_S = 0.1
-KINDS = 4
-"""Streams with a seed of their own; machines share them, each with its own times."""
+KINDS = 4  # streams with a seed of their own; machines share them, each with its own times
 IN_TIME_S = 1.0
 CACHED = 1200
 

@@ -24,6 +24,7 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+from capacity import Process
 
 from models.commissioning.commissioned import install
 from models.signals.block import SampleBlock
@@ -48,12 +49,6 @@ def stream(seed: int, length_s: float, start_ns: int) -> Iterator[SampleBlock]:
     scenario, machine = load_scenario("healthy")
     for block, _ in blocks(scenario.overridden(seed=seed, duration_s=length_s), machine, BLOCK_S, start_ns):
         yield block
-
-
-def written() -> int:
-    """Bytes that this process has caused to be written to the device."""
-    lines = dict(line.split(": ") for line in Path("/proc/self/io").read_text(encoding="ascii").splitlines())
-    return int(lines["write_bytes"])
 
 
 def age(file: Path, before_ns: int, days: float) -> int:
@@ -122,25 +117,26 @@ def measure(machines: int, hops: int, seed: int, days: float, *, together: bool)
         streams = [stream(seed + number, length_s, start_ns) for number in range(machines)]
         feed(workers, streams, warm, together=together)
         buckets = age(file, start_ns, days)
-        before, begin_s, count = written(), time.monotonic(), sum(worker.tally.windows for worker in workers)
+        own = Process(os.getpid())
+        before, begin_s, count = own.written_mb(), time.monotonic(), sum(worker.tally.windows for worker in workers)
         feed(workers, streams, hops, together=together)
         per_s = time.monotonic() - begin_s
         with closing(sqlite3.connect(file, timeout=60.0)) as database:
             page = database.execute("PRAGMA page_size").fetchone()[0]
             database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        total = written() - before
+        total_mb = own.written_mb() - before
         count = sum(worker.tally.windows for worker in workers) - count
         print(
             f"{machines:3d} machines (seeds {seed} to {seed + machines - 1}), {count} hops in {per_s:.0f} s, "
             f"{'together' if together else 'one after the other'}, {buckets} buckets before, pages of {page} bytes: "
-            f"{total / count / 1e3:.1f} kB per hop and machine; the file has {file.stat().st_size / 1e6:.1f} MB",
+            f"{1e3 * total_mb / count:.1f} kB per hop and machine; the file has {file.stat().st_size / 1e6:.1f} MB",
             flush=True,
         )
-        before = written()
+        before = own.written_mb()
         for worker in workers:
             worker.stop()
         store.close()
-        print(f"    an orderly stop: {(written() - before) / machines / 1e6:.2f} MB for each machine", flush=True)
+        print(f"    an orderly stop: {(own.written_mb() - before) / machines:.2f} MB for each machine", flush=True)
 
 
 def main() -> None:

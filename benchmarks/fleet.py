@@ -27,6 +27,7 @@ import httpx
 import numpy as np
 import psycopg
 from capacity import BLOCK_S, KINDS, Plant, sending
+from machine_kind import MachineKind
 from ray.cluster_utils import Cluster
 from running_monitor import on_loopback, serving, started
 
@@ -50,14 +51,10 @@ def emptied(database: str) -> None:
 
 
 def fleet_files(folder: Path, machines: Sequence[MachineFile], database: str, link: str, inner: str) -> Path:
-    """Settings and machine files; returns the settings."""
-    text = Path("models/machines/lab.toml").read_text(encoding="utf-8")
+    """Settings for machines whose files are in the folder; returns their file."""
     lines = [f'[link]\nmode = "client"\nconnect = ["{link}"]', f'[fleet]\nlisten = "{inner}"']
     lines += [f'[history]\nurl = "{database}"']
-    for machine in machines:
-        file = folder / f"{machine.name}.toml"
-        file.write_text(text.replace('name = "lab"', f'name = "{machine.name}"'), encoding="utf-8")
-        lines.append(f'[[machines]]\nfile = "{file.name}"\nbundle = "lab"')
+    lines += [f'[[machines]]\nfile = "{machine.name}.toml"\nbundle = "lab"' for machine in machines]
     (folder / "fleet.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder / "fleet.toml"
 
@@ -135,7 +132,6 @@ def run(
     """Monitor so many machines, killing so many computers; returns the alarm logs."""
     emptied(database)
     base = load_machine("lab")
-    machines = [base.model_copy(update={"name": f"kit{number}"}) for number in range(count)]
     scenario, _ = load_scenario("healthy")
     fault = parse_fault(f"k_by=-0.33@{WARM_S:g}")
     streams = []
@@ -144,6 +140,7 @@ def run(
         streams.append([block for block, _ in blocks(given, base, BLOCK_S, start_ns=0)])
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name, cluster_of() as cluster:
         folder = Path(name)
+        machines = [MachineKind().machine(folder, f"kit{number}") for number in range(count)]
         environment, link = on_loopback(folder)
         _, inner = on_loopback(folder)
         for gone in ("ROTORWATCH_LINK", "ROTORWATCH_HISTORY__URL"):

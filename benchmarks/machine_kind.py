@@ -28,8 +28,7 @@ location = "place {number}"
 direction = "y"
 unit = "m/s2"
 """
-_KIT = 9
-"""Channels of the rotor kit, the shaft angle among them; four of tilt are known besides."""
+_KIT = 9  # channels of the rotor kit, the shaft angle among them; four of tilt are known besides
 
 
 def rotor_kit(rate_hz: float = 2000.0, hop_s: float = 5.0, *, tilt: bool = False) -> str:

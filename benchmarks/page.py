@@ -28,6 +28,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
+from capacity import Process
 from page_plant import Plant, told
 from playwright.sync_api import Browser, CDPSession, sync_playwright
 from running_monitor import PLACE, Monitor, monitor
@@ -36,7 +37,6 @@ NAMES = ("chromium", "chromium-browser", "google-chrome")
 EVERY_S = 15.0
 STREAM = f"/api/v1/events?detail=overview&in_full={PLACE}"
 MANY_STREAMS = {"ROTORWATCH_ACCESS__LIMITS__STREAMS_PER_CALLER": "100"}
-TICKS = os.sysconf("SC_CLK_TCK")
 WATCH = """() => {
   window.longest = 0;
   const note = (one) => { window.longest = Math.max(window.longest, one.duration); };
@@ -97,12 +97,6 @@ def plant(browser: Browser, machines: int, seconds: float) -> None:
             f"| {standing}, {len(served.asked) - standing} |",
             flush=True,
         )
-
-
-def processor_s(one: Monitor) -> float:
-    """Processor time that the monitor has taken."""
-    fields = Path(f"/proc/{one.process.pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS
 
 
 def arrivals(one: Monitor, ended: threading.Event, found: list[tuple[int, float]]) -> None:
@@ -168,11 +162,12 @@ def pages(one: Monitor, paths: list[str], count: int, seconds: float) -> tuple[f
     for each in (listener, *threads):
         each.start()
     time.sleep(EVERY_S)  # whatever is asked first is not asked again
-    before_s, before, begin_s = processor_s(one), sum(heard), time.monotonic()
+    process = Process(one.process.pid)
+    before_s, before, begin_s = process.cpu_s(), sum(heard), time.monotonic()
     arrived.clear()
     time.sleep(seconds)
     length_s = time.monotonic() - begin_s
-    share, rate = (processor_s(one) - before_s) / length_s, (sum(heard) - before) / length_s / max(count, 1)
+    share, rate = (process.cpu_s() - before_s) / length_s, (sum(heard) - before) / length_s / max(count, 1)
     found = [at_s - end_ns / 1e9 for end_ns, at_s in arrived]
     ended.set()
     for each in (listener, *threads):

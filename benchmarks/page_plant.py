@@ -20,8 +20,7 @@ from rotorwatch.records.health import Health
 from service.analysis.overview import overview
 from service.api.routes.page import add_page_routes
 
-SITE = 25
-"""Machines of one site."""
+SITE = 25  # machines of one site
 DAY_NS = 86_400_000_000_000
 
 

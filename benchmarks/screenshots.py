@@ -30,8 +30,7 @@ VIEWS = {
 FAULT = "k_by=-0.25@140"
 WIDTH, MOST_BYTES, PACE = 1280, 150_000, "6"
 WAIT_MS = 240_000
-SCRUBBER = 130
-"""Height of what stays above the window of a replay, px."""
+SCRUBBER = 130  # height of what stays above the window of a replay, px
 
 
 def picture(page: Page, at: Path, height: int, top: str = "body") -> None:

@@ -27,9 +27,9 @@ import httpx
 import numpy as np
 import zenoh
 from capacity import Process, session_with
+from machine_kind import rotor_kit
 from running_monitor import on_loopback, started, url_of
 
-import models
 from models.alarm_names import STREAM_LOST
 from models.commissioning.commissioned import install
 from models.machine import Machine, load_machine
@@ -49,8 +49,7 @@ from simulator.stream import blocks
 _PLACE = "demo/lab"
 _BLOCK_S = 0.5
 _START_NS = 1_767_225_600_000_000_000
-_AHEAD = 80
-"""Blocks that may be on their way; a publisher keeps 1200."""
+_AHEAD = 80  # blocks that may be on their way; a publisher keeps 1200
 _PATIENCE_S = 30.0
 _FAULTS = {"k_by": (-0.35, -0.2, 0.4), "k_bz": (-0.35, 0.4), "c_by": (-0.5, 0.8), "c_bz": (-0.5, 0.8), "e": (0.5, 1.0)}
 _PAGE = 1000
@@ -58,9 +57,8 @@ _PAGE = 1000
 
 def machine_file(folder: Path) -> Path:
     """The shipped rotor kit, for which a minute without data is no lost stream: the day is played much faster."""
-    text = (Path(models.__file__).parent / "machines" / "lab.toml").read_text(encoding="utf-8")
     path = folder / "lab.toml"
-    path.write_text(f"{text}\n[ingest]\nno_data_after_s = 60.0\n", encoding="utf-8")
+    path.write_text(f"{rotor_kit()}\n[ingest]\nno_data_after_s = 60.0\n", encoding="utf-8")
     return path
 
 

@@ -30,12 +30,12 @@ from pathlib import Path
 from typing import Any
 
 import zenoh
+from machine_kind import rotor_kit
 from rich.console import Console
 from rich.progress import Progress
 from running_monitor import PLACE, Monitor, monitor
 from wire_grammar import GOOD_RUN, Grammar, Message
 
-import models
 from models.machine import load_machine
 from models.signals.link import LinkSettings
 from service.stream.transport import Link
@@ -46,8 +46,7 @@ _GROWTH_MB, _HEALTH_BYTES, _LOG_BYTES_PER_S = 50.0, 100_000, 2_000.0
 _ERRORS = re.compile(r"Traceback|\[(error|critical)|panicked|Exception|something was lost", re.IGNORECASE)
 _ON_THE_WAY = 10
 """Blocks of the last second, which a publisher that is stopped may take with it; there are no gaps before them."""
-_WARM_MINUTES = 4
-"""Until windows are full and evaluated, caches too."""
+_WARM_MINUTES = 4  # until windows are full and evaluated, caches too
 
 
 @dataclass(slots=True)
@@ -271,10 +270,9 @@ def main() -> int:
     parser.add_argument("--json", type=Path, default=Path("wire_fuzz.json"), help="where the result goes")
     options = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="wire-fuzz-"))
-    lab = (Path(models.__file__).parent / "machines" / "lab.toml").read_text(encoding="utf-8")
     others = [folder / f"{place.partition('/')[2]}.toml" for place in (_SECOND, _THIRD)]
     for other in others:
-        other.write_text(lab.replace('name = "lab"', f'name = "{other.stem}"'), encoding="utf-8")
+        other.write_text(rotor_kit().replace('name = "lab"', f'name = "{other.stem}"'), encoding="utf-8")
     settings = {
         "ROTORWATCH_MACHINES": json.dumps([{"file": "lab", "bundle": "lab"}, *({"file": str(one)} for one in others)]),
         "ROTORWATCH_RECORDING": json.dumps(

@@ -13,8 +13,10 @@ are evaluated, too. Everything that cannot be a block goes to any of them.
 
 import json
 import struct
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -29,14 +31,12 @@ from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health
 
-GOOD_RUN = 7
-"""Of the first machine's own publisher."""
+GOOD_RUN = 7  # of the first machine's own publisher
 
 _START_NS = 1_767_225_600_000_000_000
 _STRETCH = 2000
 _BLOCK_S = 0.5
-_EVERY = 20
-"""Each so many-th message is the next block of the second machine."""
+_EVERY = 20  # each so many-th message is the next block of the second machine
 
 _BOUNDS = (7, 8, 15, 16, 31, 32, 53, 63, 64)
 WHOLE = [0, 1, -1, *(sign * 2**bits + off for bits in _BOUNDS for sign in (1, -1) for off in (-1, 0, 1)), 10**30]
@@ -65,14 +65,12 @@ class Message:
     """What is to be done on the network, on the key: publish, delete, declare a liveliness token, or ask."""
 
     number: int
-    kind: str
-    """The rule that made it."""
+    kind: str  # the rule that made it
     act: Literal["put", "delete", "declare", "ask"]
     key: str
     payload: bytes = b""
     attachment: bytes = b""
-    encoding: str = ""
-    """Of a question its parameters."""
+    encoding: str = ""  # of a question its parameters
 
 
 class Grammar:
@@ -104,12 +102,8 @@ class Grammar:
         dice = _Dice(np.random.default_rng([self._seed, number]))
         if number % _EVERY == 0:
             return self._next_block(dice, number)
-        draw = dice.below(sum(weight for weight, _ in self._rules))
-        rules = iter(self._rules)
-        weight, rule = next(rules)
-        while draw >= weight:
-            draw -= weight
-            weight, rule = next(rules)
+        ends = list(accumulate(weight for weight, _ in self._rules))
+        _, rule = self._rules[bisect_right(ends, dice.below(ends[-1]))]
         return rule(dice, number)
 
     # Blocks

@@ -64,10 +64,7 @@ def force_samples(forces: tuple[Force, ...], count: int, rate_hz: float, rng: np
 def covariance_under(equations: Equations, forces: tuple[Force, ...]) -> FloatArray:
     """Stationary covariance of (ξ, ξ̇) under coloured forces, from the Ljapunov equation; shape (2n, 2n), SI.
 
-    Raises
-    ------
-    models.errors.EstimationError
-        If the rotor is unstable.
+    Raises EstimationError if the rotor is unstable.
     """
     n = len(equations.M)
     colours = [force.colour for force in forces]

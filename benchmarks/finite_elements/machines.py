@@ -138,11 +138,5 @@ ROTORS: tuple[BeamRotor, ...] = (
 
 
 def rotor_named(name: str) -> BeamRotor:
-    """Take a machine from the table.
-
-    Raises
-    ------
-    KeyError
-        If it is not there.
-    """
+    """Take a machine from the table; raises KeyError if it is not there."""
     return {rotor.name: rotor for rotor in ROTORS}[name]

@@ -56,8 +56,7 @@ class _Modal:
     roots: ComplexArray
     shapes: ComplexArray
     drive: ComplexArray
-    direct: FloatArray
-    """M⁻¹ of these forces."""
+    direct: FloatArray  # M⁻¹ of these forces
 
 
 def move(
@@ -72,10 +71,7 @@ def move(
 ) -> Motion:
     """Run a rotor at constant speed; one with cubic stiffness in several steps a sample.
 
-    Raises
-    ------
-    EstimationError
-        If the rotor is unstable at this speed, or its cubic stiffness throws it out of range.
+    Raises EstimationError if the rotor is unstable at this speed, or its cubic stiffness throws it out of range.
     """
     equations = assemble(rotor, speed_rad_s)
     fine = 1 if rotor.linear else oversampling

@@ -52,15 +52,10 @@ def sampled(
     duration_s: float,
     seed: int | list[int],
     probes: tuple[str, ...] = MOTION,
-    *,
-    phase_reference: bool = True,
 ) -> FloatArray:
-    """Samples in SI, the shaft angle last if there is a phase reference; shape (n_samples, n_probes [+ 1]).
+    """Samples in SI, the shaft angle last; shape (n_samples, n_probes + 1).
 
-    Raises
-    ------
-    models.errors.EstimationError
-        If the rotor is unstable.
+    Raises EstimationError if the rotor is unstable.
     """
     motion_rng, noise_rng = np.random.default_rng(seed).spawn(2)
     changed = changed_rotor(rotor, condition.changes)
@@ -68,8 +63,6 @@ def sampled(
     seen = motion.values[:, [PROBES.index(name) for name in probes]]
     noise = _noise(seen.shape, condition.noise_corner_hz, noise_rng)
     seen = seen + condition.noise_relative * seen.std(axis=0) * noise
-    if not phase_reference:
-        return np.asarray(seen, dtype=np.float64)
     return np.column_stack([seen, np.mod(motion.angle_rad, 2 * np.pi)])
 
 
@@ -110,11 +103,9 @@ def _channel(probe: str) -> dict[str, str]:
     return {"name": probe, "quantity": quantity, "location": location, "direction": place[0], "unit": unit}
 
 
-def plan(
-    rotor: BeamRotor, sizes: WindowSizes, probes: tuple[str, ...] = MOTION, *, phase_reference: bool = True
-) -> Plan:
+def plan(rotor: BeamRotor, sizes: WindowSizes, probes: tuple[str, ...] = MOTION) -> Plan:
     """Sizes of the monitor's sliding window, for SI samples as `sampled` gives them."""
-    monitored = plan_for(machine_of(rotor, sizes, probes, phase_reference=phase_reference))
+    monitored = plan_for(machine_of(rotor, sizes, probes))
     return replace(monitored, scales=np.ones(len(monitored.states)))
 
 

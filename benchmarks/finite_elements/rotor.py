@@ -124,10 +124,7 @@ class BeamRotor:
 def changed_rotor(rotor: BeamRotor, changes: Mapping[str, float]) -> BeamRotor:
     """The rotor with relative changes of `CHANGEABLE` parameters; a bearing's cubic stiffness changes with its linear.
 
-    Raises
-    ------
-    ValueError
-        If a parameter is not known, or would become negative.
+    Raises ValueError if a parameter is not known, or would become negative.
     """
     for name, change in changes.items():
         if name not in CHANGEABLE or change < -1:

@@ -39,10 +39,7 @@ def drawn_condition(
 ) -> RunCondition:
     """Draw a condition; the level is that of the linear, unchanged rotor, so that a change shows as it would.
 
-    Raises
-    ------
-    models.errors.EstimationError
-        If the rotor is unstable.
+    Raises EstimationError if the rotor is unstable.
     """
     speed_rad_s = rotor.speed_rad_s * float(rng.uniform(*limits.speed_relative))
     cutoff_hz = float(rng.uniform(*limits.cutoff_hz))

@@ -33,8 +33,7 @@ _FAULTS: tuple[dict[str, float], ...] = (
 _NUMBERS = ("28", "29", "31")
 _OWN = {equation.number: equation.parameters for equation in EQUATIONS}
 _FIXED_STREAM = 90
-_EVERY_LAG = 3
-"""Training takes every third lag: neighbours 1 ms apart are nearly the same numbers, up to 150 Hz."""
+_EVERY_LAG = 3  # training takes every third lag: neighbours 1 ms apart are nearly the same numbers, up to 150 Hz
 
 _Values = dict[str, Value]
 """Columns: test values of parameters (or of the MSD), and their relative changes where they are read."""

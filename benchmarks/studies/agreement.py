@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -134,27 +135,13 @@ def agreement(options: Options) -> Study:
         (_EVERYTHING, (), {}, 0.3),
         *((o.changed_in(faults), PARAMETERS, faults, 0.2) for faults in _CHANGES),
     ]
-    cells = tuple(
-        Cell(
-            {"machine": name, "changed": text, "layout": o.LAYOUTS[layout]},
-            max(2, round(options.windows * share)),
-            partial(
-                _measure,
-                one,
-                Draw(
-                    one.machine,
-                    options.seed,
-                    Purpose.EVALUATION,
-                    _STREAM + 2 * stream + layout,
-                    kept,
-                    faults=faults,
-                    layout=layout,
-                ),
-                text == _HEALTHY and layout is Layout.INDEPENDENT,
-            ),
-        )
-        for name, one in machines.items()
-        for stream, (text, kept, faults, share) in enumerate(kinds)
-        for layout in Layout
+    cells = []
+    for (name, one), (at, (text, kept, faults, share)), layout in product(machines.items(), enumerate(kinds), Layout):
+        stream = _STREAM + 2 * at + layout
+        draw = Draw(one.machine, options.seed, Purpose.EVALUATION, stream, kept, faults=faults, layout=layout)
+        measure = partial(_measure, one, draw, text == _HEALTHY and layout is Layout.INDEPENDENT)
+        keys = {"machine": name, "changed": text, "layout": o.LAYOUTS[layout]}
+        cells.append(Cell(keys, max(2, round(options.windows * share)), measure))
+    return Study(
+        name="agreement", cells=tuple(cells), tables=_TABLES, goals=_goals, made_with=o.made_with(machines.values())
     )
-    return Study(name="agreement", cells=cells, tables=_TABLES, goals=_goals, made_with=o.made_with(machines.values()))

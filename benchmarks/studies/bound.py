@@ -27,8 +27,7 @@ from simulator.plant import theoretical_rms
 from simulator.scenario import Scenario
 from simulator.timeline import Condition
 
-_PULL = 1e-6
-"""Keeps directions invertible that the sensors do not see at all."""
+_PULL = 1e-6  # keeps directions invertible that the sensors do not see at all
 
 
 @dataclass(frozen=True, slots=True)

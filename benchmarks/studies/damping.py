@@ -32,12 +32,10 @@ from service.monitor.monitor import MachineMonitor
 _SIZES = WindowSizes(length_s=30.0, hop_s=2.5, segment_s=2.5)
 _HEALTHY_S = (60.0, 120.0)
 _WITHIN_S = 120.0
-_DELAY_S = 15.0
-"""On-delay of an alarm, and the hop it is seen at: a verdict of 120 s is an alarm by then."""
+_DELAY_S = 15.0  # on-delay of an alarm, and the hop it is seen at: a verdict of 120 s is an alarm by then
 _SETTLING_S = 0.1
 _OWN = ("c_by", "c_bz")
-_HOLDS = 10.0
-"""χ² on average, beyond chance, up to which the relation is taken to be true of a recording."""
+_HOLDS = 10.0  # χ² on average, beyond chance, up to which the relation is taken to be true of a recording
 _CHANGES: tuple[dict[str, float], ...] = (
     {},
     {"c_by": -0.2},

@@ -34,8 +34,7 @@ from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 
 _CHANGES = (("k_by", -0.05), ("c_by", -0.2), ("c_by", -0.1), ("e", 0.2))
 """Steps that are timed; their place is part of the seed."""
-_POWER = 0.95
-"""How often a change that takes the bound's time is found."""
+_POWER = 0.95  # how often a change that takes the bound's time is found
 _HEALTHY_HOPS = 3
 _AFTER_S = 120.0
 _BLOCK_S = 0.5
@@ -244,11 +243,8 @@ def delay(options: Options) -> Study:
     own = machine.window.hop_s
     hops = [own / 2] if (own / machine.window.segment_s).is_integer() else []  # a hop holds whole half segments
     cells = []
-    for hop_s, layout in (
-        (own, Layout.INDEPENDENT),
-        (own, Layout.ONE_SOURCE),
-        *((h, Layout.INDEPENDENT) for h in hops),
-    ):
+    ways = [(own, Layout.INDEPENDENT), (own, Layout.ONE_SOURCE), *((h, Layout.INDEPENDENT) for h in hops)]
+    for hop_s, layout in ways:
         one = with_hop(machine, hop_s)
         most = options.small or (hop_s == own and layout is Layout.INDEPENDENT)
         trials = options.windows if most else max(2, round(0.4 * options.windows))

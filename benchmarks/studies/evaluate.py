@@ -42,8 +42,7 @@ _TOGETHER = ({"k_by": -0.02, "c_bz": -0.10, "e": 0.10}, {"k_bz": -0.05, "c_by": 
 _ALONE = ({"k_by": -0.02}, {"c_bz": -0.10}, {"e": 0.10}, {"c_by": -0.05}, {"e": 0.05}, {"k_bz": -0.05})
 _LENGTHS_S = {15.0: 0.2, 30.0: 0.2, 120.0: 0.1, 300.0: 0.06, 600.0: 0.04}
 """Window lengths with their share of windows: a ten-minute window costs forty 15-second ones."""
-_WHOLE = ("lab",)
-"""Machines with all topics; the others have healthy windows and small changes."""
+_WHOLE = ("lab",)  # machines with all topics; the others have healthy windows and small changes
 _OTHER_REALISATION = 7919
 _LARGEST_LOSS = -0.9
 

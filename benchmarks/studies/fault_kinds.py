@@ -25,8 +25,7 @@ class Rotor:
     rate_hz: float
     response: Callable[[FloatArray], ComplexArray]
     """Of displacements to unit forces at `MOTIONS` at frequencies, Hz: shape (n, 4, 4), m/N."""
-    bearing: tuple[float, float]
-    """Stiffness, N/m, and damping, Ns/m, of the probed one, mean of both planes."""
+    bearing: tuple[float, float]  # stiffness, N/m, and damping, Ns/m, of the probed one, mean of both planes
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,8 +202,7 @@ def as_simulated(_rotor: Rotor, seen: Seen, _rng: np.random.Generator) -> Seen:
     return seen
 
 
-Change = Callable[[Rotor, Seen, np.random.Generator], Seen]
-"""What something does to the motion of a rotor."""
+Change = Callable[[Rotor, Seen, np.random.Generator], Seen]  # what something does to the motion of a rotor
 
 RUBS = {"rub, light": (0.5, 2.0), "rub, intermittent": (3.0, 1.6), "rub, heavy": (2.0, 1.0)}
 """Stiffness of the contact over the shaft's, and clearance over the radial rms of the disc."""

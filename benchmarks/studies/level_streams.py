@@ -37,11 +37,9 @@ class Kind:
 
     quantity: str
     unit: str
-    size: float
-    """Amplitude of 1x about which machines are drawn, in the unit."""
+    size: float  # amplitude of 1x about which machines are drawn, in the unit
     rate_hz: float
-    rotation: str
-    """How the running speed is known: ``phase reference``, ``nominal`` or not at all."""
+    rotation: str  # how the running speed is known: ``phase reference``, ``nominal`` or not at all
     schedule: tuple[float, float] | None = None
     """Length of snapshots and their period, s; none where samples come all the time."""
     window_s: float = 60.0
@@ -59,14 +57,11 @@ KINDS = {
 class Gains:
     """Factors on what a channel shows, over some samples."""
 
-    lines: FloatArray
-    """Of 1x, 2x and 3x and each channel, shape (3, n)."""
-    noise: FloatArray
-    """Shape (n,) or (n_samples, n)."""
+    lines: FloatArray  # of 1x, 2x and 3x and each channel, shape (3, n)
+    noise: FloatArray  # shape (n,) or (n_samples, n)
 
 
-Course = Callable[[FloatArray], Gains]
-"""Gains at times, s from the first sample."""
+Course = Callable[[FloatArray], Gains]  # gains at times, s from the first sample
 
 
 def steady(_: FloatArray) -> Gains:
@@ -108,8 +103,7 @@ class Scene:
     lines: FloatArray
     phases: FloatArray
     noise: FloatArray
-    poles: FloatArray
-    """Of the first-order filters that colour the noise, shape (2,)."""
+    poles: FloatArray  # of the first-order filters that colour the noise, shape (2,)
     defect: Defect | None = field(default=None)
 
     def blocks(self, rng: np.random.Generator, seconds: float, course: Course) -> Iterator[SampleBlock]:

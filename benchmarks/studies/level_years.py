@@ -31,8 +31,7 @@ from rotorwatch.records.levels import ChannelLevels
 
 REFERENCES = ("first windows", "commissioned")
 SPREADS, DRAWN = (0.1, 0.2), ("inside the reference's range", "same distribution")
-_LENGTH_S, _HOP_S = 60.0, 5.0
-"""A machine file's own, if it says nothing."""
+_LENGTH_S, _HOP_S = 60.0, 5.0  # a machine file's own, if it says nothing
 _HOPS = round(_LENGTH_S / _HOP_S)
 _DAY_S = 86400.0
 _KIND = replace(KINDS["velocity sensors, speed in the machine file"], rate_hz=1280.0)

@@ -22,13 +22,10 @@ from models.commissioning.commissioned import Installed, KnowledgeLevel
 from models.signals.block import FloatArray
 from service.monitor.monitor import MachineMonitor
 
-_FIRST_WINDOWS = 5
-"""The reference of a machine of which nothing is known."""
-_DOUBLED = ("overall", "1x", "2x")
-"""Their place is part of the seed."""
+_FIRST_WINDOWS = 5  # the reference of a machine of which nothing is known
+_DOUBLED = ("overall", "1x", "2x")  # their place is part of the seed
 _IN_NOISE = "2x, within the noise"
-_KNOWN_ERRORS = 10.0
-"""A 2x is known to a tenth: in the reference it is so many standard errors of one window."""
+_KNOWN_ERRORS = 10.0  # a 2x is known to a tenth: in the reference it is so many standard errors of one window
 _BEARING, _IN_SNAPSHOTS = "accelerometers, 12.8 kHz", "accelerometers, 12.8 kHz, 0.1 s every 10 s"
 _BEARING_WINDOW_S = 20.0
 

@@ -22,8 +22,7 @@ from models.machine import Machine, load_machine
 from models.physics.rotor import PARAMETERS
 from simulator.training.draws import Layout
 
-RATES = (0.01, 0.001)
-"""Declared false alarms per window at which an opinion is judged, strict last."""
+RATES = (0.01, 0.001)  # declared false alarms per window at which an opinion is judged, strict last
 TITLES = {
     "likelihood": "likelihood",
     "network": "amortised networks",

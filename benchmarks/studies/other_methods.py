@@ -26,8 +26,7 @@ _MORE_ORDERS = 16
 them counts."""
 _BLOCK_ROWS_PER_PERIOD = 1.4
 _MOST_DAMPING = 0.3
-_NEAREST = 0.3
-"""A pole further than this from a reference mode in relative frequency is not that mode."""
+_NEAREST = 0.3  # a pole further than this from a reference mode in relative frequency is not that mode
 _LEAST_MAC = 0.5
 _MOST_SHARE_LOST = 0.5
 _LEAST_SHARE_THERE = 0.8

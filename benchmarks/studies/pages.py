@@ -18,10 +18,7 @@ _TEXTS = tomllib.loads((_HERE / "texts.toml").read_text(encoding="utf-8"))
 def write_page(study: Study, options: Options, records: Sequence[Record], docs: Path) -> list[Path]:
     """Write a page, its charts into ``figures/`` and its tables into ``results/`` beside it; returns what was written.
 
-    Raises
-    ------
-    OSError
-        If something cannot be written.
+    Raises OSError if something cannot be written.
     """
     figures, results = docs / "figures", docs / "results"
     for folder in (figures, results):

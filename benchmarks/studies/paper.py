@@ -102,10 +102,7 @@ class PaperNetwork:
     def deviation(self, window: WindowStatistics) -> float:
         """MSD between the network's output and the estimated correlation, in units of the latter's mean square.
 
-        Raises
-        ------
-        EstimationError
-            If the target correlation is zero throughout.
+        Raises EstimationError if the target correlation is zero throughout.
         """
         inputs, target = paper_rows(self.equation, window, self.machine)
         power = float(np.mean(target**2))
@@ -123,10 +120,7 @@ def train_paper_network(
     Correlations stand in their own units: no window is normalised. All inputs are divided by their rms over the
     training rows, and the target by its own, which only helps the search.
 
-    Raises
-    ------
-    EstimationError
-        If there is no window, or the fit does not come out finite.
+    Raises EstimationError if there is no window, or the fit does not come out finite.
     """
     import torch  # noqa: PLC0415  # for whoever trains: it takes seconds
 
@@ -179,10 +173,7 @@ class PaperDiagnostician:
     ) -> "PaperDiagnostician":
         """With limits at a rate of false alarms per window over all equations together.
 
-        Raises
-        ------
-        EstimationError
-            If there are too few windows for the declared rate.
+        Raises EstimationError if there are too few windows for the declared rate.
         """
         undecided = cls(networks, {})
         return cls(networks, limits_of([undecided.deviations(window) for window in healthy], false_alarm_rate))

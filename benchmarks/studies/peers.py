@@ -26,8 +26,7 @@ from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 
 _BLOCK_S = 5.0
-_APART = 1_000_000
-"""Numbers of the laboratory's windows: learning, limits and every cell have a million of their own."""
+_APART = 1_000_000  # numbers of the laboratory's windows: learning, limits and every cell have a million of their own
 _SETTINGS = ("laboratory", "varying")
 _CHANGES: tuple[dict[str, float], ...] = (
     {},

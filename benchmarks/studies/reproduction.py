@@ -24,10 +24,8 @@ from models.machine import Machine
 from simulator.scenario import Event, NamedSource, Scenario, Sensors
 from simulator.training.draws import Purpose, scaled, simulate_scenario, with_tilt
 
-_CUTOFFS_HZ = (25.0, 50.0, 100.0, 200.0)
-"""Cutoffs of the excitation; the paper's own four (its Table 3) are lost."""
-_NOISE_LEVELS = (0.01, 0.02, 0.03, 0.04, 0.05)
-"""Coloured noise at the sensors in parts of each channel's rms (§4.2.3)."""
+_CUTOFFS_HZ = (25.0, 50.0, 100.0, 200.0)  # cutoffs of the excitation; the paper's own four (its Table 3) are lost
+_NOISE_LEVELS = (0.01, 0.02, 0.03, 0.04, 0.05)  # coloured noise at the sensors in parts of each channel's rms (§4.2.3)
 _REALISATIONS = ("shared", "independent")
 _NOISE_CORNER_HZ, _NOISE_CUTOFF_HZ = 200.0, 100.0
 _EQUATIONS = tuple(equation.number for equation in PAPER_EQUATIONS)
@@ -255,14 +253,8 @@ def reproduction(options: Options) -> Study:
         # The training's realisations again, or ones that no other cell has.
         own = (Purpose.TRAINING, cutoffs.index(cutoff)) if kind == "shared" else (Purpose.EVALUATION, at)
         measure = partial(_measure, trained, options, kind, (CONDITIONS[name], cutoff, noise, own))
-        keys: dict[str, Value] = {
-            "part": part,
-            "realisation": kind,
-            "condition": name,
-            "cutoff_hz": cutoff,
-            "noise": noise,
-        }
-        cells.append(Cell(keys | {"noise": noise}, options.windows, measure))
+        keys: dict[str, Value] = {"part": part, "realisation": kind, "condition": name}
+        cells.append(Cell(keys | {"cutoff_hz": cutoff, "noise": noise}, options.windows, measure))
     return Study(
         name="reproduction",
         cells=tuple(cells),

@@ -17,18 +17,15 @@ import scipy.stats
 from models.diagnosis.readings import Z95
 from models.errors import EstimationError
 
-Value = str | float | bool | None
-"""Of a record: what JSON has, none of it nested."""
+Value = str | float | bool | None  # of a record: what JSON has, none of it nested
 Record = Mapping[str, Value]
 FloatArray = npt.NDArray[np.float64]
 _T = TypeVar("_T")
-Of = Callable[[Sequence[Record]], _T]
-"""A figure of some records."""
+Of = Callable[[Sequence[Record]], _T]  # a figure of some records
 
 _RESAMPLINGS = 400
 _RESAMPLING_SEED = 20261
-_FEWEST = 4
-"""A spread of fewer windows says nothing."""
+_FEWEST = 4  # a spread of fewer windows says nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +35,8 @@ class Estimate:
     value: float
     low: float
     high: float
-    n: int
-    """Windows."""
-    count: int | None = None
-    """Of a rate: windows in which it holds."""
+    n: int  # windows
+    count: int | None = None  # of a rate: windows in which it holds
 
     def __str__(self) -> str:
         if self.count is None:
@@ -178,14 +173,12 @@ Figure = Estimate | float | str | None
 class Table:
     """A table of results: one row for every group of records."""
 
-    name: str
-    """Of its CSV file."""
+    name: str  # of its CSV file
     by: tuple[str, ...]
     columns: Mapping[str, Of[Figure]]
     rows: Callable[[Sequence[Record]], Iterable[Record]] = field(default=lambda records: records)
     """What is grouped, from the records: themselves, or one for each parameter."""
-    page: str = ""
-    """Words above it on the page; without any it is in its file alone."""
+    page: str = ""  # words above it on the page; without any it is in its file alone
 
     def of(self, records: Sequence[Record]) -> list[dict[str, Figure]]:
         """Its rows."""
@@ -221,8 +214,7 @@ class Goal:
     what: str
     declared: str
     measured: str
-    verdict: str
-    """``met``; ``missed``: the whole interval misses it; ``within chance``: only the figure does; or ``–``."""
+    verdict: str  # ``met``; ``missed``: the whole interval misses it; ``within chance``: only the figure does; or ``–``
 
 
 def at_least(what: str, measured: Estimate | None, least: float, declared: str = "") -> Goal:
@@ -298,8 +290,7 @@ class Chart:
     y: str
     steps: bool = False
     log: bool = False
-    lines: tuple[float, ...] = ()
-    """Rules across."""
+    lines: tuple[float, ...] = ()  # rules across
 
 
 def panels(parts: Iterable[tuple[str, str, Iterable[_Point]]]) -> dict[str, dict[str, list[_Point]]]:

@@ -32,35 +32,21 @@ _Result = TypeVar("_Result")
 class Options:
     """What is asked for on the command line."""
 
-    machines: tuple[str, ...] = ()
-    """The study's own if empty."""
-    windows: int = 100
-    """Per cell; a study gives some cells a fixed multiple of it."""
+    machines: tuple[str, ...] = ()  # the study's own if empty
+    windows: int = 100  # per cell; a study gives some cells a fixed multiple of it
     seed: int = 20261122
     small: bool = False
     """The smallest plan that exercises everything, at a declared rate of 10 % false alarms: a check, not a result."""
 
     @property
     def machine(self) -> str:
-        """The machine of a study that has one.
-
-        Raises
-        ------
-        MachineFileError
-            If several are asked for.
-        """
+        """The machine of a study that has one; raises MachineFileError if several are asked for."""
         if len(self.machines) > 1:
             raise MachineFileError(f"--machine {', '.join(self.machines)}: this study takes one machine")
         return (self.machines or ("lab",))[0]
 
     def machines_among(self, known: Sequence[str], *own: str) -> tuple[str, ...]:
-        """Those that are asked for, or the study's own.
-
-        Raises
-        ------
-        MachineFileError
-            If one is not among the known ones.
-        """
+        """Those that are asked for, or the study's own; raises MachineFileError if one is not among the known ones."""
         for name in self.machines:
             if name not in known:
                 raise MachineFileError(f"--machine {name}: not among {', '.join(known)}")
@@ -76,8 +62,7 @@ class Options:
 class Cell:
     """Windows of one kind."""
 
-    keys: Mapping[str, Value]
-    """What tells them from all others; columns of their records."""
+    keys: Mapping[str, Value]  # what tells them from all others; columns of their records
     windows: int
     measure: Callable[[Any, int], Iterable[Mapping[str, Value]]]
     """Records of one window, from what was learned and the window's number."""
@@ -93,8 +78,7 @@ class Over:
     """Apply a function to tasks, in order, with a progress bar."""
 
     name: str
-    spread: Callable[..., Iterable[Any]]
-    """Like `map`."""
+    spread: Callable[..., Iterable[Any]]  # like `map`
     progress: Callable[[str, int, int], None]
 
     def __call__(self, label: str, function: Callable[[_Task], _Result], tasks: Sequence[_Task]) -> list[_Result]:
@@ -113,8 +97,7 @@ class Study:
     What is sent to the workers, how cells measure, is at the top level of a module, or a partial of such a function.
     """
 
-    name: str
-    """Of its records, and of its words in ``texts.toml``."""
+    name: str  # of its records, and of its words in ``texts.toml``
     cells: tuple[Cell, ...]
     tables: tuple[Table, ...]
     goals: Callable[[Sequence[Record]], Iterable[Goal]] = field(default=lambda _: ())
@@ -186,10 +169,7 @@ def _measured(learned: object, task: tuple[Cell, int]) -> dict[str, Any]:
 def _lines(path: Path) -> list[dict[str, Any]]:
     """What is kept; a last line cut short by an interruption is left out.
 
-    Raises
-    ------
-    RecordingError
-        If another line is damaged.
+    Raises RecordingError if another line is damaged.
     """
     if not path.exists():
         return []
@@ -210,10 +190,7 @@ def _of_plan(head: Mapping[str, Any]) -> Mapping[str, Any]:
 def read(study: Study, folder: Path) -> list[Record]:
     """Records of all windows of the plan, with the keys of their cells; windows beyond the plan are left out.
 
-    Raises
-    ------
-    RecordingError
-        If there are none, or a line is damaged.
+    Raises RecordingError if there are none, or a line is damaged.
     """
     path = folder / f"{study.name}.jsonl"
     lines = _lines(path)[1:]

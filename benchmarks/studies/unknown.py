@@ -26,10 +26,8 @@ _CHANGES: tuple[dict[str, float], ...] = (
 )
 """True changes; their place is part of the seed."""
 _COMMISSIONINGS = 5
-_RAISE_ABOVE = 0.1
-"""A smaller change raises no alarm, as shipped."""
-_HEALTHY_WEIGHT = 8
-"""Windows of the healthy machine for each one of a change: false alarms are rare."""
+_RAISE_ABOVE = 0.1  # a smaller change raises no alarm, as shipped
+_HEALTHY_WEIGHT = 8  # windows of the healthy machine for each one of a change: false alarms are rare
 
 
 def _measure(

@@ -44,8 +44,7 @@ class Variant:
     group: str
     label: str
     equations: tuple[str, ...]
-    has: frozenset[str]
-    """Of `_INGREDIENTS`."""
+    has: frozenset[str]  # of `_INGREDIENTS`
     measure: Measure = Measure.OWN_ERROR
     reader: Reader = Reader.NETWORK
 
@@ -104,8 +103,7 @@ def _in_its_place() -> Iterator[Variant]:
         yield Variant("in its place", label, _ALL, has, measure, reader)
 
 
-VARIANTS: tuple[Variant, ...] = (*_one_after_the_other(), *_without(), *_in_its_place())
-"""The rows of the table."""
+VARIANTS: tuple[Variant, ...] = (*_one_after_the_other(), *_without(), *_in_its_place())  # the rows of the table
 
 
 class _LevelRows(EquationRows):

@@ -33,10 +33,8 @@ from simulator.stream import blocks
 from simulator.training.draws import draw_condition
 
 CONDITIONS = 3
-_HEALTHY, AFTER = 4.1, 2.5
-"""Windows of a healthy recording, and of a stream after its fault has begun."""
-_RUBBING = 6.0
-"""Windows of a stream after a rub has begun: a light one is told by four."""
+_HEALTHY, AFTER = 4.1, 2.5  # windows of a healthy recording, and of a stream after its fault has begun
+_RUBBING = 6.0  # windows of a stream after a rub has begun: a light one is told by four
 _BEFORE_S = 10.0
 """Healthy, once the window is full, or the first windows that a machine is compared with that is not commissioned."""
 _BLOCK_S = 0.5
@@ -60,10 +58,8 @@ class Subject:
     level: KnowledgeLevel
     seed: int
     number: int
-    always: Change = as_simulated
-    """What is so from the beginning, in healthy recordings too."""
-    windows: int = 1
-    """That are full before a fault begins."""
+    always: Change = as_simulated  # what is so from the beginning, in healthy recordings too
+    windows: int = 1  # that are full before a fault begins
 
     @property
     def file(self) -> MachineFile:
