@@ -54,7 +54,8 @@ def probed(rotor: BeamRotor) -> tuple[int, int, int, int]:
 def assemble(rotor: BeamRotor, speed_rad_s: float) -> Equations:
     """Equations of motion at a speed, cubic stiffness left out."""
     length_m, EI = rotor.length_m / rotor.elements, rotor.bending_stiffness
-    shear_stiffness_N = _shear_coefficient(rotor.poisson) * rotor.E_Pa / (2 * (1 + rotor.poisson)) * rotor.area_m2
+    kappa = 6 * (1 + rotor.poisson) / (7 + 6 * rotor.poisson)  # Cowper's, of a solid round section
+    shear_stiffness_N = kappa * rotor.E_Pa / (2 * (1 + rotor.poisson)) * rotor.area_m2
     phi = shear_ratio(EI, shear_stiffness_N, length_m) if rotor.shear else 0.0
     inertia = rotor.density_kg_m3 * EI / rotor.E_Pa if rotor.shear else 0.0
     element_N = beam_inertia(length_m, inertia, phi)
@@ -93,11 +94,6 @@ def assemble(rotor: BeamRotor, speed_rad_s: float) -> Equations:
         K += against.T @ stiffness @ against
         C += against.T @ damping @ against
     return Equations(M, C, K)
-
-
-def _shear_coefficient(poisson: float) -> float:
-    """Cowper's κ of a solid round section."""
-    return 6 * (1 + poisson) / (7 + 6 * poisson)
 
 
 def modes(equations: Equations) -> tuple[Mode, ...]:

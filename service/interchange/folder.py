@@ -21,7 +21,7 @@ from service.interchange.clock import Clock, clock_for
 from service.interchange.formats import DATED, format_of, open_source
 from service.interchange.mapping import Keyphasor, Mapping
 from service.interchange.samples import Gap, Piece, Read, Signal, pieces, signals_of
-from service.interchange.source import Reference, Source, SourceError
+from service.interchange.source import Source, SourceError
 
 _DATE = re.compile(
     r"(?<!\d)(\d{4})[-_. ]?(\d{2})[-_. ]?(\d{2})"  # day
@@ -123,20 +123,16 @@ def _by_their_own_times(paths: Sequence[Path], mapping: Mapping, machine: Machin
 
     One that cannot be read comes first: whoever reads them says what is wrong with it.
     """
-    begun = []
+    begun, base = [], mapping.time
     for path, told_ns in zip(paths, _named(paths, mapping), strict=True):
         begin_ns, named_ns = -1, None
         with suppress(SourceError), open_source(path, mapping) as source:
             columns = [one.reference for one in signals_of(source, mapping, machine)]
-            named_ns = told_ns if _has_no_time(source, columns, mapping) else None
-            begin_ns = clock_for(source, columns, mapping.time, machine, named_ns).origin_ns
+            if not base.is_datetime and base.start is None and source.timing(columns).start_ns is None:
+                named_ns = told_ns
+            begin_ns = clock_for(source, columns, base, machine, named_ns).origin_ns
         begun.append((begin_ns, SnapshotFile(path, named_ns)))
     return tuple(file for _, file in sorted(begun, key=lambda one: one[0]))
-
-
-def _has_no_time(source: Source, columns: list[Reference], mapping: Mapping) -> bool:
-    base = mapping.time
-    return not base.is_datetime and base.start is None and source.timing(columns).start_ns is None
 
 
 def _places(paths: Sequence[Path]) -> list[int]:

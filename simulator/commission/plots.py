@@ -23,8 +23,8 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 INK, GREY, BAND = "#1c2530", "#66727f", "#edf2f6"
 WIDTH_IN = 10.0  # width of every picture, so that letters are of one size on the page
 _GRID = "#dde2e6"
-_VARIABLES = {INK: "--ink", GREY: "--grey", _GRID: "--line", BAND: "--band"} | {
-    colour: f"--c{number}" for number, colour in enumerate(COLOURS)
+_VARIABLES = {INK: "var(--ink)", GREY: "var(--grey)", _GRID: "var(--line)", BAND: "var(--band)"} | {
+    colour: f"var(--c{number})" for number, colour in enumerate(COLOURS)
 }
 """Colours and the properties of the page that replace them: light, dark and on paper."""
 
@@ -82,11 +82,7 @@ def inline_svg(name: str, label: str, paint: Callable[[], Figure | None]) -> Mar
     text = re.sub(r'\bid="', f'id="{name}-', text)
     text = re.sub(r'(?:xlink:)?href="#', f'href="#{name}-', text)
     text = text.replace("url(#", f"url(#{name}-")
-    return Markup(re.sub(r"#[0-9a-f]{6}\b", lambda found: _coloured(found[0]), text))  # noqa: S704  # drawn, not given
-
-
-def _coloured(colour: str) -> str:
-    return f"var({_VARIABLES[colour]})" if colour in _VARIABLES else colour
+    return Markup(re.sub(r"#[0-9a-f]{6}\b", lambda found: _VARIABLES.get(found[0], found[0]), text))  # noqa: S704  # drawn, not given
 
 
 _ROW_IN, _PANEL_IN = 0.42, 1.75
