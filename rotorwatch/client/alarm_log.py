@@ -6,8 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
-from functools import partial
 
 import zenoh
 
@@ -64,57 +62,62 @@ def follow_alarms(
     ClientError
         If a monitor sends something that this version does not understand.
     """
-    _Follower(tuple(machines), after, on_event, stop or threading.Event(), ask_every_s).run(session)
+    _Follower(machines, after, on_event, stop or threading.Event(), ask_every_s).run(session)
 
 
-@dataclass(slots=True)
 class _Follower:
-    machines: tuple[str, ...]
-    after: Mapping[str, int]
-    on_event: Callable[[AlarmCloudEvent], None]
-    stop: threading.Event
-    ask_every_s: float
-    heard: queue.Queue[AlarmMessage] = field(default_factory=partial(queue.Queue, _QUEUED))
-    orders: dict[str, LogOrder] = field(default_factory=dict)
-    due_s: dict[str, float] = field(default_factory=dict)
-    silent: set[str] = field(default_factory=set)
-
-    def __post_init__(self) -> None:
-        for place in self.machines:
+    def __init__(
+        self,
+        machines: Sequence[str],
+        after: Mapping[str, int],
+        on_event: Callable[[AlarmCloudEvent], None],
+        stop: threading.Event,
+        ask_every_s: float,
+    ) -> None:
+        self._machines = tuple(machines)
+        self._after = after
+        self._on_event = on_event
+        self._stop = stop
+        self._ask_every_s = ask_every_s
+        self._heard: queue.Queue[AlarmMessage] = queue.Queue(_QUEUED)
+        self._orders: dict[str, LogOrder] = {}
+        self._due_s: dict[str, float] = {}
+        self._silent: set[str] = set()
+        for place in self._machines:
             if "*" not in place:
                 self._order(place)
 
     def run(self, session: zenoh.Session) -> None:
-        with closing(AlarmTopics(session, self.machines, self._hear)) as topics:
-            while not self.stop.is_set():
+        with closing(AlarmTopics(session, self._machines, self._hear)) as topics:
+            while not self._stop.is_set():
                 now_s = time.monotonic()
-                due = [place for place, due_s in self.due_s.items() if due_s <= now_s]
+                due = [place for place, due_s in self._due_s.items() if due_s <= now_s]
                 for place in due:
-                    self._ask(topics, self.orders[place])
-                next_s = min(self.due_s.values(), default=now_s + _STOP_S)
+                    self._ask(topics, self._orders[place])
+                next_s = min(self._due_s.values(), default=now_s + _STOP_S)
                 self._listen(min(_STOP_S, max(0.0, next_s - time.monotonic())))
 
     def _hear(self, message: AlarmMessage) -> None:
         """Put a message into the queue, on Zenoh's thread; what does not fit in is a hole like any other."""
         try:
-            self.heard.put_nowait(message)
+            self._heard.put_nowait(message)
         except queue.Full:
             _log.debug("%s: a message was missed and will be read from the log", message.place)
 
     def _order(self, place: str) -> LogOrder:
-        if place not in self.orders:
-            self.orders[place] = LogOrder(place, self.after.get(place, -1))
-            self.due_s[place] = 0.0
-        return self.orders[place]
+        if place not in self._orders:
+            self._orders[place] = LogOrder(place, self._after.get(place, -1))
+            self._due_s[place] = 0.0
+        return self._orders[place]
 
     def _listen(self, timeout_s: float) -> None:
         try:
-            message = self.heard.get(timeout=timeout_s)
+            message = self._heard.get(timeout=timeout_s)
         except queue.Empty:
             return
         order = self._order(message.place)
         if message.kind == "monitor":
-            self.due_s[message.place] = 0.0
+            self._due_s[message.place] = 0.0
             return
         try:
             if message.kind == "event":
@@ -124,17 +127,17 @@ class _Follower:
         except ClientError as error:
             # Whoever sent it: what counts is what the log says.
             _log.warning("%s", error)
-            self.due_s[message.place] = 0.0
+            self._due_s[message.place] = 0.0
             return
         self._hand_over(order)
         if order.incomplete:
             # A moment's patience: what is missing may be on its way.
-            self.due_s[message.place] = min(self.due_s[message.place], time.monotonic() + _HOLE_S)
+            self._due_s[message.place] = min(self._due_s[message.place], time.monotonic() + _HOLE_S)
 
     def _ask(self, topics: AlarmTopics, order: LogOrder) -> None:
         """Read the log up to its end."""
-        self.due_s[order.place] = time.monotonic() + self.ask_every_s
-        while not self.stop.is_set():
+        self._due_s[order.place] = time.monotonic() + self._ask_every_s
+        while not self._stop.is_set():
             before = order.last
             page = self._page(topics, order)
             if page is None:
@@ -144,7 +147,7 @@ class _Follower:
             if not order.incomplete:
                 return
             if order.last == before:  # announced and not committed yet
-                self.due_s[order.place] = time.monotonic() + min(1.0, self.ask_every_s)
+                self._due_s[order.place] = time.monotonic() + min(1.0, self._ask_every_s)
                 return
 
     def _page(self, topics: AlarmTopics, order: LogOrder) -> str | None:
@@ -153,15 +156,15 @@ class _Follower:
             page = topics.ask(order.place, order.ask_after, _PAGE)
         except LogUnavailable as error:
             page, trouble = None, str(error)
-        if page is None and order.place not in self.silent:
-            self.silent.add(order.place)
+        if page is None and order.place not in self._silent:
+            self._silent.add(order.place)
             _log.warning("%s: the alarm log cannot be read at present: %s", order.place, trouble)
-        elif page is not None and order.place in self.silent:
-            self.silent.discard(order.place)
+        elif page is not None and order.place in self._silent:
+            self._silent.discard(order.place)
             _log.warning("%s: the alarm log can be read again", order.place)
         return page
 
     def _hand_over(self, order: LogOrder) -> None:
-        while not self.stop.is_set() and (event := order.next()) is not None:
-            self.on_event(event)
+        while not self._stop.is_set() and (event := order.next()) is not None:
+            self._on_event(event)
             order.taken()

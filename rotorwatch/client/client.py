@@ -176,10 +176,16 @@ class Client:
         kind: EventKind | None = None,
         severity: Severity | None = None,
     ) -> Iterator[AlarmCloudEvent]:
-        """Alarm events with since_ns ≤ time_ns < until_ns, fetched page by page, newest first.
+        """Alarm events, fetched page by page: newest first, or after a sequence number in the order of the log.
 
-        `after` a sequence number they come in the order of the log, -1 for the whole log, and end with the latest there
-        is. `name` is that of the alarm.
+        Parameters
+        ----------
+        after : int, optional
+            -1 for the whole log. Ends with the latest event there is.
+        since_ns, until_ns : int, optional
+            Only those with since_ns ≤ time_ns < until_ns.
+        name, kind, severity : optional
+            Only of this alarm, kind, severity.
         """
         chosen = {"since_ns": since_ns, "until_ns": until_ns, "name": name, "kind": kind, "severity": severity}
         path = _path(place, "alarms/events")
@@ -237,8 +243,14 @@ class Client:
     ) -> CorrelationSnapshot:
         """Correlation functions of a window, measured and as theory predicts them.
 
-        Instead of what is live, of recordings of the machine, by their file names, or of a replay, by its id: theory is
-        that of what it read. The window of them ends at `until_ns`; without it, it is the last one.
+        Parameters
+        ----------
+        recordings : sequence of str
+            File names of recordings of the machine, instead of what is live.
+        replay : str, optional
+            Id of a replay of the machine, instead of its recordings: theory is that of what it read.
+        until_ns : int, optional
+            The window of them that ends then; the last one without it.
         """
         first, second = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
         wanted: dict[str, _Parameter] = {"recording": recordings, "replay": replay, "until_ns": until_ns}
@@ -282,9 +294,17 @@ class Client:
     def events(self, *machines: str, after: str = "", from_beginning: bool = False) -> Iterator[ServiceEvent]:
         """Alarm events and changes of health as they happen; goes on by itself after a lost connection.
 
-        Every alarm event, of these machines or all, comes once and in the order of its machine's log. Whoever keeps the
-        cursor of the last event and gives it back as `after` has all of them without a hole; without it, they begin
-        now, or `from_beginning` with the first event there is. Of health, the latest comes first.
+        Every alarm event comes once and in the order of its machine's log. Whoever keeps the cursor of the last event
+        and gives it back has all of them without a hole; of health, the latest comes first.
+
+        Parameters
+        ----------
+        *machines : str
+            Only of these.
+        after : str
+            Cursor of the last event that was taken; empty to begin now.
+        from_beginning : bool
+            Without `after`: begin with the first event there is.
 
         Raises
         ------
@@ -344,7 +364,13 @@ class Client:
 
 
 def _checked(url: str) -> httpx.URL:
-    """An address that a service can have."""
+    """An address that a service can have.
+
+    Raises
+    ------
+    ClientError
+        With what was expected.
+    """
     with suppress(httpx.InvalidURL):
         found = httpx.URL(url)
         if found.scheme in {"http", "https"} and found.host and (found.port or 0) < 65_536:
@@ -354,7 +380,13 @@ def _checked(url: str) -> httpx.URL:
 
 
 def _path(place: str, below: str) -> str:
-    """Path of something of a machine; a name in it must be one, and not lead anywhere else."""
+    """Path of something of a machine.
+
+    Raises
+    ------
+    ClientError
+        If a name in it cannot be one: it must not lead anywhere else.
+    """
     if not _PLACE.fullmatch(place):
         raise ClientError(f"{place!r}: expected a machine as site/machine, such as demo/lab")
     if below and not _BELOW.fullmatch(below):
