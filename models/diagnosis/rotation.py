@@ -30,8 +30,10 @@ _FOLLOWED_PART = 0.8
 _FEW_HOPS = 6  # a stretch of as few needs lines that stand out by themselves
 # Hops in a row that one set point of a drive is held for at least, and part of a window that such rows make up.
 _HELD, _HELD_PART = 4, 0.5
-WEAKER = 0.25
-"""Strength of a hop's line over that of the window's others, up to which its speed was another one in a part of it."""
+# Strength of a hop's line over that of the window's others, up to which its speed was another one in a part of it.
+_WEAKER = 0.25
+LEAST_SETTLED = 0.5
+"""Part of a window that is left, at least, where a drive goes from one set point to another."""
 STRONG = 15.0
 """Strength from which a line stands out by itself: noise has none like it."""
 
@@ -171,7 +173,8 @@ def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> Flo
 def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, hop_s: float) -> npt.NDArray[np.bool_]:
     """Which hops had one speed from beginning to end; all where a line does not stand out enough to tell.
 
-    Of a hop beside one with another speed a part may have had that already.
+    Of a hop beside one with another speed a part may have had that already. A line that is weaker at the speed of its
+    neighbours is one in more vibration: of a load that has grown.
 
     Parameters
     ----------
@@ -185,10 +188,14 @@ def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, h
     usual = float(np.median(strength[found])) if found.any() else 0.0
     if usual <= STRONG:
         return np.full(found.shape, True)
-    settled = found & (strength > WEAKER * usual)
     steps = np.diff(followed)
     off = np.minimum(np.abs(steps), np.abs(steps - _swept(lines, hop_s)))
-    held = settled[1:] & settled[:-1] & (off < _near(followed, hop_s)[1:])
+    held = off < _near(followed, hop_s)[1:]  # not so beside a hop without a line
+    # Of the first and the last hop one neighbour alone tells.
+    level = held & (np.minimum(strength[1:], strength[:-1]) > _WEAKER * np.maximum(strength[1:], strength[:-1]))
+    as_it_was = np.append(held, level[-1:]) & np.insert(held, 0, level[:1])
+    settled = found & (as_it_was | (strength > _WEAKER * usual))
+    held &= settled[1:] & settled[:-1]
     return np.asarray(settled & np.append(held, True) & np.insert(held, 0, True), dtype=np.bool_)
 
 

@@ -15,6 +15,7 @@ from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.excluded import KnownLine
 from models.diagnosis.moments import HopMoments, Plan, hop_moments
 from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of, samples_of
+from models.diagnosis.rotation import LEAST_SETTLED
 from models.diagnosis.window import WindowStatistics, levels_of, window_statistics
 from models.errors import CheckpointError
 from models.levels.measures import WindowLevels
@@ -291,10 +292,17 @@ class SlidingWindow:
         return window_statistics(self.plan, tuple(self._hops), lines=self._lines, settled=True)
 
     def again(self) -> Callable[[], WindowStatistics] | None:
-        """What makes the statistics of the window as it is now when they are asked for; None before it is full.
+        """What makes the statistics of the window as it is judged now when they are asked for; None before it is full.
 
-        They are megabytes, and the hops they are made of are there anyway. Once made they stay with it.
+        Hops in which the speed changed are left out where they are not judged (`settled`). Statistics are megabytes,
+        and the hops they are made of are there anyway. Once made they stay with it.
         """
         if len(self._hops) < self.plan.hops:
             return None
-        return cache(partial(window_statistics, self.plan, tuple(self._hops), lines=self._lines))
+        return cache(partial(_as_judged, self.plan, tuple(self._hops), self._lines))
+
+
+def _as_judged(plan: Plan, hops: tuple[HopMoments, ...], lines: Sequence[KnownLine] | None) -> WindowStatistics:
+    whole = window_statistics(plan, hops, lines=lines)
+    left_out = not whole.settled.all() and whole.settled.mean() >= LEAST_SETTLED
+    return window_statistics(plan, hops, lines=lines, settled=True) if left_out else whole

@@ -68,7 +68,7 @@ def recorded_window(
         window.gap()
         deque(window.feed(plan.to_si(part.samples), part.start_ns), maxlen=0)
     return LatestData(
-        window=window.statistics(),
+        window=None if (judged := window.again()) is None else judged(),
         filled=window.filled if report is None else report.filled,
         parameters=() if report is None else report.parameters,
         why_not=_NOT_EVALUATED if report is None else report.reason,

@@ -175,7 +175,8 @@ class MachineStore:
                 for column, value in ((log.alarm, alarm), (log.kind, kind), (log.severity, severity))
                 if value is not None
             ),
-            *_between(log.sequence, None if after is None else after + 1, before),
+            *([] if after is None else [log.sequence > after]),
+            *_between(log.sequence, None, before),
         )
         query = query.order_by(log.sequence.desc() if newest_first else log.sequence).limit(_checked(limit))
         return tuple(StoredEvent(*row) for row in self._database.rows(query))

@@ -94,7 +94,7 @@ class MatlabSource(_Arrays):
         attributes = getattr(self._columns[column.column], "attrs", {})
         stated = np.ravel(attributes.get("unit", attributes.get("units", "")))
         one = stated[0] if stated.size == 1 else ""
-        return one.decode(errors="replace") if isinstance(one, bytes) else str(one)
+        return one.decode(errors="replace") if isinstance(one, bytes) else str(one) if isinstance(one, str) else ""
 
     def close(self) -> None:
         """Close the file, if it is still open."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from models.diagnosis.readings import Diagnosis, no_reading
-from models.diagnosis.rotation import STRONG, WEAKER
+from models.diagnosis.rotation import LEAST_SETTLED, STRONG
 from models.diagnosis.sensors.level import at_range_end
 from models.diagnosis.sensors.reference import Naming
 from models.diagnosis.sliding_window import SlidingWindow
@@ -23,7 +23,6 @@ from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import Equation, Opinion, Parameter, SensorFault, Shape
 
 _INSIDE = 2.0  # standard deviations of the misfit within which nothing has to be explained
-_LEAST_SETTLED = 0.5  # part of a window that is left where a drive goes from one set point to another
 
 Newest = tuple[SlidingWindow, SequentialTest]
 """Where the window is the latest, and what wants its latest hops evaluated."""
@@ -193,10 +192,10 @@ def settled(place: str, window: WindowStatistics, newest: Newest | None) -> tupl
     passed = np.flatnonzero(~window.settled)
     if newest is None or not passed.size:
         return window, window.settled.size
-    if window.settled.mean() < _LEAST_SETTLED:
+    if window.settled.mean() < LEAST_SETTLED:
         raise EstimationError(
             f"{place}: the speed was found and steady in {np.count_nonzero(window.settled)} of {window.settled.size} "
-            f"hops, evaluation limit {_LEAST_SETTLED:.0%}: without a shaft angle the rotation is taken out of no others"
+            f"hops, evaluation limit {LEAST_SETTLED:.0%}: without a shaft angle the rotation is taken out of no others"
         )
     return newest[0].settled(), window.settled.size - 1 - int(passed[-1])
 
@@ -210,17 +209,17 @@ class LatestRotation:
     def take(self, window: WindowStatistics) -> None:
         """Go on with a window."""
         if window.speed_source == "estimated":
-            strength = float(np.median(window.hop_strength[np.isfinite(window.hop_speed_rad_s)]))
-            self.power = strength * _noise(window) if strength > STRONG else self.power
+            found = np.isfinite(window.hop_speed_rad_s)
+            strength = float(np.median(window.hop_strength[found]))
+            # Found in all hops it is no chance: after balancing, or at another set point, there may be less of it.
+            self.power = strength * _noise(window) if strength > STRONG or found.all() else self.power
 
     def lost(self, window: WindowStatistics, operation: Operation) -> str:
         """In how many hops it was found, where that is not all of them and as much of it would stand out.
 
         A hop in which the shaft came to its speed, or left it, has a line that is much weaker than the others'.
         """
-        found = np.isfinite(window.hop_speed_rad_s)
-        if found.any():
-            found &= window.hop_strength > WEAKER * np.median(window.hop_strength[found])
+        found = np.isfinite(window.hop_speed_rad_s) & window.settled
         if window.speed_source == "phase reference" or self.power <= STRONG * _noise(window) or found.all():
             return ""
         slowest, fastest = (operation.speed_rpm * (1 + sign * operation.speed_tolerance) for sign in (-1, 1))

@@ -38,8 +38,8 @@ from service.terminal.logs import logger
 _JSON = "application/json"
 _CLOUD_EVENT = "application/cloudevents+json"
 _HEARTBEAT_S = 1.0
-_AT_ONCE = 1000
-"""Blocks of one machine before the others have their turn."""
+_AT_ONCE, _AT_ONCE_HELD_UP = 1000, 64
+"""Blocks of one machine before the others have their turn; fewer where each may have to wait for it."""
 _CACHED_EVENTS = 200
 _QUERY_TIMEOUT_S = 10.0
 _QUICK_CONNECT_S = 3.0
@@ -195,7 +195,8 @@ class MachineLink:
         keep(alive.declare_subscriber(keys.publisher_alive, guarded(self._take_alive), history=True).undeclare)
         blocks = BlockSubscription(session, keys.stream, guarded(self._take_miss), holds_up=wait_when_full)
         keep(blocks.close)
-        keep(self._link.intake.add(partial(guarded(partial(blocks.take, guarded(self._take_block))), _AT_ONCE)))
+        most = _AT_ONCE_HELD_UP if wait_when_full else _AT_ONCE
+        keep(self._link.intake.add(partial(guarded(partial(blocks.take, guarded(self._take_block))), most)))
         keep(alive.declare_token(keys.monitor_alive).undeclare)
 
     def publish(self, topic: Topic, text: str) -> None:

@@ -1,5 +1,7 @@
 """Which hops' lines are those of one shaft."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -58,6 +60,15 @@ def test_a_ramp_that_the_sweeps_tell_of_is_settled_and_one_that_they_do_not_is_n
     assert settled_hops(ramp, speeds, HOP_S).all()
     stairs = tuple(RotationLine(one.speed_rad_s, 0.0, one.strength) for one in ramp)
     assert not settled_hops(stairs, speeds, HOP_S)[4:10].any()
+
+
+@pytest.mark.parametrize("weak", [range(6, 12), range(11, 12), range(3, 4)])
+def test_lines_that_are_weaker_at_one_speed_are_of_a_load_that_has_grown(weak: range) -> None:
+    steady = lines(5, 0.01, 0.02, strength=100.0)
+    grown = tuple(
+        replace(one, strength=30.0 if n == 11 else 15.0) if n in weak else one for n, one in enumerate(steady)
+    )
+    assert settled_hops(grown, sure(followed_speeds(grown, HOP_S)), HOP_S).all()
 
 
 def test_lines_that_do_not_stand_out_tell_of_no_change() -> None:

@@ -157,8 +157,10 @@ def test_a_time_column_in_another_unit_than_the_mappings_is_refused(tmp_path: Pa
     imported(tmp_path, table(tmp_path / "run.csv", GOOD, "t (UTC),x,v,a"), TEXT.replace('"t"', '"t (UTC)"'))
 
 
-@pytest.mark.parametrize(("attribute", "refused"), [("mil", True), (np.bytes_(b"um"), False)])
-def test_rates_and_units_of_an_hdf5_file_are_read(tmp_path: Path, attribute: str, refused: bool) -> None:
+@pytest.mark.parametrize(
+    ("attribute", "refused"), [("mil", True), (np.bytes_(b"um"), False), (h5py.Empty("S1"), False)]
+)
+def test_rates_and_units_of_an_hdf5_file_are_read(tmp_path: Path, attribute: object, refused: bool) -> None:
     with h5py.File(tmp_path / "run.h5", "w") as file:
         for name, column in zip("xva", signals(1000)[1:], strict=True):
             file[name] = column

@@ -91,4 +91,5 @@ def test_pages_are_everything_once(
     for wanted in ({"alarm": "e"}, {"kind": "cleared"}, {"alarm": "e", "kind": "raised", "severity": "danger"}):
         found = [events[n] for n in chosen if wanted.items() <= kinds[n].items()]
         assert pages(forth, lambda event: event.sequence, limit) == found
+        assert forth(2**63 - 1) == ()
     assert pages(back, lambda event: event.sequence, limit) == [events[n] for n in chosen[::-1]]

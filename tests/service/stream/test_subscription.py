@@ -11,8 +11,18 @@ import zenoh
 
 from models.signals.link import LinkSettings
 from service.stream.inbox import RawBlock
+from service.stream.transport import MachineCallbacks, MachineLink
 from tests.loopback import session_of
-from tests.service.rig.live import LAB, advanced_publisher, endpoint, machine_link, until, until_subscribed
+from tests.service.rig.live import (
+    LAB,
+    advanced_publisher,
+    endpoint,
+    ignore,
+    machine_link,
+    no_events,
+    until,
+    until_subscribed,
+)
 
 KEPT, LIVE = 300, 60
 SIZE = 30_000
@@ -206,6 +216,39 @@ def test_blocks_of_a_publisher_that_gives_times_and_no_numbers_arrive_in_order()
             until(lambda: len(seen) >= KEPT + LIVE, "all blocks")
         publisher.undeclare()  # type: ignore[no-untyped-call]
     assert seen == list(range(KEPT + LIVE))
+
+
+def test_a_machine_that_holds_up_its_publisher_leaves_the_others_their_turns() -> None:
+    address, order = endpoint(), list[str]()
+    other = LAB.model_copy(update={"name": "other"})
+
+    def slowly(_: RawBlock) -> None:
+        order.append("slow")
+        time.sleep(0.002)
+
+    with (
+        machine_link(address, slowly, wait=True) as (link, _),
+        session_of(LinkSettings(connect=(address,))) as session,
+        session_of(LinkSettings(connect=(address,))) as another,
+    ):
+        taken = MachineCallbacks(lambda _: order.append("other"), ignore, ignore, ignore, str, str, no_events)
+        declared = MachineLink(link, other.keys, taken, wait_when_full=True)
+        flood = advanced_publisher(session, LAB.keys.stream, KEPT)
+        beside = advanced_publisher(another, other.keys.stream, KEPT)
+        until_subscribed(session, LAB.keys.stream)
+        until_subscribed(another, other.keys.stream)
+        sender = threading.Thread(target=lambda: [flood.put(_payload(n)) for n in range(1000)])
+        sender.start()
+        while sender.is_alive() and len(order) < 1000:
+            beside.put(_payload(len(order)))
+            time.sleep(0.01)
+        sender.join()
+        until(lambda: order.count("slow") == 1000, "all blocks")
+        declared.close()
+        for publisher in (flood, beside):
+            publisher.undeclare()  # type: ignore[no-untyped-call]
+    turns = "".join(one[0] for one in order).strip("s").split("o")
+    assert max(len(turn) for turn in turns) < 200
 
 
 def _payload(number: int) -> bytes:
