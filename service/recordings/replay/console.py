@@ -3,8 +3,10 @@
 import os
 import select
 import sys
+import termios
 import threading
 import time
+import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Literal
@@ -147,12 +149,6 @@ def _read_keys(control: Control, done: threading.Event) -> None:
 @contextmanager
 def _single_keys() -> Iterator[None]:
     """Keys arrive one by one and are not shown."""
-    try:
-        import termios  # noqa: PLC0415  # not everywhere
-        import tty  # noqa: PLC0415
-    except ImportError:
-        yield
-        return
     number = sys.stdin.fileno()
     before = termios.tcgetattr(number)
     tty.setcbreak(number)
