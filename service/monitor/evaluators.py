@@ -19,8 +19,9 @@ from models.diagnosis.moments import states_of
 from models.diagnosis.readings import Diagnosis, no_reading
 from models.diagnosis.sensors.reference import Naming
 from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.verdict.isolation import misfit_beside
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
-from models.diagnosis.verdict.stretch import determined
+from models.diagnosis.verdict.stretch import determined, stretch_of
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import MachineFile
@@ -101,6 +102,7 @@ class BaselineEvaluator(WindowEvaluator):
                 raise EstimationError(f"{self._place}: {lost}")
             if newest is not None:
                 deciding, short = self._newest(*newest, deciding, latest)
+                deciding = self._witnessed(*newest, deciding, latest)
         else:
             nothing = tuple(no_reading(name, _SHAPE, _NO_EQUATION) for name in PARAMETERS)
             deciding = Diagnosis(_SHAPE, nothing, covariance=np.zeros((0, 0)))
@@ -148,6 +150,21 @@ class BaselineEvaluator(WindowEvaluator):
         if found and outside and not deciding.unexplained:
             deciding = replace(deciding, unexplained=_ASTRIDE)
         return deciding, found
+
+    def _witnessed(self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int) -> Diagnosis:
+        """What the window says, with the misfit of its latest hops if an unbalance is named and theirs is larger.
+
+        The unbalance is what stands out first where a foundation goes soft: while the window is mostly of before the
+        change it fits, and its latest hops alone do not, or only with other parameters changed than are named.
+        """
+        names, hops = test.astride, min(test.settings.short_hops, default=latest + 1)
+        if "e" not in names or latest < hops:
+            return deciding
+        with suppress(EstimationError):
+            if (statistics := sliding.statistics(hops, lagged=True)) is not None:
+                misfit_z = misfit_beside(stretch_of(self._read(statistics), 0, 1), names)
+                return replace(deciding, misfit_z=max(misfit_z, deciding.misfit_z or 0.0))
+        return deciding
 
     def _baseline_for(self, window: WindowStatistics) -> BaselineDiagnostician:
         """The baseline of these conditions."""

@@ -13,12 +13,13 @@ parameter, the spread of possible sizes included. The confidence is the posterio
 """
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import chdtrc, ndtr, ndtri
 
 from models.diagnosis.readings import Diagnosis, possible_reading
 from models.diagnosis.verdict.calibration import Thresholds, widened, window_thresholds
@@ -84,6 +85,17 @@ def model_test(stretch: Stretch, thresholds: Thresholds) -> tuple[bool, float | 
     if stretch.misfit_z is None or not math.isfinite(stretch.misfit_z):
         return False, None
     return stretch.misfit_z > thresholds.outside, outside_confidence(stretch.misfit_z)
+
+
+def misfit_beside(stretch: Stretch, names: Collection[str]) -> float:
+    """Misfit of a stretch in which no other parameters than these have changed, as a standard normal variable."""
+    look = stretch.complete().believed()
+    misfit_z, others = look.misfit_z or 0.0, [at for at, name in enumerate(look.names) if name not in names]
+    if not others:
+        return misfit_z
+    values, covariance = look.estimate()
+    chi2 = float(values[others] @ np.linalg.solve(covariance[np.ix_(others, others)], values[others]))
+    return max(misfit_z, -float(ndtri(max(chdtrc(len(others), chi2), 1e-300))))
 
 
 def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") -> Isolation:

@@ -145,6 +145,12 @@ class SequentialTest:
         return not self.state.findings and self.wanted() == self.settings.short_hops
 
     @property
+    def astride(self) -> tuple[str, ...]:
+        """Parameters found changed within the latest window."""
+        windows = self.state.sums.get(1)
+        return tuple(one.name for one in self.state.findings if windows and one.found_ns > windows[-1].start_ns)
+
+    @property
     def astride_s(self) -> float:
         """For how long windows that are outside the model may be astride a change, s."""
         began_ns, windows = self.state.outside_ns, self.state.sums.get(1)

@@ -123,6 +123,9 @@ class AlarmBook:
         nameless = another or hidden
         sure = {one for one in named if not nameless and probability.get(one, 0.0) >= self._settings.name_confidence}
         held = {*named, *(one for one, likely in probability.items() if likely >= _TAKEN_BACK)}
+        # The unbalance is read through the stiffness to ground at running speed. Where that has changed in both planes,
+        # what the bearings stand on may move, and it is another one there than the random vibration shows.
+        moves = {"k_by", "k_bz"} <= set(named)
         start_ns = end_ns - round(verdict.decided_s * 1e9)
         evidence = Evidence(start_ns=start_ns, end_ns=end_ns, confidence=verdict.confidence)
         for reading in verdict.current:
@@ -134,7 +137,7 @@ class AlarmBook:
                     end_ns,
                     named=reading.name in sure,
                     taken_back=verdict.settled and not hidden and (another or reading.name not in held),
-                    low_confidence=verdict.outside_model or hidden,
+                    low_confidence=verdict.outside_model or hidden or (moves and reading.name == "e"),
                     growth=None if reading.vector is None else reading.vector.magnitude_change,
                     evidence=evidence,
                     note="" if reading.vector is None else reading.vector.text,

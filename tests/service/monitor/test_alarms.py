@@ -220,6 +220,14 @@ def test_where_a_wrong_gain_would_explain_it_as_well_both_are_told(change: float
     assert judged([SURE] * 3, outside=True, hidden=True) == ["raised model"]
 
 
+def test_an_unbalance_beside_both_stiffnesses_is_named_with_reserve() -> None:
+    """What the bearings stand on may have changed, and then no unbalance is read right."""
+    for stiff in (("k_by",), ("k_by", "k_bz")):
+        events = happened([dict.fromkeys((*stiff, "e"), 1.0)] * 3)
+        named = {event.alarm.name: event.alarm.low_confidence for event in events}
+        assert named == dict.fromkeys(stiff, False) | {"e": len(stiff) == 2}
+
+
 def test_where_a_line_hides_the_machine_nothing_is_named() -> None:
     assert judged([SURE] * 3, outside=True) == ["raised c_bz", "raised model"]
     assert judged([SURE] * 9, outside=True, hidden=True) == ["raised model"]

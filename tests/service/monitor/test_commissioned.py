@@ -83,6 +83,16 @@ def test_a_change_within_the_window_is_named_and_is_not_outside_the_model() -> N
     assert (told[0].time_ns - blocks[0].start_ns) / 1e9 < begins_s + 25.0
 
 
+def test_an_unbalance_that_does_not_explain_the_latest_data_is_named_with_reserve() -> None:
+    """As where a foundation goes soft: most of the window is of before, so that it fits all the same."""
+    changes = {"e": 1.0, "k_by": -0.15, "k_bz": -0.15}
+    at_once = [Event(at_s=63.0, parameter=name, relative_change=change) for name, change in changes.items()]
+    _, events = feed(MachineMonitor(installed()), stream(82.0, SEED + 5, *at_once))
+    told = {event.alarm.name: event.alarm for event in events if not event.alarm.name.startswith(LEVEL)}
+    assert told.keys() == {"e", MODEL}
+    assert told["e"].low_confidence
+
+
 def test_another_speed_is_not_evaluable_here_and_raises_nothing_but_levels() -> None:
     faster = Event(at_s=0.0, speed_rpm=1.15 * LAB.operation.speed_rpm)
     windows, events = feed(MachineMonitor(installed()), stream(65.0, SEED + 3, faster))
