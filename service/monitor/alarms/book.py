@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pydantic import TypeAdapter
 
 from models.alarm_names import ALARMS, CHANGED, MODEL, alarm_kind, is_alarm
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.errors import CheckpointError
 from models.machine import AlarmSettings, SuppressRule
 from models.physics.rotor import PARAMETERS
@@ -123,8 +124,8 @@ class AlarmBook:
         nameless = another or hidden
         sure = {one for one in named if not nameless and probability.get(one, 0.0) >= self._settings.name_confidence}
         held = {*named, *(one for one, likely in probability.items() if likely >= _TAKEN_BACK)}
-        # The unbalance is read through the stiffness to ground at running speed. Where that has changed in both planes,
-        # what the bearings stand on may move, and it is another one there than the random vibration shows.
+        # Without parameters the unbalance is read through the stiffness to ground at running speed. Where that has
+        # changed in both planes, what the bearings stand on may move, and it is another one than at other frequencies.
         moves = {"k_by", "k_bz"} <= set(named)
         start_ns = end_ns - round(verdict.decided_s * 1e9)
         evidence = Evidence(start_ns=start_ns, end_ns=end_ns, confidence=verdict.confidence)
@@ -137,7 +138,9 @@ class AlarmBook:
                     end_ns,
                     named=reading.name in sure,
                     taken_back=verdict.settled and not hidden and (another or reading.name not in held),
-                    low_confidence=verdict.outside_model or hidden or (moves and reading.name == "e"),
+                    low_confidence=verdict.outside_model
+                    or hidden
+                    or (moves and (reading.name, reading.by) == ("e", BaselineDiagnostician.by)),
                     growth=None if reading.vector is None else reading.vector.magnitude_change,
                     evidence=evidence,
                     note="" if reading.vector is None else reading.vector.text,

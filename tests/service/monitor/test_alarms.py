@@ -220,12 +220,20 @@ def test_where_a_wrong_gain_would_explain_it_as_well_both_are_told(change: float
     assert judged([SURE] * 3, outside=True, hidden=True) == ["raised model"]
 
 
-def test_an_unbalance_beside_both_stiffnesses_is_named_with_reserve() -> None:
+@pytest.mark.parametrize(
+    ("stiff", "by", "reserve"),
+    [(("k_by",), "baseline", False), (("k_by", "k_bz"), "baseline", True), (("k_by", "k_bz"), "likelihood", False)],
+)
+def test_an_unbalance_beside_both_stiffnesses_without_parameters_is_named_with_reserve(
+    stiff: tuple[str, ...], by: str, reserve: bool
+) -> None:
     """What the bearings stand on may have changed, and then no unbalance is read right."""
-    for stiff in (("k_by",), ("k_by", "k_bz")):
-        events = happened([dict.fromkeys((*stiff, "e"), 1.0)] * 3)
-        named = {event.alarm.name: event.alarm.low_confidence for event in events}
-        assert named == dict.fromkeys(stiff, False) | {"e": len(stiff) == 2}
+    book, found = AlarmBook(SETTINGS), verdict(dict.fromkeys((*stiff, "e"), 1.0))
+    current = tuple(one.model_copy(update={"by": by}) for one in found.current)
+    for number in range(3):
+        book.found(found.model_copy(update={"current": current}), "", "", number * 5_000_000_000)
+    named = {event.alarm.name: event.alarm.low_confidence for event in book.take()}
+    assert named == dict.fromkeys(stiff, False) | {"e": reserve}
 
 
 def test_where_a_line_hides_the_machine_nothing_is_named() -> None:
