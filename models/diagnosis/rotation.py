@@ -189,11 +189,11 @@ def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, h
     if usual <= STRONG:
         return np.full(found.shape, True)
     steps = np.diff(followed)
-    off = np.minimum(np.abs(steps), np.abs(steps - _swept(lines, hop_s)))
-    held = off < _near(followed, hop_s)[1:]  # not so beside a hop without a line
+    near = _near(followed, hop_s)[1:]
+    steady, held = np.abs(steps) < near, np.minimum(np.abs(steps), np.abs(steps - _swept(lines, hop_s))) < near
     # Of the first and the last hop one neighbour alone tells.
-    level = held & (np.minimum(strength[1:], strength[:-1]) > _WEAKER * np.maximum(strength[1:], strength[:-1]))
-    as_it_was = np.append(held, level[-1:]) & np.insert(held, 0, level[:1])
+    level = steady & (np.minimum(strength[1:], strength[:-1]) > _WEAKER * np.maximum(strength[1:], strength[:-1]))
+    as_it_was = np.append(steady, level[-1:]) & np.insert(steady, 0, level[:1])
     settled = found & (as_it_was | (strength > _WEAKER * usual))
     held &= settled[1:] & settled[:-1]
     return np.asarray(settled & np.append(held, True) & np.insert(held, 0, True), dtype=np.bool_)

@@ -58,6 +58,8 @@ def test_a_ramp_that_the_sweeps_tell_of_is_settled_and_one_that_they_do_not_is_n
     ramp = tuple(RotationLine(2 * np.pi * f, 2 * np.pi * s, 30.0) for f, s in zip(hz, sweeps, strict=True))
     speeds = sure(followed_speeds(ramp, HOP_S))
     assert settled_hops(ramp, speeds, HOP_S).all()
+    smeared = tuple(replace(one, strength=5.0 if one.sweep_rad_s2 > 0.1 else 100.0) for one in ramp)
+    assert np.flatnonzero(settled_hops(smeared, speeds, HOP_S)).tolist() == [0, 1, 2, 11]
     stairs = tuple(RotationLine(one.speed_rad_s, 0.0, one.strength) for one in ramp)
     assert not settled_hops(stairs, speeds, HOP_S)[4:10].any()
 
