@@ -79,7 +79,7 @@ class BaselineEvaluator(WindowEvaluator):
         self._diagnosed = states_of(machine) != ()
         self._lines = commissioned.lines != ()  # without any, relations were learned with all that the windows held
         self._shape = commissioned.shape
-        self._length_s = machine.window_data_s
+        self._length_s, self._on_delay_ns = machine.window_data_s, round(machine.alarms.on_delay_s * 1e9)
         self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate
         self._baselines = tuple((one.conditions, one.baseline.diagnostician()) for one in commissioned.baselines)
         self.by = self._baselines[0][1].by if self._baselines else _SHAPE
@@ -155,10 +155,13 @@ class BaselineEvaluator(WindowEvaluator):
         """What the window says, with the misfit of its latest hops if an unbalance is named and theirs is larger.
 
         The unbalance is what stands out first where a foundation goes soft: while the window is mostly of before the
-        change it fits, and its latest hops alone do not, or only with other parameters changed than are named.
+        change it fits, and its latest hops alone do not, or only with other parameters changed than are named. They are
+        asked from when an alarm is due: of a bearing, too, an unbalance may be the first guess.
         """
         names, hops = test.astride, min(test.settings.short_hops, default=latest + 1)
-        if "e" not in names or latest < hops:
+        due_ns = sliding.hops[-1].end_ns - self._on_delay_ns
+        due = any(one.name == "e" and one.found_ns <= due_ns for one in test.state.findings)
+        if not due or "e" not in names or latest < hops:
             return deciding
         with suppress(EstimationError):
             if (statistics := sliding.statistics(hops, lagged=True)) is not None:
