@@ -102,19 +102,12 @@ def compare(
     *,
     sized: bool = False,
 ) -> Identified:
-    """Read healthy windows of a rotor that is known; without a shaft angle, identify the size of its unbalance.
-
-    Parameters
-    ----------
-    windows : sequence of WindowStatistics
-        Healthy ones that do not overlap.
-    sized : bool
-        As for `identify`.
+    """Read healthy windows, as for `identify`, of a rotor that is known; `sized`, identify its unbalance alone.
 
     Raises
     ------
     EstimationError
-        As `identify`.
+        If windows without a shaft angle are not of one unbalance.
     """
     whole, covariance = in_sense(machine, sense), np.zeros((len(PARAMETERS), len(PARAMETERS)))
     read = _read(whole, windows, progress, sized=sized)

@@ -203,8 +203,8 @@ def settled(place: str, window: WindowStatistics, newest: Newest | None) -> tupl
 class LatestRotation:
     """How strong the rotation was when it last stood out of the vibration, where there is no shaft angle."""
 
-    def __init__(self, power: float = 0.0) -> None:
-        self.power = power
+    def __init__(self) -> None:
+        self.power = 0.0
 
     def take(self, window: WindowStatistics) -> None:
         """Go on with a window."""
