@@ -7,7 +7,7 @@ B 15 (1953))
 
 Nothing but the rotor's other properties is taken as known: the level matrix, the cutoff of the excitation and the
 density and colour of every channel's noise are unknown beside the parameters. The excitation's shape, a second-order
-low-pass, is known here; a method that does not know it has a higher bound, given beside it.
+low-pass, is known here; a method that does not know it has a higher bound.
 """
 
 from dataclasses import dataclass

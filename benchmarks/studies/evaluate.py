@@ -15,7 +15,7 @@ from benchmarks.studies.study import Cell, Options, Study
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Z95
 from models.diagnosis.verdict.calibration import detectable_changes, window_thresholds
-from models.diagnosis.verdict.stretch import stretch_of, to_scale
+from models.diagnosis.verdict.stretch import slope, stretch_of, to_scale
 from models.machine import Machine, load_machine
 from models.physics.rotor import PARAMETERS
 from simulator.training.draws import Anomaly, Draw, Excitation, Layout, Purpose, draw_condition, simulate_scenario
@@ -101,7 +101,7 @@ def _measure(trained: o.Trained, seed: int, stream: int, kind: _Kind, _: None, n
         "noise": scenario.sensors.noise_relative,
         **o.truth(faults),
     }
-    if kind.topic in ("healthy", "length"):
+    if kind.topic in ("healthy", "length", "small", "paper"):
         known |= {f"{name} bound": value for name, value in bound_of(scenario, machine).items()}
     return [known | o.opinion(one, window) for one in trained.diagnosticians()]
 
@@ -210,14 +210,16 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
 
 
 def _detection(lab: Sequence[Record], asked: Sequence[str]) -> Iterator[Goal]:
+    named = r.share("is named")
     for name, true in _SMALL:
-        found, possible = _found(lab, "likelihood", o.SEVERAL, name, true), _found_at_bound(lab, o.SEVERAL, name, true)
+        windows = _changed(lab, "likelihood", o.SEVERAL, name, true)
+        found, possible = named(windows), _found_at_bound(windows, name, true)
         declared = f"≥ {100 * possible:.1f} %, as at the bound"
         yield r.at_least(f"likelihood: {name} {true:+.0%} detected, {o.SEVERAL}", found, possible, declared)
-    one = {f"{name} {true:+.0%}": _found(lab, "likelihood", o.ONE, name, true) for name, true in _SMALL}
+    one = {f"{name} {true:+.0%}": named(_changed(lab, "likelihood", o.ONE, name, true)) for name, true in _SMALL}
     yield r.within(f"likelihood: the same changes, {o.ONE}", one, 0.99, 1.0)
     for layout in (o.SEVERAL, o.ONE) if "network" in asked else ():
-        rates = {f"{name} {true:+.0%}": _found(lab, "network", layout, name, true) for name, true in _NETWORK}
+        rates = {f"{name} {true:+.0%}": named(_changed(lab, "network", layout, name, true)) for name, true in _NETWORK}
         yield r.within(f"network: k −5 %, c −20 %, e +20 % detected, {layout}", rates, 0.99, 1.0)
 
 
@@ -234,26 +236,26 @@ def _strained(lab: Sequence[Record]) -> Iterator[Goal]:
     ):
         figures = r.each(untold, ("parameter", "excitation", "layout"), figure)
         yield r.within(f"likelihood: {what}, another excitation than assumed", figures, low, high)
-    lengths = [row for row in r.where(own, parameter=_READ) if "bound" in row]
+    lengths = [row for row in r.where(own, parameter=_READ, topic=("healthy", "length")) if "bound" in row]
     exponents = r.each(lengths, ("parameter", "layout"), _exponent)
     yield r.within("likelihood: exponent of the window length in the spread", exponents, -0.6, -0.4)
 
 
-def _found(rows: Iterable[Record], by: str, layout: str, name: str, true: float) -> Estimate | None:
-    """Windows in which a change is named; alone, where that was measured: beside another it needs stronger evidence."""
+def _changed(rows: Iterable[Record], by: str, layout: str, name: str, true: float) -> list[Record]:
+    """Readings of a change; alone, where that was measured: beside another it needs stronger evidence."""
     same = r.where(rows, method=by, layout=layout, parameter=name, true=true, topic=("small", "paper"))
     alone = [row for row in same if sum(bool(row[f"{other} true"]) for other in PARAMETERS) == 1]
-    return r.share("is named")(alone or r.where(same, topic="small"))
+    return alone or r.where(same, topic="small")
 
 
-def _found_at_bound(rows: Iterable[Record], layout: str, name: str, true: float) -> float:
-    """Share of windows in which a normal reading with the bound's standard error would cross the same threshold.
+def _found_at_bound(windows: Iterable[Record], name: str, true: float) -> float:
+    """Share of these windows in which a normal reading with the bound's standard error would cross the threshold.
 
-    Over the conditions of the healthy windows, which are drawn as those of the changed ones are.
+    The bound is that of the changed machine in the window's own condition.
     """
-    healthy = r.where(rows, method="likelihood", layout=layout, parameter=name, topic="healthy")
     threshold = window_thresholds(o.RATES[0], len(PARAMETERS)).first
-    z = abs(to_scale(name, true)) / r.floats(row.get("bound") for row in healthy)
+    scaled = to_scale(name, true)
+    z = abs(scaled) * slope(name, scaled) / r.floats(row.get("bound") for row in windows)
     return float(np.mean(ndtr(z - threshold) + ndtr(-z - threshold)))
 
 
@@ -286,8 +288,8 @@ def _charts(records: Sequence[Record]) -> Iterator[Chart]:
         for layout in (o.SEVERAL, o.ONE)
         for name, true in (*_SMALL, *_NETWORK)
         for title, one in (
-            *((title, _found(lab, by, layout, name, true)) for by, title in o.TITLES.items()),
-            (at_bound, _found_at_bound(lab, layout, name, true)),
+            *((title, r.share("is named")(_changed(lab, by, layout, name, true))) for by, title in o.TITLES.items()),
+            (at_bound, _found_at_bound(_changed(lab, "likelihood", layout, name, true), name, true)),
         )
         if one is not None
     )
