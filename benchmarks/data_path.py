@@ -15,8 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.studies.subjects import without_parameters
-from benchmarks.studies.watched import commissioned
+from benchmarks.studies.subjects.machines import without_parameters
+from benchmarks.studies.subjects.watched import commissioned
 from models.commissioning.commissioned import Installed
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import hop_moments, plan_for

@@ -1,4 +1,4 @@
-"""What the diagnosticians find, measured on simulated windows: seven studies, one runner, one page template."""
+"""What the diagnosticians find, measured on simulated windows: a module for each study, run by one command."""
 
 import os
 

@@ -14,11 +14,11 @@ from benchmarks.studies.evaluate import evaluate
 from benchmarks.studies.level_years import level_years
 from benchmarks.studies.levels import levels
 from benchmarks.studies.other_faults import other_faults
-from benchmarks.studies.pages import write_page
 from benchmarks.studies.peers import peers
+from benchmarks.studies.reporting.pages import write_page
+from benchmarks.studies.reporting.study import Options, read, run, spread_over
 from benchmarks.studies.reproduction import reproduction
 from benchmarks.studies.sensors import sensors
-from benchmarks.studies.study import Options, read, run, spread_over
 from benchmarks.studies.unknown import unknown
 from models.errors import RotorwatchError
 

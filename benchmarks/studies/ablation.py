@@ -10,13 +10,13 @@ from functools import cache, partial
 
 import numpy as np
 
-from benchmarks.studies import results as r
-from benchmarks.studies import variants as v
-from benchmarks.studies.opinions import LAYOUTS, Trained, changed_in, made_with
-from benchmarks.studies.paper import PAPER_EQUATIONS, PaperNetwork, train_paper_network
-from benchmarks.studies.results import Estimate, Record, Table, Value
-from benchmarks.studies.study import Cell, Options, Over, Study
-from benchmarks.studies.variants import VARIANTS, Measure, Reader, Variant
+from benchmarks.studies.methods import variants as v
+from benchmarks.studies.methods.paper import PAPER_EQUATIONS, PaperNetwork, train_paper_network
+from benchmarks.studies.methods.variants import VARIANTS, Measure, Reader, Variant
+from benchmarks.studies.reporting import results as r
+from benchmarks.studies.reporting.opinions import LAYOUTS, Trained, changed_in, made_with
+from benchmarks.studies.reporting.results import Estimate, Record, Table, Value
+from benchmarks.studies.reporting.study import Cell, Options, Over, Study
 from models.diagnosis.networks.equations import EQUATIONS
 from models.diagnosis.networks.relation import EquationNetwork, equation_by_number, read_equation, window_view
 from models.diagnosis.window import WindowStatistics

@@ -6,11 +6,11 @@ from itertools import product
 
 import numpy as np
 
-from benchmarks.studies import opinions as o
-from benchmarks.studies import results as r
-from benchmarks.studies.bound import bound_of
-from benchmarks.studies.results import Goal, Record, Table, Value
-from benchmarks.studies.study import Cell, Options, Study
+from benchmarks.studies.methods.bound import bound_of
+from benchmarks.studies.reporting import opinions as o
+from benchmarks.studies.reporting import results as r
+from benchmarks.studies.reporting.results import Goal, Record, Table, Value
+from benchmarks.studies.reporting.study import Cell, Options, Study
 from models.diagnosis.readings import Diagnosis, Diagnostician
 from models.diagnosis.verdict.calibration import agreements, beside
 from models.diagnosis.window import WindowStatistics

@@ -6,10 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from benchmarks.studies import results as r
-from benchmarks.studies.results import Goal, Record, Table, Value
-from benchmarks.studies.subjects import drawn_in_one_condition, without_parameters
-from benchmarks.studies.watched import commissioned
+from benchmarks.studies.reporting import results as r
+from benchmarks.studies.reporting.results import Goal, Record, Table, Value
+from benchmarks.studies.subjects.machines import drawn_in_one_condition, without_parameters
+from benchmarks.studies.subjects.watched import commissioned
 from models.commissioning.commissioned import Installed, KnowledgeLevel
 from models.diagnosis.readings import Z95
 from models.machine import Machine, load_machine

@@ -15,12 +15,12 @@ from benchmarks.finite_elements.machines import ROTORS, rotor_named
 from benchmarks.finite_elements.observed import RunCondition, WindowSizes, blocks, machine_of, plan, sampled, windows_of
 from benchmarks.finite_elements.rotor import BeamRotor
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
-from benchmarks.studies import results as r
-from benchmarks.studies.damping_bound import DampingBound, damping_bound, expected
-from benchmarks.studies.opinions import changed_in
-from benchmarks.studies.results import Goal, Record, Table, Value
-from benchmarks.studies.study import Cell, Options, Study
-from benchmarks.studies.watched import commissioned, raised
+from benchmarks.studies.methods.damping_bound import DampingBound, damping_bound, expected
+from benchmarks.studies.reporting import results as r
+from benchmarks.studies.reporting.opinions import changed_in
+from benchmarks.studies.reporting.results import Goal, Record, Table, Value
+from benchmarks.studies.reporting.study import Cell, Options, Study
+from benchmarks.studies.subjects.watched import commissioned, raised
 from models.commissioning.commissioned import Installed
 from models.diagnosis.baseline.rows import ROWS, Row
 from models.diagnosis.verdict.sequential import SequentialSettings

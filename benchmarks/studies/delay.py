@@ -13,11 +13,11 @@ import numpy as np
 from scipy.special import ndtri
 
 from benchmarks.studies import alarm_readings as t
-from benchmarks.studies import results as r
-from benchmarks.studies.bound import bound_of
-from benchmarks.studies.opinions import LAYOUTS, SEVERAL, physics_hash
-from benchmarks.studies.results import Chart, Goal, Record, Table, Value
-from benchmarks.studies.study import Cell, Options, Study
+from benchmarks.studies.methods.bound import bound_of
+from benchmarks.studies.reporting import results as r
+from benchmarks.studies.reporting.opinions import LAYOUTS, SEVERAL, physics_hash
+from benchmarks.studies.reporting.results import Chart, Goal, Record, Table, Value
+from benchmarks.studies.reporting.study import Cell, Options, Study
 from models.commissioning.commissioned import KnowledgeLevel
 from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import plan_for

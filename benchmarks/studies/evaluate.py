@@ -7,11 +7,11 @@ from functools import partial
 import numpy as np
 from scipy.special import ndtr
 
-from benchmarks.studies import opinions as o
-from benchmarks.studies import results as r
-from benchmarks.studies.bound import bound_of
-from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value
-from benchmarks.studies.study import Cell, Options, Study
+from benchmarks.studies.methods.bound import bound_of
+from benchmarks.studies.reporting import opinions as o
+from benchmarks.studies.reporting import results as r
+from benchmarks.studies.reporting.results import Chart, Estimate, Goal, Record, Table, Value
+from benchmarks.studies.reporting.study import Cell, Options, Study
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Z95
 from models.diagnosis.verdict.calibration import detectable_changes, window_thresholds

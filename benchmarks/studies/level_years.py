@@ -14,10 +14,10 @@ from typing import Self
 import numpy as np
 import scipy.stats
 
-from benchmarks.studies import results as r
-from benchmarks.studies.level_streams import KINDS, At, Scene, drawn, generator, steady
-from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
-from benchmarks.studies.study import Cell, Options, Study
+from benchmarks.studies.reporting import results as r
+from benchmarks.studies.reporting.results import Estimate, Goal, Record, Table, Value
+from benchmarks.studies.reporting.study import Cell, Options, Study
+from benchmarks.studies.subjects.level_streams import KINDS, At, Scene, drawn, generator, steady
 from models.diagnosis.verdict.calibration import MONTH_S
 from models.levels.bands import NYQUIST_PART, band_edges
 from models.levels.judgement import LevelJudge

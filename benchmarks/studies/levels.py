@@ -9,14 +9,14 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.studies import results as r
-from benchmarks.studies.fault_kinds import Rotor, Seen, as_simulated, line
-from benchmarks.studies.level_streams import KINDS, At, Defect, Gains, drawn, generator, steady
-from benchmarks.studies.results import Goal, Record, Table, Value
-from benchmarks.studies.study import Cell, Options, Study
-from benchmarks.studies.subjects import SHIPPED, SUBJECTS
-from benchmarks.studies.watched import Raised, commissioned, raised
-from benchmarks.studies.watched_machine import CONDITIONS, Subject
+from benchmarks.studies.reporting import results as r
+from benchmarks.studies.reporting.results import Goal, Record, Table, Value
+from benchmarks.studies.reporting.study import Cell, Options, Study
+from benchmarks.studies.subjects.fault_kinds import Rotor, Seen, as_simulated, line
+from benchmarks.studies.subjects.level_streams import KINDS, At, Defect, Gains, drawn, generator, steady
+from benchmarks.studies.subjects.machines import SHIPPED, SUBJECTS
+from benchmarks.studies.subjects.watched import Raised, commissioned, raised
+from benchmarks.studies.subjects.watched_machine import CONDITIONS, Subject
 from models.alarm_names import LEVEL
 from models.commissioning.commissioned import Installed, KnowledgeLevel
 from models.signals.block import FloatArray

@@ -8,13 +8,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
-from benchmarks.studies import results as r
-from benchmarks.studies.fault_kinds import ANOTHER, CRACK, FAULTS, HEALTHY, RUBS
-from benchmarks.studies.results import Goal, Record, Table, Value
-from benchmarks.studies.study import Cell, Options, Study
-from benchmarks.studies.subjects import SHIPPED, SUBJECTS
-from benchmarks.studies.watched import commissioned, raised
-from benchmarks.studies.watched_machine import CONDITIONS, Subject
+from benchmarks.studies.reporting import results as r
+from benchmarks.studies.reporting.results import Goal, Record, Table, Value
+from benchmarks.studies.reporting.study import Cell, Options, Study
+from benchmarks.studies.subjects.fault_kinds import ANOTHER, CRACK, FAULTS, HEALTHY, RUBS
+from benchmarks.studies.subjects.machines import SHIPPED, SUBJECTS
+from benchmarks.studies.subjects.watched import commissioned, raised
+from benchmarks.studies.subjects.watched_machine import CONDITIONS, Subject
 from models.alarm_names import CHANGED, DATA, LEVEL, MODEL, SHAPE
 from models.commissioning.commissioned import Installed, KnowledgeLevel
 from models.physics.rotor import PARAMETERS

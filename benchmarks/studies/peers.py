@@ -10,12 +10,12 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.studies import results as r
-from benchmarks.studies.opinions import TITLES, Trained, changed_in, made_with, named_in, opinion
-from benchmarks.studies.other_methods import FeatureVector, SubspaceModes
-from benchmarks.studies.paper import PAPER_EQUATIONS, PaperDiagnostician, train_paper_network
-from benchmarks.studies.results import Chart, Goal, Record, Table, Value
-from benchmarks.studies.study import Cell, Options, Over, Study
+from benchmarks.studies.methods.other_methods import FeatureVector, SubspaceModes
+from benchmarks.studies.methods.paper import PAPER_EQUATIONS, PaperDiagnostician, train_paper_network
+from benchmarks.studies.reporting import results as r
+from benchmarks.studies.reporting.opinions import TITLES, Trained, changed_in, made_with, named_in, opinion
+from benchmarks.studies.reporting.results import Chart, Goal, Record, Table, Value
+from benchmarks.studies.reporting.study import Cell, Options, Over, Study
 from models.diagnosis.moments import plan_for
 from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.window import WindowStatistics

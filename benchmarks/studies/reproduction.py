@@ -11,11 +11,11 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.studies import results as r
-from benchmarks.studies.opinions import TITLES, Trained, made_with, named_in
-from benchmarks.studies.paper import PAPER_EQUATIONS, PaperDiagnostician, train_paper_network
-from benchmarks.studies.results import Chart, Estimate, Record, Table, Value
-from benchmarks.studies.study import Cell, Options, Over, Study
+from benchmarks.studies.methods.paper import PAPER_EQUATIONS, PaperDiagnostician, train_paper_network
+from benchmarks.studies.reporting import results as r
+from benchmarks.studies.reporting.opinions import TITLES, Trained, made_with, named_in
+from benchmarks.studies.reporting.results import Chart, Estimate, Record, Table, Value
+from benchmarks.studies.reporting.study import Cell, Options, Over, Study
 from models.diagnosis.moments import plan_for
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics

@@ -5,11 +5,11 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from benchmarks.studies import results as r
-from benchmarks.studies.opinions import opinion
-from benchmarks.studies.results import Goal, Record, Table, Value
-from benchmarks.studies.study import Cell, Options, Study
-from benchmarks.studies.subjects import SHIPPED, commissioned, subject_named
+from benchmarks.studies.reporting import results as r
+from benchmarks.studies.reporting.opinions import opinion
+from benchmarks.studies.reporting.results import Goal, Record, Table, Value
+from benchmarks.studies.reporting.study import Cell, Options, Study
+from benchmarks.studies.subjects.machines import SHIPPED, commissioned, subject_named
 from models.commissioning.commissioned import KnowledgeLevel
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import SensorReference, learn_sensor_reference

@@ -8,11 +8,11 @@ changed.
 from collections.abc import Iterator, Sequence
 from functools import partial
 
-from benchmarks.studies import results as r
-from benchmarks.studies.opinions import LAYOUTS, changed_in, judged, opinion, readings, truth
-from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
-from benchmarks.studies.study import Cell, Options, Study
-from benchmarks.studies.subjects import SUBJECTS, commissioned, subject_named
+from benchmarks.studies.reporting import results as r
+from benchmarks.studies.reporting.opinions import LAYOUTS, changed_in, judged, opinion, readings, truth
+from benchmarks.studies.reporting.results import Estimate, Goal, Record, Table, Value
+from benchmarks.studies.reporting.study import Cell, Options, Study
+from benchmarks.studies.subjects.machines import SUBJECTS, commissioned, subject_named
 from models.commissioning.commissioned import KnowledgeLevel
 from simulator.training.draws import Layout
 

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.finite_elements.machines import rotor_named
 from benchmarks.finite_elements.observed import WindowSizes, plan, sampled, windows_of
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
-from benchmarks.studies.damping_bound import damping_bound, expected
+from benchmarks.studies.methods.damping_bound import damping_bound, expected
 from models.diagnosis.baseline.rows import ROWS
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from benchmarks.finite_elements.assembly import ComplexArray, assemble, harmonic_response, probed
 from benchmarks.finite_elements.machines import rotor_named
-from benchmarks.studies.fault_kinds import FAULTS, Rotor, Seen
+from benchmarks.studies.subjects.fault_kinds import FAULTS, Rotor, Seen
 from models.signals.block import FloatArray
 
 BEAM = rotor_named("overhung")

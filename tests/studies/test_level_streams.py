@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.studies.level_streams import KINDS, At, Defect, drawn, generator, steady
 from benchmarks.studies.level_years import Drawing, level_years
 from benchmarks.studies.levels import levels
-from benchmarks.studies.results import Record
-from benchmarks.studies.study import Options
+from benchmarks.studies.reporting.results import Record
+from benchmarks.studies.reporting.study import Options
+from benchmarks.studies.subjects.level_streams import KINDS, At, Defect, drawn, generator, steady
 from models.diagnosis.verdict.calibration import MONTH_S
 from models.levels.judgement import LevelJudge
 from models.levels.reference import learn_levels

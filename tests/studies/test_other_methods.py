@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from benchmarks.studies.other_methods import FeatureVector, SubspaceModes, reference_modes
-from benchmarks.studies.paper import PAPER_EQUATIONS, full_correlation, phase_correlation
+from benchmarks.studies.methods.other_methods import FeatureVector, SubspaceModes, reference_modes
+from benchmarks.studies.methods.paper import PAPER_EQUATIONS, full_correlation, phase_correlation
 from models.diagnosis.moments import plan_for
 from models.errors import EstimationError
 from models.machine import Machine, load_machine

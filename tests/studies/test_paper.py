@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.studies.paper import PAPER_EQUATIONS, PaperDiagnostician, PaperNetwork, paper_rows, train_paper_network
+from benchmarks.studies.methods.paper import (
+    PAPER_EQUATIONS,
+    PaperDiagnostician,
+    PaperNetwork,
+    paper_rows,
+    train_paper_network,
+)
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
@@ -42,7 +48,7 @@ def healthy(rig: Machine) -> list[WindowStatistics]:
 @pytest.fixture(scope="module")
 def networks(rig: Machine, training: list[WindowStatistics]) -> list[PaperNetwork]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("benchmarks.studies.paper._STEPS", 25)
+        patch.setattr("benchmarks.studies.methods.paper._STEPS", 25)
         return [train_paper_network(equation, training, rig, seed=1) for equation in PAPER_EQUATIONS]
 
 
@@ -58,7 +64,7 @@ def test_training_fits_its_own_windows_and_is_repeatable(
     rig: Machine, networks: list[PaperNetwork], training: list[WindowStatistics], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = networks[0]
-    monkeypatch.setattr("benchmarks.studies.paper._STEPS", 25)
+    monkeypatch.setattr("benchmarks.studies.methods.paper._STEPS", 25)
     again = train_paper_network(PAPER_EQUATIONS[0], training, rig, seed=1)
     assert np.array_equal(first.network.W1, again.network.W1)
     assert np.mean([first.deviation(window) for window in training]) < 0.05

@@ -14,11 +14,11 @@ from typer.testing import CliRunner
 from benchmarks.studies import __main__ as command
 from benchmarks.studies.delay import bound_time_s, with_hop
 from benchmarks.studies.evaluate import evaluate
-from benchmarks.studies.opinions import physics_hash
-from benchmarks.studies.pages import write_page
-from benchmarks.studies.paper import full_correlation
-from benchmarks.studies.reproduction import CONDITIONS, own_equations
-from benchmarks.studies.results import (
+from benchmarks.studies.methods.paper import full_correlation
+from benchmarks.studies.methods.variants import VARIANTS, as_seen, linear_fit, variant_equation
+from benchmarks.studies.reporting.opinions import physics_hash
+from benchmarks.studies.reporting.pages import write_page
+from benchmarks.studies.reporting.results import (
     Chart,
     Estimate,
     Goal,
@@ -39,9 +39,9 @@ from benchmarks.studies.results import (
     where,
     within,
 )
-from benchmarks.studies.study import Cell, Options, Over, Study, read, run, spread_over
-from benchmarks.studies.subjects import SHIPPED, SUBJECTS, subject_named
-from benchmarks.studies.variants import VARIANTS, as_seen, linear_fit, variant_equation
+from benchmarks.studies.reporting.study import Cell, Options, Over, Study, read, run, spread_over
+from benchmarks.studies.reproduction import CONDITIONS, own_equations
+from benchmarks.studies.subjects.machines import SHIPPED, SUBJECTS, subject_named
 from models.commissioning.commissioned import KnowledgeLevel, knowledge_of
 from models.diagnosis.networks.equations import EQUATIONS
 from models.diagnosis.networks.relation import window_view

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.studies.subjects import subject_named
+from benchmarks.studies.subjects.machines import subject_named
 from models.commissioning.levels import learned_baseline
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.learned import Baseline, planes_coupled, undetermined

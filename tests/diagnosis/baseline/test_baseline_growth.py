@@ -9,7 +9,7 @@ import pytest
 from benchmarks.finite_elements.machines import rotor_named
 from benchmarks.finite_elements.observed import WindowSizes, plan, sampled, windows_of
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
-from benchmarks.studies.subjects import subject_named
+from benchmarks.studies.subjects.machines import subject_named
 from models.commissioning.levels import learned_baseline
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.growth import Growth

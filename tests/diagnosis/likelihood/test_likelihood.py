@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.studies.bound import TrueCondition, cramer_rao
+from benchmarks.studies.methods.bound import TrueCondition, cramer_rao
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN, BinGroups, Motions, group_bins
 from models.diagnosis.likelihood.scoring import FisherScoring

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks.studies.study import spread_over
+from benchmarks.studies.reporting.study import spread_over
 from models.errors import BundleError, MachineFileError
 from models.machine import load_machine
 from models.signals.block import SampleBlock

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.studies.results import limits_of
+from benchmarks.studies.reporting.results import limits_of
 from models.diagnosis.networks.relation import HIDDEN, Network
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError

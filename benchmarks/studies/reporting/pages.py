@@ -7,9 +7,9 @@ from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from benchmarks.studies.plots import draw
-from benchmarks.studies.results import Figure, Record
-from benchmarks.studies.study import Options, Study
+from benchmarks.studies.reporting.plots import draw
+from benchmarks.studies.reporting.results import Figure, Record
+from benchmarks.studies.reporting.study import Options, Study
 
 _HERE = Path(__file__).parent
 _TEXTS = tomllib.loads((_HERE / "texts.toml").read_text(encoding="utf-8"))

@@ -12,8 +12,8 @@ from benchmarks.finite_elements.machines import rotor_named
 from benchmarks.finite_elements.observed import RATE_HZ, RunCondition, sampled
 from benchmarks.finite_elements.rotor import BeamRotor
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
-from benchmarks.studies.fault_kinds import ANOTHER, CRACK, MOTIONS, RUBS, Change, Rotor, Seen, as_simulated
-from benchmarks.studies.subjects import (
+from benchmarks.studies.subjects.fault_kinds import ANOTHER, CRACK, MOTIONS, RUBS, Change, Rotor, Seen, as_simulated
+from benchmarks.studies.subjects.machines import (
     ALIKE,
     SHIPPED,
     SUBJECTS,

@@ -8,8 +8,8 @@ from time import process_time
 
 import numpy as np
 
-from benchmarks.studies import results as r
-from benchmarks.studies.results import Goal, Record, Value
+from benchmarks.studies.reporting import results as r
+from benchmarks.studies.reporting.results import Goal, Record, Value
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle, load_bundle

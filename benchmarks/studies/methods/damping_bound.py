@@ -19,7 +19,7 @@ from benchmarks.finite_elements.assembly import assemble, probed, unbalance_resp
 from benchmarks.finite_elements.forces import distribution, forced
 from benchmarks.finite_elements.observed import MOTION, RATE_HZ, RunCondition
 from benchmarks.finite_elements.rotor import BeamRotor, changed_rotor
-from benchmarks.studies.watched_machine import displacement_response
+from benchmarks.studies.subjects.watched_machine import displacement_response
 from models.diagnosis.baseline.lag_moments import SHORTEST_LAG_FROM_S, LagMoments, inverse, row_window
 from models.diagnosis.baseline.learned import references_of
 from models.diagnosis.baseline.relation import prior_of

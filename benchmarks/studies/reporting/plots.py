@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from benchmarks.studies.results import Chart, Estimate
+from benchmarks.studies.reporting.results import Chart, Estimate
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """After Okabe and Ito: told apart with any colour vision."""

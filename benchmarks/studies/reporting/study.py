@@ -20,7 +20,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeVar
 
-from benchmarks.studies.results import Chart, Goal, Record, Table, Value
+from benchmarks.studies.reporting.results import Chart, Goal, Record, Table, Value
 from models.errors import MachineFileError, RecordingError
 from simulator.commands import labelled_bars
 
