@@ -35,7 +35,7 @@ import zenoh.ext
 from machine_kind import MachineKind
 from running_monitor import on_loopback, serving
 
-from models.diagnosis.moments import plan_for
+from models.diagnosis.window.moments import plan_for
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings

@@ -19,12 +19,12 @@ from benchmarks.studies.subjects.machines import without_parameters
 from benchmarks.studies.subjects.watched import commissioned
 from models.commissioning.commissioned import Installed
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.moments import hop_moments, plan_for
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import load_bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import hop_moments, plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.levels.judgement import LevelJudge
 from models.levels.measures import WindowLevels, hop_levels
 from models.levels.reference import learn_levels

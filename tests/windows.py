@@ -2,9 +2,9 @@
 
 from collections.abc import Iterable, Iterator
 
-from models.diagnosis.moments import Plan
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import Plan
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import SampleBlock
 from tests.sure import sure
 

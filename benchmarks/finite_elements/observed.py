@@ -9,9 +9,9 @@ from scipy.signal import lfilter
 from benchmarks.finite_elements.forces import Force
 from benchmarks.finite_elements.motion import PROBES, move
 from benchmarks.finite_elements.rotor import BeamRotor, changed_rotor
-from models.diagnosis.moments import Plan, plan_for
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import Plan, plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.channels import ChannelDescriptor

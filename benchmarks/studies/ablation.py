@@ -19,7 +19,7 @@ from benchmarks.studies.reporting.results import Estimate, Record, Table, Value
 from benchmarks.studies.reporting.study import Cell, Options, Over, Study
 from models.diagnosis.networks.equations import EQUATIONS
 from models.diagnosis.networks.relation import EquationNetwork, equation_by_number, read_equation, window_view
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from rotorwatch.records.windows import Parameter

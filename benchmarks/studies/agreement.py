@@ -13,7 +13,7 @@ from benchmarks.studies.reporting.results import Goal, Record, Table, Value
 from benchmarks.studies.reporting.study import Cell, Options, Study
 from models.diagnosis.readings import Diagnosis, Diagnostician
 from models.diagnosis.verdict.calibration import agreements, beside
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.physics.rotor import PARAMETERS
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_scenario

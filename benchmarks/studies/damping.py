@@ -25,7 +25,7 @@ from models.commissioning.commissioned import Installed
 from models.diagnosis.baseline.rows import ROWS, Row
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import to_scale
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.physics.rotor import PARAMETERS
 from service.monitor.monitor import MachineMonitor
 

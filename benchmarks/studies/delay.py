@@ -20,11 +20,11 @@ from benchmarks.studies.reporting.results import Chart, Goal, Record, Table, Val
 from benchmarks.studies.reporting.study import Cell, Options, Study
 from models.commissioning.commissioned import KnowledgeLevel
 from models.diagnosis.likelihood.lengths import LengthFits
-from models.diagnosis.moments import plan_for
-from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.stretch import Stretch, determined, stretch_of, to_scale
+from models.diagnosis.window.moments import plan_for
+from models.diagnosis.window.sliding import SlidingWindow
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.rotor import PARAMETERS

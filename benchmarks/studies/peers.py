@@ -16,9 +16,9 @@ from benchmarks.studies.reporting import results as r
 from benchmarks.studies.reporting.opinions import TITLES, Trained, changed_in, made_with, named_in, opinion
 from benchmarks.studies.reporting.results import Chart, Goal, Record, Table, Value
 from benchmarks.studies.reporting.study import Cell, Options, Over, Study
-from models.diagnosis.moments import plan_for
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray
 from simulator.scenario import Event

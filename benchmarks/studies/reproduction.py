@@ -16,9 +16,9 @@ from benchmarks.studies.reporting import results as r
 from benchmarks.studies.reporting.opinions import TITLES, Trained, made_with, named_in
 from benchmarks.studies.reporting.results import Chart, Estimate, Record, Table, Value
 from benchmarks.studies.reporting.study import Cell, Options, Over, Study
-from models.diagnosis.moments import plan_for
 from models.diagnosis.verdict.isolation import isolate_window
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import plan_for
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from simulator.scenario import Event, NamedSource, Scenario, Sensors

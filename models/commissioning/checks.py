@@ -18,7 +18,7 @@ from models.diagnosis.sensors.level import at_range_end
 from models.diagnosis.sensors.reference import Naming
 from models.diagnosis.shape import SEEN_GROWTH, ShapePower
 from models.diagnosis.verdict.isolation import isolate_window
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETER_TEXT
 from models.signals.channels import with_channel_names

@@ -28,9 +28,7 @@ from models.commissioning.commissioned import (
 from models.commissioning.healthy import HealthyRecording, known_lines
 from models.commissioning.levels import NO_SUCH_ROTOR, HealthyPiece, Learned, Progress, learn, pieces_of
 from models.diagnosis.baseline.rows import Row, evaluable_rows
-from models.diagnosis.excluded import KnownLine
 from models.diagnosis.misfit import HealthyMisfit
-from models.diagnosis.moments import states_of
 from models.diagnosis.networks.equations import EQUATIONS, Equation, SynchronousEquation, missing
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.check import sensor_findings
@@ -38,7 +36,9 @@ from models.diagnosis.sensors.disagreement import crossed_planes
 from models.diagnosis.sensors.reference import Naming, learn_sensor_reference
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import from_scale, slope, to_scale
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.excluded import KnownLine
+from models.diagnosis.window.moments import states_of
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.levels.gains import learn_gains, place_of
 from models.levels.limits import GrowthToAlert, alerts_of

@@ -24,13 +24,13 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from models.diagnosis.baseline.stored import BaselineRecord
-from models.diagnosis.excluded import KnownLine
 from models.diagnosis.misfit import HealthyMisfit
-from models.diagnosis.moments import states_of
 from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.sensors.reference import Naming, SensorReference
 from models.diagnosis.shape import HealthyShape
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.excluded import KnownLine
+from models.diagnosis.window.moments import states_of
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import BundleError
 from models.levels.reference import LevelReference
 from models.machine import Machine, MachineFile

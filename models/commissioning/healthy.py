@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from models.diagnosis.excluded import KnownLine
-from models.diagnosis.lines import Line, steady_lines
-from models.diagnosis.moments import HopMoments, Plan, plan_for
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import window_statistics
+from models.diagnosis.window.excluded import KnownLine
+from models.diagnosis.window.lines import Line, steady_lines
+from models.diagnosis.window.moments import HopMoments, Plan, plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import window_statistics
 from models.errors import RecordingError, WireError
 from models.ingest import Gate
 from models.levels.measures import STANDS_RAD_S

@@ -18,7 +18,7 @@ from models.diagnosis.baseline.learned import learn_baseline
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.verdict.stretch import added, stretch_of
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError, MachineFileError
 from models.machine import ConditionRange, Machine, MachineFile, Operation
 from models.physics.rotor import PARAMETERS, M_matrix, Q_matrix, RotorParameters, changed

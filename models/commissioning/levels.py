@@ -46,7 +46,7 @@ from models.diagnosis.readings import Diagnosis
 from models.diagnosis.shape import HealthyShape, learn_shape
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import determined, with_shared_error
-from models.diagnosis.window import WindowStatistics, levels_of, window_statistics
+from models.diagnosis.window.statistics import WindowStatistics, levels_of, window_statistics
 from models.errors import EstimationError
 from models.levels.measures import WindowLevels
 from models.machine import Machine, MachineFile

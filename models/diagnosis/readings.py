@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from models.diagnosis.misfit import Goodness
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.physics.rotor import PARAMETER_TEXT, QUANTITY, impossible
 from models.signals.block import FloatArray

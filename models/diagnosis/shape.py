@@ -27,7 +27,7 @@ import numpy as np
 from pydantic import BaseModel, Field, model_validator
 from scipy.special import fdtrc, fdtri, ndtri
 
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Shape

@@ -31,7 +31,7 @@ and the mean from which on a mode cannot be told from a line. On the rotor kits,
 (seed 20261341), the strongest bins had up to 0.26 where modes are damped by 0.1 % and 0.40 would be the mean, and 0.21
 where 0.15 would."""
 _LOUD = 0.02
-"""Part of a channel's power without 1x from which on a line is told, as of the lines of `models.diagnosis.lines`."""
+"""Part of a channel's power without 1x from which on a line is told, as of the lines that diagnosis leaves out."""
 
 
 def learn_lines(windows: Sequence[FloatArray], bands: BandLevels, hops: float, unsteady: float) -> FloatArray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.commissioning.commissioned import Installed
-from models.diagnosis.moments import plan_for
+from models.diagnosis.window.moments import plan_for
 from models.errors import WireError
 from models.ingest import Admission, Gate
 from models.levels.measures import hop_levels, window_levels

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.diagnosis.moments import ComplexArray, plan_for
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.equations import EQUATIONS, Equation, SynchronousEquation
 from models.diagnosis.networks.relation import EquationNetwork, read_equation, window_view
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import ComplexArray, plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import RotorwatchError, WireError
 from models.ingest import Gate
 from models.machine import Machine, MachineFile

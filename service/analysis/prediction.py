@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.diagnosis.likelihood.motions import group_bins
-from models.diagnosis.moments import ComplexArray
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import ComplexArray
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS, RotorParameters, changed, system_A

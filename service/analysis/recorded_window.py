@@ -4,8 +4,8 @@ from collections import deque
 
 import numpy as np
 
-from models.diagnosis.moments import Plan, plan_for
-from models.diagnosis.sliding_window import SlidingWindow
+from models.diagnosis.window.moments import Plan, plan_for
+from models.diagnosis.window.sliding import SlidingWindow
 from models.errors import RotorwatchError
 from models.machine import MachineFile
 from models.signals.block import SampleBlock

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.rotation import rotation_line
+from models.diagnosis.window.rotation import rotation_line
 from models.errors import MachineFileError, RotorwatchError
 from models.levels.measures import hop_levels, level_plan
 from models.levels.orders import ORDERS
@@ -20,7 +20,7 @@ from service.analysis.revolutions import Excerpt, pulses
 _LONGEST_S = 20.0
 _ESTIMATED_S = 2.0
 _STANDS_OUT = 15.0
-"""Times the surroundings: what noise has in 2 s is 3 to 8 times, see `models.diagnosis.rotation`."""
+"""Times the surroundings: what noise has in 2 s is 3 to 8 times, see `models.diagnosis.window.rotation`."""
 _FOLLOWS, _FOLLOWS_S = 0.05, 2.5 * _ESTIMATED_S
 """How far lines of one shaft may be apart, relative and in time."""
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from models.diagnosis.readings import Diagnosis, no_reading
-from models.diagnosis.rotation import LEAST_SETTLED, STRONG
 from models.diagnosis.sensors.level import at_range_end
 from models.diagnosis.sensors.reference import Naming
-from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.verdict.calibration import agreements
 from models.diagnosis.verdict.sequential import SequentialTest
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.rotation import LEAST_SETTLED, STRONG
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import CheckpointError, EstimationError
 from models.levels.judgement import Foreign
 from models.machine import Operation

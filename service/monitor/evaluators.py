@@ -15,14 +15,14 @@ from models.checkpoint import checked
 from models.commissioning.commissioned import Commissioned, Installed
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.rows import evaluable_rows
-from models.diagnosis.moments import states_of
 from models.diagnosis.readings import Diagnosis, no_reading
 from models.diagnosis.sensors.reference import Naming
-from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.verdict.isolation import misfit_beside
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.stretch import determined, stretch_of
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import states_of
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETERS

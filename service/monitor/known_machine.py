@@ -10,16 +10,16 @@ import numpy as np
 from models.checkpoint import checked, prefixed, unprefixed
 from models.commissioning.commissioned import Commissioned, in_sense
 from models.diagnosis.likelihood.lengths import LengthFits
-from models.diagnosis.moments import STEADY
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading
-from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.verdict.calibration import beside
 from models.diagnosis.verdict.sequential import SequentialTest
 from models.diagnosis.verdict.stretch import determined, with_shared_error
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import STEADY
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError, UnexplainedError
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS
@@ -29,7 +29,8 @@ from service.monitor.evaluation import Evaluation, LatestRotation, Newest, Windo
 _LIKELIHOOD, _EXPLAINED, _SENSE, _DIRECTED, _ROTATION = "likelihood", "explained_ns", "sense", "directed", "rotation"
 _STEADY = 0.15
 """Range of speed within a window, relative, up to which the rotation taken out hop by hop leaves nothing behind: on the
-rotor kit readings stay unbiased at ramps of 5, 10 and 15 % (16 seeds each, ``tests/diagnosis/test_window.py``)."""
+rotor kit readings stay unbiased at ramps of 5, 10 and 15 % (16 seeds each,
+``tests/diagnosis/window/test_window.py``)."""
 
 _INSIDE, _BETTER, _SURELY_OUTSIDE = 2.0, 3.0, 8.0
 """Standard deviations of the misfit with which a window is explained beyond doubt, by which one explanation is better

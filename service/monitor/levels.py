@@ -12,10 +12,10 @@ from models.alarm_names import LEVEL
 from models.checkpoint import checked
 from models.commissioning.commissioned import Installed
 from models.diagnosis.likelihood.motions import natural_frequencies
-from models.diagnosis.lines import LatestLines, new_line, steady_lines
-from models.diagnosis.moments import HopMoments, Plan
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.lines import LatestLines, new_line, steady_lines
+from models.diagnosis.window.moments import HopMoments, Plan
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.levels.bands import NEIGHBOURHOOD
 from models.levels.contact import LatestContact
 from models.levels.judgement import Foreign, LevelJudge, channel_state, fallen

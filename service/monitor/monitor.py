@@ -21,16 +21,16 @@ from models.alarm_names import SHAPE
 from models.arrivals import Arrivals, Arrived, Senders
 from models.checkpoint import checked, prefixed, texts, unprefixed
 from models.commissioning.commissioned import Installed
-from models.diagnosis.moments import plan_for
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import implicated
 from models.diagnosis.sensors.standstill import Standstill
-from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.verdict.calibration import detectable_changes
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.sequential_state import SequentialState
 from models.diagnosis.verdict.stretch import stretch_of
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import CheckpointError, EstimationError, WireError
 from models.ingest import Admission, Gate, Reason, lasting
 from models.levels.judgement import growth_seen

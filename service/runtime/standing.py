@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BaseModel, TypeAdapter
 
 from models.checkpoint import from_bytes, to_bytes
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import SampleBlock
 from models.signals.waveform import Waveform
 from rotorwatch.records.alarms import AlarmCloudEvent

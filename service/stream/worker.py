@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 
 from models.commissioning.commissioned import Installed
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import SampleBlock
 from models.signals.keys import Topic
 from models.signals.recording import RecordedMessage

@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from models.commissioning.healthy import HealthyRecording, foreign_lines
-from models.diagnosis.lines import Line
-from models.diagnosis.window import WindowStatistics, window_statistics
+from models.diagnosis.window.lines import Line
+from models.diagnosis.window.statistics import WindowStatistics, window_statistics
 from models.signals.block import FloatArray
 from simulator.commission.plots import BAND, COLOURS, GREY, INK, WIDTH_IN
 from simulator.commission.verdict import channel_text, channel_unit

@@ -13,9 +13,9 @@ from functools import partial
 
 import numpy as np
 
-from models.diagnosis.moments import plan_for
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.response import stochastic_covariance, synchronous_response

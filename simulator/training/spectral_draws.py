@@ -5,8 +5,8 @@ Fourier coefficients. Its distribution therefore follows from the expected spect
 degrees of freedom as untapered segments fit into the window. The Hann taper of the real segments mixes three
 neighbouring frequencies, (1, 4, 1)/6 in power. The theoretical spectrum is mixed like this, and so are the white
 Wishart matrices that scatter around it; so expectation, scatter at one frequency and correlation between neighbouring
-frequencies come out as in `models.diagnosis.moments`. A thousand times faster than simulating, which is what lets every
-training step see windows never seen before.
+frequencies come out as in `models.diagnosis.window.moments`. A thousand times faster than simulating, which is what
+lets every training step see windows never seen before.
 
 The real thing remains the judge: calibration and evaluation use windows simulated in time
 (`simulator.training.draws`).
@@ -30,9 +30,9 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.moments import ComplexArray, plan_for
 from models.diagnosis.networks.amortised import NEAR, around
 from models.diagnosis.networks.features import Float32Array, ForceFeatures, principal_directions
+from models.diagnosis.window.moments import ComplexArray, plan_for
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS, STATE_INDEX, H_matrix, M_matrix, P_matrix, Q_matrix, changed
 from models.signals.block import FloatArray

@@ -9,7 +9,7 @@ import numpy as np
 from models.commissioning.commission import Commissioning, commission
 from models.commissioning.commissioned import HealthyEntry
 from models.commissioning.healthy import HealthyRecording, healthy_from_blocks
-from models.diagnosis.window import WindowStatistics, window_statistics
+from models.diagnosis.window.statistics import WindowStatistics, window_statistics
 from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import FloatArray, SampleBlock
 from simulator.scenario import Event, load_scenario

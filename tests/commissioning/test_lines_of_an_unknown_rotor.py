@@ -10,7 +10,7 @@ import pytest
 from models.commissioning.commissioned import Commissioned
 from models.commissioning.identified import identify
 from models.commissioning.levels import pieces_of
-from models.diagnosis.window import WindowStatistics, window_statistics
+from models.diagnosis.window.statistics import WindowStatistics, window_statistics
 from models.signals.block import SampleBlock
 from service.monitor.evaluators import BaselineEvaluator
 from simulator.scenario import load_scenario

@@ -4,7 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 from models.commissioning.checks import Check, check_sources
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_scenario
 from tests.commissioning.rotor_kit import LAB
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from models.diagnosis.moments import plan_for
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import plan_for
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import load_machine
 from models.physics.excitation import expanded_A, expanded_B
 from models.physics.response import correlation, stationary_covariance, synchronous_response

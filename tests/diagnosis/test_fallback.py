@@ -12,7 +12,7 @@ from benchmarks.finite_elements.machines import rotor_named
 from benchmarks.finite_elements.observed import WindowSizes, plan, sampled, windows_of
 from benchmarks.finite_elements.scenes import COMMISSIONED, SceneRange, SourceLayout, drawn_condition
 from models.diagnosis.shape import FEWEST_WINDOWS, HealthyShape, learn_shape
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.physics.rotor import PARAMETERS
 from tests.sure import sure

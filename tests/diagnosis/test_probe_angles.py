@@ -12,11 +12,11 @@ from pydantic import ValidationError
 
 from models.commissioning.healthy import foreign_lines, healthy_from_blocks
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.moments import plan_for
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import learn_sensor_reference
 from models.diagnosis.shape import learn_shape
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import plan_for
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import SampleBlock
 from models.signals.channels import ChannelDescriptor, state_name, with_channel_names

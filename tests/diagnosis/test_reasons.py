@@ -12,7 +12,7 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import load_bundle
 from models.diagnosis.readings import Diagnosis, beyond, parameter_reading, possible_reading
 from models.diagnosis.verdict.stretch import determined
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError, UnexplainedError
 from models.machine import load_machine
 from models.physics.rotor import impossible

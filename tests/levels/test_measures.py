@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from models.diagnosis.moments import hop_moments, plan_for
+from models.diagnosis.window.moments import hop_moments, plan_for
 from models.levels.measures import CONTACT, LevelPlan, WindowLevels, hop_levels, level_plan, window_levels
 from models.machine import load_machine
 from models.signals.block import FloatArray

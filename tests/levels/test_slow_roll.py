@@ -8,10 +8,10 @@ import pytest
 from pydantic import ValidationError
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.moments import plan_for
 from models.diagnosis.sensors.check import sensor_findings
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.levels.judgement import LevelJudge
 from models.levels.measures import WindowLevels
 from models.machine import Machine, MachineFile, load_machine, load_machine_file

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.diagnosis.moments import plan_for
+from models.diagnosis.window.moments import plan_for
 from models.errors import MachineFileError
 from models.machine import Machine, load_machine, load_machine_file
 from models.physics.response import synchronous_response

@@ -12,7 +12,7 @@ from models.machine import load_machine
 from models.signals.block import FloatArray
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
-from tests.diagnosis.test_equaliser import statistics
+from tests.diagnosis.window.test_equaliser import statistics
 from tests.signals.test_wire import page_blocks
 from tests.sure import sure
 

@@ -33,7 +33,7 @@ from benchmarks.finite_elements.observed import (
 )
 from benchmarks.finite_elements.rotor import BeamRotor, Bearing, Disc, changed_rotor
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
-from models.diagnosis.moments import plan_for
+from models.diagnosis.window.moments import plan_for
 from models.errors import EstimationError
 from models.physics.excitation import Source, source_spectrum
 from models.signals.block import FloatArray

@@ -6,7 +6,7 @@ import scipy.stats
 
 from benchmarks.studies.methods.other_methods import FeatureVector, SubspaceModes, reference_modes
 from benchmarks.studies.methods.paper import PAPER_EQUATIONS, full_correlation, phase_correlation
-from models.diagnosis.moments import plan_for
+from models.diagnosis.window.moments import plan_for
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.excitation import expanded_A, expanded_B

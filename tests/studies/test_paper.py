@@ -12,7 +12,7 @@ from benchmarks.studies.methods.paper import (
     paper_rows,
     train_paper_network,
 )
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window, with_tilt

@@ -45,7 +45,7 @@ from benchmarks.studies.subjects.machines import SHIPPED, SUBJECTS, subject_name
 from models.commissioning.commissioned import KnowledgeLevel, knowledge_of
 from models.diagnosis.networks.equations import EQUATIONS
 from models.diagnosis.networks.relation import window_view
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError, RecordingError
 from models.machine import load_machine
 from simulator.training.draws import Draw, Purpose, simulate_window

@@ -17,7 +17,7 @@ import numpy as np
 from models.diagnosis.likelihood.motions import BinGroups, Motions
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, SHAPES, STRUCTURAL, SpectralModel
 from models.diagnosis.likelihood.unbalance import estimate_unbalance
-from models.diagnosis.moments import plan_for
+from models.diagnosis.window.moments import plan_for
 from models.machine import Machine
 from models.physics.excitation import source_spectrum
 from models.physics.response import synchronous_response

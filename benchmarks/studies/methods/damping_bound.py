@@ -24,7 +24,7 @@ from models.diagnosis.baseline.lag_moments import SHORTEST_LAG_FROM_S, LagMoment
 from models.diagnosis.baseline.learned import references_of
 from models.diagnosis.baseline.relation import prior_of
 from models.diagnosis.baseline.rows import Row
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 
 _STEP_HZ = 0.1

@@ -15,7 +15,7 @@ import scipy.optimize
 import scipy.signal
 import scipy.stats
 
-from models.diagnosis.moments import plan_for
+from models.diagnosis.window.moments import plan_for
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.rotor import STATE_INDEX, system_A

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.studies.reporting.results import limits_of
 from models.diagnosis.networks.relation import HIDDEN, Network
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray

@@ -9,7 +9,7 @@ import numpy as np
 
 from models.diagnosis.networks.equations import Equation, EquationRows, StatisticsView, SynchronousEquation
 from models.diagnosis.networks.relation import Network, equation_by_number, window_view
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray
 

@@ -16,7 +16,7 @@ from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Z95, Diagnostician
 from models.diagnosis.verdict.isolation import isolate_window
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.rotor import PARAMETERS

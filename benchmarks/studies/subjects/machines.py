@@ -23,7 +23,7 @@ from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Diagnosis, Diagnostician
 from models.diagnosis.verdict.stretch import determined, with_shared_error
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import ConditionRange, Machine, MachineFile, load_machine
 from models.signals.block import FloatArray

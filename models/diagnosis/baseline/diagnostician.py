@@ -29,7 +29,7 @@ from models.diagnosis.baseline.unbalance import (
     rotation_of,
 )
 from models.diagnosis.readings import Diagnosis, beyond, foreign_rotation, no_reading, parameter_reading
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 

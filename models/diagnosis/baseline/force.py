@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from models.diagnosis.baseline.lag_moments import RowWindow
-from models.diagnosis.moments import ComplexArray
+from models.diagnosis.window.moments import ComplexArray
 from models.signals.block import FloatArray
 
 _BAND_HZ = 8.0

@@ -13,7 +13,7 @@ import numpy as np
 from models.diagnosis.baseline.lag_moments import LagMoments
 from models.diagnosis.baseline.relation import Relation, change_of
 from models.diagnosis.baseline.rows import Row
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 

@@ -21,8 +21,8 @@ import numpy.typing as npt
 from scipy.linalg.lapack import dpstrf
 
 from models.diagnosis.baseline.rows import Formation, Row, formation_of
-from models.diagnosis.moments import ComplexArray
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import ComplexArray
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 
 # Times of a machine that the usual window suits; of another one each is multiplied by its time scale.

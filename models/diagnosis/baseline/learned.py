@@ -18,7 +18,7 @@ from models.diagnosis.baseline.lag_moments import (
 from models.diagnosis.baseline.relation import Contribution, Relation, RowChange, beyond_memory, change_of, learn_row
 from models.diagnosis.baseline.rows import COUPLED_ROWS, ROWS, Row, not_measured, state_of
 from models.diagnosis.baseline.unbalance import SynchronousVectors, rotation_of, rotations_by_speed
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.physics.rotor import PARAMETER_TEXT
 from models.signals.block import FloatArray

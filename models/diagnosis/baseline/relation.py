@@ -30,7 +30,7 @@ from models.diagnosis.baseline.lag_moments import (
     telling,
 )
 from models.diagnosis.baseline.rows import Row
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.diagnosis.baseline.rows import Row, lowest, state_of
-from models.diagnosis.moments import ComplexArray
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import ComplexArray
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 

@@ -20,9 +20,9 @@ from models.diagnosis.likelihood.motions import BinGroups, Motions, group_bins, 
 from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Weights, Whitened
 from models.diagnosis.likelihood.spectral_model import STRUCTURAL, Expected, SpectralModel, starting_point, usual_force
 from models.diagnosis.likelihood.unbalance import Unbalance, estimate_unbalance, estimate_unbalance_by_hop
-from models.diagnosis.moments import ComplexArray
 from models.diagnosis.readings import Diagnosis, no_reading, parameter_reading
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import ComplexArray
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import CheckpointError, EstimationError, UnexplainedError
 from models.machine import Machine
 from models.physics.rotor import STATE_INDEX

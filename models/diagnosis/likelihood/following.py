@@ -33,7 +33,7 @@ from models.diagnosis.likelihood.spectral_model import (
     factor_of,
     packed,
 )
-from models.diagnosis.moments import ComplexArray
+from models.diagnosis.window.moments import ComplexArray
 from models.signals.block import FloatArray
 
 _MOST_STEPS = 6

@@ -18,8 +18,8 @@ from models.diagnosis.likelihood.motions import Mismatch
 from models.diagnosis.likelihood.scoring import Maximum, Weights, Whitened, inverse_factor
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed, twice_packed
 from models.diagnosis.misfit import ACROSS, DELAY, EACH_LATE, UNEQUAL, AlternativeTest, Goodness
-from models.diagnosis.moments import ComplexArray, through
 from models.diagnosis.readings import beyond
+from models.diagnosis.window.moments import ComplexArray, through
 from models.machine import Machine
 from models.physics.rotor import PARAMETER_TEXT, STATE_INDEX, Q_shaft
 from models.signals.block import FloatArray

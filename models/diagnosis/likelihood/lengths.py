@@ -7,10 +7,10 @@ import numpy as np
 from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.motions import integrated
-from models.diagnosis.moments import through
 from models.diagnosis.readings import Diagnosis
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import through
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 
 

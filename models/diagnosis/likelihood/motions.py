@@ -27,8 +27,8 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.moments import ComplexArray, divided
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import ComplexArray, divided
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.physics.rotor import STATE_INDEX, system_A
 from models.signals.block import FloatArray

@@ -7,7 +7,7 @@ import numpy as np
 
 from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint, SpectralModel, packed
-from models.diagnosis.moments import ComplexArray
+from models.diagnosis.window.moments import ComplexArray
 from models.signals.block import FloatArray
 
 # Usual noise density of a channel, relative to its mean density in the band (3 % in amplitude).

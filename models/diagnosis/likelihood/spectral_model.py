@@ -29,7 +29,7 @@ import numpy.typing as npt
 from scipy.special import eval_legendre
 
 from models.diagnosis.likelihood.motions import BinGroups, Motions
-from models.diagnosis.moments import ComplexArray, through
+from models.diagnosis.window.moments import ComplexArray, through
 from models.machine import Machine
 from models.physics.excitation import low_pass, low_pass_slopes
 from models.physics.rotor import M_matrix, P_matrix, Q_matrix, Q_shaft

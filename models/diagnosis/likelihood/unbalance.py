@@ -14,8 +14,8 @@ from scipy.special import chdtri
 
 from models.diagnosis.likelihood.motions import BinGroups
 from models.diagnosis.likelihood.spectral_model import STRUCTURAL, Expected, SpectralModel
-from models.diagnosis.moments import ComplexArray
 from models.diagnosis.readings import UnbalanceVector, foreign_rotation
+from models.diagnosis.window.moments import ComplexArray
 from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, Field
 
-from models.diagnosis.moments import ComplexArray
 from models.diagnosis.networks.features import FeatureBasis, Float32Array, ForceFeatures
 from models.diagnosis.readings import Diagnosis, beyond, no_reading, parameter_reading
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import ComplexArray
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS, changed
 from models.signals.block import FloatArray

@@ -17,7 +17,7 @@ from scipy.special import ndtri, poch, stdtrit
 from models.diagnosis.networks.amortised import OWN, AmortisedNetworks, Calibration, NetworkDiagnostician
 from models.diagnosis.networks.relation import EquationNetwork, Healthy, read_equation
 from models.diagnosis.readings import Z95
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray
 

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from models.diagnosis.moments import ComplexArray
+from models.diagnosis.window.moments import ComplexArray
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.response import synchronous_response

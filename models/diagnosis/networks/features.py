@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.moments import ComplexArray, plan_for
+from models.diagnosis.window.moments import ComplexArray, plan_for
 from models.machine import Machine
 from models.physics.excitation import Source
 from models.physics.response import stochastic_covariance

@@ -18,7 +18,7 @@ from models.diagnosis.networks.equations import (
     missing,
 )
 from models.diagnosis.readings import Diagnosis, no_reading, possible_reading
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Equation as EquationReading

@@ -19,7 +19,7 @@ from models.diagnosis.networks.amortised import LAYERS, LIMIT, OWN, AmortisedNet
 from models.diagnosis.networks.equations import Equation, SynchronousEquation
 from models.diagnosis.networks.features import FeatureBasis, Float32Array, fit_basis
 from models.diagnosis.networks.relation import HIDDEN, EquationNetwork, Network, window_view
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS

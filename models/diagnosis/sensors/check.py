@@ -4,7 +4,6 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from models.diagnosis.motion import motion_pairs
 from models.diagnosis.sensors.disagreement import BROKEN, gain_and_delay, suspect_pairs, swapped
 from models.diagnosis.sensors.kinematics import PairReading, banded, read_pair
 from models.diagnosis.sensors.level import clipped, dropped, gain_jump, offset, spiked, stuck
@@ -12,7 +11,8 @@ from models.diagnosis.sensors.noise import noisy
 from models.diagnosis.sensors.phase import no_angle, phase_faults
 from models.diagnosis.sensors.reference import Naming, SensorReference, implicated
 from models.diagnosis.sensors.standstill import runs_down
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.motion import motion_pairs
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.channels import Channel
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault

@@ -6,10 +6,10 @@ from itertools import combinations
 
 import numpy as np
 
-from models.diagnosis.motion import MotionPair, motion_pairs
 from models.diagnosis.sensors.kinematics import Banded, PairReading, banded, gain_course, same
 from models.diagnosis.sensors.reference import Naming, SensorReference
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.motion import MotionPair, motion_pairs
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault

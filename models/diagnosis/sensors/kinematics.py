@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.diagnosis.moments import ComplexArray
-from models.diagnosis.motion import MotionPair, motion_pairs, pair_bands
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import ComplexArray
+from models.diagnosis.window.motion import MotionPair, motion_pairs, pair_bands
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 
 LONGEST_DELAY_S = 0.02  # longest delay that is looked for

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.motion import motion_pairs
 from models.diagnosis.sensors.reference import Naming, SensorReference
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.motion import motion_pairs
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 from models.signals.waveform import stacked_waveform
 from rotorwatch.records.sensor_faults import FaultKind

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.motion import MotionPair
 from models.diagnosis.sensors.kinematics import Banded, PairReading
 from models.diagnosis.sensors.reference import (
     ChannelNoise,
@@ -24,7 +23,8 @@ from models.diagnosis.sensors.reference import (
     pair_noise,
     single,
 )
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.motion import MotionPair
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault

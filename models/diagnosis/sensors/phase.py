@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.diagnosis.moments import ComplexArray
 from models.diagnosis.sensors.reference import Naming, SensorReference
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import ComplexArray
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault

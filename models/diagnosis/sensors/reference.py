@@ -13,10 +13,10 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import BaseModel, Field, model_validator
 
-from models.diagnosis.moments import ComplexArray
-from models.diagnosis.motion import motion_pairs, pair_bands
 from models.diagnosis.sensors.kinematics import Banded, PairReading, banded, read_pair, same
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import ComplexArray
+from models.diagnosis.window.motion import motion_pairs, pair_bands
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, state_name, unit_in_text

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from models.checkpoint import checked
 from models.diagnosis.sensors.reference import SensorReference
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.levels.measures import STANDS_RAD_S
 from models.levels.reference import QUIET
 from models.signals.block import FloatArray

@@ -23,7 +23,7 @@ from models.diagnosis.readings import (
     parameter_reading,
     possible_reading,
 )
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Parameter

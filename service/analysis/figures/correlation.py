@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import MachineFileError
 from service.analysis.correlation import Panel, correlations_of, latest_window
 from service.analysis.figures.style import COLOURS, GREY, INK, Look, Paint, heading, rpm

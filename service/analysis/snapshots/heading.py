@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine, MachineFile
 from models.signals.block import SampleBlock
 from rotorwatch.records.snapshots import PredictedChange, Theory

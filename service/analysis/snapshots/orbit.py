@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from models.diagnosis.moments import ComplexArray
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import ComplexArray
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine, MachineFile
 from models.physics.response import synchronous_response
 from models.physics.rotor import STATES, RotorParameters, changed

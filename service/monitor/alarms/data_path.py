@@ -6,7 +6,7 @@ import numpy as np
 
 from models.alarm_names import CLOCK, CONFLICT, FAULT, GAP, OVERLOADED, PHASE_REFERENCE, STREAM_LOST, data_alarm
 from models.checkpoint import checked, texts
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.ingest import Admission, Reason, lasting
 from models.machine import MachineFile
 from rotorwatch.records.alarms import Evidence

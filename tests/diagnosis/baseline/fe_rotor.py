@@ -11,8 +11,8 @@ from benchmarks.finite_elements.forces import Force
 from benchmarks.finite_elements.machines import rotor_named
 from benchmarks.finite_elements.motion import PROBES
 from benchmarks.finite_elements.rotor import BeamRotor
-from models.diagnosis.moments import Plan
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import Plan
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 
 ROTOR = replace(rotor_named("overhung"), speed_rad_s=2 * np.pi * 24.0)

@@ -13,7 +13,7 @@ from models.diagnosis.baseline.learned import Baseline, planes_coupled, undeterm
 from models.diagnosis.baseline.rows import COUPLED_ROWS, ROWS
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.verdict.isolation import isolate_window
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from tests.sure import sure
 

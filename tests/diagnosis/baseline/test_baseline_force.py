@@ -15,9 +15,9 @@ from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.force import alike
 from models.diagnosis.baseline.learned import Baseline, learn_baseline
 from models.diagnosis.baseline.stored import BaselineRecord
-from models.diagnosis.moments import ComplexArray
 from models.diagnosis.readings import Diagnosis
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import ComplexArray
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 from tests.sure import sure
 

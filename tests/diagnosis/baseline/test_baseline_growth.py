@@ -17,7 +17,7 @@ from models.diagnosis.baseline.learned import Baseline, learn_baseline
 from models.diagnosis.baseline.rows import COUPLED_ROWS
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.verdict.isolation import isolate_window
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from tests.sure import sure
 
 _SEED = 6101

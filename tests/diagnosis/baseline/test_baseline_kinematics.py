@@ -23,7 +23,7 @@ from models.diagnosis.baseline.rows import (
 )
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.verdict.isolation import isolate_window
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 from tests.diagnosis.baseline.fe_rotor import OTHER, ROTOR, Excitation, of_states, plan, simulate
 from tests.sure import sure

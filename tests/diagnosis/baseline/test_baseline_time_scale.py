@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.finite_elements.rotor import changed_rotor
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.learned import learn_baseline, unsuitable
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from tests.diagnosis.baseline.fe_rotor import OTHER, ROTOR, Excitation, recorded
 from tests.sure import sure
 

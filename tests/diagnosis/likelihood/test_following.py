@@ -8,10 +8,10 @@ import pytest
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.lengths import LengthFits
-from models.diagnosis.moments import plan_for
 from models.diagnosis.readings import Diagnosis
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import UnexplainedError
 from models.machine import load_machine
 from models.signals.block import FloatArray

@@ -12,10 +12,10 @@ from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN, BinGroups, Motions, group_bins
 from models.diagnosis.likelihood.scoring import FisherScoring
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed
-from models.diagnosis.moments import plan_for
 from models.diagnosis.readings import Diagnosis
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.rotor import M_matrix, P_matrix, Q_matrix, changed

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from models.diagnosis.likelihood.motions import Motions
-from models.diagnosis.moments import ComplexArray
+from models.diagnosis.window.moments import ComplexArray
 from models.signals.block import FloatArray
 
 STATES = ("y1", "z1", "y1_dot")

@@ -11,7 +11,7 @@ from models.diagnosis.likelihood.motions import integrated
 from models.diagnosis.readings import Diagnosis, UnbalanceVector, parameter_reading
 from models.diagnosis.verdict.isolation import isolate_window, reading_of
 from models.diagnosis.verdict.stretch import stretch_of
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine, load_machine
 from models.signals.block import FloatArray
 from models.signals.channels import Quantity

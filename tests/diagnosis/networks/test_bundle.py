@@ -19,7 +19,7 @@ from models.diagnosis.networks.amortised import NEAR, AmortisedNetworks, Network
 from models.diagnosis.networks.bundle import Training, load_bundle, save_bundle
 from models.diagnosis.networks.features import ForceFeatures
 from models.diagnosis.networks.relation import EquationNetwork, RelationDiagnostician, read_equation
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import BundleError
 from models.machine import load_machine
 from models.physics.rotor import PARAMETERS

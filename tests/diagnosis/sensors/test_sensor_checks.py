@@ -9,12 +9,12 @@ import pytest
 from pydantic import ValidationError
 from scipy.signal import butter, lfilter
 
-from models.diagnosis.moments import Plan, plan_for
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.level import gain_jump
 from models.diagnosis.sensors.reference import Naming, SensorReference, implicated, learn_sensor_reference
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import Plan, plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import load_machine
 from models.signals.block import FloatArray

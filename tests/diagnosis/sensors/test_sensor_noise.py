@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from models.diagnosis.moments import Plan, plan_for
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import SensorReference, learn_sensor_reference
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import Plan, plan_for
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import load_machine
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import SensorFault

@@ -9,9 +9,9 @@ import numpy.typing as npt
 
 from models.commissioning.commissioned import Installed
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.moments import plan_for
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import MachineFile
 from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix
 from models.signals.block import FloatArray, SampleBlock

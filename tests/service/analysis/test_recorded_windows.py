@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models.commissioning.commissioned import Installed, install
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import RotorwatchError
 from models.machine import load_machine
 from rotorwatch.records.health import Report

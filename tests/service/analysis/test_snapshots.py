@@ -9,7 +9,7 @@ import pytest
 from pydantic import BaseModel
 from scipy.signal import oaconvolve
 
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.physics.excitation import Source, expanded_A, expanded_B
 from models.physics.response import correlation, stationary_covariance

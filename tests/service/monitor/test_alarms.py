@@ -12,7 +12,7 @@ from typing import cast
 import pytest
 
 from models.alarm_names import MODEL, STREAM_LOST
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import AlarmSettings, load_machine
 from rotorwatch.records.alarms import Severity
 from rotorwatch.records.sensor_faults import FaultKind

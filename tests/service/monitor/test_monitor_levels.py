@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from models.commissioning.commissioned import FILE, Installed, install
 from models.commissioning.healthy import healthy_from_blocks
-from models.diagnosis.moments import plan_for
+from models.diagnosis.window.moments import plan_for
 from models.machine import AlarmSettings, MachineFile, Operation
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.sensor import Sensor

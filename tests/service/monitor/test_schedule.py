@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from models.alarm_names import GAP, LEVEL
 from models.commissioning.commissioned import install
 from models.commissioning.healthy import healthy_from_blocks
-from models.diagnosis.moments import plan_for
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import window_statistics
+from models.diagnosis.window.moments import plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import window_statistics
 from models.errors import MachineFileError
 from models.ingest import Admission, Gate, Reason
 from models.machine import Machine, MachineFile

@@ -1,8 +1,8 @@
 """The sliding window: a ring of hop moments.
 
 What is remembered of a window with every hop is small: from where to where its hops reach, and which samples they are
-made of. The moments themselves, megabytes, are computed again from the same samples (`models.diagnosis.recall`), unless
-all of them were stored.
+made of. The moments themselves, megabytes, are computed again from the same samples (`recall.py`), unless all of them
+were stored.
 """
 
 from collections import deque
@@ -12,11 +12,11 @@ from functools import cache, partial
 import numpy as np
 
 from models.checkpoint import checked, prefixed, unprefixed
-from models.diagnosis.excluded import KnownLine
-from models.diagnosis.moments import HopMoments, Plan, hop_moments
-from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of, samples_of
-from models.diagnosis.rotation import LEAST_SETTLED
-from models.diagnosis.window import WindowStatistics, levels_of, window_statistics
+from models.diagnosis.window.excluded import KnownLine
+from models.diagnosis.window.moments import HopMoments, Plan, hop_moments
+from models.diagnosis.window.recall import Piece, Recall, digest_of, pieces_of, samples_of
+from models.diagnosis.window.rotation import LEAST_SETTLED
+from models.diagnosis.window.statistics import WindowStatistics, levels_of, window_statistics
 from models.errors import CheckpointError
 from models.levels.measures import WindowLevels
 from models.signals.block import FloatArray, SampleArray

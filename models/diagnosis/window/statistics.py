@@ -7,9 +7,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.equaliser import Equaliser
-from models.diagnosis.excluded import ExcludedLine, KnownLine, excluded_lines
-from models.diagnosis.moments import (
+from models.diagnosis.window.equaliser import Equaliser
+from models.diagnosis.window.excluded import ExcludedLine, KnownLine, excluded_lines
+from models.diagnosis.window.moments import (
     ComplexArray,
     HopMoments,
     Plan,
@@ -23,9 +23,9 @@ from models.diagnosis.moments import (
     through,
     turns,
 )
-from models.diagnosis.motion import pair_bands
-from models.diagnosis.rotation import relative_vectors
-from models.diagnosis.stationarity import segment_levels, summed
+from models.diagnosis.window.motion import pair_bands
+from models.diagnosis.window.rotation import relative_vectors
+from models.diagnosis.window.stationarity import segment_levels, summed
 from models.levels.measures import WindowLevels, window_levels
 from models.signals.block import FloatArray
 from models.signals.waveform import Waveform, stacked_waveform
@@ -80,7 +80,7 @@ class WindowStatistics:
     # What the samples of each hop look like: of each of `sensors`, those of `states` first.
     waveforms: tuple[Waveform, ...]
     sensors: tuple[str, ...]
-    # (n_pairs, n_bands, 3): powers of the motions that are measured twice, of each hop (`models.diagnosis.motion`)
+    # (n_pairs, n_bands, 3): powers of the motions that are measured twice, of each hop (`motion.py`)
     pair_powers: tuple[ComplexArray, ...]
     # The same window of the sensors as they are mounted, run-out included, where some of them are at an angle or have a
     # slow-roll vector. `waveforms` and `pair_powers` are those of mounted sensors in either, and what the file states

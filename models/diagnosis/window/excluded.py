@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.moments import ComplexArray
+from models.diagnosis.window.moments import ComplexArray
 from models.signals.block import FloatArray
 
 _LOBE = 2  # a Hann window spreads a line over two bins on either side

@@ -4,8 +4,8 @@ A window's statistics are sums over its hops, so a sliding window is a ring of h
 time. Nothing is ever subtracted: a running sum would keep the rounding of everything that went through it.
 
 The rotation-synchronous part and the mean are not removed sample by sample. The regressors n = (1, cos θ, sin θ) ride
-along as further channels, and the window takes out their part by algebra (`models.diagnosis.window`). That is exact for
-any window and needs no second pass over samples.
+along as further channels, and the window takes out their part by algebra (`statistics.py`). That is exact for any
+window and needs no second pass over samples.
 
 The rotation is taken out of every hop and segment. At a steady speed one set of coefficients serves the whole window.
 Where the speed changes, the amplitude at the rotation changes with it, and what one set leaves behind is no longer next
@@ -24,10 +24,10 @@ import numpy as np
 import numpy.typing as npt
 
 from models.checkpoint import checked, prefixed, unprefixed
-from models.diagnosis.equaliser import Equaliser, equaliser_of
-from models.diagnosis.lagged import lagged_products
-from models.diagnosis.motion import MotionPair, motion_pairs, pair_powers
-from models.diagnosis.rotation import RotationLine, followed_speeds, rotation_line, settled_hops
+from models.diagnosis.window.equaliser import Equaliser, equaliser_of
+from models.diagnosis.window.lagged import lagged_products
+from models.diagnosis.window.motion import MotionPair, motion_pairs, pair_powers
+from models.diagnosis.window.rotation import RotationLine, followed_speeds, rotation_line, settled_hops
 from models.levels.contact import contact
 from models.levels.measures import CONTACT, HopLevels, LevelPlan, hop_levels, level_plan
 from models.machine import MachineFile

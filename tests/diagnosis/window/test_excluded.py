@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from models.diagnosis.excluded import ExcludedLine, KnownLine, excluded_lines
-from models.diagnosis.moments import ComplexArray
-from models.diagnosis.stationarity import summed
+from models.diagnosis.window.excluded import ExcludedLine, KnownLine, excluded_lines
+from models.diagnosis.window.moments import ComplexArray
+from models.diagnosis.window.stationarity import summed
 from models.signals.block import FloatArray
-from tests.diagnosis.test_stationarity import BINS, SEGMENTS, segments
+from tests.diagnosis.window.test_stationarity import BINS, SEGMENTS, segments
 
 STEP_HZ, EVERY_S = 0.2, 2.5
 FREQUENCIES_HZ: FloatArray = np.linspace(3, 150, BINS)

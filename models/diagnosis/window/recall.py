@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.checkpoint import checked
-from models.diagnosis.moments import HopMoments, Plan, hop_moments
+from models.diagnosis.window.moments import HopMoments, Plan, hop_moments
 from models.signals.block import FloatArray, SampleArray
 
 _DIGEST = 16

@@ -22,9 +22,9 @@ import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
 
 from models.checkpoint import checked
-from models.diagnosis.excluded import KnownLine
-from models.diagnosis.moments import ComplexArray, HopMoments, Plan
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.excluded import KnownLine
+from models.diagnosis.window.moments import ComplexArray, HopMoments, Plan
+from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 
 _STEADY = 1.35  # fourth power over the square of the second: 2 for noise, 1 for a line; between them with little data

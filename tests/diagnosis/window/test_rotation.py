@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.diagnosis.rotation import RotationLine, followed_speeds, settled_hops
+from models.diagnosis.window.rotation import RotationLine, followed_speeds, settled_hops
 from tests.sure import sure
 
 HOP_S, HOPS, SPEED_HZ = 5.0, 12, 15.0

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.diagnosis.excluded import ExcludedLine
-from models.diagnosis.lagged import lagged_products
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.moments import Plan, hop_moments, plan_for
-from models.diagnosis.sliding_window import SlidingWindow
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.excluded import ExcludedLine
+from models.diagnosis.window.lagged import lagged_products
+from models.diagnosis.window.moments import Plan, hop_moments, plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import load_machine
 from models.signals.block import FloatArray
 from models.signals.waveform import Waveform, waveform_of

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from models.diagnosis.moments import ComplexArray
-from models.diagnosis.stationarity import segment_levels, summed
+from models.diagnosis.window.moments import ComplexArray
+from models.diagnosis.window.stationarity import segment_levels, summed
 from models.signals.block import FloatArray
 
 BINS, SEGMENTS = 736, 24

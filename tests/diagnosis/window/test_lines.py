@@ -9,8 +9,8 @@ from scipy.signal import lfilter
 
 from models.commissioning.checks import check_lines
 from models.commissioning.healthy import HealthyRecording, healthy_from_blocks, known_lines
-from models.diagnosis.lines import LatestLines, Line, new_line, steady_lines
-from models.diagnosis.window import window_statistics
+from models.diagnosis.window.lines import LatestLines, Line, new_line, steady_lines
+from models.diagnosis.window.statistics import window_statistics
 from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from tests.commissioning.rotor_kit import NOTHING

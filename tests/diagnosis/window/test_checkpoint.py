@@ -15,12 +15,12 @@ from models.commissioning.commissioned import install
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.likelihood.lengths import LengthFits
-from models.diagnosis.moments import plan_for
-from models.diagnosis.recall import digest_of
-from models.diagnosis.sliding_window import SlidingWindow
 from models.diagnosis.verdict.sequential_state import SequentialState, finding, hop_arrays
 from models.diagnosis.verdict.stretch import Stretch
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.window.moments import plan_for
+from models.diagnosis.window.recall import digest_of
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import CheckpointError
 from models.ingest import Admission, Gate, Reason
 from models.physics.rotor import PARAMETERS
