@@ -217,7 +217,7 @@ class HopMoments:
     # What the samples of each measured state look like and, last, those of the shaft angle if there is one.
     waveform: Waveform
     # (n_pairs, n_bands, 3): powers of the motions that are measured twice, their mean taken out
-    # (`models.diagnosis.motion.pair_powers`)
+    # (`motion.pair_powers`)
     pair_powers: ComplexArray
     levels: HopLevels | None = None
 

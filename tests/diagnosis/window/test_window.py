@@ -308,7 +308,7 @@ def test_readings_stay_unbiased_while_the_speed_goes_through_a_flank() -> None:
 @pytest.mark.slow
 def test_one_set_of_coefficients_would_not_do(monkeypatch: pytest.MonkeyPatch) -> None:
     samples, plan = run_of_lab(40, 0.15), plan_for(LAB, lagged=False)
-    monkeypatch.setattr("models.diagnosis.moments.STEADY", 1.0)
+    monkeypatch.setattr("models.diagnosis.window.moments.STEADY", 1.0)
     (window,) = feed(SlidingWindow(plan), samples)
     assert not window.removed_by_hop
     misfit = sure(LikelihoodFit(LAB).diagnose(window).misfit_z)
