@@ -80,7 +80,7 @@ class Grammar:
         self._seed = seed
         self._machines = (first, second, third)
         self._first, self._second, self._third = self._machines
-        self._gate = Gate(first)
+        self._gate = Gate(first, partial=True)
         self._hashes = [machine.descriptor.schema_hash for machine in self._machines]
         self._descriptors = {one.keys.descriptor: one.descriptor.model_dump(mode="json") for one in self._machines}
         self._health = example(Health)

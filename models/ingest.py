@@ -114,9 +114,17 @@ class Course:
 
 
 class Gate:
-    """Judges the blocks of one machine in the order of their arrival."""
+    """Judges the blocks of one machine in the order of their arrival.
 
-    def __init__(self, machine: MachineFile) -> None:
+    Parameters
+    ----------
+    partial : bool
+        Whether blocks are accepted in which a channel, but not every one, has no finite number at all: its sensor is
+        not connected. Where single numbers are missing, samples have been lost.
+    """
+
+    def __init__(self, machine: MachineFile, *, partial: bool = False) -> None:
+        self._partial = partial
         self._name = machine.title
         self._settings = machine.ingest
         self._rate_hz = machine.rate_hz
@@ -243,6 +251,8 @@ class Gate:
                 f"to {settings.block_to_s:g} s",
             )
         finite = np.isfinite(block.samples)
+        if self._partial and finite.any():
+            finite |= ~finite.any(axis=0)
         if not finite.all():
             row, column = (int(where) for where in np.argwhere(~finite)[0])
             return self._refuse(

@@ -26,6 +26,7 @@ class FaultKind(StrEnum):
         kind.measure = ""
         return kind
 
+    MISSING = "missing", "channel without numbers", "s"
     STUCK = "stuck", "sensor stuck", "s"
     CLIPPED = "clipped", "sensor clipped", "part of the samples"
     OFFSET = "offset", "offset", "SI"

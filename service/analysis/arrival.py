@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.commissioning.commissioned import Installed
+from models.diagnosis.sensors.missing import completed
 from models.diagnosis.window.moments import plan_for
 from models.errors import WireError
 from models.ingest import Admission, Gate
@@ -45,7 +46,12 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
         others = sorted({one.key for one in messages})
         heard = f"; heard were {', '.join(others)}" if others else ""
         return Arrival((f"{place}: no sample blocks",), (f"nothing arrived under {keys.stream}{heard}", *troubles))
-    gate, refused, accepted, breaks = Gate(machine), Counter[str](), list[SampleBlock](), list[Admission]()
+    gate, refused, accepted, breaks = (
+        Gate(machine, partial=True),
+        Counter[str](),
+        list[SampleBlock](),
+        list[Admission](),
+    )
     rates: set[float] = set()
     for message in stream:
         try:
@@ -62,7 +68,7 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
             breaks.append(verdict)
         if not verdict.continuous or verdict.new_snapshot:
             accepted.clear()
-        accepted.append(block)
+        accepted.append(completed(block))
     if len(breaks) > _MOST_BREAKS:
         missing_s = sum(one.gap_s for one in breaks)
         troubles.append(

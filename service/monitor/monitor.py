@@ -22,6 +22,7 @@ from models.arrivals import Arrivals, Arrived, Senders
 from models.checkpoint import checked, prefixed, texts, unprefixed
 from models.commissioning.commissioned import Installed
 from models.diagnosis.sensors.check import sensor_findings
+from models.diagnosis.sensors.missing import MissingNumbers, completed
 from models.diagnosis.sensors.reference import implicated
 from models.diagnosis.sensors.standstill import Standstill
 from models.diagnosis.verdict.calibration import detectable_changes
@@ -85,12 +86,16 @@ class MachineMonitor:
         self._senders, self._arrivals = Senders(), Arrivals(machine.ingest.reorder_blocks)
         self._due: deque[Arrived] = deque()
         self._done: list[MonitorReport] = []
-        self._gate = Gate(machine)
+        self._gate, self._missing = Gate(machine, partial=True), MissingNumbers(machine.sensors)
         channels = len(machine.sensors)
         self._window = SlidingWindow(plan, remembered=remembered, lines=installed.lines, channels=channels)
         self._test = SequentialTest(SequentialSettings.for_machine(machine, short=judge.takes_short), by=judge.by)
         self._alarms = AlarmBook(machine.alarms)
         self._data_path = DataPathAlarms(self._alarms, machine)
+        self._parts = (
+            ("gate", self._gate), ("evaluator", judge), ("standstill", self._standstill),
+            ("data_path", self._data_path), ("missing", self._missing),
+        )  # fmt: skip
         self._quality = Quality()
         self._latest: Report | None = None
         self._calm = HealthState.WARMING
@@ -163,7 +168,7 @@ class MachineMonitor:
 
     def _recall(self, block: SampleBlock) -> bool:
         newest = self._gate.is_newest(block)
-        self._window.recall(block.samples, block.start_ns, newest=newest)
+        self._window.recall(completed(block).samples, block.start_ns, newest=newest)
         return newest
 
     @property
@@ -224,7 +229,7 @@ class MachineMonitor:
         if not verdict.accepted:
             self._dropped += dropped
             return MonitorReport(verdict)
-        self._used = block
+        self._used, block = block, self._missing.take(block)
         windows: list[Report] = []
         try:
             windows.extend(map(self._evaluate, self._hops(block, verdict, dropped)))  # each before the next hop
@@ -306,13 +311,10 @@ class MachineMonitor:
     def state(self, kept: Collection[str] = (), *, whole: bool = False) -> MonitorState:
         """What is remembered, without parts named in `kept`; with `whole` the window too, megabytes."""
         arrays = {
-            **prefixed("gate", self._gate.checkpoint()),
             **prefixed("window", self._window.checkpoint(whole=whole)),
             **prefixed("test", self._test.state.checkpoint()),
-            **prefixed("evaluator", self._evaluator.checkpoint()),
             **prefixed("levels", self._levels.checkpoint()),
-            **prefixed("standstill", self._standstill.checkpoint()),
-            **prefixed("data_path", self._data_path.checkpoint()),
+            **{key: one for name, part in self._parts for key, one in prefixed(name, part.checkpoint()).items()},
             "calm": np.array([self._calm.value]),
             "end_ns": np.array([] if self.end_ns is None else [self.end_ns], dtype=np.int64),
         }
@@ -339,11 +341,9 @@ class MachineMonitor:
         if calm not in {(state.value,) for state in HealthState}:
             raise CheckpointError(f"calm is {calm}, expected one of {', '.join(HealthState)}")
         end_ns = next(iter(checked(arrays, "end_ns", np.int64, (None,)).tolist()), None)
-        self._gate.restore(unprefixed("gate", arrays))
         self._window.restore(unprefixed("window", arrays))
-        self._evaluator.restore(unprefixed("evaluator", arrays))
-        self._standstill.restore(unprefixed("standstill", arrays))
-        self._data_path.restore(unprefixed("data_path", arrays))
+        for name, part in self._parts:
+            part.restore(unprefixed(name, arrays))
         self._test.state = test
         self.end_ns, self._calm = end_ns, HealthState(*calm)
         self._arrivals.resume(self._gate.courses)
@@ -421,12 +421,13 @@ class MachineMonitor:
         statistics, self.window = self._window.statistics(), self._window.again()
         there = statistics or self._window.statistics(len(self._window.hops))  # while it fills
         stood = "" if there is None else self._standstill.found(there)
+        missing = self._missing.found(self._window.hops[0].start_ns, end_ns)
         if statistics is None:
-            self._levels.tell(self._alarms, end_ns, standing=bool(stood))
+            self._levels.tell(self._alarms, end_ns, faulty=implicated(missing), standing=bool(stood))
             return Report(**self._window_now(end_ns, end_ns, self._state(HealthState.WARMING)))
         speed_rad_s = statistics.speed_rad_s
         self._alarms.suppress(float(speed_rad_s * _RPM) if np.isfinite(speed_rad_s) else None, end_ns)
-        findings = sensor_findings(statistics, self._sensors, self.machine.sensors, standing=bool(stood))
+        findings = sensor_findings(statistics, self._sensors, self.machine.sensors, missing, standing=bool(stood))
         self._data_path.sensors(findings, statistics, standing=bool(stood))
         self._evaluator.heard(findings)
         start_ns, faulty = statistics.start_ns, implicated(findings)
@@ -451,8 +452,7 @@ class MachineMonitor:
         whole = self._test.settings.window_hops
         looks[whole] = stretch_of(evaluation.deciding, start_ns, end_ns)
         verdict = self._test.update(looks, foreign=foreign.text != "", rivals=evaluation.rivals(foreign))
-        unexplained = evaluation.deciding.unexplained
-        suspect = evaluation.deciding.suspect
+        unexplained, suspect = evaluation.deciding.unexplained, evaluation.deciding.suspect
         astride_s = self._test.astride_s if evaluation.alone and not foreign.text else 0.0
         self._alarms.found(verdict, self._test.unexplained, suspect, end_ns, hidden=foreign.hides, astride_s=astride_s)
         explained = bool(verdict.changed) and not (verdict.outside_model or foreign.hides)

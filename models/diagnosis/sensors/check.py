@@ -1,6 +1,6 @@
 """All checks of the sensors on one window."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -22,6 +22,7 @@ def sensor_findings(
     window: WindowStatistics,
     reference: SensorReference | None = None,
     channels: Iterable[Channel] = (),
+    missing: Sequence[SensorFault] = (),
     *,
     standing: bool = False,
 ) -> tuple[SensorFault, ...]:
@@ -32,6 +33,8 @@ def sensor_findings(
     reference : SensorReference, optional
         What the sensors were like on the healthy machine; without it only what is impossible for any healthy sensor is
         found.
+    missing : sequence of SensorFault
+        Channels that lack numbers; they are not looked at further.
     standing : bool
         Whether the machine stood in the window: channels are not compared then, and no angle has to turn.
 
@@ -43,11 +46,13 @@ def sensor_findings(
     """
     window, naming = window.as_mounted, Naming(channels)
     stood = np.full(len(window.waveforms), True) if standing else runs_down(window)
-    findings = [*stuck(window, naming, stood), *dropped(window, naming)]
+    bare = implicated(missing)
+    still = [*stuck(window, naming, stood), *dropped(window, naming)]
+    findings = [*missing, *(found for found in still if not set(found.states) & bare)]
     lost = implicated(findings)  # where a channel falls to the end of its range it is not cut off there
     findings += [found for found in clipped(window, naming) if not set(found.states) & lost]
-    wrong_angle = no_angle(window, naming)
-    if stood.any() or wrong_angle:
+    wrong_angle = [] if "theta" in bare else no_angle(window, naming)
+    if stood.any() or wrong_angle or "theta" in bare:
         return (*findings, *wrong_angle)
     findings += [found for found in offset(window, naming, reference) if not set(found.states) & implicated(findings)]
     findings += [found for found in spiked(window, naming) if not set(found.states) & implicated(findings)]

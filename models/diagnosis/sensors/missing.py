@@ -1,0 +1,76 @@
+"""Channels without numbers: their sensors are not connected, and the data acquisition sends NaN for them.
+
+The other channels are as good as before. What stands in for such a channel only keeps computations going: it is a
+finding in every window that has some of it, and nothing is read of it there.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from models.checkpoint import checked
+from models.diagnosis.sensors.reference import Naming
+from models.signals.block import SampleBlock
+from models.signals.channels import Channel, state_name
+from rotorwatch.records.sensor_faults import FaultKind
+from rotorwatch.records.windows import SensorFault
+
+
+def completed(block: SampleBlock) -> SampleBlock:
+    """The block with 0 in channels without numbers. Depends on nothing else: recalled, it gives the same window."""
+    missing = ~np.isfinite(block.samples)
+    return (
+        replace(block, samples=np.where(missing, block.samples.dtype.type(0), block.samples))
+        if missing.any()
+        else block
+    )
+
+
+class MissingNumbers:
+    """Remembers when channels had no numbers.
+
+    Parameters
+    ----------
+    channels : sequence of Channel
+        Of the machine, in the order of a block's columns.
+    """
+
+    def __init__(self, channels: Sequence[Channel]) -> None:
+        self._states, self._naming = [state_name(channel) for channel in channels], Naming(channels)
+        # Of each channel the newest time without numbers, from where to where.
+        self._times_ns = np.full((2, len(self._states)), -1, dtype=np.int64)
+
+    def take(self, block: SampleBlock) -> SampleBlock:
+        """Take note of what a block lacks, and return it `completed`."""
+        lost = ~np.isfinite(block.samples).any(axis=0)
+        begun = lost & (self._times_ns[1] != block.start_ns)
+        self._times_ns[0, begun], self._times_ns[1, lost] = block.start_ns, block.end_ns
+        return completed(block)
+
+    def found(self, start_ns: int, end_ns: int) -> tuple[SensorFault, ...]:
+        """Channels that lacked numbers in a window; none where the clock has been set back since."""
+        findings = []
+        for state, first_ns, last_ns in zip(self._states, *self._times_ns.tolist(), strict=True):
+            if start_ns < last_ns <= end_ns:
+                lost_s = (last_ns - max(first_ns, start_ns)) / 1e9
+                text = (
+                    f"{self._naming.name(state)}: sent as NaN, the last time for {lost_s:.3g} s of the window, "
+                    "expected numbers: its sensor is not connected"
+                )
+                findings.append(SensorFault(states=(state,), kind=FaultKind.MISSING, text=text, value=lost_s))
+        return tuple(findings)
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything as named arrays."""
+        return {"times_ns": self._times_ns}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called.
+
+        Raises
+        ------
+        CheckpointError
+            If the array is missing or of another form.
+        """
+        self._times_ns = checked(arrays, "times_ns", np.int64, self._times_ns.shape).copy()

@@ -1,0 +1,128 @@
+"""A channel without numbers costs what is read of that channel, and nothing of the others."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from models.alarm_names import PHASE_REFERENCE
+from models.commissioning.commissioned import install
+from models.diagnosis.sensors.missing import MissingNumbers
+from models.ingest import Reason
+from models.signals.block import SampleBlock
+from models.signals.sensor import Sensor
+from models.signals.wire import encode_block
+from rotorwatch.records.alarms import EventKind
+from rotorwatch.records.health import HealthState, Report
+from service.monitor.monitor import MachineMonitor
+from tests.service.rig.live import LAB, scenario_blocks
+
+KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 20.0, "max_span_s": 40.0})})
+Z1_DOT, THETA = 3, 8
+FROM_S, TO_S, END_S = 31.0, 33.0, 125.0
+
+
+def without(column: int, begin_s: float, end_s: float, value: float = np.nan) -> Iterator[SampleBlock]:
+    """A stream in which a channel has no numbers for a time."""
+    stream = scenario_blocks(END_S)
+    for block in stream:
+        samples = block.samples.copy()
+        if begin_s <= (block.start_ns - stream[0].start_ns) / 1e9 < end_s:
+            samples[:, column] = value
+        yield replace(block, samples=samples)
+
+
+def windows(monitor: MachineMonitor, stream: Sequence[SampleBlock]) -> list[Report]:
+    return [report for block in stream for report in monitor.step(block).windows]
+
+
+def ends_s(reports: Sequence[Report], first_ns: int) -> list[float]:
+    return [(one.end_ns - first_ns) / 1e9 for one in reports]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_missing_samples_are_told_of_their_channel_until_the_window_has_left_them(value: float) -> None:
+    monitor, sound = MachineMonitor(install(KIT, None)), MachineMonitor(install(KIT, None))
+    stream, events = list(without(Z1_DOT, FROM_S, TO_S, value)), list[tuple[EventKind, str]]()
+    reports: list[Report] = []
+    usual = windows(sound, scenario_blocks(END_S))
+    for block in stream:
+        done = monitor.step(block)
+        assert done.verdict.accepted
+        reports += done.windows
+        events += [(event.kind, event.alarm.name) for event in done.events]
+    first_ns = stream[0].start_ns
+    assert ends_s(reports, first_ns) == ends_s(usual, first_ns)
+    lacking = [one for one in reports if one.sensors]
+    assert all(one.start_ns < first_ns + round(TO_S * 1e9) <= one.end_ns + 10**9 for one in lacking)
+    assert {one.state for one in lacking} <= {HealthState.DATA_HEALTH, HealthState.ALERT}
+    assert not any(one.parameters for one in lacking)
+    assert {(fault.states, fault.kind) for one in lacking for fault in one.sensors} == {(("z1_dot",), "missing")}
+    fault = lacking[2].sensors[0]
+    assert fault.value == pytest.approx(2.0)
+    assert fault.text.startswith("z1_dot: sent as NaN, the last time for 2 s of the window, expected numbers")
+    assert events == [(EventKind.RAISED, "data-missing"), (EventKind.CLEARED, "data-missing")]
+    # Levels of the other channels are the same to the last bit, and the machine is diagnosed again.
+    for one, other in zip(reports, usual, strict=True):
+        kept = [level for level in one.levels if level.channel != "z1_dot"]
+        assert kept == [level for level in other.levels if level.channel != "z1_dot"]
+    last, other = reports[-1], usual[-1]
+    assert (last.state, last.sensors, last.levels) == (other.state, (), other.levels)
+    assert [one.name for one in last.parameters] == [one.name for one in other.parameters]
+
+
+def test_a_channel_that_is_not_connected_leaves_the_rotor_diagnosed_as_it_is_without_it() -> None:
+    casing = Sensor(name="DE-H", quantity="acceleration", location="DE", direction="horizontal", unit="m/s2")
+    rig = KIT.model_copy(update={"sensors": (*KIT.sensors, casing)})
+    monitor, alone = MachineMonitor(install(rig, None)), MachineMonitor(install(KIT, None))
+    stream = scenario_blocks(40.0)
+    gap = np.full((len(stream[0].samples), 1), np.nan, np.float32)
+    wider = [replace(one, samples=np.hstack([one.samples.astype(np.float32), gap])) for one in stream]
+    told = windows(monitor, wider)[-1]
+    plain = windows(alone, stream)[-1]
+    assert [(fault.states, fault.kind) for fault in told.sensors] == [(("@DE-H",), "missing")]
+    assert (told.state, told.verdict, told.parameters) == (plain.state, plain.verdict, plain.parameters)
+
+
+def test_without_an_angle_the_phase_reference_is_lost() -> None:
+    monitor = MachineMonitor(install(KIT, None))
+    reports = windows(monitor, list(without(THETA, 0.0, END_S)))
+    assert [fault.states for fault in reports[-1].sensors] == [("theta",)]
+    assert [one.name for one in monitor.health().alarms if one.raised] == [PHASE_REFERENCE]
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns"), [((7, 8), (3, 4)), ((7, None), (3, 4)), ((7, 8), (0, 9)), ((0, None), (0, 9))]
+)
+def test_lost_samples_and_a_block_of_nothing_else_are_refused(
+    rows: tuple[int, int | None], columns: tuple[int, int]
+) -> None:
+    (block, *_), monitor = scenario_blocks(1.0), MachineMonitor(install(KIT, None))
+    samples = block.samples.copy()
+    samples[slice(*rows), slice(*columns)] = np.nan
+    done = monitor.step(replace(block, samples=samples))
+    assert done.verdict.reason is Reason.NOT_FINITE
+    assert "is nan, expected a finite number" in done.verdict.text
+
+
+def test_a_restored_monitor_and_a_recalled_window_go_on_to_the_last_bit() -> None:
+    stream = list(without(Z1_DOT, FROM_S, TO_S))
+    monitor = MachineMonitor(install(KIT, None))
+    half = 340  # a second after the last sample that is missing
+    windows(monitor, stream[:half])
+    state = monitor.state()
+    again = MachineMonitor(install(KIT, None))
+    again.restore(state.state, [part for _, part in state.new_parts])
+    for block in stream[:half]:
+        again.recall(*encode_block(block, ""))
+    assert not again.recalled
+    assert windows(again, stream[half:]) == windows(monitor, stream[half:])
+
+
+def test_what_was_missing_before_a_clock_was_set_back_is_not_told_for_hours() -> None:
+    missing = MissingNumbers(LAB.sensors[:1])
+    block = SampleBlock(5_000, 0, 0, 1000.0, np.full((2, 1), np.nan))
+    missing.take(block)
+    assert missing.found(0, block.end_ns)
+    assert not missing.found(0, block.end_ns - 1)
