@@ -53,10 +53,7 @@ def gain_suspicion(
 ) -> GainSuspicion | None:
     """Find the row whose changes look most like a gain error of all sensors of a place.
 
-    Returns
-    -------
-    GainSuspicion or None
-        None where single parameters explain the window, or a common factor does not.
+    None where single parameters explain the window, or a common factor does not.
     """
     tested = [
         (row, relation)
@@ -256,7 +253,8 @@ class BaselineDiagnostician:
             for j, b in enumerate(changes[: i + 1]):
                 if b is None:
                     continue
-                own = a.moments.covariance(a.combination) if i == j else _between(a, b)
+                both = a.moments, a.combination, b.moments, b.combination
+                own = a.moments.covariance(a.combination) if i == j else shared_covariance(*both)
                 own = a.projection @ own @ b.projection.T * math.sqrt(a.widening * b.widening)
                 noise[self._own[i], self._own[j]] = own
                 noise[self._own[j], self._own[i]] = own.T
@@ -276,13 +274,7 @@ class BaselineDiagnostician:
         return _Bearing(values, noise, sensitivity, common)
 
     def _unbalance(self, changes: list[RowChange | None], bearing: _Bearing, window: WindowStatistics) -> _Unbalance:
-        """Read the unbalance.
-
-        Raises
-        ------
-        EstimationError
-            With the reason why it cannot be read.
-        """
+        """Read the unbalance; raises EstimationError with the reason why it cannot be read."""
         rows = [
             self._forces[row.name]
             for row, change in zip(self._rows, changes, strict=True)
@@ -368,10 +360,7 @@ def _unexplained(misfit_z: float | None) -> str:
 def _impossible(diagnosis: Diagnosis, variances: Mapping[str, float]) -> str:
     """What no bearing does: a stiffness or damping that is gone or has changed its sign, or cannot be told at all.
 
-    Parameters
-    ----------
-    variances : mapping of str to float
-        Of the readings by themselves, without what they carry for another force.
+    The variances are those of the readings by themselves, without what they carry for another force.
     """
     for reading in diagnosis.evaluable:
         if reading.name == "e" or reading.relative_change is None or reading.standard_error is None:
@@ -384,10 +373,6 @@ def _impossible(diagnosis: Diagnosis, variances: Mapping[str, float]) -> str:
 
 def _bordered(matrix: FloatArray, border: FloatArray, corner: float) -> FloatArray:
     return np.block([[matrix, border[:, None]], [border[None, :], np.array([[corner]])]])
-
-
-def _between(a: RowChange, b: RowChange) -> FloatArray:
-    return shared_covariance(a.moments, a.combination, b.moments, b.combination)
 
 
 def _read(row: Row, relation: Relation | None, window: WindowStatistics, why: str) -> tuple[RowChange | None, str]:

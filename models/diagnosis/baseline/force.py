@@ -23,12 +23,8 @@ _ALIKE = 0.03
 def force_spectrum(windows: Sequence[RowWindow], combinations: Sequence[FloatArray]) -> FloatArray:
     """Cross-spectra of what the rows of one window leave over, mean of every band, shape (n_bands, n_rows, n_rows).
 
-    Real parts stand on and above the diagonal, imaginary parts below.
-
-    Parameters
-    ----------
-    combinations : sequence of ndarray
-        The force of each row as a combination of its terms.
+    The force of each row is a combination of its terms. Real parts stand on and above the diagonal, imaginary parts
+    below.
     """
     window = windows[0].window
     forces = np.stack([one.terms @ combination for one, combination in zip(windows, combinations, strict=True)], axis=1)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.diagnosis.baseline.lag_moments import LagMoments
+from models.diagnosis.baseline.numbers import NotNegative, Number, Positive
 from models.diagnosis.baseline.relation import Relation, change_of
 from models.diagnosis.baseline.rows import Row
 from models.diagnosis.window.statistics import WindowStatistics
@@ -27,9 +28,9 @@ _UNSEEN, _CARRIED = 0.02, 0.005
 class Growth:
     """Growth of the scale of a row with the power of the motion that it resists."""
 
-    power: float  # mean of the healthy windows
-    slope: float  # relative change of the scale where the power changes by `power`
-    standard_error: float  # of the slope
+    power: Positive  # mean of the healthy windows
+    slope: Number  # relative change of the scale where the power changes by `power`
+    standard_error: NotNegative  # of the slope
 
     def seen_variance(self, power: float) -> float:
         """Variance of the scale's relative change where the motion has another power, from a growth beyond chance.

@@ -6,10 +6,8 @@ over lags, and derivatives stand on the kernel.
 
 What the moments scatter by follows from the window's spectra (Bartlett's formula), without assuming a model of the
 machine. As the kernels are shifted copies of one another, every covariance is made of blocks that depend on the
-distance of two kernels alone; they are summed over frequency once, for all combinations of terms.
-
-The kernels over lags, whose derivatives are the differentiator behind every row, are shifted copies of one another by a
-whole number of lags. What moments under them scatter by then depends on the distance of two kernels alone.
+distance of two kernels alone; they are summed over frequency once, for all combinations of terms. The kernels'
+derivatives are the differentiator behind every row.
 """
 
 from dataclasses import dataclass, replace
@@ -65,8 +63,6 @@ def shape_for(deepest: int, band_to_hz: float, time_scale: float) -> Shape:
         Most derivatives on a kernel (`Formation.deepest`), at most 4.
     band_to_hz : float
         Highest frequency of the window's spectra.
-    time_scale : float
-        `models.stream_settings.time_scale` of the machine.
     """
     spacing_s = _SPACING_S * time_scale
     if deepest <= 1:
@@ -83,29 +79,10 @@ class Kernels:
     values: tuple[FloatArray, ...]
     centres_s: FloatArray  # (n_kernels,)
 
-    @property
-    def spacing_s(self) -> float:
-        """Distance of neighbours."""
-        return float(self.centres_s[1] - self.centres_s[0])
-
-
-def kernels(lags_s: FloatArray, lag_from_s: float, shape: Shape, deepest: int) -> Kernels:
-    """Kernels beyond a shortest lag.
-
-    Parameters
-    ----------
-    lags_s : ndarray, shape (n_lags,)
-        Equally spaced.
-    lag_from_s : float
-        Where the first kernel begins.
-    deepest : int
-        Most derivatives that are asked for, at most 4.
-    """
-    return _kernels(lags_s.tobytes(), lag_from_s, shape, deepest)
-
 
 @lru_cache(maxsize=256)
-def _kernels(lags: bytes, lag_from_s: float, shape: Shape, deepest: int) -> Kernels:
+def kernels(lags: bytes, lag_from_s: float, shape: Shape, deepest: int) -> Kernels:
+    """Kernels from a shortest lag on, with up to `deepest` derivatives, at most 4; the lags are equally spaced."""
     lags_s = np.frombuffer(lags)
     step_s = float(lags_s[1] - lags_s[0])
     spacing_s = max(1, round(shape.spacing_s / step_s)) * step_s
@@ -214,7 +191,7 @@ class RowWindow:
         window, formation = self.window, self.formation
         column = {name: position for position, name in enumerate(window.states)}
         references = [column[name] for name in self.references]
-        over = kernels(window.lags_s, lag_from_s, self.shape, formation.deepest)
+        over = kernels(window.lags_s.tobytes(), lag_from_s, self.shape, formation.deepest)
 
         def moments(correlation: FloatArray) -> FloatArray:
             seen: dict[tuple[str, int], FloatArray] = {}
@@ -240,13 +217,7 @@ class RowWindow:
 
 
 def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], references: tuple[str, ...]) -> RowWindow:
-    """Prepare a row in a window.
-
-    Parameters
-    ----------
-    window : WindowStatistics
-        With correlations at lags up to 0.1 s or more.
-    """
+    """Prepare a row in a window, whose correlations reach up to 0.1 s or more."""
     formation = formation_of([term.motions for term in row.terms], states)
     index = {name: position for position, name in enumerate(window.states)}
     f = window.frequencies_hz
@@ -263,8 +234,9 @@ def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], refe
     own = spectra[:, pairs[0], pairs[1]].real
     shape = shape_for(formation.deepest, float(f[-1]), window.time_scale)
     between = _reference_spectra(window, columns, shape)
-    nearest = kernels(window.lags_s, SHORTEST_LAG_FROM_S * window.time_scale, shape, formation.deepest)
-    cosine, sine = _waves(f.tobytes(), nearest.spacing_s, nearest.centres_s.size)
+    shortest_s = SHORTEST_LAG_FROM_S * window.time_scale
+    centres_s = kernels(window.lags_s.tobytes(), shortest_s, shape, formation.deepest).centres_s
+    cosine, sine = _waves(f.tobytes(), float(centres_s[1] - centres_s[0]), centres_s.size)
     flat = between.reshape(f.size, -1)
     # one product for each reference pair: what the distance does to it, weighted by the pairs of terms
     even = own.T @ (flat.real[:, :, None] * cosine[:, None, :]).reshape(f.size, -1)
@@ -276,12 +248,16 @@ def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], refe
 
 def _reference_spectra(window: WindowStatistics, columns: list[int], shape: Shape) -> ComplexArray:
     """Cross-spectra of the references seen through the kernels, by frequency, per resolution of the window."""
+    weight = _bin_weights(window) * gain(window.frequencies_hz, shape) ** 2
+    return np.asarray(window.spectrum[:, columns][:, :, columns].conj() * weight[:, None, None], dtype=np.complex128)
+
+
+def _bin_weights(window: WindowStatistics) -> FloatArray:
     f = window.frequencies_hz
     step_hz = f[1] - f[0]
     bins_hz = np.full(f.size, step_hz)
     bins_hz[0] += f[0] - step_hz / 2  # below the band the spectra are taken as level
-    weight = 2 * bins_hz / window.duration_s * gain(f, shape) ** 2
-    return np.asarray(window.spectrum[:, columns][:, :, columns].conj() * weight[:, None, None], dtype=np.complex128)
+    return np.asarray(2 * bins_hz / window.duration_s, dtype=np.float64)
 
 
 @lru_cache(maxsize=16)
@@ -311,11 +287,7 @@ def shared_covariance(a: LagMoments, of_a: FloatArray, b: LagMoments, of_b: Floa
     left, right = a.of.terms @ of_a, b.of.terms @ of_b
     density = np.einsum("fi,fij,fj->f", left, window.spectrum, right.conj(), optimize=True)
     rows, columns = ([index[name] for name in one.of.references] for one in (a, b))
-    step_hz = f[1] - f[0]
-    bins_hz = np.full(f.size, step_hz)
-    bins_hz[0] += f[0] - step_hz / 2
-    weight = 2 * bins_hz / window.duration_s
-    weight = weight * gain(f, a.of.shape) * gain(f, b.of.shape) * density
+    weight = _bin_weights(window) * gain(f, a.of.shape) * gain(f, b.of.shape) * density
     between = window.spectrum[:, rows][:, :, columns].conj() * weight[:, None, None]
     ours, theirs = a.kernels.centres_s, b.kernels.centres_s
     distances_s = np.concatenate([ours[0] - theirs[:0:-1], ours - theirs[0]])

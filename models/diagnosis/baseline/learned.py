@@ -3,8 +3,10 @@
 import itertools
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from models.diagnosis.baseline.force import force_spectrum
 from models.diagnosis.baseline.growth import Growth, growth_of
@@ -15,8 +17,9 @@ from models.diagnosis.baseline.lag_moments import (
     row_window,
     shared_covariance,
 )
-from models.diagnosis.baseline.relation import Contribution, Relation, RowChange, beyond_memory, change_of, learn_row
-from models.diagnosis.baseline.rows import COUPLED_ROWS, ROWS, Row, not_measured, state_of
+from models.diagnosis.baseline.numbers import NotNegative, Number, Positive
+from models.diagnosis.baseline.relation import Contribution, Relation, beyond_memory, change_of, learn_row
+from models.diagnosis.baseline.rows import COUPLED_ROWS, ROWS, Row, lowest, not_measured, state_of
 from models.diagnosis.baseline.unbalance import SynchronousVectors, rotation_of, rotations_by_speed
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
@@ -34,8 +37,8 @@ class HeldOutReading:
 
     parameter: str
     # Relative change and its standard error, the relation's included.
-    change: float
-    standard_error: float
+    change: Number
+    standard_error: Positive
 
     @property
     def z(self) -> float:
@@ -48,22 +51,17 @@ class LeftOut:
     """One healthy window of one row against what the windows of other conditions teach."""
 
     row: str  # name of the row
-    window: int  # number of the window, from 0
+    window: Annotated[int, Field(ge=0)]  # number of the window, from 0
     condition: str  # what it belongs to
     agreements: tuple[HeldOutReading, ...]  # one for each of the row's own parameters
-    misfit: float  # χ² of what is left per degree of freedom
-    degrees_of_freedom: int
+    misfit: NotNegative  # χ² of what is left per degree of freedom
+    degrees_of_freedom: Annotated[int, Field(ge=1)]
 
 
 def left_out(row: Row, parts: Sequence[LagMoments], conditions: Sequence[Hashable]) -> tuple[LeftOut, ...]:
-    """Read every healthy window against the relation learned without its condition.
+    """Read every healthy window against the relation learned without its condition, where the others determine one.
 
     Where there is one condition, windows are left out one by one, or in up to six runs of neighbours.
-
-    Returns
-    -------
-    tuple of LeftOut
-        Without those for which too few others are left or do not determine the relation.
     """
     groups = list(dict.fromkeys(conditions))
     if len(groups) > 1:
@@ -81,25 +79,12 @@ def left_out(row: Row, parts: Sequence[LagMoments], conditions: Sequence[Hashabl
         except (EstimationError, np.linalg.LinAlgError):
             continue
         for number, change in changes:
-            uncertain = change.sensitivity @ relation.covariance @ change.sensitivity.T
-            found.append(_left_out(row, number, str(conditions[number]), change, np.diag(uncertain)))
+            readings = zip(row.own, change.change.tolist(), change.error(relation).tolist(), strict=True)
+            agreements = tuple(HeldOutReading(own.parameter, value, error) for own, value, error in readings)
+            freedom = change.degrees_of_freedom
+            misfit = change.chi2 / freedom
+            found.append(LeftOut(row.name, number, str(conditions[number]), agreements, misfit, freedom))
     return tuple(sorted(found, key=lambda one: one.window))
-
-
-def _left_out(row: Row, number: int, condition: str, change: RowChange, uncertain: FloatArray) -> LeftOut:
-    noise = change.projection @ change.moments.covariance(change.combination) @ change.projection.T
-    errors = np.sqrt(np.diag(noise) * change.widening + uncertain)
-    return LeftOut(
-        row=row.name,
-        window=number,
-        condition=condition,
-        agreements=tuple(
-            HeldOutReading(own.parameter, float(value), float(error))
-            for own, value, error in zip(row.own, change.change, errors, strict=True)
-        ),
-        misfit=change.chi2 / change.degrees_of_freedom,
-        degrees_of_freedom=change.degrees_of_freedom,
-    )
 
 
 def allowance_of(found: Sequence[LeftOut]) -> float:
@@ -127,7 +112,7 @@ _SHORTEST_LAG_RANGE_S = 0.1
 # Planes are coupled where the stiffness across is more of that along, and more standard errors, in one of them.
 _COUPLED, _SHOWN = 0.03, 4.0
 _FEWEST_HOPS = 2
-_NO_FORCE: FloatArray = np.zeros((0, 0, 0))
+NO_FORCE: FloatArray = np.zeros((0, 0, 0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,14 +130,14 @@ class Baseline:
     consistency: tuple[LeftOut, ...] = ()
     # (n_bands, n_rows, n_rows): force that it was learned under (`force_spectrum`); empty where it was not one, or is
     # not seen in all rows
-    force: FloatArray = field(default_factory=_NO_FORCE.copy)
+    force: FloatArray = field(default_factory=NO_FORCE.copy)
     # How the stiffness of each learned row grows with the motion; None where that is not known, empty in older records.
     growth: tuple[Growth | None, ...] = ()
 
     @property
     def without_force(self) -> "Baseline":
         """The same without the force: what it reads has the errors of other conditions, whatever moves the machine."""
-        return replace(self, force=_NO_FORCE)
+        return replace(self, force=NO_FORCE)
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -221,7 +206,10 @@ def learn_baseline(
         parts.append(contributions)
     if all(relation is None for relation in relations):
         raise EstimationError("; ".join(dict.fromkeys(reasons)))
-    coordinates = _coordinates(rows, learned, relations)
+    # Synchronous vectors are kept of all rows that the unbalance can be read by.
+    there = {relation.row for relation in relations if relation is not None}
+    used = [row for row in rows if row.synchronous and row.rests_on in there]
+    coordinates = tuple(sorted({motion.coordinate for row in used for motion in row.motions}))
     rotations = [rotation_of(window, coordinates) for window in windows]
     return Baseline(
         relations=tuple(relations),
@@ -286,20 +274,8 @@ def planes_coupled(windows: Sequence[WindowStatistics]) -> bool:
 
 def references_of(states: tuple[str, ...]) -> tuple[str, ...]:
     """States that serve as references: the lowest derivative of bearing and disc in both planes."""
-    found = []
-    for coordinate in ("y1", "y2", "z1", "z2"):
-        measured = [state_of(coordinate, order) for order in range(3) if state_of(coordinate, order) in states]
-        found += measured[:1]
-    return tuple(found)
-
-
-def _coordinates(
-    rows: Sequence[Row], learned: tuple[Row, ...], relations: Sequence[Relation | None]
-) -> tuple[str, ...]:
-    """Whose synchronous vectors are kept: of all rows that the unbalance can be read by."""
-    there = {row.name for row, relation in zip(learned, relations, strict=True) if relation is not None}
-    used = [row for row in rows if row.synchronous and row.rests_on in there]
-    return tuple(sorted({motion.coordinate for row in used for motion in row.motions}))
+    lowest_of = [(coordinate, lowest(coordinate, states)) for coordinate in ("y1", "y2", "z1", "z2")]
+    return tuple(state_of(coordinate, order) for coordinate, order in lowest_of if order is not None)
 
 
 def _covariance(
@@ -363,13 +339,8 @@ def undetermined(baseline: Baseline) -> tuple[str, ...]:
     """Say of every learned row why the healthy windows do not determine it; empty where they do.
 
     One source of excitation leaves combinations of coefficients weakly determined. The estimate then wanders to where
-    damping or inertia is not physical, and no interval around it is honest.
-
-    Returns
-    -------
-    tuple of str
-        A sentence with what to record instead for each row, in the order of the learned rows; empty if there is no
-        doubt, or if there is no relation (``baseline.reasons`` says why).
+    damping or inertia is not physical, and no interval around it is honest. Each sentence says what to record instead;
+    it is empty, too, where there is no relation (``baseline.reasons`` says why).
     """
     found, alone = [], len({one.condition for one in baseline.consistency}) < 2
     for row, relation in zip(learned_rows(baseline.rows), baseline.relations, strict=True):
@@ -402,13 +373,8 @@ def disagreements(baseline: Baseline) -> tuple[str, ...]:
     """Sentences on conditions in which a parameter reads otherwise than in all others.
 
     Readings of one condition share the error of the relation: their mean is compared with a standard error that does
-    not fall with their number.
-
-    Returns
-    -------
-    tuple of str
-        Empty if one relation holds for all conditions. Otherwise keep a baseline for each, or widen (which later
-        windows do by `Relation.allowance` in any case).
+    not fall with their number. Where there are such conditions, keep a baseline for each, or widen (which later windows
+    do by `Relation.allowance` in any case).
     """
     found = []
     for condition in dict.fromkeys(one.condition for one in baseline.consistency):

@@ -16,8 +16,10 @@ J. H. Stock and J. H. Wright, "GMM with weak identification", Econometrica 68 (2
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 from scipy.linalg import eigh
 
 from models.diagnosis.baseline.lag_moments import (
@@ -29,6 +31,7 @@ from models.diagnosis.baseline.lag_moments import (
     inverse,
     telling,
 )
+from models.diagnosis.baseline.numbers import Covariance, NotNegative, Vector
 from models.diagnosis.baseline.rows import Row
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
@@ -42,14 +45,7 @@ _STEPS = 2.0 * 1.4 ** np.arange(10)
 def stretching(criterion: Callable[[FloatArray], float], b: FloatArray, covariance: FloatArray) -> FloatArray:
     """Matrix A that stretches errors e with the given covariance to A e, whose covariance is what the criterion says.
 
-    Parameters
-    ----------
-    criterion : callable
-        χ² at an estimate.
-    b : ndarray, shape (n,)
-        Estimate.
-    covariance : ndarray, shape (n, n)
-        Its own.
+    The criterion is χ² at an estimate; `b`, shape (n,), is the one whose covariance, shape (n, n), is given.
     """
     spread = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
@@ -68,10 +64,7 @@ def stretching(criterion: Callable[[FloatArray], float], b: FloatArray, covarian
 def relation_criterion(parts: Sequence[LagMoments], prior: FloatArray, b: FloatArray) -> float:
     """Left-over moments of healthy windows, weighted as at these coefficients, less what scatter explains.
 
-    Parameters
-    ----------
-    prior : ndarray, shape (n, n)
-        Precision of what was expected of the coefficients.
+    The prior, shape (n, n), is the precision of what was expected of the coefficients.
     """
     combination = np.concatenate([[1.0], -b])
     total = float(b @ prior @ b)
@@ -146,22 +139,27 @@ _CONVERGED = 1e-4  # standard errors
 LOST = 0.5  # standard error of a stiffness beyond which a window says nothing of it
 
 
+_Names = Annotated[tuple[str, ...], Field(min_length=1)]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Relation:
     """What holds between the correlation functions of one row on the healthy machine."""
 
     row: str  # name in the table of rows
-    states: tuple[str, ...]  # measured states the terms are formed from
-    references: tuple[str, ...]  # measured states they were correlated with
+    states: _Names  # measured states the terms are formed from
+    references: _Names  # measured states they were correlated with
     # (n,): of every term but the first in term₀ = Σ b term; for the bearing's row -c/k, -m2/k, -m1/k and -s
-    coefficients: FloatArray
-    covariance: FloatArray  # (n, n), theirs, widened where the relation did not fit
-    misfit: float  # χ² of the fit per degree of freedom
-    degrees_of_freedom: int
+    coefficients: Annotated[Vector, Field(min_length=1)]
+    covariance: Covariance  # (n, n), theirs, widened where the relation did not fit
+    misfit: NotNegative  # χ² of the fit per degree of freedom
+    degrees_of_freedom: Annotated[int, Field(ge=1)]
     # Factor on the variances of every later window, from how well the relation holds in conditions that it was not
     # learned in; at least 1.
-    allowance: float = 1.0
-    lag_from_s: float = 0.0  # where it does not fit below this lag, no window is read below it either
+    allowance: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 1.0
+    # Where it does not fit below this lag, no window is read below it either. What older records lack is left out where
+    # it says nothing: their commissionings keep their identity.
+    lag_from_s: Annotated[NotNegative, Field(exclude_if=lambda lag_s: lag_s == 0)] = 0.0
 
     @property
     def combination(self) -> FloatArray:
@@ -182,8 +180,8 @@ class RowChange:
     """What one window says of one row."""
 
     change: FloatArray  # (n_own,), relative change of the row's own parameters
-    # (n_own, n_moments): from the window's moments to the change, stretched to what the window objects to (`flatness`),
-    # and wider where more is left over than chance leaves
+    # (n_own, n_moments): from the window's moments to the change, stretched to what the window objects to, and wider
+    # where more is left over than chance leaves
     projection: FloatArray
     sensitivity: FloatArray  # (n_own, n_coefficients), of the change to the relation's coefficients
     moments: LagMoments
@@ -244,11 +242,8 @@ def prior_of(row: Row, start: FloatArray, *, minimal: bool) -> FloatArray:
 
 def _start(row: Row, parts: Sequence[LagMoments]) -> FloatArray:
     """First coefficients, from the terms of which nothing is expected beforehand."""
-    rows = []
-    for part in parts:
-        ones = part.covariance(np.eye(len(row.terms))[0])
-        rows.append(part.values / np.sqrt(np.diag(ones))[:, None])
-    stacked = np.concatenate(rows)
+    target = np.eye(len(row.terms))[0]
+    stacked = np.concatenate([part.values / np.sqrt(np.diag(part.covariance(target)))[:, None] for part in parts])
     free = [number for number, term in enumerate(row.terms) if number and term.spread is None]
     b = np.zeros(row.n_coefficients)
     b[[number - 1 for number in free]] = np.linalg.lstsq(stacked[:, free], stacked[:, 0], rcond=None)[0]
@@ -276,11 +271,8 @@ def beyond_memory(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMomen
 
 
 def _beyond_force(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMoments], tuple[Fit, Fit], list[float]]:
-    parts, lags, used = (
-        [window.beyond(LAG_FROM_S * window.window.time_scale) for window in windows],
-        [0.0] * len(windows),
-        [LAG_FROM_S * window.window.time_scale for window in windows],
-    )
+    lags, used = [0.0] * len(windows), [LAG_FROM_S * window.window.time_scale for window in windows]
+    parts = [window.beyond(lag) for window, lag in zip(windows, used, strict=True)]
     fits = fit_row(row, parts)
     for _ in range(_LAG_ROUNDS):
         for fit in fits:
@@ -309,18 +301,16 @@ def learn_row(
     *,
     widened: bool = True,
 ) -> tuple[Relation, list[Contribution]]:
-    """Learn the relation of a row.
+    """Learn the relation of a row from moments of healthy windows that do not overlap, each in one condition.
 
     Parameters
     ----------
-    parts : sequence of LagMoments
-        One of each healthy window; windows do not overlap, each is in one condition, they may differ from each other.
     fits : tuple of Fit, optional
         What `fit_row` makes of them, where that is known.
     lag_from_s : float
         Lag that later windows are not to be read below.
     widened : bool
-        Whether the covariance is widened to what the windows object to (`flatness`), which takes most of the time.
+        Whether the covariance is widened to what the windows object to (`stretching`), which takes most of the time.
 
     Raises
     ------
@@ -432,10 +422,7 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
 def change_of(row: Row, relation: Relation, moments: LagMoments, *, stretched: bool = True) -> RowChange:
     """Read the change from given moments.
 
-    Parameters
-    ----------
-    stretched : bool
-        Whether errors are stretched to what the window objects to (`stretching`), which takes most of the time.
+    To stretch errors to what the window objects to (`stretching`) takes most of the time.
 
     Raises
     ------

@@ -95,15 +95,10 @@ def _described(coordinate: str) -> str:
 
 
 def formation_of(terms: Sequence[Sequence[Motion]], states: Sequence[str]) -> Formation:
-    """Choose how to form the terms of a row.
+    """Choose how to form the terms of a row, each the sum of motions whose coordinates are measured (`not_measured`).
 
     The row is differentiated as rarely as possible. Then every motion is taken from the highest measured derivative
     that does not exceed it: what needs not be differentiated is not made noisier.
-
-    Parameters
-    ----------
-    terms : sequence of sequences of Motion
-        Motions of each term; every one's coordinate is measured (see `not_measured`).
     """
     motions = [motion for term in terms for motion in term]
     raised = max(max(0, _measured(motion.coordinate, states)[0] - motion.order) for motion in motions)
@@ -200,36 +195,25 @@ def _bearing_and_disc(plane: str) -> tuple[Term, ...]:
     )
 
 
-def _bearing(name: str, number: str, plane: str, direction: str) -> Row:
-    return Row(
-        name=name,
-        number=number,
-        title=f"bearing and disc, {direction}",
-        terms=_bearing_and_disc(plane),
-        own=(
-            Own(f"k_b{plane}", (0,), elsewhere=0.005, always=True),
-            Own(f"c_b{plane}", (1,), one_source=1.6, elsewhere=0.03),
-        ),
+def _bearing(plane: str, number: str, direction: str) -> Row:
+    own = (
+        Own(f"k_b{plane}", (0,), elsewhere=0.005, always=True),
+        Own(f"c_b{plane}", (1,), one_source=1.6, elsewhere=0.03),
     )
+    return Row(plane, number, f"bearing and disc, {direction}", _bearing_and_disc(plane), own)
 
 
-def _unbalance(name: str, rests_on: str, number: str, plane: str, direction: str) -> Row:
-    return Row(
-        name=name,
-        number=number,
-        title=f"unbalance force through bearing and disc, {direction}",
-        terms=_bearing_and_disc(plane),
-        own=(Own("e", one_source=1.4),),
-        rests_on=rests_on,
+def _unbalance(bearing: Row) -> Row:
+    name, number, title = (
+        f"{bearing.name} 1x",
+        f"{bearing.number} at the speed",
+        f"unbalance force through {bearing.title}",
     )
+    return Row(name, number, title, bearing.terms, (Own("e", one_source=1.4),), rests_on=bearing.name)
 
 
-ROWS: tuple[Row, ...] = (
-    _bearing("y", "28 + 29", "y", "horizontal"),
-    _bearing("z", "31 + 29 in z", "z", "vertical"),
-    _unbalance("y 1x", "y", "28 + 29 at the speed", "y", "horizontal"),
-    _unbalance("z 1x", "z", "31 + 29 in z at the speed", "z", "vertical"),
-)
+_BEARINGS = _bearing("y", "28 + 29", "horizontal"), _bearing("z", "31 + 29 in z", "vertical")
+ROWS: tuple[Row, ...] = (*_BEARINGS, *map(_unbalance, _BEARINGS))
 """The rows that can be learned from a recording alone."""
 
 
@@ -252,10 +236,7 @@ def parameters_of(rows: Sequence[Row] = ROWS) -> tuple[str, ...]:
 def evaluable_rows(states: Sequence[str], has_phase_reference: bool) -> list[tuple[Row, str]]:
     """Every row with the reason why it cannot be evaluated with these sensors; empty if it can.
 
-    Parameters
-    ----------
-    has_phase_reference : bool
-        Or a speed that the vibration's own line is looked for at.
+    A speed that the vibration's own line is looked for at serves as phase reference, too.
     """
     found = []
     for row in ROWS:

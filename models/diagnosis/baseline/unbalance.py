@@ -8,9 +8,12 @@ unbalance. Velocities and accelerations are displacements times jΩ and -Ω².
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
+from models.diagnosis.baseline.numbers import Covariance, Number, Vector
 from models.diagnosis.baseline.rows import Row, lowest, state_of
 from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
@@ -25,10 +28,10 @@ _NEIGHBOURS = (2, 8)
 class SynchronousVectors:
     """Synchronous vectors of one window, or of a baseline at one speed."""
 
-    coordinates: tuple[str, ...]  # whose they are, for example y1, y2, z1, z2
-    vectors: FloatArray  # (2 n,), real parts of the displacements, then their imaginary parts, m
-    covariance: FloatArray  # (2 n, 2 n), from the stochastic part near the speed
-    speed_rad_s: float
+    coordinates: Annotated[tuple[str, ...], Field(min_length=1)]  # whose they are, for example y1, y2, z1, z2
+    vectors: Vector  # (2 n,), real parts of the displacements, then their imaginary parts, m
+    covariance: Covariance  # (2 n, 2 n), from the stochastic part near the speed
+    speed_rad_s: Number
     # Whether angles are those to the phase reference; otherwise only angles between coordinates hold.
     absolute: bool = True
 
@@ -82,15 +85,12 @@ def rotation_of(window: WindowStatistics, coordinates: tuple[str, ...]) -> Synch
 
     Where the speed was estimated from the vibration, angles to the shaft are not known.
     """
-    orders = [lowest(name, window.states) for name in coordinates]
     measured = _synchronous(window)
-    if measured is None or not coordinates or not np.isfinite(window.speed_rad_s):
+    if measured is None or not coordinates or not np.isfinite(window.speed_rad_s) or window.speed_rad_s == 0:
         return None
     slowest, fastest = window.speed_range
-    if fastest - slowest > SPEED_TOLERANCE * window.speed_rad_s:
-        return None
-    known = [order for order in orders if order is not None]
-    if len(known) < len(orders) or window.speed_rad_s == 0:
+    known = [order for name in coordinates if (order := lowest(name, window.states)) is not None]
+    if fastest - slowest > SPEED_TOLERANCE * window.speed_rad_s or len(known) < len(coordinates):
         return None
     columns = [window.states.index(state_of(name, order)) for name, order in zip(coordinates, known, strict=True)]
     to_displacement = (1j * window.speed_rad_s) ** -np.array(known, dtype=np.float64)
@@ -150,12 +150,8 @@ def relative_force(
 ) -> RelativeForce:
     """Compare what the rows leave of synchronous vectors with what they leave of the healthy ones.
 
-    Parameters
-    ----------
-    coefficients : ndarray, shape (n_coefficients,)
-        Of all relations.
-    change : ndarray, shape (n_own,)
-        Of all their own parameters, relative; the healthy machine has none.
+    Coefficients, shape (n_coefficients,), are those of all relations; the relative change, shape (n_own,), that of all
+    their own parameters, of which the healthy machine has none.
     """
     n, n_coordinates = len(rows), len(now.coordinates)
     ratio = np.zeros(n, dtype=np.complex128)
@@ -208,11 +204,7 @@ class ForeignRotationError(EstimationError):
 def combination(design: FloatArray, covariance: FloatArray) -> FloatArray:
     """Weights with which the rows' forces make the vector of the unbalance, shape (2, n_rows).
 
-    Parameters
-    ----------
-    design : ndarray, shape (n_rows, 2)
-    covariance : ndarray, shape (n_rows, n_rows)
-        Of the rows' errors.
+    The design is of shape (n_rows, 2), the covariance of the rows' errors of shape (n_rows, n_rows).
 
     Raises
     ------

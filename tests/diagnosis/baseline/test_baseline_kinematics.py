@@ -93,7 +93,7 @@ def test_what_is_missing_is_said_as_a_place() -> None:
 def test_kernels_differentiate_within_their_passband(deepest: int) -> None:
     lags = np.arange(0, 0.1255, 0.001)
     shape = shape_for(deepest, 150.0, 1.0)
-    over = kernels(lags, 0.03, shape, deepest)
+    over = kernels(lags.tobytes(), 0.03, shape, deepest)
     edge = passband_hz(deepest, 150.0, 1.0)
     assert 100 < edge <= 150
     for f in (5.0, 30.0, 0.9 * edge):

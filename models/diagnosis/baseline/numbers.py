@@ -1,0 +1,36 @@
+"""Numbers and arrays as a stored baseline has them: finite, and of possible sign and shape."""
+
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import AfterValidator, Field, GetPydanticSchema, PlainSerializer
+
+from models.signals.block import FloatArray
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_Rows = tuple[tuple[Number, ...], ...]
+
+
+def _array(rows: tuple[Any, ...]) -> FloatArray:
+    return np.array(rows, dtype=np.float64)
+
+
+def _square(rows: _Rows) -> _Rows:
+    if any(len(row) != len(rows) for row in rows):
+        raise ValueError(f"not {len(rows)} by {len(rows)}")
+    if any(row[at] < 0 for at, row in enumerate(rows)):
+        raise ValueError("a value on the diagonal is negative")
+    return rows
+
+
+def _stored(kind: object) -> GetPydanticSchema:
+    """Say that an array is stored as nested numbers."""
+    as_numbers = Annotated[kind, AfterValidator(_array), PlainSerializer(np.ndarray.tolist)]  # type: ignore[valid-type]
+    return GetPydanticSchema(lambda _, handler: handler(as_numbers))
+
+
+Vector = Annotated[FloatArray, _stored(tuple[Number, ...])]
+Covariance = Annotated[FloatArray, _stored(Annotated[_Rows, AfterValidator(_square)])]
+Spectra = Annotated[FloatArray, _stored(tuple[Annotated[_Rows, AfterValidator(_square)], ...])]
