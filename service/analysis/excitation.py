@@ -113,7 +113,7 @@ def excitation_of(machine: Machine, window: WindowStatistics) -> Excitation:
     try:
         # Trial points may lie far out; what comes of them is checked, not warned of.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            start = starting_point(model, observed, search.centre, speed)
+            start = starting_point(model, observed, search.weights.centre, speed)
             theta = search.maximise(start, _STEPS, _NEAR, _GAIN).theta
     except np.linalg.LinAlgError as error:
         raise EstimationError(

@@ -8,6 +8,7 @@ the paper's: the theory compared with is Eqs. (1)-(12) and (17)-(18).
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -49,14 +50,8 @@ class LikelihoodFit:
     """Fits window after window, each from where the last one ended.
 
     The state kept between windows is the starting point, how alike the forces' colours were, and the slopes of the last
-    search, with which windows that differ little from it are followed.
-
-    Parameters
-    ----------
-    follow : bool
-        Whether windows that follow each other overlap, so that they may be followed.
-    sized : bool
-        Whether the size of the unbalance is read without a phase reference, too.
+    search, with which windows that differ little from it are followed. They may be followed if windows that come one
+    after the other overlap (`follow`). If `sized`, the size of the unbalance is read without a phase reference, too.
     """
 
     by = "likelihood"
@@ -144,7 +139,7 @@ class LikelihoodFit:
             )
         motions = Motions(states, checked(arrays, "scale", np.float64, (len(states),)))
         force_scale = float(checked(arrays, "force_scale", np.float64, ()))
-        model = SpectralModel(self._machine, motions, self._grouped(frequencies_hz, excluded, 1.0), force_scale)
+        model = SpectralModel(self._machine, motions, self._grouped(frequencies_hz, excluded), force_scale)
         strength = float(checked(arrays, "line_strength", np.float64, ()))
         weights = Weights(model, segments, self._usual_cutoff_hz, strength)
         return Linearised.restored(model, weights, unprefixed("line", arrays))
@@ -163,7 +158,7 @@ class LikelihoodFit:
         speed = self._speed(window)
         excluded = _near_lines(window, speed)
         power = self._checked_power(window, ~excluded)
-        states = self._grouped(window.frequencies_hz, excluded, 1.0).average(window.spectrum)
+        states = self._grouped(window.frequencies_hz, excluded).average(window.spectrum)
         no_maximum = f"{self._machine.name}: the likelihood has no maximum for this window: {_OUTSIDE}"
         try:
             # Trial points may lie far out; what comes of them is checked, not warned of.
@@ -214,24 +209,16 @@ class LikelihoodFit:
         return replace(diagnosis, parameters=read.parameters, covariance=read.covariance, unbalance=read.unbalance)
 
     def glance(self, stretch: WindowStatistics) -> Diagnosis | None:
-        """Read a short stretch of the latest window by one step from the window's maximum.
+        """Read a short stretch, latest hops of the window diagnosed last, by one step from the window's maximum.
 
-        Parameters
-        ----------
-        stretch : WindowStatistics
-            Latest hops of the window that was diagnosed last.
-
-        Returns
-        -------
-        Diagnosis or None
-            None if there is no such window, or the stretch says anything that the window does not: diagnose it then.
-            Whether the stretch is outside the model is not tested closely, so there is no misfit.
+        None if there is no such window, or the stretch says anything that the window does not: diagnose it then.
+        Whether the stretch is outside the model is not tested closely, so there is no misfit.
         """
         stretch = integrated(stretch)
         line, speed = self._line, self._speed(stretch)
         if line is None:
             return None
-        groups = self._grouped(stretch.frequencies_hz, _near_lines(stretch, speed), 1.0)
+        groups = self._grouped(stretch.frequencies_hz, _near_lines(stretch, speed))
         if not groups.same_as(line.model.groups) or stretch.states != line.model.motions.states:
             return None
         seen = line.glance(_observed(line.model, stretch), stretch.n_segments / self._line_segments)
@@ -321,7 +308,13 @@ class LikelihoodFit:
     ) -> tuple[SpectralModel, Weights, Maximum]:
         found = None
         line, self._line = self._line, None
-        if line is not None and self._followed < _FOLLOWED and self._alike(line, window, excluded):
+        if (
+            line is not None
+            and self._followed < _FOLLOWED
+            and window.n_segments == self._line_segments
+            and window.states == line.model.motions.states
+            and self._grouped(window.frequencies_hz, excluded).same_as(line.model.groups)
+        ):
             self._followed += 1
             found = line.follow(line.model.observed(states), speed, _NEAR, _GAIN)
             if found is not None:
@@ -329,7 +322,9 @@ class LikelihoodFit:
                 return line.model, line.weights, found
             search = self._search(line.model, window, speed, self._strength)
             # The same units, and the first step's derivatives are those at which the last search ended.
-            model, found = line.model, _searched(search, line)
+            model = line.model
+            with suppress(np.linalg.LinAlgError):  # unless that makes no valid spectrum for this window
+                found = search.maximise(line.theta, _WARM_STEPS, _NEAR, _GAIN, line.derivatives)
         if found is None:
             model, search, found = self._maximise(window, excluded, scale, speed)
             self._followed = 0
@@ -337,14 +332,6 @@ class LikelihoodFit:
             self._line, self._line_segments = Linearised.around(model, search.weights, found), window.n_segments
             self._line_band = window.frequencies_hz, excluded
         return model, search.weights, found
-
-    def _alike(self, line: Linearised, window: WindowStatistics, excluded: npt.NDArray[np.bool_]) -> bool:
-        """Whether a window has the size, the channels and the frequencies of the last search."""
-        return (
-            window.n_segments == self._line_segments
-            and window.states == line.model.motions.states
-            and self._grouped(window.frequencies_hz, excluded, 1.0).same_as(line.model.groups)
-        )
 
     def _checked_power(self, window: WindowStatistics, used: npt.NDArray[np.bool_]) -> FloatArray:
         """Mean density of every state; raises EstimationError for dead or doubled channels."""
@@ -355,11 +342,9 @@ class LikelihoodFit:
             )
         observed = window.spectrum[used]
         power = np.einsum("fii->i", observed).real / observed.shape[0]
-        twins = _twins(window.states, observed)
-        if twins:
+        if twins := _twins(window.states, observed):
             raise EstimationError(f"{self._machine.name}: channels {' and '.join(twins)} carry the same signal")
-        dead = _dead(window.states, power)
-        if dead:
+        if dead := _dead(window.states, power):
             raise EstimationError(
                 f"{self._machine.name}: no fluctuation in {', '.join(dead)}: nothing to compare with theory"
             )
@@ -369,7 +354,7 @@ class LikelihoodFit:
         self, window: WindowStatistics, excluded: npt.NDArray[np.bool_], scale: FloatArray, speed: float
     ) -> tuple[SpectralModel, FisherScoring, Maximum]:
         """Search from the last window's maximum, or cold: first on coarse groups with one low-pass for all forces."""
-        groups = self._grouped(window.frequencies_hz, excluded, 1.0)
+        groups = self._grouped(window.frequencies_hz, excluded)
         motions = Motions(window.states, scale)
         force_scale = usual_force(self._machine, motions, groups, speed, self._usual_cutoff_hz)
         model = SpectralModel(self._machine, motions, groups, force_scale)
@@ -383,9 +368,9 @@ class LikelihoodFit:
         wide = self._grouped(window.frequencies_hz, excluded, _COARSE)
         coarse = SpectralModel(self._machine, motions, wide, force_scale, shapes=0)
         first = self._search(coarse, window, speed)
-        start = starting_point(coarse, _observed(coarse, window), first.centre, speed)
+        start = starting_point(coarse, _observed(coarse, window), first.weights.centre, speed)
         near = first.maximise(start, _COARSE_STEPS, _COARSE_NEAR, _COARSE_GAIN).theta
-        theta = search.centre.copy()
+        theta = search.weights.centre.copy()
         theta[: coarse.colour_at.stop], theta[model.level_at] = near[: coarse.colour_at.stop], near[coarse.level_at]
         states = groups.average(window.spectrum)
 
@@ -400,7 +385,7 @@ class LikelihoodFit:
         observed = _observed(model, window)
         return FisherScoring(model, observed, window.n_segments, speed, self._usual_cutoff_hz, strength)
 
-    def _grouped(self, frequencies_hz: FloatArray, excluded: npt.NDArray[np.bool_], coarser: float) -> BinGroups:
+    def _grouped(self, frequencies_hz: FloatArray, excluded: npt.NDArray[np.bool_], coarser: float = 1.0) -> BinGroups:
         """Groups for frequencies and excluded bins, remembered while the speed stays in the same bin."""
         key = frequencies_hz.tobytes() + excluded.tobytes() + bytes([int(coarser)])
         if key not in self._groups:
@@ -428,14 +413,6 @@ class LikelihoodFit:
             f"{self._machine.name}: it would take a shaft {100 * change:.0f} % stiffer than that of the machine file, "
             "which no fault causes: the file's masses or lengths are not those of this machine, or its shaft is not"
         )
-
-
-def _searched(search: FisherScoring, line: Linearised) -> Maximum | None:
-    """Search from where the last search ended; None if that makes no valid spectrum for this window."""
-    try:
-        return search.maximise(line.theta, _WARM_STEPS, _NEAR, _GAIN, line.derivatives)
-    except np.linalg.LinAlgError:
-        return None
 
 
 def _observed(model: SpectralModel, window: WindowStatistics) -> ComplexArray:

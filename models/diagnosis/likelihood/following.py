@@ -56,18 +56,8 @@ class Glance:
 class Linearised:
     """The spectra around the maximum of the last search, and where the maximum has moved since.
 
-    Parameters
-    ----------
-    weights : Weights
-        Those of the search that ended there.
-    searched : Expected
-        Where it ended.
-    point : Expected
-        Where the maximum is now.
-    derivatives : Derivatives
-        At the search's end.
-    left : ndarray, shape (n_levels,)
-        What the search left of the data's gradient by the levels.
+    The search had these weights, ended at `searched` with these derivatives, and left `left`, shape (n_levels,), of the
+    data's gradient by the levels; the maximum is at `point` now.
     """
 
     def __init__(
@@ -150,14 +140,9 @@ class Linearised:
         )
 
     def follow(self, observed: ComplexArray, speed_rad_s: float, near: float, gain: float) -> Maximum | None:
-        """Solve for the next window's estimated spectra; None where a new search is due.
+        """Solve for the next window's estimated spectra, in the units of the model; None where a new search is due.
 
-        Parameters
-        ----------
-        observed : ndarray, shape (n_groups, n, n)
-            In the units of the model.
-        near, gain : float
-            As `FisherScoring.maximise` has them.
+        It has converged as `FisherScoring.maximise` says, which `near` and `gain` are from.
         """
         model, point = self.model, self._point
         there: ModelPoint | None = None
@@ -166,7 +151,8 @@ class Linearised:
         errors = np.sqrt(np.diag(covariance)[diagnosed])
         before = np.inf
         for steps in range(_MOST_STEPS + 1):
-            gradient = self._pulled(self._gradient(self._whitened(observed - point.S)), point, 1.0)
+            rest = self._whitened(observed - point.S)
+            gradient = self._pulled(_gradient(self.derivatives.slopes, rest, self.weights), point, 1.0)
             step = np.asarray(covariance @ gradient, dtype=np.float64)
             left = float(gradient @ step) / 2
             if np.all(np.abs(step[diagnosed]) < near * errors) and left < gain:
@@ -198,18 +184,10 @@ class Linearised:
         return None
 
     def glance(self, observed: ComplexArray, share: float) -> Glance | None:
-        """Take one step from the latest maximum; None if the stretch says anything new.
-
-        Parameters
-        ----------
-        observed : ndarray, shape (n_groups, n, n)
-            Of the stretch.
-        share : float
-            Its segments over those of the window.
-        """
+        """Take one step from the latest maximum; None if the stretch, a share of the window's segments, is news."""
         model, point = self.model, self._point
         rest = self._whitened(observed - point.S)
-        gradient = self._gradient(rest)
+        gradient = _gradient(self.derivatives.slopes, rest, self.weights)
         covariance = self._inverse(share)
         step = covariance @ self._pulled(gradient, point, share)
         diagnosed = slice(model.cutoff_at)
@@ -230,10 +208,6 @@ class Linearised:
     def _whitened(self, difference: ComplexArray) -> FloatArray:
         """L₀⁻¹ X L₀⁻ᴴ, packed, shape (n_groups, n²)."""
         return packed(self._L_inverse @ difference @ self._L_inverse.conj().swapaxes(1, 2))
-
-    def _gradient(self, rest: FloatArray) -> FloatArray:
-        """What the data say about every parameter, levels by C."""
-        return _gradient(self.derivatives.slopes, rest, self.weights)
 
     def _pulled(self, gradient: FloatArray, point: Expected, share: float) -> FloatArray:
         """The gradient of a share of the data with the pulls."""
@@ -263,5 +237,6 @@ class Linearised:
 
 
 def _gradient(slopes: FloatArray, rest: FloatArray, weights: Weights) -> FloatArray:
+    """What the data say about every parameter, levels by C."""
     weighted = (rest * weights.averages[:, None]).ravel()
     return np.asarray(slopes.reshape(slopes.shape[0], -1) @ weighted, dtype=np.float64)

@@ -39,19 +39,17 @@ def goodness_of_fit(
 ) -> Goodness:
     """Try the alternatives at the maximum of one window.
 
-    Parameters
-    ----------
-    states : ndarray, shape (n_groups, n_states, n_states)
-        Estimated cross-spectra of the states, SI: displacement and velocity are compared with each other, too.
+    The estimated cross-spectra of the states, SI, are of shape (n_groups, n_states, n_states): displacement and
+    velocity are compared with each other, too.
     """
     names, slopes = _alternatives(machine, model, found)
-    excess = packed(found.whitened.excess)
+    seen = packed(found.whitened.excess)
     weight = weights.averages[:, None]
     flat = found.slopes.reshape(model.size, -1)
     weighted = (slopes * weight).reshape(len(names), -1)
     cross = weighted @ flat.T
     projection = np.linalg.solve(found.information, cross.T).T
-    score = weighted @ excess.ravel() - projection @ (flat @ (excess * weight).ravel())
+    score = weighted @ seen.ravel() - projection @ (flat @ (seen * weight).ravel())
     alone = np.einsum("af,af->a", weighted, slopes.reshape(len(names), -1))
     left = alone - np.einsum("ap,ap->a", projection, cross)
     alternatives = tuple(
@@ -63,7 +61,12 @@ def goodness_of_fit(
     pairs = [_named(mismatch, {one.name: one for one in alternatives}) for mismatch in mismatches]
     # The gains of a pair are nearly one test, and how far the pair disagrees is hardly random.
     tests = len(alternatives) - len(pairs) + 1
-    over, scatter = _excess(model, weights, found)
+    # Σ ν ‖L⁻¹ŜL⁻ᴴ - I‖² over its expectation, and its standard deviation. Where the model holds every element scatters
+    # as the groups say, less one for every parameter that was fitted.
+    shared, excess = model.groups.shared, found.whitened.excess
+    total = float(weights.averages @ np.einsum("fij,fji->f", excess, excess).real)
+    over = total - (model.n**2 * float(np.trace(shared)) - found.fitted)
+    scatter = float(model.n * np.sqrt(2 * np.sum(shared**2)))
     return Goodness(over / scatter, (*alternatives, *pairs), tests, over)
 
 
@@ -74,17 +77,6 @@ def _named(mismatch: Mismatch, alternatives: dict[str, AlternativeTest]) -> Alte
     if z_x > z_v:
         return AlternativeTest(x, mismatch.z, 1 / (1 + mismatch.change) - 1, mismatch.states)
     return AlternativeTest(v, mismatch.z, mismatch.change, mismatch.states)
-
-
-def _excess(model: SpectralModel, weights: Weights, found: Maximum) -> tuple[float, float]:
-    """Σ ν ‖L⁻¹ŜL⁻ᴴ - I‖² over its expectation, and its standard deviation.
-
-    Where the model holds every element scatters as the groups say, less one for every parameter that was fitted.
-    """
-    shared, excess = model.groups.shared, found.whitened.excess
-    total = float(weights.averages @ np.einsum("fij,fji->f", excess, excess).real)
-    expected = model.n**2 * float(np.trace(shared)) - found.fitted
-    return total - expected, float(model.n * np.sqrt(2 * np.sum(shared**2)))
 
 
 def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tuple[list[str], FloatArray]:
@@ -111,10 +103,7 @@ def _of_sensors(
 ) -> tuple[list[str], FloatArray]:
     """Names and packed slopes of what may be wrong with sensors: what each shows besides of which motion, or how late.
 
-    Parameters
-    ----------
-    coloured : ndarray, shape (n_groups, n, n)
-        SL⁻ᴴ.
+    `coloured` is SL⁻ᴴ.
     """
     motions, w = model.motions, model.centre
     names, at_once, weights, by, shown, into = _tried(tuple(machine.sensors), motions.states)
@@ -194,12 +183,8 @@ def unexplained_at(
 ) -> tuple[str, bool]:
     """Why nothing at this point means anything, if so, and whether nothing within the model comes near the window.
 
-    Parameters
-    ----------
-    states : ndarray, shape (n_groups, n_states, n_states)
-        Estimated cross-spectra of the states, SI.
-    times : float
-        So many times what is evaluated counts as too much.
+    The estimated cross-spectra of the states, SI, are of shape (n_groups, n_states, n_states); so many `times` what is
+    evaluated counts as too much.
     """
     excess, point, bins = reached.excess, reached.point, model.groups.bins
     squared = np.einsum("fij,fij->f", excess, excess.conj()).real / model.n**2

@@ -1,4 +1,4 @@
-"""One fit for the window and one for every shorter length that has news, and which lengths may have any."""
+"""The fits of a window and of its latest hops."""
 
 from collections.abc import Mapping
 
@@ -15,7 +15,7 @@ from models.machine import Machine
 
 
 class LengthFits:
-    """One fit for the window, and one for every shorter length that has news."""
+    """One fit for the window, and one for every shorter length that has news; and which lengths may have any."""
 
     def __init__(self, machine: Machine, *, sized: bool = False) -> None:
         self._machine, self._sized = machine, sized
@@ -89,10 +89,7 @@ class LengthFits:
     def short(self, hops: int, stretch: WindowStatistics, *, closely: bool = False) -> Diagnosis:
         """Estimate the parameters of the window's latest hops: at a glance if they say what the window says.
 
-        Parameters
-        ----------
-        closely : bool
-            Not at a glance, which does not say whether the stretch is outside the model.
+        If `closely`, not at a glance, which does not say whether the stretch is outside the model.
 
         Raises
         ------

@@ -104,16 +104,9 @@ def natural_frequencies(machine: Machine) -> tuple[FloatArray, FloatArray]:
 def group_bins(
     frequencies_hz: FloatArray, machine: Machine, excluded: npt.NDArray[np.bool_], widest_hz: float
 ) -> BinGroups:
-    """Group bins: narrow near the modes, at most `widest_hz` elsewhere.
+    """Group evenly spaced bins: narrow near the machine's nominal modes, at most `widest_hz` elsewhere.
 
-    Parameters
-    ----------
-    frequencies_hz : ndarray, shape (n_bins,)
-        Evenly spaced.
-    machine : Machine
-        Its nominal modes say where spectra are narrow.
-    excluded : ndarray of bool, shape (n_bins,)
-        Bins that belong to no group.
+    Bins that are excluded, shape (n_bins,), belong to no group.
     """
     spacing = frequencies_hz[1] - frequencies_hz[0]
     modes_hz, damping = natural_frequencies(machine)
@@ -183,10 +176,8 @@ class Mismatch:
 class Motions:
     """Measured degrees of freedom, and how the measured states make them.
 
-    Parameters
-    ----------
-    scale : ndarray, shape (n_states,)
-        Unit of each, in the ratio of the sensors' noise: the mean amplitude in the band, for want of better.
+    The scale, shape (n_states,), is the unit of each, in the ratio of the sensors' noise: the mean amplitude in the
+    band, for want of better.
     """
 
     def __init__(self, states: tuple[str, ...], scale: FloatArray) -> None:
@@ -211,14 +202,9 @@ class Motions:
         )
 
     def factor(self, w: FloatArray, centre: FloatArray) -> ComplexArray:
-        """What a displacement of one, at frequency w, makes of each motion, shape (*w.shape, n).
+        """What a displacement of one, at angular frequencies w, rad/s, makes of each motion, shape (*w.shape, n).
 
-        Parameters
-        ----------
-        w : ndarray
-            Angular frequencies, rad/s.
-        centre : ndarray, broadcast to the shape of w
-            Frequency the states are combined for: that of the group w is seen in.
+        The states are combined for a frequency of their own, the centre, that of the group w is seen in.
         """
         at_centre = self._r(centre)
         pair = (1 + at_centre * self._r(w)) / np.sqrt(1 + at_centre**2)
@@ -257,11 +243,7 @@ class Motions:
     def rest(self, states: ComplexArray, w: FloatArray) -> FloatArray:
         """Power of what the two sensors of a motion do not share, shape (n_groups, n); infinite where there is one.
 
-        Parameters
-        ----------
-        states : ndarray, shape (n_groups, n_states, n_states)
-            Cross-spectra of the states, SI.
-        w : ndarray, shape (n_groups,)
+        The cross-spectra of the states, SI, are of shape (n_groups, n_states, n_states).
         """
         r = self._r(w)
         left = np.full(r.shape, np.inf)
@@ -279,13 +261,8 @@ class Motions:
         With gains 1 and 1 + δ the rest d = (v - jr x)/√(1 + r²) of a pair holds jr δ z/(1 + r²) of its motion z; δ is
         the least-squares regression of d on that, with standard error from what of d remains.
 
-        Parameters
-        ----------
-        states : ndarray, shape (n_groups, n_states, n_states)
-            Cross-spectra of the states, SI.
-        w : ndarray, shape (n_groups,)
-        averages : ndarray, shape (n_groups,)
-            Independent averages they are made of.
+        The cross-spectra of the states, SI, are of shape (n_groups, n_states, n_states), each group of so many
+        independent averages.
         """
         both = np.flatnonzero(self._has_x & self._has_v)
         r, x, v = self._r(w)[:, both], self._x[both], self._v[both]

@@ -68,14 +68,9 @@ class Maximum:
 class Weights:
     """How much a window's data count, and how strongly usual values pull at what they leave undetermined.
 
-    Parameters
-    ----------
-    n_segments : int
-        Segments the estimated spectra are averaged over.
-    usual_cutoff_hz : float
-        Where the cutoff is pulled, weakly, if the band does not show it.
-    strength : float, optional
-        How strongly the forces' own colours are pulled towards none; the weakest pull without it.
+    Estimated spectra are averaged over so many segments. The cutoff is pulled, weakly, to the usual one, if the band
+    does not show it; the strength is that with which the forces' own colours are pulled towards none, by default the
+    weakest.
     """
 
     def __init__(
@@ -116,15 +111,8 @@ class FisherScoring:
 
     The levels move as T of C = T Tᵀ. Where the data want less of a direction than there is, T's own curvature is added
     to the information; without it the small columns of an excitation of low rank overshoot, and every other parameter
-    waits for them.
-
-    Parameters
-    ----------
-    observed : ndarray, shape (n_groups, n, n)
-        Estimated cross-spectra in units of the model's scale.
-    strength : float, optional
-        How strongly the forces' own colours are pulled towards none until the window itself has said so; the weakest
-        pull without it.
+    waits for them. The estimated cross-spectra, shape (n_groups, n, n), are in units of the model's scale. The strength
+    (`Weights`) holds until the window itself has said how strong it is.
     """
 
     def __init__(
@@ -140,11 +128,6 @@ class FisherScoring:
         self.weights = Weights(model, n_segments, usual_cutoff_hz, strength)
         shape = (model.size, model.groups.bins.size, model.n * model.n)
         self._slopes, self._weighted = np.empty(shape), np.empty(shape)  # filled by every step
-
-    @property
-    def centre(self) -> FloatArray:
-        """Usual values of all parameters."""
-        return self.weights.centre
 
     def maximise(
         self,

@@ -81,14 +81,8 @@ class SpectralModel:
     cutoff (Hz) and order, the logarithms of the noise densities of the measured states (in units of `scale`² per
     Hz), their exponents b, the shape coefficients a (polynomial by polynomial), and the lower triangle of T.
 
-    Parameters
-    ----------
-    motions : Motions
-        What is measured, in units that make all spectra of the order of one.
-    force_scale : float
-        Unit of forces, N/√Hz, so that the elements of C are of the order of one.
-    shapes : int
-        Polynomials of the forces' colour; 0 leaves one low-pass for all.
+    The motions are measured in units that make all spectra of the order of one, and forces in `force_scale`, N/√Hz,
+    that makes the elements of C so. No polynomials of the forces' colour (`shapes`) leave one low-pass for all.
     """
 
     def __init__(
@@ -138,14 +132,9 @@ class SpectralModel:
         self._combined: ComplexArray | None = None
 
     def receptance(self, structural: FloatArray, speed_rad_s: float, w: FloatArray) -> ComplexArray:
-        """H(ω) = (-ω²M + jωP + Q)⁻¹ in SI units, shape (n_frequencies, 6, 6).
+        """H(ω) = (-ω²M + jωP + Q)⁻¹ in SI units, shape (n_frequencies, 6, 6), at angular frequencies w, rad/s.
 
-        Parameters
-        ----------
-        structural : ndarray, shape (5,)
-            Logarithmic ratios of `STRUCTURAL` to nominal.
-        w : ndarray, shape (n_frequencies,)
-            Angular frequencies, rad/s.
+        `structural`, shape (5,), are the logarithmic ratios of `STRUCTURAL` to nominal.
         """
         change = self._bearing * np.expm1(structural[:4])
         Q = self._Q + self._Q_shaft * np.expm1(structural[4])
@@ -220,14 +209,8 @@ class SpectralModel:
         """L⁻¹ (∂S/∂θ_a) L⁻ᴴ of every parameter a, packed, shape (size, n_groups, n²).
 
         The last 21 are by the elements of C, not of T. With ∂H = -H ∂D H every structural derivative, and
-        every level's, is an outer product of columns of G and of G C Hᴴ plus its conjugate transpose.
-
-        Parameters
-        ----------
-        L_inverse : ndarray, shape (n_groups, n, n)
-            Inverse Cholesky factors of the spectra.
-        out : ndarray, shape (size, n_groups, n²), optional
-            Where to put them: megabytes, better not allocated at every step.
+        every level's, is an outer product of columns of G and of G C Hᴴ plus its conjugate transpose. `out` is where to
+        put them: megabytes, better not allocated at every step.
         """
         theta = point.theta
         whitened = L_inverse[:, None] @ point.G
@@ -258,13 +241,7 @@ class SpectralModel:
         return out
 
     def sides(self, point: ModelPoint, whitened: ComplexArray, response: ComplexArray) -> "Sides":
-        """What stands on either side of a change of the dynamic matrix.
-
-        Parameters
-        ----------
-        whitened, response : ndarray, shape (n_groups, n_nodes, n, 6)
-            L⁻¹G and L⁻¹GC.
-        """
+        """What stands on either side of a change of the dynamic matrix, from L⁻¹G and its response L⁻¹GC."""
         return Sides(whitened * (1 / point.unit), response.conj() @ point.H.swapaxes(2, 3))
 
 
@@ -280,14 +257,8 @@ class Sides:
     ) -> FloatArray:
         """Packed slope of the spectra by a change of the dynamic matrix, sign reversed.
 
-        Parameters
-        ----------
-        factor : ndarray, shape (n_groups, n_nodes)
-            What changes, times `change`.
-        dofs : slice
-            Degrees of freedom whose rows and columns change.
-        change : ndarray, shape (n_dofs, n_dofs), optional
-            Symmetric; the diagonal alone, by one, without it.
+        Rows and columns of the degrees of freedom change by `factor`, shape (n_groups, n_nodes), times `change`,
+        symmetric and of shape (n_dofs, n_dofs), or times one on the diagonal without it.
         """
         n_groups, _, n, _ = self.left.shape
         moved = self.left[..., dofs] * factor[..., None, None]
@@ -378,14 +349,7 @@ def starting_point(model: SpectralModel, observed: ComplexArray, centre: FloatAr
     """Guess the excitation with the nominal rotor.
 
     Forces follow from the response through the regularised inverse of G, bin group by bin group; their mean, divided by
-    the low-pass that fits its trace best, is the level matrix.
-
-    Parameters
-    ----------
-    observed : ndarray, shape (n_groups, n, n)
-        Estimated cross-spectra in units of the model's scale.
-    centre : ndarray, shape (size,)
-        Usual values of everything else.
+    the low-pass that fits its trace best, is the level matrix. Everything else has its usual value, from the centre.
     """
     groups = model.groups
     w = 2 * np.pi * groups.centre_hz

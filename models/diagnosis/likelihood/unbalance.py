@@ -85,10 +85,8 @@ def estimate_unbalance(
 
     Parameters
     ----------
-    point : Expected
-        The model's spectra at the estimate.
     covariance : ndarray, shape (5, 5)
-        Of the logarithmic ratios of the structural parameters.
+        Of the logarithmic ratios of the structural parameters at the estimate, `point`.
     synchronous : ndarray of complex, shape (n_states,)
         q, SI.
     sized : bool
@@ -157,16 +155,9 @@ def _contradiction(observed: FloatArray, design: FloatArray, spread: FloatArray,
     the machine are large and of either sign, make many times as much of them (R. C. Paule and J. Mandel, Journal of
     Research of the National Bureau of Standards 87 (1982)).
 
-    Parameters
-    ----------
-    observed : ndarray, shape (2n,)
-        Real parts of the vectors, then imaginary ones.
-    design : ndarray, shape (2n, 2)
-        Those of the nominal unbalance, and of it turned by 90°.
-    spread : ndarray, shape (2n, 2n)
-        Covariance of what was observed, by chance.
-    size : ndarray, shape (n,)
-        What the error is relative to.
+    Observed are real parts of the vectors, then imaginary ones, shape (2n,), with `spread` as their covariance by
+    chance; the design, shape (2n, 2), holds those of the nominal unbalance, and of it turned by 90°; the error is
+    relative to the size, shape (n,).
     """
     relative = np.diag(np.tile(size**2 / 2, 2))
 
@@ -198,19 +189,8 @@ def estimate_unbalance_by_hop(
 ) -> Unbalance:
     """Estimate e where the speed varies: every hop at its own speed, with its own vector.
 
-    The hops' own errors are independent; that of the structural parameters is one for all.
-
-    Parameters
-    ----------
-    machine, model, point, covariance
-        As for `estimate_unbalance`.
-    hop_synchronous : ndarray of complex, shape (n_hops, n_states)
-    hop_speed_rad_s : ndarray, shape (n_hops,)
-    directed : bool
-        See `UnbalanceRatios.decided`.
-    sized : bool
-        Whether the vectors of a hop are from an unknown angle, and so is the way in which the shaft turns: that which
-        explains more of them.
+    The hops' own errors are independent; that of the structural parameters is one for all. If `sized`, the vectors of a
+    hop are from an unknown angle, and so is the way in which the shaft turns: that which explains more of them.
 
     Raises
     ------

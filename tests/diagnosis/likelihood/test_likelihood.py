@@ -116,7 +116,7 @@ def test_the_score_is_the_slope_of_the_likelihood() -> None:
     observed = model.motions.spectra(groups.average(window.spectrum), model.centre)
     search = FisherScoring(model, observed, window.n_segments, window.speed_rad_s, 80.0)
     rng = np.random.default_rng(1)
-    theta = search.centre + rng.normal(0, 0.1, model.size)
+    theta = search.weights.centre + rng.normal(0, 0.1, model.size)
     theta[model.level_at] += np.eye(6)[ROWS, COLUMNS]
     _, whitened = search._value(theta)
     gradient = search._scores(theta, sure(whitened))[0]
