@@ -7,7 +7,7 @@ import numpy as np
 
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.equations import EQUATIONS, Equation, SynchronousEquation
-from models.diagnosis.networks.relation import EquationNetwork, read_equation, window_view
+from models.diagnosis.networks.relation import EquationNetwork, not_read, read_equation, window_view
 from models.diagnosis.window.moments import ComplexArray, plan_for
 from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
@@ -95,12 +95,7 @@ def _panel(
     synchronous = isinstance(equation, SynchronousEquation)
     target = "R[n,disc]" if isinstance(equation, SynchronousEquation) else equation.target.name
     over = "angle" if synchronous else "lag"
-    if trained is None:
-        reading = EquationReading(
-            equation=equation.number, title=equation.title, evaluable=False, reason="no trained network"
-        )
-    else:
-        reading = read_equation(trained, window, machine)
+    reading = not_read(equation, "no trained network") if trained is None else read_equation(trained, window, machine)
     if trained is None or reading.reason:
         return Panel(target, over, np.empty(0), (), reading)
     view = window_view(window, machine)

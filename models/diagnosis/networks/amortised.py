@@ -10,12 +10,11 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, Field
+from scipy.linalg import block_diag
 
 from models.diagnosis.networks.features import FeatureBasis, Float32Array, ForceFeatures
 from models.diagnosis.readings import Diagnosis, beyond, no_reading, parameter_reading
-from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS, changed
@@ -120,12 +119,8 @@ class NetworkDiagnostician:
     def inputs(self, window: WindowStatistics) -> tuple[Float32Array, float] | None:
         """What the first reading looks at; None if a state the networks were trained with is not in the window.
 
-        Returns
-        -------
-        inputs : ndarray, shape (1, n_inputs)
-            Standardised; those of equation 29 only with a phase reference.
-        coherence : float
-            Mean squared coherence of the forces on the nominal machine, over all pairs and frequencies, 0 to 1.
+        Standardised inputs, shape (1, n_inputs), those of equation 29 only with a phase reference, and the mean squared
+        coherence of the forces on the nominal machine, over all pairs and frequencies, 0 to 1.
         """
         if any(name not in window.states for name in self._amortised.states):
             return None
@@ -138,7 +133,11 @@ class NetworkDiagnostician:
         self, window: WindowStatistics, basis: FeatureBasis, features: ForceFeatures, centre: Float32Array
     ) -> tuple[Float32Array, Float32Array]:
         """Standardised inputs, and the functions of frequency that they condense."""
-        spectrum, synchronous = self._measured(window)
+        spectrum, synchronous = window.spectrum_without_lines[None], window.synchronous
+        if window.states != self._amortised.states:
+            columns = [window.states.index(name) for name in self._amortised.states]
+            spectrum = spectrum[:, :, columns][:, :, :, columns]
+            synchronous = None if synchronous is None else synchronous[columns]
         speed = np.array([window.speed_rad_s])
         series = features.series(features.force(spectrum))
         parts = [basis.condensed(series), centre, features.consistency(spectrum, speed)]
@@ -150,11 +149,6 @@ class NetworkDiagnostician:
         """Mean and Cholesky factor of the logarithmic ratios, not calibrated, of every equation that has its inputs.
 
         Those of the second reading, unless a parameter is too vague in the first, or out of range in either.
-
-        Parameters
-        ----------
-        inputs : ndarray, shape (1, n_inputs)
-            From `inputs`.
         """
         first, near = _stated(self._amortised.networks, inputs), self._amortised.near
         if near is None:
@@ -172,15 +166,6 @@ class NetworkDiagnostician:
         if not all(np.all(np.abs(mean) <= trained[own[name]]) for name, (mean, _) in remainder.items()):
             return first
         return {name: (centre[own[name]] + mean, factor) for name, (mean, factor) in remainder.items()}
-
-    def _measured(self, window: WindowStatistics) -> tuple[ComplexArray, ComplexArray | None]:
-        """Spectra, shape (1, n_bins, n, n), and rotation-synchronous vectors of the states trained with."""
-        wanted, synchronous = self._amortised.states, window.synchronous
-        spectrum = window.spectrum_without_lines[None]
-        if wanted == window.states:
-            return spectrum, synchronous
-        columns = [window.states.index(name) for name in wanted]
-        return spectrum[:, :, columns][:, :, :, columns], None if synchronous is None else synchronous[columns]
 
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Judge one window; never raises: what cannot be read carries its reason."""
@@ -200,7 +185,7 @@ class NetworkDiagnostician:
                 f"the window is unlike what the networks were trained on ({text} apart, evaluation limit {limit})"
             )
         readings: list[Parameter] = []
-        blocks: list[FloatArray] = []
+        blocks: list[FloatArray] = [np.empty((0, 0))]
         calibration = amortised.calibration_at(coherence)
         stated = self.stated(window, inputs)
         for network in amortised.networks:
@@ -211,7 +196,7 @@ class NetworkDiagnostician:
             readings += read
             blocks.append(covariance)
         freedom = {name: one.freedom for name, one in calibration.items() if one.freedom is not None}
-        return Diagnosis(self.by, tuple(readings), covariance=_block_diagonal(blocks), freedom=freedom)
+        return Diagnosis(self.by, tuple(readings), covariance=block_diag(*blocks), freedom=freedom)
 
     def _disagreement(self, inputs: Float32Array) -> str:
         """Degrees of freedom of which two sensors tell different things; empty if none."""
@@ -268,13 +253,3 @@ def _stated(networks: tuple[AmortisedNetwork, ...], inputs: Float32Array) -> dic
             mean, factor = network(np.clip(inputs[:, :n_inputs], -LIMIT, LIMIT))
             found[network.equation] = mean[0], factor[0]
     return found
-
-
-def _block_diagonal(blocks: list[FloatArray]) -> FloatArray:
-    size = sum(block.shape[0] for block in blocks)
-    out: npt.NDArray[np.float64] = np.zeros((size, size))
-    at = 0
-    for block in blocks:
-        out[at : at + block.shape[0], at : at + block.shape[0]] = block
-        at += block.shape[0]
-    return out

@@ -34,15 +34,11 @@ _LEAST_GAIN = 0.02
 def calibrate(
     trained: EquationNetwork, healthy: Iterable[WindowStatistics], changed: Sequence[Iterable[Held]], machine: Machine
 ) -> EquationNetwork:
-    """Measure how a relation network reads windows that training did not see.
+    """Measure how a relation network reads windows that training did not see, from seeds of their own.
 
-    Parameters
-    ----------
-    healthy : iterable of WindowStatistics
-        Healthy in the equation's own parameters, from seeds of their own.
-    changed : sequence of iterables of Held
-        Own parameters changed, too; those that the equation takes as unchanged beside them are nominal. One group for
-        every layout of the sources: the one with the heaviest tails decides on the degrees of freedom.
+    The healthy ones are so in the equation's own parameters. In the others own parameters are changed, too; those that
+    the equation takes as unchanged beside them are nominal. They are in one group for every layout of the sources: the
+    one with the heaviest tails decides on the degrees of freedom.
     """
     raw = EquationNetwork(trained.equation, trained.network, None)
     names = trained.equation.parameters
@@ -82,10 +78,7 @@ def calibrate(
 def _relation_errors(groups: Sequence[FloatArray]) -> tuple[float, float, float, float]:
     """Scale, floor, gain and degrees of freedom by maximum likelihood: change = gain · true + error.
 
-    Parameters
-    ----------
-    groups : sequence of ndarray, each of shape (3, n)
-        Change as projected, scatter over the hops, true change.
+    A group, shape (3, n), holds the change as projected, its scatter over the hops, and the true one.
     """
     freedom = min(min((_fitted(group, one)[0], one) for one in _RELATION_FREEDOMS)[1] for group in groups)
     _, scale, floor, gain = _fitted(np.concatenate(groups, axis=1), freedom)
@@ -132,12 +125,7 @@ def calibrate_networks(
     """Measure bias and true size of the amortised networks' standard errors.
 
     One source leaves the forces coherent and independent sources do not: a window shows of which kind it is, and each
-    kind has a calibration of its own.
-
-    Parameters
-    ----------
-    coherent, independent : iterable of Held
-        Windows with one source and with independent ones, from seeds of their own.
+    kind has a calibration of its own, from windows of seeds of their own.
     """
     reader = NetworkDiagnostician(machine, trained)
     calibrated, coherences = [], []

@@ -238,11 +238,5 @@ EQUATIONS: tuple[Equation | SynchronousEquation, ...] = (
 
 
 def missing(equation: Equation | SynchronousEquation, measured: tuple[str, ...]) -> tuple[str, ...]:
-    """What would have to be measured besides, to evaluate an equation.
-
-    Parameters
-    ----------
-    measured : tuple of str
-        Measured states, with ``theta`` for the phase reference.
-    """
+    """What would have to be measured besides, to evaluate an equation, with ``theta`` for the phase reference."""
     return tuple(name for name in equation.channels if name not in measured)

@@ -32,16 +32,11 @@ _LEAST_VARIANCE = 1e-3
 
 
 class ForceFeatures:
-    """Features of one machine's windows before they are condensed.
+    """Features of one machine's windows, of all states that it measures or of some, before they are condensed.
 
-    Parameters
-    ----------
-    states : tuple of str or None
-        Measured states to look at; None takes all that the machine measures.
-    near : bool
-        Make `series` for machines that are nearly nominal. With one source, all forces at a frequency share their
-        sampling error, and it drops out of contrasts of their levels; the imaginary part of a squared coherence shows
-        whether forces lag behind each other, whichever sign they have to each other.
+    `near` is for machines that are nearly nominal. With one source, all forces at a frequency share their sampling
+    error, and it drops out of contrasts of their levels; the imaginary part of a squared coherence shows whether forces
+    lag behind each other, whichever sign they have to each other.
     """
 
     def __init__(self, machine: Machine, states: tuple[str, ...] | None = None, near: bool = False) -> None:
@@ -113,12 +108,7 @@ class ForceFeatures:
     def _to_force(self, w: FloatArray, speed_rad_s: FloatArray) -> ComplexArray:
         """Matrices that turn measured states into equivalent forces, shape (n_frequencies, n_dofs, n).
 
-        Parameters
-        ----------
-        w : ndarray, shape (n_frequencies,)
-            Angular frequencies, rad/s.
-        speed_rad_s : ndarray, shape (n_frequencies,)
-            Speed Ω at each of them.
+        At angular frequencies w, rad/s, with the speed Ω at each of them.
         """
         m, jw = len(self._dofs), 1j * w
         dynamic = (np.stack([np.ones_like(jw), w**2, jw, jw * speed_rad_s], axis=1) @ self._terms).reshape(-1, 6, 6)
@@ -133,10 +123,7 @@ class ForceFeatures:
     def force(self, spectrum: npt.NDArray[np.complexfloating]) -> ComplexArray:
         """Cross-spectra of the equivalent forces, shape (n_windows, n_bins, n_dofs, n_dofs).
 
-        Parameters
-        ----------
-        spectrum : ndarray of complex, shape (n_windows, n_bins, n, n)
-            Cross-spectra of the measured states, SI²/Hz.
+        From those of the measured states, SI²/Hz, shape (n_windows, n_bins, n, n).
         """
         return np.asarray(self._force @ spectrum @ self._force.conj().swapaxes(1, 2), dtype=np.complex128)
 
@@ -159,10 +146,7 @@ class ForceFeatures:
     def coherence(self, series: Float32Array) -> float:
         """Mean squared coherence over all windows, frequencies and pairs of forces; 0 where there is no pair.
 
-        Parameters
-        ----------
-        series : ndarray, shape (n_series, n_windows, n_bins)
-            From `series`, of the nominal machine.
+        From the `series` of the nominal machine.
         """
         parts = series[len(self._dofs) :]
         return 2 * float(np.mean(parts**2)) if self._pairs else 0.0
@@ -179,31 +163,18 @@ class ForceFeatures:
         w = 2 * np.pi * self.frequencies_hz
         if self._twice:
             x, v = (list(side) for side in zip(*self._twice, strict=True))
-            sums = (
-                np.add.reduceat(part, self._bands, axis=1)
-                for part in (
-                    spectrum[:, :, x, x].real * w[:, None] ** 2,
-                    spectrum[:, :, v, v].real,
-                    spectrum[:, :, x, v] * w[:, None],
-                )
-            )
-            s_x, s_v, s_xv = sums
-            apart = 1 - np.abs(s_xv) ** 2 / (s_x * s_v)
-            parts += [
-                np.log(s_x / s_v).reshape(n_windows, -1),
-                np.log(np.maximum(apart, _FLOOR)).reshape(n_windows, -1),
-            ]
+            powers = spectrum[:, :, x, x].real * w[:, None] ** 2, spectrum[:, :, v, v].real
+            s_x, s_v = (np.add.reduceat(power, self._bands, axis=1) for power in powers)
+            s_xv = np.add.reduceat(spectrum[:, :, x, v] * w[:, None], self._bands, axis=1)
+            apart = np.maximum(1 - np.abs(s_xv) ** 2 / (s_x * s_v), _FLOOR)
+            parts += [np.log(of).reshape(n_windows, -1) for of in (s_x / s_v, apart)]
         return np.asarray(np.concatenate(parts, axis=1).reshape(n_windows, -1), dtype=np.float32)
 
     def disagreement(self, consistency: Float32Array) -> dict[str, FloatArray]:
         """Relative disagreement in amplitude of displacement and rate, each of shape (n_windows,), by displacement.
 
-        Of the band in which they agree best: sensor noise sets them apart in some bands, a wrong gain in all of them.
-
-        Parameters
-        ----------
-        consistency : ndarray, shape (n_windows, n)
-            From `consistency`.
+        From `consistency`, of the band in which they agree best: sensor noise sets them apart in some bands, a wrong
+        gain in all of them.
         """
         n = len(self._twice)
         ratio = consistency[:, 1 : 1 + _BANDS * n].reshape(-1, _BANDS, n)
@@ -219,13 +190,8 @@ class ForceFeatures:
         """What equation 29 looks at besides, shape (n_windows, 3 n_dofs).
 
         The rotation-synchronous vectors as forces, in units of the nominal unbalance force (real parts, imaginary
-        parts), and the logarithm of the sampling variance that the stochastic forces beside them give them.
-
-        Parameters
-        ----------
-        spectrum : ndarray of complex, shape (n_windows, n_bins, n, n)
-        synchronous : ndarray of complex, shape (n_windows, n)
-        speed_rad_s : ndarray, shape (n_windows,)
+        parts), and the logarithm of the sampling variance that the stochastic forces beside them give them. Spectra are
+        of shape (n_windows, n_bins, n, n), vectors of shape (n_windows, n), speeds of shape (n_windows,).
         """
         machine = self._machine
         unbalance = machine.rotor.m2_kg * machine.rotor.e_m * speed_rad_s**2
@@ -277,10 +243,7 @@ class FeatureBasis:
 def principal_directions(series: Float32Array, n_kept: int) -> tuple[Float32Array, Float32Array]:
     """Mean, shape (n_series, 1, n_bins), and first principal components, shape (n_series, n_bins, n_kept).
 
-    Parameters
-    ----------
-    series : ndarray, shape (n_series, n_windows, n_bins)
-        Of expected spectra, without sampling error.
+    The series, shape (n_series, n_windows, n_bins), are those of expected spectra, without sampling error.
     """
     mean = series.mean(axis=1, keepdims=True)
     deviation = (series - mean).astype(np.float64)
@@ -290,16 +253,9 @@ def principal_directions(series: Float32Array, n_kept: int) -> tuple[Float32Arra
 
 
 def fit_basis(mean: Float32Array, directions: Float32Array, raw: Float32Array, n_common: int) -> FeatureBasis:
-    """Standardise features and measure their covariance.
+    """Standardise condensed features and measure their covariance.
 
-    Parameters
-    ----------
-    mean, directions : ndarray
-        From `principal_directions`.
-    raw : ndarray, shape (n_windows, n_inputs)
-        Condensed features of windows with sampling error.
-    n_common : int
-        How many of the inputs all networks share.
+    They are raw, shape (n_windows, n_inputs), of windows with sampling error; all networks share so many of them.
     """
     centre = raw.mean(axis=0)
     scale = raw.std(axis=0) + np.float32(1e-6)

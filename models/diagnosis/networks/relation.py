@@ -78,23 +78,16 @@ class EquationNetwork:
     healthy: Healthy | None
 
 
-def _used_lags(window: WindowStatistics, machine: Machine) -> slice:
-    """Lags from ``lag_from_s``: shorter ones see the excitation itself."""
+def window_view(window: WindowStatistics, machine: Machine, *, by_hop: bool = False) -> StatisticsView:
+    """The window, or each of its hops alone, along the first axis, as equations look at it.
+
+    Lags are those from ``lag_from_s``: shorter ones see the excitation itself.
+    """
     first = int(np.searchsorted(window.lags_s, machine.window.lag_from_s - 1e-9))
-    return slice(first, None)
-
-
-def window_view(window: WindowStatistics, machine: Machine) -> StatisticsView:
-    """The whole window, as equations look at it."""
-    lags = _used_lags(window, machine)
     speed = window.speed_rad_s if np.isfinite(window.speed_rad_s) else machine.operation.speed_rad_s
-    return StatisticsView(window.states, window.correlation[lags], window.synchronous, speed)
-
-
-def hop_view(window: WindowStatistics, machine: Machine) -> StatisticsView:
-    """Each hop of the window alone, along the first axis."""
-    lags, speed = _used_lags(window, machine), window_view(window, machine).speed_rad_s
-    return StatisticsView(window.states, window.hop_correlation[:, lags], window.hop_synchronous, speed)
+    if by_hop:
+        return StatisticsView(window.states, window.hop_correlation[:, first:], window.hop_synchronous, speed)
+    return StatisticsView(window.states, window.correlation[first:], window.synchronous, speed)
 
 
 def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: Machine) -> EquationReading:
@@ -107,15 +100,16 @@ def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: M
     equation = trained.equation
     absent = missing(equation, window.states if window.synchronous is None else (*window.states, "theta"))
     if absent:
-        return _not_read(equation, f"not measured: {', '.join(absent)}")
+        return not_read(equation, f"not measured: {', '.join(absent)}")
     rows = equation.rows(window_view(window, machine), machine)
     norm = rows.norm
     if not norm > 0:
-        return _not_read(equation, "the target correlation is zero")
+        return not_read(equation, "the target correlation is zero")
     residual = _residual(trained.network, rows, norm)
     projection = np.linalg.pinv(rows.signatures / norm)
     change = projection @ residual
-    hops = _residual(trained.network, equation.rows(hop_view(window, machine), machine), norm) @ projection.T
+    by_hop = equation.rows(window_view(window, machine, by_hop=True), machine)
+    hops = _residual(trained.network, by_hop, norm) @ projection.T
     error = hops.std(axis=0, ddof=1) / np.sqrt(hops.shape[0])
     healthy = trained.healthy
     if healthy is not None:
@@ -143,7 +137,8 @@ def equation_by_number(number: str) -> Equation | SynchronousEquation:
     return {equation.number: equation for equation in EQUATIONS}[number]
 
 
-def _not_read(equation: Equation | SynchronousEquation, reason: str) -> EquationReading:
+def not_read(equation: Equation | SynchronousEquation, reason: str) -> EquationReading:
+    """What is said of an equation that cannot be evaluated."""
     return EquationReading(equation=equation.number, title=equation.title, evaluable=False, reason=reason)
 
 
@@ -174,7 +169,7 @@ class RelationDiagnostician:
         for equation in EQUATIONS:
             trained = self._networks.get(equation.number)
             if trained is None:
-                reading = _not_read(equation, "no trained network")
+                reading = not_read(equation, "no trained network")
             else:
                 reading = read_equation(trained, window, self._machine)
             equations.append(reading)
