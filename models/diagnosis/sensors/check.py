@@ -28,21 +28,10 @@ def sensor_findings(
 ) -> tuple[SensorFault, ...]:
     """Check the sensors of a window.
 
-    Parameters
-    ----------
-    reference : SensorReference, optional
-        What the sensors were like on the healthy machine; without it only what is impossible for any healthy sensor is
-        found.
-    missing : sequence of SensorFault
-        Channels that lack numbers; they are not looked at further.
-    standing : bool
-        Whether the machine stood in the window: channels are not compared then, and no angle has to turn.
-
-    Returns
-    -------
-    tuple of SensorFault
-        Empty if nothing was found. A channel that is stuck or clipped is not looked at further; where the shaft angle
-        jumps, slips or jitters, channels are not compared: what turns with the shaft stays among what they share.
+    Without a reference only what is impossible for any healthy sensor is found. A channel that is missing, stuck or
+    clipped is not looked at further; where the shaft angle jumps, slips or jitters, channels are not compared: what
+    turns with the shaft stays among what they share. Nor are they where the machine stood in the window; no angle has
+    to turn then.
     """
     window, naming = window.as_mounted, Naming(channels)
     stood = np.full(len(window.waveforms), True) if standing else runs_down(window)

@@ -194,18 +194,17 @@ def _by_chain(
         if other == pair or not {other.first, other.second} & {pair.first, pair.second}:
             continue
         (middle,) = {other.first, other.second} & {pair.first, pair.second}
-        mine, his = (_size(one, kind, moving=moving) for one in (departure, theirs))
+        if kind == FaultKind.DELAY:
+            mine, his = departure.delay_s, theirs.delay_s
+        elif moving:
+            mine, his = departure.course_step, theirs.course_step
+        else:
+            mine, his = departure.log_gain, theirs.log_gain
         if abs(his) < _ALIKE * abs(mine):
             return pair.first if middle == pair.second else pair.second
         if abs(his + mine) < _ALIKE * abs(mine):
             return middle
     return None
-
-
-def _size(departure: _Departure, kind: FaultKind, *, moving: bool) -> float:
-    if kind == FaultKind.DELAY:
-        return departure.delay_s
-    return departure.course_step if moving else departure.log_gain
 
 
 def _by_level(window: WindowStatistics, departure: _Departure, reference: SensorReference | None) -> int | None:
@@ -298,13 +297,7 @@ def suspect_pairs(
 def swapped(
     window: WindowStatistics, broken: list[MotionPair], naming: Naming, reference: SensorReference | None
 ) -> tuple[list[SensorFault], set[MotionPair]]:
-    """Find the exchange of two channels of one quantity that restores the pairs that are broken.
-
-    Returns
-    -------
-    explained : set of MotionPair
-        Pairs that need no other explanation.
-    """
+    """Find the exchange of two channels of one quantity that restores broken pairs, which need no other explanation."""
     findings: list[SensorFault] = []
     explained: set[MotionPair] = set()
     for one, other in combinations(broken, 2):
@@ -370,7 +363,7 @@ def _guilty(
     for number, side in enumerate(sides):
         if all(sum(column in (pair.first, pair.second) for pair in broken) > 1 for column in side):
             return number
-    chained = [any(column in _chain(window, number, column) for column in side) for number, side in enumerate(sides)]
+    chained = [any(_agrees(window, number, column) for column in side) for number, side in enumerate(sides)]
     if chained.count(True) == 1:  # the other side has a third sensor that still agrees with it
         return chained.index(False)
     vectors = window.rotation_vectors
@@ -381,21 +374,16 @@ def _guilty(
     return alike.index(True) if alike.count(True) == 1 else None
 
 
-def _chain(window: WindowStatistics, side: int, column: int) -> set[int]:
-    """Columns that share a pair with this one on the side away from the broken pair, and still agree."""
-    found = set()
-    for pair in motion_pairs(window.states):
-        inner = pair.second if side == 0 else pair.first
-        if inner == column and same(banded(window, pair)) > _RESTORED:
-            found.add(column)
-    return found
+def _agrees(window: WindowStatistics, side: int, column: int) -> bool:
+    """Whether a column still agrees with one that it shares a pair with on the side away from the broken pair."""
+    pairs = [pair for pair in motion_pairs(window.states) if column == (pair.first if side else pair.second)]
+    return any(same(banded(window, pair)) > _RESTORED for pair in pairs)
 
 
 def _exchanged(window: WindowStatistics, sizes: FloatArray, side: tuple[int, int], reference: SensorReference) -> bool:
     """Whether the rotation's amplitudes at two channels are the healthy ones of each other and not their own."""
     known = [reference.channel(window.states[column]) for column in side]
-    amplitudes = [None if one is None else one.rotation for one in known]
-    first, second = amplitudes
+    first, second = (None if one is None else one.rotation for one in known)
     if not first or not second:
         return False
     seen = [float(sizes[column]) for column in side]

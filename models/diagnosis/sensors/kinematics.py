@@ -10,6 +10,7 @@ of its high-pass by a phase that falls as one over the frequency, where a delay'
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -147,14 +148,9 @@ def _turned(w: FloatArray, cross: ComplexArray) -> tuple[float, float]:
 def read_pair(
     window: WindowStatistics, pair: MotionPair, bands: Banded | None = None, lead_rad_s: float | None = None
 ) -> PairReading | None:
-    """Compare two sensors of one motion; None if one of them shows no fluctuation.
+    """Compare two sensors of one motion, `banded` already or not; None if one of them shows no fluctuation.
 
-    Parameters
-    ----------
-    bands : Banded, optional
-        What `banded` has made of them.
-    lead_rad_s : float, optional
-        That of the healthy pair; without it, what these data say of it.
+    The lead is that of the healthy pair; without it, what these data say of it.
     """
     bands = banded(window, pair) if bands is None else bands
     z, v = bands.spectra[:, 0, 0].real, bands.spectra[:, 1, 1].real
@@ -164,25 +160,24 @@ def read_pair(
     h, variance, bias = _transfer(bands, incoherent)
     level, other, cross = _even(bands)
     delay_s, total = _turned(bands.w, cross)
-    start = _Start(1 if total >= 0 else -1, float(np.log(max(abs(total) / level, _FLOOR))), delay_s)
+    polarity, log_gain = 1 if total >= 0 else -1, float(np.log(max(abs(total) / level, _FLOOR)))
+    fitted = partial(_fitted, PairReading(pair, log_gain, 0.0, polarity, delay_s, 0.0, 0.0, 0.0))
     shared = min(1.0, abs(total) / (math.sqrt(level) * math.sqrt(other)))
-    alone = _fitted(pair, start, bands.w, h, variance, bias)
+    alone = fitted(bands.w, h, variance, bias)
     across = _across(alone, _other_plane(window, pair, bands), bands.w, h, variance)
     if across is not None:
         h = h - across
-        alone = _fitted(pair, start, bands.w, h, variance, bias)
+        alone = fitted(bands.w, h, variance, bias)
     lead_rad_s = _lead(alone, bands.w, h, variance) if lead_rad_s is None else lead_rad_s
     if lead_rad_s:
         h = h * np.exp(-1j * lead_rad_s / bands.w)
-        alone = _fitted(pair, start, bands.w, h, variance, bias)
+        alone = fitted(bands.w, h, variance, bias)
     line = None if bands.rotation is None else _line(bands.rotation, window, bands, incoherent)
     if line is None:
         return replace(alone, lead_rad_s=lead_rad_s, shared=shared)
     speed, ratio, spread = line
     ratio *= complex(np.exp(-1j * lead_rad_s / speed))
-    found = _fitted(
-        pair, start, np.append(bands.w, speed), np.append(h, ratio), np.append(variance, spread), np.append(bias, 0.0)
-    )
+    found = fitted(np.append(bands.w, speed), np.append(h, ratio), np.append(variance, spread), np.append(bias, 0.0))
     foreign = abs(found.log_gain - alone.log_gain) > max(_LINE_FITS * alone.log_gain_error, _RUNOUT)
     foreign |= abs(found.delay_s - alone.delay_s) > _LINE_FITS * alone.delay_error_s
     if foreign and alone.log_gain_error < _RUNOUT:
@@ -190,16 +185,7 @@ def read_pair(
     return replace(found, lead_rad_s=lead_rad_s, shared=shared)
 
 
-@dataclass(frozen=True, slots=True)
-class _Start:
-    polarity: int
-    log_gain: float
-    delay_s: float
-
-
-def _fitted(
-    pair: MotionPair, start: _Start, w: FloatArray, h: ComplexArray, variance: FloatArray, bias: FloatArray
-) -> PairReading:
+def _fitted(start: PairReading, w: FloatArray, h: ComplexArray, variance: FloatArray, bias: FloatArray) -> PairReading:
     """Gain and delay that fit the transfer of all bands best, from a first guess."""
     log_gain, delay_s, weight = start.log_gain, start.delay_s, 1 / variance
     y, jw, total, by_delay = h * start.polarity, 1j * w, float(weight.sum()), weight * w
@@ -213,7 +199,7 @@ def _fitted(
     scatter_delay = max(1.0, float(weight @ y.imag**2) * 2 / freedom)
     gain_error = math.sqrt(scatter_gain / (2 * total)) + float(weight @ bias) / total
     delay_error_s = math.sqrt(scatter_delay / (2 * moment))
-    return PairReading(pair, log_gain, gain_error, start.polarity, delay_s, delay_error_s, 0.0, 0.0)
+    return PairReading(start.pair, log_gain, gain_error, start.polarity, delay_s, delay_error_s, 0.0, 0.0)
 
 
 def _other_plane(window: WindowStatistics, pair: MotionPair, bands: Banded) -> ComplexArray | None:

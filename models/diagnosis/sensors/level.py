@@ -43,10 +43,7 @@ _TOGETHER = 0.3  # where another displacement moves by at least this part of a d
 def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]) -> list[SensorFault]:
     """Channels that hold a value, show nothing but their quantisation, or an angle that does not turn.
 
-    Parameters
-    ----------
-    stood : ndarray of bool, shape (n_hops,)
-        Where the machine stood or was about to: no angle turns then.
+    No angle turns in hops, shape (n_hops,), where the machine stood or was about to.
     """
     hops, findings = window.hop_waveform, []
     rate_hz = hops.n_samples * len(window.waveforms) / window.duration_s
@@ -57,30 +54,29 @@ def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]
         if state == "theta":
             runs = np.where(stood, 0, runs)
         whole = int(np.sum(runs[runs >= hops.n_samples]))
-        longest_s = max(whole, int(runs.max())) / rate_hz
-        if state == "theta":
-            if runs.max() >= limit:
-                text = (
-                    f"{name}: the shaft angle stood still for {longest_s:.3g} s: the phase reference is lost, or "
-                    "the machine has not run since the monitor started"
-                )
-                findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=longest_s))
-        elif np.any(coarse):
-            quiet_s = float(coarse.sum()) * hops.n_samples / rate_hz
+        lost_s = max(whole, int(runs.max())) / rate_hz
+        if state != "theta" and np.any(coarse):
+            lost_s = float(coarse.sum()) * hops.n_samples / rate_hz
             text = (
                 f"{name}: shows nothing but quantisation steps of {naming.value(state, float(step[coarse].max()))} for "
-                f"{quiet_s:.3g} s, expected a vibration of several steps: the sensor is dead or its range far too wide"
+                f"{lost_s:.3g} s, expected a vibration of several steps: the sensor is dead or its range far too wide"
             )
-            findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=quiet_s))
-        elif runs.max() >= limit:
+        elif runs.max() < limit:
+            continue
+        elif state == "theta":
+            text = (
+                f"{name}: the shaft angle stood still for {lost_s:.3g} s: the phase reference is lost, or "
+                "the machine has not run since the monitor started"
+            )
+        else:
             still = int(runs.argmax())  # the mean of a hop is the value that was repeated, if all of the hop was
             known = runs[still] >= hops.n_samples
             what = f"the value {naming.value(state, float(hops.mean[still, column]))}" if known else "one value"
             text = (
-                f"{name}: repeated {what} for {longest_s:.3g} s, "
+                f"{name}: repeated {what} for {lost_s:.3g} s, "
                 f"expected to change within {STILL_S:g} s: the sensor or its line is stuck"
             )
-            findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=longest_s))
+        findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=lost_s))
     return findings
 
 
@@ -185,34 +181,32 @@ def offset(window: WindowStatistics, naming: Naming, reference: SensorReference 
         name, own = naming.name(state), float(rms[column])
         if not own > 0:  # stuck, and reported as that
             continue
-        z = float(abs(steps[column]) / spread[column]) if spread[column] > 0 else np.inf
-        if z > STEP_SPREADS and abs(steps[column]) > STEP_PART * own and not _shaft(window.states, column, steps):
+        step_z = float(abs(steps[column]) / spread[column]) if spread[column] > 0 else np.inf
+        z: float | None = step_z
+        jumped = step_z > STEP_SPREADS and abs(steps[column]) > STEP_PART * own
+        drifted = abs(drifts[column]) > max(DRIFT_PART * own, STEP_SPREADS * spread[column])
+        if jumped and not _shaft(window.states, column, steps):
             value = float(steps[column])
             text = (
                 f"{name}: the mean jumped by {naming.value(state, value)} within the window ({abs(value) / own:.3g} "
                 f"times the channel's rms), expected a steady one: connector, supply or gap"
             )
-            findings.append(SensorFault(states=(state,), kind=FaultKind.OFFSET, text=text, value=value, z=z))
-        elif abs(drifts[column]) > max(DRIFT_PART * own, STEP_SPREADS * spread[column]) and not _shaft(
-            window.states, column, drifts
-        ):
+        elif drifted and not _shaft(window.states, column, drifts):
             value = float(drifts[column])
+            z = abs(value) / float(spread[column])
             text = (
                 f"{name}: the mean drifted by {naming.value(state, value)} within the window, the limit is "
                 f"{DRIFT_PART:g} times the channel's rms ({naming.value(state, DRIFT_PART * own)})"
             )
-            findings.append(
-                SensorFault(
-                    states=(state,), kind=FaultKind.OFFSET, text=text, value=value, z=abs(value) / float(spread[column])
-                )
-            )
         elif abs(moved[column]) > floor[column] and not _shaft(window.states, column, moved):
-            value = float(moved[column])
+            value, z = float(moved[column]), None
             text = (
                 f"{name}: the mean stands {naming.value(state, value)} from where it was on the healthy machine, "
                 f"expected within {naming.value(state, float(floor[column]))}"
             )
-            findings.append(SensorFault(states=(state,), kind=FaultKind.OFFSET, text=text, value=value))
+        else:
+            continue
+        findings.append(SensorFault(states=(state,), kind=FaultKind.OFFSET, text=text, value=value, z=z))
     return findings
 
 

@@ -74,16 +74,9 @@ def noisy(
     reference: SensorReference | None,
     sound: Callable[..., bool],
 ) -> list[SensorFault]:
-    """Channels whose noise is above what it was on the healthy machine.
+    """Channels whose noise is above what it was on the healthy machine; none if no reference says how that was.
 
-    Parameters
-    ----------
-    readings : sequence of PairReading
-        Of pairs that see the same motion.
-    reference : SensorReference or None
-        Without it, or if it says nothing of noise, nothing is found.
-    sound : callable
-        Whether nothing else is wrong with columns.
+    The readings are of pairs that see the same motion; `sound` says whether nothing else is wrong with columns.
     """
     if reference is None:
         return []

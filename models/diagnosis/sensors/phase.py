@@ -7,7 +7,6 @@ heavy spot, and no fault of the angle; an angle that jumps does so within a turn
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -46,25 +45,12 @@ _LINE_STRENGTH = 15.0  # a line is one where the channels' mean power stands out
 _GONE, _THERE = 1 / 3, 3.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Common:
-    """Vectors of all hops, each channel in units of its own noise, and what they have in common."""
-
-    vectors: ComplexArray
-    course: ComplexArray
-
-
 def phase_faults(
     window: WindowStatistics, columns: Sequence[int], naming: Naming, reference: SensorReference | None
 ) -> list[SensorFault]:
-    """At most one finding on the shaft angle.
+    """At most one finding on the shaft angle, from channels that nothing is wrong with.
 
-    Parameters
-    ----------
-    columns : sequence of int
-        Channels that nothing is wrong with.
-    reference : SensorReference or None
-        Without it a speed that contradicts the vibration is not found.
+    Without a reference a speed that contradicts the vibration is not found.
     """
     vectors, speed = window.hop_synchronous, window.speed_rad_s
     if window.speed_source != "phase reference" or vectors is None or not columns or not abs(speed) > 0:
@@ -73,8 +59,8 @@ def phase_faults(
     found = _lost(window, name) or _elsewhere(window, columns, name, reference)
     if found is None and len(vectors) >= _FEWEST_HOPS:
         if not window.removed_by_hop:
-            common = _common(columns, vectors)
-            found = _slip(window, common, name) or _jump(window, common, name)
+            scaled, course = _common(columns, vectors)
+            found = _slip(window, course, name) or _jump(window, scaled, course, name)
         found = found or _jitter(window, columns, vectors, name)
     return [found] if found else []
 
@@ -184,18 +170,18 @@ def _elsewhere(
     return _theta(FaultKind.INCOHERENT, text, float(own_rpm / rpm))
 
 
-def _common(columns: Sequence[int], vectors: ComplexArray) -> _Common:
+def _common(columns: Sequence[int], vectors: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """Vectors of all hops, each channel in units of its own noise, and what they have in common."""
     own = vectors[:, list(columns)]
     size = np.sqrt((np.abs(own) ** 2).mean(axis=0))
     noise = np.abs(np.diff(np.abs(own), axis=0)).mean(axis=0)
     unit = own / np.maximum(noise, np.maximum(1e-3 * size, np.finfo(float).tiny))
     left, singular, _ = np.linalg.svd(unit, full_matrices=False)
-    return _Common(unit, np.asarray(left[:, 0] * singular[0], dtype=np.complex128))
+    return unit, np.asarray(left[:, 0] * singular[0], dtype=np.complex128)
 
 
-def _slip(window: WindowStatistics, common: _Common, name: str) -> SensorFault | None:
+def _slip(window: WindowStatistics, course: ComplexArray, name: str) -> SensorFault | None:
     """The vectors keep their length and turn evenly, hop by hop."""
-    course = common.course
     length = np.abs(course)
     if length.std() > _ALIKE * length.mean():
         return None
@@ -209,26 +195,25 @@ def _slip(window: WindowStatistics, common: _Common, name: str) -> SensorFault |
         f"{name}: slips against the vibration by {per_minute:+.3g} turns a minute, expected none: "
         "the angle is not this shaft's, or pulses are missing throughout"
     )
-    return _theta(
-        FaultKind.INCOHERENT, text, 1 + per_minute / (window.speed_rad_s * 30 / np.pi), abs(mean) / max(error, 1e-9)
-    )
+    value = 1 + per_minute / (window.speed_rad_s * 30 / np.pi)
+    return _theta(FaultKind.INCOHERENT, text, value, abs(mean) / max(error, 1e-9))
 
 
-def _jump(window: WindowStatistics, common: _Common, name: str) -> SensorFault | None:
+def _jump(window: WindowStatistics, vectors: ComplexArray, course: ComplexArray, name: str) -> SensorFault | None:
     """The vectors of all channels turned by one angle between two hops and kept their lengths, and the angle jumped.
 
     Where data are missing between the hops, whether it jumped is not known, and the vectors alone decide.
     """
-    n = len(common.course)
+    n = len(course)
     best, at = 0.0, 0
     for k in range(_FEWEST_SIDE, n - _FEWEST_SIDE + 1):
-        change, error = _turn(common.course[:, None], k)
+        change, error = _turn(course[:, None], k)
         z = abs(float(change[0])) / float(error[0])
         if z > best:
             best, at = z, k
     if best < SEEN_ERRORS:
         return None
-    change, error = _turn(common.course[:, None], at)
+    change, error = _turn(course[:, None], at)
     value = float(change[0])
     own = window.hop_jump_rad[max(1, at - 2) : at + 2]
     seen = np.abs(np.angle(np.exp(1j * (own + value)))) < max(_STAY * float(error[0]), _ALIKE * abs(value))
@@ -236,9 +221,9 @@ def _jump(window: WindowStatistics, common: _Common, name: str) -> SensorFault |
         value = float(np.angle(np.exp(-1j * own[seen.argmax()])))
     elif best < MOST_ERRORS or not np.isnan(own).any():
         return None
-    before, after = np.abs(common.course[: at - 1]), np.abs(common.course[at + 1 :])
+    before, after = np.abs(course[: at - 1]), np.abs(course[at + 1 :])
     longer = abs(float(after.mean() / before.mean()) - 1)
-    turns, errors = _turn(common.vectors, at)
+    turns, errors = _turn(vectors, at)
     together = np.abs(np.angle(np.exp(1j * (turns - value)))) < np.maximum(_STAY * errors, _ALIKE * abs(value))
     clear = _STAY * errors < abs(value) / 2
     known = seen.any() or 2 * clear.sum() >= clear.size

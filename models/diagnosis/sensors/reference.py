@@ -31,10 +31,7 @@ def implicated(findings: Iterable[SensorFault]) -> set[str]:
 class Naming:
     """Names of channels and values in their units, for sentences.
 
-    Parameters
-    ----------
-    channels : iterable of Channel
-        Those of the machine; what is not among them is called by its state and given in SI units.
+    What is not among the channels of the machine is called by its state and given in SI units.
     """
 
     def __init__(self, channels: Iterable[Channel] = ()) -> None:
@@ -152,16 +149,11 @@ def channel_noise(window: WindowStatistics, columns: Sequence[int]) -> list[Chan
         return []
     flat = (np.log(left) < floor(np.log(left)) + np.log(_FLAT)).mean(axis=0)
     lines = _lines(window, columns)
-    return [
-        ChannelNoise(
-            column,
-            left[:, column],
-            left[:, column] / rms[column] ** 2,
-            float(flat[column]),
-            *lines.get(column, (0.0, 0.0)),
-        )
-        for column in columns
-    ]
+    found = []
+    for column in columns:
+        own, line = left[:, column], lines.get(column, (0.0, 0.0))
+        found.append(ChannelNoise(column, own, own / rms[column] ** 2, float(flat[column]), *line))
+    return found
 
 
 def floor(log_density: FloatArray) -> FloatArray:
@@ -367,10 +359,8 @@ def _pair(
     states: tuple[str, ...], readings: list[PairReading], least_same: float, noise: NoiseReference | None
 ) -> PairReference:
     """Mean of the windows' readings; the spread is their scatter beyond their own errors, and the mean's error."""
-    gains = np.array([reading.log_gain for reading in readings])
-    delays = np.array([reading.delay_s for reading in readings])
-    gain_errors = np.array([reading.log_gain_error for reading in readings])
-    delay_errors = np.array([reading.delay_error_s for reading in readings])
+    figures = [(one.log_gain, one.log_gain_error, one.delay_s, one.delay_error_s) for one in readings]
+    gains, gain_errors, delays, delay_errors = np.array(figures).T.copy()
     pair = readings[0].pair
     return PairReference(
         first=states[pair.first],

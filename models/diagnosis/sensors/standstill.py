@@ -25,12 +25,8 @@ _STEADY = 0.15
 def runs_down(window: WindowStatistics) -> npt.NDArray[np.bool_]:
     """Which hops have little or nothing of a running machine, shape (n_hops,), beside others that do: a slow end, say.
 
-    None where no speed is known: hops may be quiet beside one that a blow or a disturbance has made loud.
-
-    Parameters
-    ----------
-    window : WindowStatistics
-        As its sensors are mounted.
+    None where no speed is known: hops may be quiet beside one that a blow or a disturbance has made loud. The window is
+    that of its sensors as they are mounted.
     """
     hops, speeds = window.hop_waveform, np.abs(window.hop_speed_rad_s)
     vibrations = [column for column, state in enumerate(window.sensors) if state != "theta"]
@@ -42,11 +38,8 @@ def runs_down(window: WindowStatistics) -> npt.NDArray[np.bool_]:
 class Standstill:
     """Tells windows in which the machine stood from those in which its phase reference is lost.
 
-    Parameters
-    ----------
-    reference : SensorReference, optional
-        How the healthy machine runs; otherwise, and for channels that are not in it, it is the newest window in which
-        it ran steadily.
+    The reference says how the healthy machine runs; otherwise, and for channels that are not in it, it is the newest
+    window in which it ran steadily.
     """
 
     def __init__(self, reference: SensorReference | None) -> None:
