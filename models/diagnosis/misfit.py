@@ -129,12 +129,8 @@ class HealthyMisfit(BaseModel, extra="forbid", frozen=True):
 
         A deviation of one size stands out by the root of the data's length in a score, and by the length in the total
         excess. How much it stands out depends on what shakes the machine, too: where one force does, a wrong gain of a
-        hundredth is many standard errors, where several do it is hardly one.
-
-        Parameters
-        ----------
-        parts : sequence of float
-            Data of each, in parts of a window of the monitor.
+        hundredth is many standard errors, where several do it is hardly one. The data of each are given in parts of a
+        window of the monitor.
         """
         if not windows:
             return None
@@ -160,10 +156,7 @@ class HealthyMisfit(BaseModel, extra="forbid", frozen=True):
     def beyond(self, window: Goodness, part: float) -> Goodness:
         """What is left of a later window: as of a machine that the theory explains, as long as this one is as it was.
 
-        Parameters
-        ----------
-        part : float
-            Its data, in parts of a window of the monitor.
+        Its data are such a part of a window of the monitor.
         """
         root = math.sqrt(part)
         alternatives = []

@@ -44,12 +44,8 @@ _RATE = 1e-6  # probability that vectors of an unbalance are taken for those of 
 def foreign_rotation(observed: FloatArray, explained: FloatArray, spread: FloatArray) -> str:
     """By how much what turns with the shaft is not what an unbalance makes; empty if it is.
 
-    Parameters
-    ----------
-    observed, explained : ndarray, shape (2n,)
-        Real parts of the vectors, then imaginary ones; and those of the unbalance that is nearest.
-    spread : ndarray, shape (2n, 2n)
-        Covariance of what was observed.
+    Observed are real parts of the vectors, then imaginary ones, shape (2n,), with their covariance, `spread`; explained
+    are those of the unbalance that is nearest.
     """
     n = observed.size // 2
     if n < 2:
@@ -92,17 +88,13 @@ class UnbalanceVector:
 
     def widened(self, variance: float) -> "UnbalanceVector":
         """Return the same with an error added to both parts."""
-        return replace(
-            self, variance_real=self.variance_real + variance, variance_imaginary=self.variance_imaginary + variance
-        )
+        real, imaginary = self.variance_real + variance, self.variance_imaginary + variance
+        return replace(self, variance_real=real, variance_imaginary=imaginary)
 
     def read_as(self, change: float, own: float) -> "UnbalanceVector":
         """Return the same as large as e is read: a window that is astride a change shows a part of it.
 
-        Parameters
-        ----------
-        change, own : float
-            Relative change of e as read, and as the window by itself says; see `parameter_reading`.
+        The relative change of e is that read, and its own what the window by itself says; see `parameter_reading`.
         """
         if self.moved:
             part = change / own if own else 1.0
@@ -212,15 +204,8 @@ def parameter_reading(
 ) -> Parameter:
     """One parameter as one diagnostician reads it.
 
-    Parameters
-    ----------
-    name : str
-        One of ``models.physics.rotor.PARAMETERS``.
-    by : str
-        Who says so: ``likelihood``, ``network`` (amortised), ``relation`` or ``baseline``.
-    vector : UnbalanceVector, optional
-        Of e, where there is a phase reference. `change` is then that of its size as long as the heavy spot stays where
-        it is, and the size of the vector of change once it has turned.
+    Of e there is a vector where there is a phase reference. The change is then that of its size as long as the heavy
+    spot stays where it is, and the size of the vector of change once it has turned.
 
     Raises
     ------

@@ -21,6 +21,7 @@ E. Brunner, H. Dette, A. Munk, "Box-type approximations in nonparametric factori
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -92,10 +93,7 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
     def judge(self, window: WindowStatistics, rate: float = 0.01) -> tuple[Shape, ...]:
         """Compare every channel of a window with its healthy shape; what cannot be compared says why.
 
-        Parameters
-        ----------
-        rate : float
-            Declared probability that any channel of an unchanged machine is called changed in one window.
+        The rate is the declared probability that any channel of an unchanged machine is called changed in one window.
 
         Raises
         ------
@@ -131,15 +129,10 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
         if not reason and one.channel not in window.states:
             reason = "not measured"
         rho = None if reason else _shape(window, one.channel)
+        stated = partial(Shape, state=one.channel, limit=limit)
         if rho is None:
             reason = reason or "it does not move, or its correlation is not finite"
-            return Shape(
-                state=one.channel,
-                verdict="not evaluable",
-                z=None,
-                limit=limit,
-                text=f"{one.channel}: not evaluable, {reason}",
-            )
+            return stated(verdict="not evaluable", z=None, text=f"{one.channel}: not evaluable, {reason}")
         d = np.array(one.directions) @ (rho - np.array(one.mean))
         # a shorter window scatters more; that a longer one scatters less is not relied on
         wider = (1 + 1 / self.windows) * max(1.0, self.window_s / window.duration_s)
@@ -152,15 +145,15 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
                 f"{one.channel}: its correlation function has changed shape ({figures}); this comparison cannot "
                 "tell whether the machine or its excitation has"
             )
-            return Shape(state=one.channel, verdict="changed", z=z, limit=limit, text=text)
+            return stated(verdict="changed", z=z, text=text)
         if not _power(one, self.windows, np.array(self.lags_s), rate).growth <= SEEN_GROWTH:
             text = (
                 f"{one.channel}: not evaluable, with {self.windows} healthy windows not even noise that makes it "
                 f"{SEEN_GROWTH:g} times as loud would change its shape beyond chance"
             )
-            return Shape(state=one.channel, verdict="not evaluable", z=z, limit=limit, text=text)
+            return stated(verdict="not evaluable", z=z, text=text)
         text = f"{one.channel}: its correlation function has its healthy shape ({figures})"
-        return Shape(state=one.channel, verdict="not changed", z=z, limit=limit, text=text)
+        return stated(verdict="not changed", z=z, text=text)
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,13 +182,10 @@ def _power(one: ShapeSpread, windows: int, lags_s: FloatArray, rate: float) -> S
 
 
 def learn_shape(windows: Sequence[WindowStatistics]) -> HealthyShape:
-    """Learn the healthy shape of every channel.
+    """Learn the shape of every channel from healthy windows that do not overlap.
 
-    Parameters
-    ----------
-    windows : sequence of WindowStatistics
-        Healthy windows that do not overlap, of all conditions that are to count as healthy: a colour of excitation that
-        is in none of them will be called a change.
+    They are of all conditions that are to count as healthy: a colour of excitation that is in none of them will be
+    called a change.
 
     Raises
     ------

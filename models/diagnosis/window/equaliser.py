@@ -28,16 +28,9 @@ class Equaliser:
     delay_s: FloatArray
 
     def response(self, frequency_hz: FloatArray) -> _ComplexArray:
-        """What each sensor gives for a vibration of amplitude 1; 1 where the frequency is not known (nan).
+        """What each sensor gives for a vibration of amplitude 1, shape (..., n); 1 where no frequency is known (nan).
 
-        Parameters
-        ----------
-        frequency_hz : ndarray, shape (...)
-            Negative for a shaft angle that falls.
-
-        Returns
-        -------
-        ndarray, shape (..., n)
+        Frequencies, shape (...), are negative for a shaft angle that falls.
         """
         f = frequency_hz[..., np.newaxis]
         below = self.corner_hz / (1j * np.where(f == 0, np.nan, f))
@@ -45,17 +38,10 @@ class Equaliser:
         return np.asarray(np.nan_to_num(np.exp(-2j * np.pi * f * self.delay_s) / damped, nan=1.0), dtype=np.complex128)
 
     def missing(self, segments: _ComplexArray, frequencies_hz: FloatArray, lags_s: FloatArray) -> FloatArray:
-        """What correlations lack because the sensors are as they are.
+        """What correlations lack because the sensors are as they are, shape (n_hops, n_lags, n, n).
 
-        Parameters
-        ----------
-        segments : ndarray, shape (n_hops, n_segments, n_bins, n)
-            Fourier coefficients as the sensors give them, two-sided densities.
-
-        Returns
-        -------
-        ndarray, shape (n_hops, n_lags, n, n)
-            To be added to E{x_i(t) x_j(t + τ)} of each hop.
+        It is to be added to E{x_i(t) x_j(t + τ)} of each hop. Segments, shape (n_hops, n_segments, n_bins, n), hold
+        Fourier coefficients as the sensors give them, two-sided densities.
         """
         n_hops, n_segments, n_bins, n = segments.shape
         of_bins = segments.transpose(0, 2, 3, 1)

@@ -59,12 +59,11 @@ def excluded_lines(
     known: Sequence[KnownLine] | None = (),
     turning: ComplexArray | None = None,
 ) -> tuple[ExcludedLine, ...]:
-    """Lines that say nothing of the machine.
+    """Lines that say nothing of the machine, in Fourier coefficients without mean and rotation.
 
     Parameters
     ----------
     segments : ndarray, shape (n_bins, n_segments, n)
-        Fourier coefficients without mean and rotation.
     spectrum : ndarray, shape (n_bins, n, n)
         Their cross-spectra, in any unit.
     speeds_rad_s : tuple of float

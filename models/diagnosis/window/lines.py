@@ -44,28 +44,14 @@ _LOUD, _SAME = 0.02, 0.02
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A line.
+    """A line."""
 
-    Attributes
-    ----------
-    state : str
-        Where it is strongest.
-    share : float
-        Of the power of that channel's part that does not turn with the shaft.
-    certain : bool
-        Whether no noise is coherent like that.
-    beside : int
-        The multiple of the speed it is next to, within three bins of the spectra; 0 if next to none.
-    likely : bool
-        Whether noise is coherent like that by so small a chance that it is not in two windows.
-    """
-
-    state: str
+    state: str  # where it is strongest
     frequency_hz: float
-    share: float
-    certain: bool
-    beside: int = 0
-    likely: bool = False
+    share: float  # of the power of that channel's part that does not turn with the shaft
+    certain: bool  # whether no noise is coherent like that
+    beside: int = 0  # the multiple of the speed it is next to, within three bins of the spectra; 0 if next to none
+    likely: bool = False  # whether noise is coherent like that by so small a chance that it is not in two windows
 
     def known(self, speed_rad_s: float) -> KnownLine:
         """What is kept of it."""
@@ -73,15 +59,7 @@ class Line:
 
 
 def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistics) -> tuple[Line, ...]:
-    """Lines that are neither noise nor a multiple of the speed, strongest first.
-
-    Parameters
-    ----------
-    hops : sequence of HopMoments
-        At least one.
-    window : WindowStatistics
-        What the hops add up to.
-    """
+    """Lines that are neither noise nor a multiple of the speed, strongest first, of the hops that make up a window."""
     window = window.as_mounted
     states = plan.mounted
     every = np.concatenate([hop.segments for hop in hops], dtype=np.complex128)
@@ -123,12 +101,8 @@ def _beside_multiples(
 ) -> Iterator[Line]:
     """The strongest line that is certain beside each multiple of the speed, where this is steady.
 
-    Parameters
-    ----------
-    every : ndarray of complex, shape (n_segments, n_bins, n_states + n_regressors)
-    floor : ndarray, shape (n_bins, n_states)
-        Power of what surrounds a bin.
-    total : ndarray, shape (n_states,)
+    `every` is of shape (n_segments, n_bins, n_states + n_regressors), the power of what surrounds a bin, `floor`, of
+    shape (n_bins, n_states).
     """
     if window.speed_source != "phase reference" or window.removed_by_hop:
         return
@@ -161,17 +135,10 @@ def new_line(
 ) -> Line | None:
     """The strongest line that the healthy machine did not have, at its frequency or order; None without one.
 
-    Parameters
-    ----------
-    beside : bool
-        Whether the known ones are all, those next to a multiple of the speed too.
+    `beside` says whether the known ones are all, those next to a multiple of the speed too.
     """
-    for line in lines:
-        if line.beside and not beside:
-            continue
-        if line.certain and line.share > _LOUD and not _among(line, known, speed_rad_s):
-            return line
-    return None
+    told = (line for line in lines if line.certain and line.share > _LOUD and (beside or not line.beside))
+    return next((line for line in told if not _among(line, known, speed_rad_s)), None)
 
 
 class LatestLines:

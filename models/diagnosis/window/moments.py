@@ -124,9 +124,7 @@ class Plan:
     def to_si(self, samples: npt.NDArray[np.float32] | FloatArray) -> FloatArray:
         """Sensors as mounted, and other channels, in SI units and, last, the shaft angle if there is one.
 
-        Returns
-        -------
-        ndarray, shape (n_samples, width), a channel's samples side by side
+        Of shape (n_samples, width), with a channel's samples side by side.
         """
         si = np.empty((self.width, samples.shape[0]))
         np.multiply(samples.T[self.columns], self.scales[:, np.newaxis], out=si[: self.columns.size])
@@ -368,14 +366,6 @@ class Rotation:
     settled: npt.NDArray[np.bool_]  # (n_hops,), whether it had one speed in each, see `settled_hops`
 
 
-@dataclass(frozen=True, slots=True)
-class HopCoefficients:
-    """What is taken out hop by hop, on the regressors (1, cos θ, sin θ)."""
-
-    hops: FloatArray  # (n_hops, n, 3)
-    segments: FloatArray  # (n_segments, n, 3)
-
-
 def rotation_of(plan: Plan, hops: tuple[HopMoments, ...]) -> Rotation:
     """Tell how fast the machine turned in each hop, and whether that was steady."""
     hop_s, settled = plan.hop / plan.rate_hz, np.full(len(hops), True)
@@ -403,15 +393,12 @@ def regression(zero_lag: FloatArray, n: int) -> FloatArray:
     return np.asarray((between @ zero_lag[..., n:, :n]).swapaxes(-1, -2), dtype=np.float64)
 
 
-def hop_coefficients(plan: Plan, hops: tuple[HopMoments, ...], rotation: Rotation, mean: FloatArray) -> HopCoefficients:
-    """Coefficients of every hop and segment, with one mean for the whole window.
+def hop_coefficients(
+    plan: Plan, hops: tuple[HopMoments, ...], rotation: Rotation, mean: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Coefficients of every hop, shape (n_hops, n, 3), and segment, (n_segments, n, 3), on (1, cos θ, sin θ).
 
-    Parameters
-    ----------
-    rotation : Rotation
-        Where its speed is nan, nothing but the mean is taken out.
-    mean : ndarray, shape (n,)
-        Coefficient of the constant.
+    The mean, shape (n,), is one for the whole window; where the rotation's speed is nan, nothing else is taken out.
     """
     n = len(plan.states)
     beta = np.zeros((len(hops), n, 3))
@@ -428,7 +415,7 @@ def hop_coefficients(plan: Plan, hops: tuple[HopMoments, ...], rotation: Rotatio
             for k in range(per_hop):  # its middle lies k halves of a segment after the hop's beginning
                 part = k * (plan.segment // 2) / plan.hop - 0.5
                 segments[number * per_hop + k] = _between(hops, beta, number, part)
-    return HopCoefficients(beta, segments)
+    return beta, segments
 
 
 def _between(hops: tuple[HopMoments, ...], beta: FloatArray, number: int, part: float) -> FloatArray:

@@ -64,18 +64,9 @@ def pair_bands(n_bins: int) -> npt.NDArray[np.intp]:
 
 
 def pair_powers(segments: _ComplexArray, frequencies_hz: FloatArray, pairs: tuple[MotionPair, ...]) -> _ComplexArray:
-    """Sum powers over segments and the bins of each band.
+    """Sum powers over Fourier coefficients, shape (n_segments, n_bins, n), of segments and the bins of each band.
 
-    Parameters
-    ----------
-    segments : ndarray, shape (n_segments, n_bins, n)
-        Fourier coefficients.
-    frequencies_hz : ndarray, shape (n_bins,)
-
-    Returns
-    -------
-    ndarray, shape (n_pairs, n_bands, 3)
-        With z = (jω)ᵒʳᵈᵉʳ x: Σ|z|², Σ z* v, Σ|v|².
+    With z = (jω)ᵒʳᵈᵉʳ x: Σ|z|², Σ z* v, Σ|v|², shape (n_pairs, n_bands, 3).
     """
     edges = pair_bands(frequencies_hz.size)
     powers = np.zeros((len(pairs), edges.size, 3), dtype=np.complex128)

@@ -64,21 +64,8 @@ def samples_of(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, in
 class Recall:
     """Blocks that are taken again, and what can be made of them.
 
-    Parameters
-    ----------
-    level : ndarray, shape (n_states,) or (0,)
-        What was subtracted from all samples.
-    arrays : mapping of str to ndarray
-        From `pieces_of`: the hops, oldest first, and last the unfinished one.
-
-    Attributes
-    ----------
-    arrays : dict of str to ndarray
-        The same again, with the level.
-    pieces : tuple of Piece
-        Of the hops.
-    last : Piece
-        The unfinished hop.
+    The arrays are from `pieces_of`: the hops, oldest first, and last the unfinished one; the level, shape (n_states,)
+    or (0,), was subtracted from all samples.
 
     Raises
     ------
@@ -93,7 +80,7 @@ class Recall:
             Piece(start_ns, block_ns, row, rows, digest.tobytes())
             for (start_ns, block_ns, row, rows), digest in zip(numbers.tolist(), digests, strict=True)
         ]
-        self.arrays: dict[str, np.ndarray] = {"level": level, "pieces": numbers, "digests": digests}
+        self.arrays: dict[str, np.ndarray] = {"level": level, "pieces": numbers, "digests": digests}  # the same again
         self.pieces, self.last = tuple(hops), last
         self._plan, self._level = plan, level
         self._oldest_ns = min(one.block_ns for one in (*hops, last) if one.rows) if hops or last.rows else 0

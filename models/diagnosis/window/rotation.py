@@ -56,12 +56,8 @@ class RotationLine:
 def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: float) -> RotationLine | None:
     """Find the line in one hop; None if no channel fluctuates or the range holds no frequency.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n, n_samples)
-        All samples of the hop and what it needs before it.
-    speed_rad_s, tolerance : float
-        Expected speed and how far it may be off, relative.
+    All samples of the hop and what it needs before it, shape (n, n_samples), are looked at, near the expected speed,
+    with a relative tolerance.
     """
     n_samples = x.shape[1]
     duration_s, expected_hz = n_samples / rate_hz, speed_rad_s / (2 * np.pi)
@@ -133,17 +129,8 @@ def _top(values: list[float]) -> float:
 def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> FloatArray | None:
     """Speed of each hop if the lines are those of one shaft; nan where a hop's largest peak was another one.
 
-    A drive that goes from one set point to another is followed at each of them.
-
-    Parameters
-    ----------
-    lines : tuple of RotationLine or None
-        Of hops that follow each other, apart from gaps.
-
-    Returns
-    -------
-    ndarray, shape (n_hops,), or None
-        None if no line can be followed.
+    A drive that goes from one set point to another is followed at each of them. The hops follow each other, apart from
+    gaps. None if no line can be followed.
     """
     speed = np.array([np.nan if line is None else line.speed_rad_s for line in lines])
     strength = np.array([0.0 if line is None else line.strength for line in lines])
@@ -174,14 +161,8 @@ def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, h
     """Which hops had one speed from beginning to end; all where a line does not stand out enough to tell.
 
     Of a hop beside one with another speed a part may have had that already. A line that is weaker at the speed of its
-    neighbours is one in more vibration: of a load that has grown.
-
-    Parameters
-    ----------
-    lines : tuple of RotationLine or None
-        As for `followed_speeds`.
-    followed : ndarray, shape (n_hops,)
-        What that made of them.
+    neighbours is one in more vibration: of a load that has grown. What `followed_speeds` made of the lines is
+    `followed`.
     """
     strength = np.array([0.0 if line is None else line.strength for line in lines])
     found = np.isfinite(followed)

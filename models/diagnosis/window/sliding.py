@@ -30,7 +30,6 @@ class SlidingWindow:
 
     Parameters
     ----------
-    plan : Plan
     remembered : bool
         Whether `checkpoint` will be asked for: the samples of every hop have their digest taken then.
     lines : sequence of KnownLine
@@ -78,18 +77,11 @@ class SlidingWindow:
         return self._hops[-1] if self._hops else None
 
     def feed(self, samples: SampleArray, start_ns: int) -> Iterator[int]:
-        """Add samples that continue the previous ones, stopping at every completed hop.
+        """Add samples that continue the previous ones, stopping at every completed hop, whose end time is yielded.
 
-        Parameters
-        ----------
-        samples : ndarray, shape (n_samples, width or channels)
-            Finite, in SI units as `Plan.to_si` gives them; as received where the window was told of how many channels.
-
-        Yields
-        ------
-        int
-            End time of a hop that became complete and is in the window now. A long block may complete several: ask for
-            the statistics between them, and take all, or the rest of the block is lost.
+        They are finite, of shape (n_samples, width or channels), in SI units as `Plan.to_si` gives them; as received
+        where the window was told of how many channels. A long block may complete several hops: ask for the statistics
+        between them, and take all, or the rest of the block is lost.
         """
         self.give_up()
         # Anchored anew by every block: the device's clock is the time, however its rate deviates from nominal.
@@ -163,14 +155,9 @@ class SlidingWindow:
         return self._recall is not None
 
     def recall(self, samples: SampleArray, start_ns: int, *, newest: bool) -> None:
-        """Take a block again that was in the window when `checkpoint` was called.
+        """Take a block again, as received, that was in the window when `checkpoint` was called.
 
-        Parameters
-        ----------
-        samples : ndarray, shape (n_samples, n_channels)
-            As received, not yet in SI units.
-        newest : bool
-            Whether no later one has been there: everything may be complete now.
+        The newest is one after which no later one has been there: everything may be complete now.
         """
         if self._recall is None:
             return
@@ -197,10 +184,7 @@ class SlidingWindow:
     def checkpoint(self, *, whole: bool = False) -> dict[str, np.ndarray]:
         """What a window goes on from, as named arrays, between two blocks.
 
-        Parameters
-        ----------
-        whole : bool
-            With moments and samples, megabytes; otherwise the same samples have to be taken again with `recall`.
+        The whole has moments and samples, megabytes; otherwise the same samples have to be taken again with `recall`.
 
         Raises
         ------
@@ -272,14 +256,9 @@ class SlidingWindow:
         return levels_of(self.plan, tuple(self._hops), errors=errors) if self._hops else None
 
     def statistics(self, hops: int | None = None, *, lagged: bool = False) -> WindowStatistics | None:
-        """Statistics of the window, or of its latest hops, or None while there are not so many.
+        """Statistics of a full window, or of so many of its latest hops; None while there are not so many.
 
-        Parameters
-        ----------
-        hops : int, optional
-            How many of the latest hops; all hops of a full window without it.
-        lagged : bool
-            Whether the latest hops have correlations at all lags, as a full window has, or at lag zero alone.
+        The latest hops have correlations at all lags, as a full window has, only if `lagged`; otherwise at lag zero.
         """
         count = self.plan.hops if hops is None else hops
         if not 0 < count <= len(self._hops):

@@ -23,22 +23,11 @@ def summed(segments: ComplexArray) -> ComplexArray:
 
 
 def segment_levels(segments: ComplexArray, spectrum: ComplexArray, columns: Sequence[int]) -> FloatArray | None:
-    """Powers of the segments of a window relative to their mean; None if it is stationary.
+    """Powers of the segments of a window relative to their mean, shape (n_segments,); None if it is stationary.
 
-    Parameters
-    ----------
-    segments : ndarray, shape (n_bins, n_segments, n)
-        Fourier coefficients without mean and rotation.
-    spectrum : ndarray, shape (n_bins, n, n)
-        `summed` of them.
-    columns : sequence of int
-        Channels that count: one of each motion.
-
-    Returns
-    -------
-    ndarray, shape (n_segments,), or None
-        Medians over the band and over motions that do not go together: lines that come, and forces on a part of either,
-        are not the level.
+    They are medians over the band and over motions that do not go together: lines that come, and forces on a part of
+    either, are not the level. Segments are Fourier coefficients, shape (n_bins, n_segments, n), without mean and
+    rotation, and the spectrum is `summed` of them; one channel of each motion counts.
     """
     n, count = len(columns), segments.shape[1]
     blocks = segments.shape[0] // _BLOCK

@@ -143,13 +143,8 @@ class WindowStatistics:
         turns = np.exp(-2j * np.pi * self.lags_s[:, None] * [line.centre_hz for line in lines])
         gone = np.tensordot(turns, np.stack([line.power for line in lines if line.power is not None]), axes=1).real
         spectrum = replace(self, lines=tuple(lines)).spectrum_without_lines
-        return replace(
-            self,
-            correlation=self.correlation - gone,
-            hop_correlation=self.hop_correlation - gone,
-            spectrum=spectrum,
-            lines=(),
-        )
+        correlation, hop_correlation = self.correlation - gone, self.hop_correlation - gone
+        return replace(self, correlation=correlation, hop_correlation=hop_correlation, spectrum=spectrum, lines=())
 
     @cached_property
     def hop_waveform(self) -> Waveform:
@@ -188,18 +183,18 @@ def window_statistics(
     if rotation.by_hop:
         phase_reference = rotation.source == "phase reference"
         level = regression(total[0] if phase_reference else total[0][: n + 1, : n + 1], n)
-        own = hop_coefficients(plan, hops, rotation, level[:, 0])
-        remove = np.concatenate([np.broadcast_to(np.eye(n), (len(hops), n, n)), -own.hops], axis=2)[:, np.newaxis]
+        of_hops, of_segments = hop_coefficients(plan, hops, rotation, level[:, 0])
+        remove = np.concatenate([np.broadcast_to(np.eye(n), (len(hops), n, n)), -of_hops], axis=2)[:, np.newaxis]
         hop_correlation = (remove @ products @ remove.transpose(0, 1, 3, 2)) / plan.hop
         correlation = hop_correlation.sum(axis=0) / len(hops)
-        by_bin = segments[:, :, :n] - (segments[:, :, n:].swapaxes(0, 1) @ own.segments.swapaxes(1, 2)).swapaxes(0, 1)
+        by_bin = segments[:, :, :n] - (segments[:, :, n:].swapaxes(0, 1) @ of_segments.swapaxes(1, 2)).swapaxes(0, 1)
         if phase_reference:
             synchronous = _synchronous(level)
             one, other = by_bin[:, :-2], by_bin[:, 2:]  # those between overlap both
             powers = (np.abs(one) ** 2).sum(axis=1) * (np.abs(other) ** 2).sum(axis=1)
             phase_kept = _coherence((one * other.conj()).sum(axis=1), powers)
         elif plan.states:
-            relative_synchronous = relative_vectors(np.stack([_synchronous(one) for one in own.hops]))
+            relative_synchronous = relative_vectors(np.stack([_synchronous(one) for one in of_hops]))
     else:
         beta = regression(total[0], n)
         remove = np.hstack([np.eye(n), -beta])
