@@ -58,7 +58,8 @@ class MachineEntry(BaseModel, extra="forbid", frozen=True):
         default=None,
         min_length=1,
         description="trained networks or what was commissioned: shipped bundle by name, or folder relative to the "
-        "settings file; a machine whose parameters are not known needs one, others are monitored without networks",
+        "settings file; without one only levels are watched of a machine whose parameters are not known, and others "
+        "are monitored without networks",
     )
 
     def load(self) -> MachineFile:
