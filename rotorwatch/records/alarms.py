@@ -76,7 +76,10 @@ _AlarmInterval = Annotated[
 
 _LowConfidence = Annotated[
     bool,
-    Field(description="the data are outside the model: the parameter named here has low confidence", examples=[False]),
+    Field(
+        description="another cause is possible, as outside the model: the parameter named here has low confidence",
+        examples=[False],
+    ),
 ]
 
 _Note = Annotated[

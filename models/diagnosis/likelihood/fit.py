@@ -411,7 +411,8 @@ class LikelihoodFit:
             return ""
         return (
             f"{self._machine.name}: it would take a shaft {100 * change:.0f} % stiffer than that of the machine file, "
-            "which no fault causes: the file's masses or lengths are not those of this machine, or its shaft is not"
+            "which no fault of a shaft causes: something holds it, such as a locked coupling, or the file's masses or "
+            "lengths are not those of this machine, or its shaft is not"
         )
 
 

@@ -86,7 +86,7 @@ class AlarmEvent:
         half = Z95 * (alarm.standard_error or 0.0)
         digits = percent_digits(half)
         size = f"{alarm.change or 0.0:+.{digits}%} ± {half:.{digits}%}" + (f": {alarm.note}" if alarm.note else "")
-        reserve = " (low confidence: outside the model)" if alarm.low_confidence else ""
+        reserve = " (low confidence: another cause is possible)" if alarm.low_confidence else ""
         match self.kind:
             case EventKind.RAISED:
                 return f"{alarm.severity.upper()}: {what} changed by {size}{reserve}"

@@ -37,6 +37,7 @@ _TAKEN_BACK = 0.5
 _ANOTHER = 4
 """Parameters that seem to have changed outside the model from which none is named: it is another machine, or what is
 wrong concerns all of it."""
+_HELD = "no fault makes a shaft stiffer; something may hold it, such as a locked coupling"
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +132,8 @@ class AlarmBook:
         evidence = Evidence(start_ns=start_ns, end_ns=end_ns, confidence=verdict.confidence)
         for reading in verdict.current:
             if reading.relative_change is not None and reading.standard_error is not None:
+                larger = reading.relative_change if reading.vector is None else reading.vector.magnitude_change
+                held_stiff = reading.name == "EI" and larger > 0  # no fault of a shaft makes it stiffer
                 self.update(
                     reading.name,
                     reading.relative_change,
@@ -140,10 +143,11 @@ class AlarmBook:
                     taken_back=verdict.settled and not hidden and (another or reading.name not in held),
                     low_confidence=verdict.outside_model
                     or hidden
+                    or held_stiff
                     or (moves and (reading.name, reading.by) == ("e", BaselineDiagnostician.by)),
-                    growth=None if reading.vector is None else reading.vector.magnitude_change,
+                    growth=larger if reading.name == "e" else None,
                     evidence=evidence,
-                    note="" if reading.vector is None else reading.vector.text,
+                    note=_HELD if held_stiff else "" if reading.vector is None else reading.vector.text,
                 )
         if verdict.outside_model and not verdict.current:
             # Of what nothing explains nothing is read, and what was named before is named with reserve from now on.
@@ -201,8 +205,8 @@ class AlarmBook:
         taken_back : bool
             Whether a whole window after the change says that it is not.
         growth : float, optional
-            How much of the change loads the machine more or less than before, where that is not all: an unbalance that
-            has only turned is not dangerous.
+            By how much the machine is loaded more, where that is not all of the change: an unbalance that has only
+            turned, or has become smaller, is not dangerous.
         note : str
             The change in words, where a number does not say all.
         """
@@ -220,9 +224,7 @@ class AlarmBook:
         )
         beyond, small = named and size > limits.raise_above, taken_back or size < limits.clear_below
         # With reserve the size is one of a parameter that need not be the one; levels say whether it is dangerous.
-        danger = (
-            beyond and min(size, size if growth is None else abs(growth)) > limits.danger_above and not low_confidence
-        )
+        danger = beyond and min(size, size if growth is None else growth) > limits.danger_above and not low_confidence
         return self._judge(alarm, time_ns, beyond=beyond, small=small, danger=danger)
 
     def update_state(  # noqa: PLR0913  # what is known of a state

@@ -68,7 +68,7 @@ def test_outside_the_model_is_an_alarm_of_its_own() -> None:
     assert told[0].text.startswith("ALERT: outside the model: something has changed that no parameter describes")
     assert not book.update("e", 0.3, 0.01, 0, named=True, low_confidence=True)
     (event,) = book.update("e", 0.3, 0.01, 10**10, named=True, low_confidence=True)
-    assert event.text.endswith("changed by +30.0% ± 2.0% (low confidence: outside the model)")
+    assert event.text.endswith("changed by +30.0% ± 2.0% (low confidence: another cause is possible)")
     told = [event for n in range(4, 9) for event in book.update_state(MODEL, False, n * 5_000_000_000)]
     assert [event.text for event in told] == ["cleared: the model describes the machine again"]
 

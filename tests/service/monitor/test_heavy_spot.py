@@ -69,6 +69,25 @@ def test_without_a_shaft_angle_the_unbalance_is_judged_by_its_size(backward: boo
     assert all(one.vector is None for one in windows[-1].parameters)  # it has no direction
 
 
+@pytest.mark.parametrize("angle", [True, False])
+def test_an_unbalance_that_has_become_smaller_is_no_danger(angle: bool) -> None:
+    sensors = LAB.sensors if angle else tuple(one for one in LAB.sensors if one.name != "theta")
+    parts = stream(130.0, 0.15, Event(at_s=80.0, parameter="e", relative_change=-0.6))
+    parts = tuple(one if angle else replace(one, samples=one.samples[:, :-1]) for one in parts)
+    _, events = feed(MachineMonitor(Installed(LAB.model_copy(update={"sensors": sensors}))), parts)
+    assert [(event.kind, event.alarm.name, event.alarm.severity) for event in events] == [("raised", "e", "alert")]
+
+
+def test_a_shaft_that_reads_stiffer_is_named_with_reserve() -> None:
+    """As where a coupling has locked: in a shaft that has cracked there is none."""
+    for change, reserve in ((0.2, True), (-0.2, False)):
+        parts = stream(120.0, 0.15, Event(at_s=80.0, parameter="EI", relative_change=change))
+        _, events = feed(MachineMonitor(Installed(LAB)), parts)
+        (event,) = (one for one in events if one.alarm.name == "EI")
+        assert event.alarm.low_confidence is reserve
+        assert ("locked coupling" in event.text) is reserve
+
+
 def test_where_the_file_says_it_another_angle_is_a_change() -> None:
     windows, events = feed(MachineMonitor(Installed(with_heavy_spot(0.0))), stream(75.0, 2.5))
     assert [(event.alarm.name, event.alarm.severity) for event in events] == [("e", "alert")]  # no more than it was

@@ -15,7 +15,7 @@ function known(alarm) {
   if (shelf) return `shelved by ${shelf.by} until ${clock(shelf.until_ns)}${shelf.one_shot ? " or until it clears" : ""}: ${shelf.reason}`;
   if (alarm.out_of_service_by) return `taken out of service by ${alarm.out_of_service_by}: ${alarm.out_of_service_reason}`;
   if (alarm.suppressed_by) return `suppressed: ${alarm.suppressed_by}`;
-  const size = change !== null && range ? `${percent(change)} (${interval(range)})${alarm.low_confidence ? ", low confidence: outside the model" : ""}` : "";
+  const size = change !== null && range ? `${percent(change)} (${interval(range)})${alarm.low_confidence ? ", low confidence: another cause is possible" : ""}` : "";
   return [size, alarm.note].filter(Boolean).join("; ");
 }
 
