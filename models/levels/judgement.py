@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -159,7 +160,9 @@ class LevelJudge:
                 return Foreign(text, hides=True, direction=own[0].direction, unlike=unlike)
         if found or not seen:  # at another speed much is otherwise
             return Foreign(found)
-        kurtosis, twice = levels.random_kurtosis, [one.limit("x2") for one in judged]
+        kurtosis, hidden = levels.random_kurtosis, levels.hidden_twice
+        told = judged if hidden is None else compress(judged, ~hidden)
+        twice = [one.limit("x2") for one in told]
         grown = [limits.text for limits in twice if limits and limits.text and not limits.absolute]
         if grown or kurtosis is None:
             return Foreign(next(iter(grown), ""))

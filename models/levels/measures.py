@@ -38,7 +38,7 @@ import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
 
 from models.checkpoint import checked
-from models.levels.bands import NYQUIST_PART, BandLevels, band_edges
+from models.levels.bands import ERRORS, NYQUIST_PART, BandLevels, band_edges
 from models.levels.kurtosis import random_kurtosis, swell
 from models.levels.orders import ORDERS, Spectrum, hann_taper, order_vectors, without_orders
 from models.signals.block import FloatArray
@@ -60,6 +60,7 @@ _HANN_BINS = 1.5
 """Bins of a tapered spectrum that say as much as one of an untapered one."""
 STANDS_RAD_S = 2 * np.pi * 0.5
 """Slower than this, rad/s, a shaft is not taken to turn."""
+_LEAST_HOPS = 4  # that tell how much a line scatters
 
 _ComplexArray = npt.NDArray[np.complex128]
 _Number = TypeVar("_Number", np.float64, np.complex128)
@@ -333,6 +334,15 @@ class WindowLevels:
     def random_kurtosis(self) -> FloatArray | None:
         """See `models.levels.kurtosis`; shape (n_hops, n)."""
         return None if self.moments is None else random_kurtosis(*self.moments[:3])
+
+    @property
+    def hidden_twice(self) -> npt.NDArray[np.bool_] | None:
+        """Whether random vibration as loud as it is now explains the 2x, shape (n,); None where that cannot be told."""
+        if self.moments is None or self.vectors is None or self.hops < _LEAST_HOPS:
+            return None
+        steps = np.abs(np.diff(self.moments[2][:, 1], axis=0)) ** 2  # where a line begins, one of them is its own
+        error = np.sqrt(np.median(steps, axis=0) / (2 * math.log(2) * self.hops))
+        return np.asarray(np.abs(self.vectors[2]) < ERRORS * error)
 
 
 def window_levels(

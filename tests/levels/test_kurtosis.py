@@ -174,3 +174,11 @@ def test_less_will_do_to_doubt_what_else_was_found() -> None:
     by_five_errors = np.full(HOPS, 3.0 - 5 * 0.1 / np.sqrt(HOPS))
     assert departure(by_five_errors, healthy, 6.0) == 0.0
     assert departure(by_five_errors, healthy, 4.0) == pytest.approx(-0.144, abs=1e-3)
+
+
+def test_vibration_that_has_become_louder_is_no_2x_but_a_2x_in_it_is_one() -> None:
+    def louder(samples: FloatArray) -> FloatArray:
+        return np.asarray(10 * (samples - 2 * np.cos(THETA)) + 2 * np.cos(THETA), dtype=np.float64)
+
+    assert suspects([0.0] * 12, 0.0, louder) == [""] * 12
+    assert all(suspects([0.0] * 4, 0.0, lambda samples: louder(samples) + 6 * np.cos(2 * THETA + 1)))
