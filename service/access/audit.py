@@ -24,6 +24,7 @@ STARTED = "started"
 """Action of an entry that was written before the action, whose status is 0."""
 
 _LONGEST = 500
+_SET_BACK_NS = 10**9
 _REFUSALS_IN_ALL = 60
 _log = logger(part="access")
 
@@ -67,7 +68,10 @@ class AuditTrail:
     def visit(self, address: str, method: str, path: str) -> Visit:
         """Begin to follow a request; no two have the same time."""
         with self._lock:
-            self._latest_ns = max(self._latest_ns + 1, time.time_ns())
+            now_ns = time.time_ns()
+            if now_ns <= self._latest_ns < now_ns + _SET_BACK_NS:
+                now_ns = self._latest_ns + 1
+            self._latest_ns = now_ns  # also where the clock was set back
             return Visit(self._latest_ns, address, method, path)
 
     def start(self, visit: Visit) -> None:

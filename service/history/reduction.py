@@ -6,6 +6,7 @@ from collections.abc import Callable
 import structlog
 from sqlalchemy import Connection, Table, delete, func, select, text, update
 
+from service.history.age import AgeClock
 from service.history.database import Database
 from service.history.records import Dropped, Retention, StoreError
 from service.history.tables import buckets, machines, reports, series, windows
@@ -19,7 +20,7 @@ _log = structlog.get_logger("rotorwatch", part="history")
 
 
 class Reduction:
-    """Keeps the history as long as `Retention` says, by the computer's time `now_ns`."""
+    """Keeps the history as long as `Retention` says, by the computer's time `now_ns`, see `AgeClock`."""
 
     def __init__(self, database: Database, retention: Retention, now_ns: Callable[[], int]) -> None:
         self._database = database
@@ -55,9 +56,10 @@ class Reduction:
             )
 
     def _run(self) -> None:
+        age_ns = AgeClock(self._now_ns)
         while not self._stopping.wait(_EVERY_S):
             try:
-                dropped = self.run(self._now_ns())
+                dropped = self.run(age_ns())
             except StoreError as error:
                 _log.warning("the history could not be cleaned up", why=str(error))
                 continue

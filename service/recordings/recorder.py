@@ -23,6 +23,7 @@ from pathlib import Path
 from models.errors import RecordingError, RotorwatchError
 from models.machine import MachineFile
 from models.signals.recording import RecordedMessage, RecordingWriter, writing
+from service.history.age import AgeClock
 from service.history.records import StoredEvent
 from service.recordings.backlog import Backlog
 from service.recordings.catalogue import PART, SUFFIX, Catalogue, name_of
@@ -91,7 +92,7 @@ class MachineRecorder:
         self.folder = self.directory / machine.site / machine.name
         self._committed = committed
         self._clock = clock
-        self._now_ns = now_ns
+        self._age_ns = AgeClock(now_ns, clock)
         self._log = logger(part="recorder", machine=machine.title)
         self._limiter = Limiter(clock)
         self._backlog = Backlog(round(settings.queue_mb * 1e6), machine.keys.stream)
@@ -363,7 +364,7 @@ class MachineRecorder:
             if str(error) != self._unread:
                 self._log.warning("the history cannot be read: alarms keep no more recordings", why=str(error))
             self._unread = str(error)
-        decision = decide(recordings, self._marks, self.settings, self._now_ns())
+        decision = decide(recordings, self._marks, self.settings, self._age_ns())
         kept = {one.path.name: one.kept_because for one in recordings if one.kept_because}
         if decision.kept != kept:
             write_kept(self.folder, decision.kept, self.settings)

@@ -7,6 +7,7 @@ import socket
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import httpx
 import pytest
@@ -14,10 +15,11 @@ from fastapi import FastAPI, Request, Response
 from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
 from structlog.testing import capture_logs
 
-from service.access.audit import STARTED
+from service.access.audit import STARTED, AuditTrail
 from service.access.guard import Guard
 from service.access.scopes import Scope
-from service.history.records import TokenRecord
+from service.history.records import Retention, TokenRecord
+from service.history.store import Store
 from service.settings.access import AccessSettings, LimitSettings
 from tests.service.rig.guarded import JSON, Guarded, application, basic, guarded, problem
 from tests.service.rig.live import until
@@ -195,6 +197,15 @@ def test_what_is_done_is_written_down_before_and_after(monitor: Guarded) -> None
     assert after.reason == "bolt is being replaced"
     assert len({entry.at_ns for entry in entries}) == 4
     assert monitor.done == ["shelve k_by control room"]
+
+
+def test_a_clock_that_is_set_back_counts_for_what_is_done_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    day_ns = 86_400 * 10**9
+    times = iter([5 * day_ns, 5 * day_ns, 5 * day_ns - 1, day_ns, day_ns])
+    trail = AuditTrail(Store("sqlite:///:memory:", Retention()).audit, 5)
+    monkeypatch.setattr("service.access.audit.time", SimpleNamespace(time_ns=lambda: next(times)))
+    at_ns = [trail.visit("127.0.0.1", "POST", "/").at_ns for _ in range(5)]
+    assert at_ns == [5 * day_ns, 5 * day_ns + 1, 5 * day_ns + 2, day_ns, day_ns + 1]
 
 
 def test_nothing_is_done_that_cannot_be_written_down(monitor: Guarded, tmp_path: Path) -> None:

@@ -201,6 +201,23 @@ def test_everything_goes_in_its_time_but_alarms_and_audit(store: Store, clock: C
     assert len(store.audit.entries()) == 1
 
 
+def test_nothing_is_dropped_for_a_clock_that_was_set_forward(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.history.reduction._EVERY_S", 0.001)
+    looked, clock = threading.Semaphore(0), Clock()
+
+    def now_ns() -> int:
+        looked.release()
+        return clock()
+
+    with opened(database_url("sqlite", tmp_path), RETENTION, now_ns=now_ns) as store:
+        lab = store.machine("demo", "lab")
+        write(lab, clock, 100)
+        clock.now_ns += 400 * DAY
+        for _ in range(100):
+            assert looked.acquire(timeout=60.0)
+        assert len(lab.readings(quantity="parameter", name="k_by", limit=1000)) == 100
+
+
 def test_what_is_written_meanwhile_stays(store: Store, clock: Clock) -> None:
     lab = store.machine("demo", "lab")
     write(lab, clock, 2000, per_step=400)

@@ -212,6 +212,34 @@ def test_what_is_kept_stays_when_the_history_is_lost_or_cannot_be_read(tmp_path:
     assert numbers(folder)[:3] == [0, 1, 2]
 
 
+def test_a_clock_that_is_set_forward_drops_nothing_until_it_has_stayed_so_for_a_day(tmp_path: Path) -> None:
+    passed_s, set_days = 0.0, 0
+
+    def now_ns() -> int:
+        return NOW_NS + round((passed_s + 86_400 * set_days) * NS)
+
+    recorder = MachineRecorder(
+        LAB, RecordingSettings(directory=str(tmp_path), rotate_s=60), lambda _: (), lambda: passed_s, now_ns
+    )
+
+    def closed(count: int) -> list[str]:
+        nonlocal passed_s
+        recorder.put(RecordedMessage(LAB.keys.stream, b"x", b"", "x", now_ns(), now_ns()))
+        until(lambda: recorder.status().file != "", "a file")
+        passed_s += 61.0
+        until(lambda: recorder.status().files == count, "a closed file")
+        return [one.path.name for one in Catalogue(tmp_path).recordings()]
+
+    recorder.start()
+    (first,) = closed(1)
+    set_days = 400
+    assert first in closed(2)
+    assert first in closed(3)
+    passed_s += 86_400.0
+    assert first not in closed(4)
+    recorder.stop()
+
+
 def test_what_kept_json_says_is_found_anew_when_it_is_lost(tmp_path: Path) -> None:
     folder = record_files(tmp_path, 0, 3, events=(at_file(1),))
     before = kept_reasons(folder)
