@@ -94,7 +94,7 @@ class UnbalanceVector:
     def read_as(self, change: float, own: float) -> "UnbalanceVector":
         """Return the same as large as e is read: a window that is astride a change shows a part of it.
 
-        The relative change of e is that read, and its own what the window by itself says; see `parameter_reading`.
+        The relative change of e is `change` as read, `own` as the window by itself says; see `parameter_reading`.
         """
         if self.moved:
             part = change / own if own else 1.0

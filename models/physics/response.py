@@ -20,14 +20,8 @@ def stationary_covariance(A: FloatArray, B: FloatArray) -> FloatArray:
     """Solve A R(0) + R(0) Aᵀ = -B Bᵀ for the covariance of a stable system under unit white noise.
 
     The states are balanced first: they differ by many orders of magnitude, and the solver's error is relative to the
-    largest.
-
-    Parameters
-    ----------
-    A : ndarray, shape (n, n)
-        System matrix, all eigenvalues in the left half plane.
-    B : ndarray, shape (n, p)
-        Input matrix of independent white noise of unit intensity.
+    largest. A, shape (n, n), is the system matrix, B, shape (n, p), the input matrix of independent white noise of unit
+    intensity.
 
     Raises
     ------
@@ -40,9 +34,8 @@ def stationary_covariance(A: FloatArray, B: FloatArray) -> FloatArray:
             f"the system is unstable: an eigenvalue has real part {fastest:.3g} 1/s, expected below 0"
         )
     _, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
-    rough = scipy.linalg.solve_continuous_lyapunov(
-        A * (scale / scale[:, None]), -(B / scale[:, None]) @ (B / scale[:, None]).T
-    )
+    inputs = B / scale[:, None]
+    rough = scipy.linalg.solve_continuous_lyapunov(A * (scale / scale[:, None]), -inputs @ inputs.T)
     # One refinement in units of the states' own standard deviations.
     deviation = np.sqrt(np.maximum(np.diag(rough), np.finfo(float).tiny)) * scale
     if not np.any(B):
@@ -89,19 +82,7 @@ def discretise(A: FloatArray, B: FloatArray, step_s: float) -> DiscreteSystem:
 
     Displacement, velocity and filter states differ by many orders of magnitude. They are scaled to unit standard
     deviation before the covariance is factored; without that the displacement-velocity pair comes out inconsistent and
-    damping is off by tens of percent.
-
-    Parameters
-    ----------
-    A : ndarray, shape (n, n)
-        Stable system matrix.
-    B : ndarray, shape (n, p)
-        Input matrix of unit-intensity white noise.
-
-    Returns
-    -------
-    DiscreteSystem
-        In the original, unscaled states.
+    damping is off by tens of percent. The result is in the original states. A and B are as in `stationary_covariance`.
     """
     n = A.shape[0]
     deviation = np.sqrt(np.diag(stationary_covariance(A, B)))
@@ -121,23 +102,11 @@ def discretise(A: FloatArray, B: FloatArray, step_s: float) -> DiscreteSystem:
 
 
 def advance(system: DiscreteSystem, state: FloatArray, noise: FloatArray) -> FloatArray:
-    """Advance by many samples at once.
+    """States after each of many steps, shape (n_samples, n), from the state before the first one, shape (n,).
 
-    Equals the recursion ``x = F @ x + G @ w`` row by row. The samples are cut into pieces that advance side by side
-    from rest; the pieces' starting states follow and are carried through each piece, which costs √n array operations
-    instead of n.
-
-    Parameters
-    ----------
-    state : ndarray, shape (n,)
-        State before the first step.
-    noise : ndarray, shape (n_samples, n)
-        Standard normal numbers, one row per step.
-
-    Returns
-    -------
-    ndarray, shape (n_samples, n)
-        States after each step; the last row is where to go on from.
+    Equals the recursion ``x = F @ x + G @ w`` row by row, with standard normal noise, shape (n_samples, n). The samples
+    are cut into pieces that advance side by side from rest; the pieces' starting states follow and are carried through
+    each piece, which costs √n array operations instead of n. The last row is where to go on from.
     """
     n_samples, n = noise.shape
     length = max(1, int(np.sqrt(n_samples)))

@@ -112,12 +112,7 @@ QUANTITY: Mapping[str, str] = MappingProxyType({name: row.quantity for name, row
 
 
 def changed(rotor: RotorParameters, relative_changes: Mapping[str, float]) -> RotorParameters:
-    """Return the rotor with some parameters changed by a relative amount.
-
-    Parameters
-    ----------
-    relative_changes : mapping of str to float
-        Parameter (one of `PARAMETERS`) to relative change, above -1; -0.2 is a loss of 20 %.
+    """Return the rotor with some of `PARAMETERS` changed by a relative amount, above -1; -0.2 is a loss of 20 %.
 
     Raises
     ------
@@ -194,8 +189,7 @@ def H_matrix(rotor: RotorParameters, speed_rad_s: float) -> FloatArray:
     """Input matrix of n(t) = (cos Ωt, sin Ωt): unbalance force on the disc (Eq. 16), shape (6, 2), N."""
     force_N = rotor.m2_kg * rotor.e_m * speed_rad_s**2
     H = np.zeros((6, 2))
-    H[1, 0] = force_N
-    H[4, 1] = force_N
+    H[1, 0] = H[4, 1] = force_N
     return H
 
 
@@ -213,12 +207,7 @@ _LEAST = -1.0  # nothing that is positive by nature can lose all it has and stil
 
 
 def impossible(change: float, quantity: str) -> str:
-    """Why a relative change cannot be; empty if it can.
-
-    Parameters
-    ----------
-    change : float
-        Relative change of something that is positive by nature: a mass, a stiffness, a damping, a gain, a length.
+    """Why a relative change of what is positive by nature (a mass, a gain, a length) cannot be; empty if it can.
 
     Examples
     --------

@@ -37,13 +37,7 @@ class SampleBlock:
 
 
 class NewestBlocks:
-    """The newest blocks without a gap, for whoever wants to see samples.
-
-    Parameters
-    ----------
-    n_samples : int
-        As many blocks as hold at least so many samples.
-    """
+    """The newest blocks without a gap that hold at least so many samples, for whoever wants to see some."""
 
     def __init__(self, n_samples: int) -> None:
         self._enough = n_samples
@@ -85,23 +79,10 @@ def settling_s(high_pass_hz: float) -> float:
 
 
 def integrated(acceleration: FloatArray, rate_hz: float, times: int, high_pass_hz: float) -> FloatArray:
-    """Integrate samples once or twice.
+    """Integrate equally spaced samples without a gap, shape (n,), once to velocity or twice to displacement.
 
-    The first and last `settling_s` of the result are not valid.
-
-    Parameters
-    ----------
-    acceleration : ndarray, shape (n,)
-        Equally spaced, without a gap.
-    times : int
-        1 for velocity, 2 for displacement.
-    high_pass_hz : float
-        Corner of the high-pass; valid from `lowest_valid_hz`.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        In the unit of `acceleration` times s or s².
+    The result, shape (n,), is in the unit of `acceleration` times s or s². It is valid from `lowest_valid_hz` of the
+    high-pass's corner, but for its first and last `settling_s`.
 
     Examples
     --------

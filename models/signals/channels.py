@@ -358,26 +358,12 @@ _UNITS: dict[str, dict[str, float]] = {
     Quantity.SHAFT_ANGLE: {"rad": 1.0, "deg": _DEGREE, "°": _DEGREE, "rev": _TURN},
 }
 
-_TIME_NS: dict[str, float] = {
-    "s": 1e9,
-    "ms": 1e6,
-    "us": 1e3,
-    "µs": 1e3,
-    "ns": 1.0,
-    "min": 60e9,
-    "h": 3600e9,
-    "d": 86_400e9,
-}
+_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "µs": 1e3, "ns": 1.0, "min": 60e9, "h": 3600e9, "d": 86_400e9}
 _DETECTED = re.compile(r"(?:[ _(-]|\b)(pp|p-p|pk-pk|pkpk|peak-peak|0-p|0-pk|pk|peak|rms|avg)\)?$", re.IGNORECASE)
 
 
 def unit_factor(quantity: str, unit: str) -> float:
-    """Factor that turns samples in `unit` into SI units of `quantity`.
-
-    Parameters
-    ----------
-    unit : str
-        As a person or a measuring program writes it; both micro signs are understood.
+    """Factor that turns samples in a unit, as a person or a measuring program writes it, into SI units of a quantity.
 
     Raises
     ------

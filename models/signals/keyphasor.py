@@ -23,11 +23,7 @@ def jump_within_a_turn(steps_rad: FloatArray) -> float:
     """Largest angle by which a sampled shaft angle jumps, between two samples or in one turn of the mark, rad.
 
     Two turns gain it over the two before, and lose it again to the next two; of a speed they gain, or lose, for good.
-
-    Parameters
-    ----------
-    steps_rad : ndarray, shape (n,)
-        From sample to sample, -π to π.
+    Steps, shape (n,), are those from sample to sample, -π to π.
 
     Examples
     --------
@@ -47,15 +43,10 @@ def jump_within_a_turn(steps_rad: FloatArray) -> float:
 
 
 class EdgeDetector:
-    """Finds the pulses in a sampled tachometer signal, piece by piece.
+    """Finds the pulses in a sampled tachometer signal, piece by piece: they begin at a threshold, in its unit.
 
-    Parameters
-    ----------
-    threshold : float
-        Level at which a pulse begins, in the signal's unit.
-    hysteresis : float
-        How far the signal must fall below the threshold (rise above it for falling edges) before the next pulse
-        counts; 0 counts every crossing.
+    The signal must fall below it (rise above it for falling edges) by the hysteresis before the next pulse counts; 0
+    counts every crossing.
     """
 
     def __init__(self, threshold: float, hysteresis: float, *, rising: bool) -> None:
@@ -70,18 +61,7 @@ class EdgeDetector:
         self._last, self._armed = None, False
 
     def feed(self, time: FloatArray, signal: FloatArray) -> FloatArray:
-        """Times of the pulses in the next piece, interpolated between samples.
-
-        Parameters
-        ----------
-        time, signal : ndarray, shape (n,)
-            Ascending times, and the signal at them.
-
-        Returns
-        -------
-        ndarray, shape (n_pulses,)
-            In the unit of `time`.
-        """
+        """Times of the pulses in the next piece, shape (n_pulses,), interpolated between samples at ascending times."""
         if time.size == 0:
             return np.empty(0)
         value = self._sign * signal
@@ -125,11 +105,6 @@ def pulse_train(times: FloatArray, pulses_per_turn: int = 1) -> PulseTrain:
 
     An interval below half of it has a pulse too many. One within a quarter of 2, 3 or 4 times the median has that many
     pulses missing. What is longer, or in between, is an interruption.
-
-    Parameters
-    ----------
-    times : ndarray, shape (n,)
-        Times of the pulses, ascending, at least two.
 
     Raises
     ------
@@ -179,19 +154,8 @@ def shaft_angle(train: PulseTrain, at: FloatArray, *, reverse: bool = False) -> 
     """Shaft angle in [0, 2π), 0 at the (first) pulse of each turn.
 
     Before the first pulse, after the last and around an interruption the angle is carried on at the neighbouring
-    interval's speed for one interval at most.
-
-    Parameters
-    ----------
-    at : ndarray, shape (n,)
-        In the unit of the train's times.
-    reverse : bool
-        Whether the shaft turns from z to y, so that the angle falls.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        rad; nan where the angle is unknown.
+    interval's speed for one interval at most; where it is unknown, it is nan. Times, shape (n,), are in the unit of the
+    train's. In reverse, the shaft turns from z to y, and the angle falls.
     """
     times, counts = train.times, train.counts
     speed = np.where(train.known, np.diff(counts) / np.diff(times), np.nan)  # pulses per unit of time

@@ -30,6 +30,16 @@ Topic = Literal["report", "alarm_event", "alarm_state", "health"]
 """What a monitor publishes, after the fields of `MachineKeys`."""
 
 
+class Key:
+    """A key below the root of all keys of a machine."""
+
+    def __init__(self, below: str) -> None:
+        self._below = below
+
+    def __get__(self, keys: "MachineKeys", _: type) -> str:
+        return f"{keys.root}/{self._below}"
+
+
 @dataclass(frozen=True, slots=True)
 class MachineKeys:
     """Keys under ``rotorwatch/<site>/<machine>/``.
@@ -55,55 +65,17 @@ class MachineKeys:
         """What all keys of the machine start with."""
         return f"{PREFIX}/{self.site}/{self.machine}"
 
-    @property
-    def stream(self) -> str:
-        """Sample blocks."""
-        return f"{self.root}/stream"
-
-    @property
-    def descriptor(self) -> str:
-        """Channel descriptor (JSON), also by query."""
-        return f"{self.root}/descriptor"
-
-    @property
-    def truth(self) -> str:
-        """What the simulator did to the machine (JSON); real machines have none."""
-        return f"{self.root}/truth"
-
-    @property
-    def report(self) -> str:
-        """One monitor report per evaluated window (JSON)."""
-        return f"{self.root}/report"
-
-    @property
-    def health(self) -> str:
-        """Current health (JSON), also by query."""
-        return f"{self.root}/health"
-
-    @property
-    def alarm_event(self) -> str:
-        """Alarm transitions (CloudEvents JSON)."""
-        return f"{self.root}/alarm/event"
-
-    @property
-    def alarm_state(self) -> str:
-        """All alarms that are not normal (JSON), also by query."""
-        return f"{self.root}/alarm/state"
-
-    @property
-    def publisher_alive(self) -> str:
-        """Liveliness token of whoever publishes the stream."""
-        return f"{self.root}/alive/publisher"
-
-    @property
-    def monitor_alive(self) -> str:
-        """Liveliness token of the monitor that watches the machine."""
-        return f"{self.root}/alive/monitor"
-
-    @property
-    def replay_alive(self) -> str:
-        """Liveliness token of a replay on the machine's own keys, which monitors state and do not evaluate."""
-        return f"{self.root}/alive/replay"
+    stream = Key("stream")  # sample blocks
+    descriptor = Key("descriptor")  # channel descriptor (JSON), also by query
+    truth = Key("truth")  # what the simulator did to the machine (JSON); real machines have none
+    report = Key("report")  # one monitor report per evaluated window (JSON)
+    health = Key("health")  # current health (JSON), also by query
+    alarm_event = Key("alarm/event")  # alarm transitions (CloudEvents JSON)
+    alarm_state = Key("alarm/state")  # all alarms that are not normal (JSON), also by query
+    publisher_alive = Key("alive/publisher")  # liveliness token of whoever publishes the stream
+    monitor_alive = Key("alive/monitor")  # liveliness token of the monitor that watches the machine
+    # Liveliness token of a replay on the machine's own keys, which monitors state and do not evaluate.
+    replay_alive = Key("alive/replay")
 
 
 _Flow = Literal["ingress", "egress"]

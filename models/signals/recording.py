@@ -71,12 +71,8 @@ class RecordingWriter:
     """Writes a recording; a context manager.
 
     Leaving the context without an exception gives the file its name. With an exception the file is completed but
-    stays ``NAME.part``. Every method raises `RecordingError` if the file cannot be written.
-
-    Parameters
-    ----------
-    overwrite : bool
-        Replace a recording that is already there, or a ``.part`` that a crash left.
+    stays ``NAME.part``. Every method raises `RecordingError` if the file cannot be written. One may `overwrite` a
+    recording that is already there, or a ``.part`` that a crash left.
 
     Raises
     ------
@@ -205,12 +201,7 @@ class RecordingWriter:
 def read_recording(
     path: Path, *, keys: Collection[str] | None = None, from_ns: int | None = None
 ) -> Iterator[RecordedMessage]:
-    """Read messages in the order in which they were written.
-
-    Parameters
-    ----------
-    from_ns : int, optional
-        Only log times from this one on.
+    """Read messages in the order in which they were written; of some keys, and from a log time on.
 
     Raises
     ------

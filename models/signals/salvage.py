@@ -42,14 +42,9 @@ class Salvage:
 def salvage_recording(damaged: Path, target: Path) -> Salvage:
     """Copy what can be read of an interrupted or damaged recording into a complete one.
 
-    A chunk that cannot be read is passed over; what comes after the place where the file is cut off is lost.
-
-    Parameters
-    ----------
-    damaged : Path
-        Usually the ``.part`` file of a program that was killed; it stays as it is.
-    target : Path
-        Must not exist; may be the name that `damaged` was to get.
+    A chunk that cannot be read is passed over; what comes after the place where the file is cut off is lost. The
+    damaged one, usually the ``.part`` file of a program that was killed, stays as it is; the target may be the name
+    that it was to get.
 
     Raises
     ------

@@ -68,18 +68,9 @@ class Waveform:
 
 
 def waveform_of(samples: FloatArray) -> tuple[Waveform, FloatArray]:
-    """Look at the samples of one hop.
+    """Look at finite samples of one hop, shape (n_samples, n_channels), at least one.
 
-    Parameters
-    ----------
-    samples : ndarray, shape (n_samples, n_channels)
-        Finite, at least one sample.
-
-    Returns
-    -------
-    Waveform
-    ndarray, shape (n_channels, n_samples)
-        Deviations from the mean.
+    Returns their deviations from the mean, shape (n_channels, n_samples), too.
     """
     x = np.array(samples.T, order="C")  # a copy: the mean is taken out of it below
     n, n_samples = x.shape

@@ -29,12 +29,7 @@ _COLUMN = "expected a single column 'samples' of fixed-size lists of float32 or 
 
 
 def write_arrow(samples: npt.NDArray[Any], metadata: dict[str, str]) -> bytes:
-    """Write samples as one fixed-size-list column.
-
-    Parameters
-    ----------
-    samples : ndarray, shape (n_samples, n_channels)
-    """
+    """Write samples, shape (n_samples, n_channels), as one fixed-size-list column."""
     import pyarrow as pa  # noqa: PLC0415  # 50 ms that only users of Arrow should pay
 
     flat = pa.array(np.ascontiguousarray(samples).reshape(-1))
@@ -172,16 +167,10 @@ _ARROW_FIELDS = ("start_ns", "sequence", "rate_hz", "run")
 
 
 def encode_block(block: SampleBlock, schema_hash: str) -> tuple[bytes, bytes, str]:
-    """Encode a block as raw little-endian samples.
+    """Encode a block as raw little-endian samples: payload, attachment and encoding.
 
-    Returns
-    -------
-    payload : bytes
-        Samples, C order, shape (n_samples, n_channels).
-    attachment : bytes
-        32-byte header.
-    encoding : str
-        ``application/x-rotorwatch-block;<schema hash>``.
+    The payload is in C order, shape (n_samples, n_channels), the attachment the header of 32 bytes, the encoding
+    ``application/x-rotorwatch-block;<schema hash>``.
     """
     n_samples, n_channels = block.samples.shape
     code = _DTYPE_CODES[block.samples.dtype.str[1:]]
@@ -193,24 +182,16 @@ def encode_block(block: SampleBlock, schema_hash: str) -> tuple[bytes, bytes, st
 def encode_arrow(block: SampleBlock, schema_hash: str) -> tuple[bytes, bytes, str]:
     """Encode a block as a self-contained Arrow IPC stream: one fixed-size-list column, header fields as metadata.
 
-    Returns
-    -------
-    payload, attachment, encoding
-        As `encode_block`; the attachment is empty.
+    As `encode_block`; the attachment is empty.
     """
     metadata = {name: repr(getattr(block, name)) for name in _ARROW_FIELDS}
     return write_arrow(block.samples, metadata), b"", f"{ARROW_ENCODING};{schema_hash}"
 
 
 def decode_block(payload: bytes, attachment: bytes, encoding: str) -> tuple[SampleBlock, str]:
-    """Decode a block in either encoding.
+    """Decode a block in either encoding, with the schema hash that this names, empty if none.
 
-    Returns
-    -------
-    block : SampleBlock
-        Its samples are a read-only view of `payload` in the raw encoding.
-    schema_hash : str
-        Schema hash named by the encoding, empty if none was named.
+    In the raw encoding the samples are a read-only view of the payload.
 
     Raises
     ------

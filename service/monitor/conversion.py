@@ -3,6 +3,7 @@
 from models.diagnosis.verdict.calibration import length_to_find
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETER_TEXT
+from models.signals.keys import Key
 from rotorwatch.records.health import Health, HealthState, StreamStatus
 from rotorwatch.records.machines import Channel, DetectableChanges, DetectableParameter, MachineDescription
 from service.monitor.alarm_conversion import alarm_entries, rfc3339
@@ -52,7 +53,7 @@ def health(  # noqa: PLR0913  # what the worker counts
 def machine_description(identity: Identity, machine: MachineFile, state: HealthState) -> MachineDescription:
     """Convert a machine file."""
     keys = machine.keys
-    names = [name for name, value in vars(type(keys)).items() if isinstance(value, property) and name != "root"]
+    names = [name for name, value in vars(type(keys)).items() if isinstance(value, Key)]
     return MachineDescription(
         **identity,
         description=machine.description,

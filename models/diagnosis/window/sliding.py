@@ -157,7 +157,7 @@ class SlidingWindow:
     def recall(self, samples: SampleArray, start_ns: int, *, newest: bool) -> None:
         """Take a block again, as received, that was in the window when `checkpoint` was called.
 
-        The newest is one after which no later one has been there: everything may be complete now.
+        If no later one has been there (`newest`), everything may be complete now.
         """
         if self._recall is None:
             return

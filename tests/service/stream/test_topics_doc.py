@@ -14,7 +14,7 @@ import pytest
 from pydantic import BaseModel
 
 from models.signals.channels import ChannelDescriptor
-from models.signals.keys import MachineKeys
+from models.signals.keys import Key, MachineKeys
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage, AlarmStates, EventKind
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, HealthState, Report
@@ -24,7 +24,7 @@ from tests.service.rig.live import LAB, ROOT, Feed, endpoint, open_session, serv
 
 PAGE = ROOT / "docs" / "topics.md"
 KEYS = MachineKeys("demo", "lab")
-NAMES = [name for name, value in vars(MachineKeys).items() if isinstance(value, property) and name != "root"]
+NAMES = [name for name, value in vars(MachineKeys).items() if isinstance(value, Key)]
 WITHOUT_JSON = {"stream", "publisher_alive", "monitor_alive", "replay_alive"}
 TAKEN: dict[str, type[BaseModel]] = {"descriptor": ChannelDescriptor, "truth": TruthRecord}
 SENT: dict[str, type[BaseModel]] = {
