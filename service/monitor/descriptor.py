@@ -16,18 +16,10 @@ _LONGEST = 80
 
 
 def descriptor_mismatch(announced: bytes, machine: MachineFile) -> tuple[str, ...]:
-    """Differences between an announced descriptor and the machine file, one sentence per field.
+    """Differences between an announced descriptor (JSON) and the machine file, one sentence per field.
 
-    Parameters
-    ----------
-    announced : bytes
-        JSON from the ``descriptor`` key.
-
-    Returns
-    -------
-    tuple of str
-        Empty if they agree; else each names the field, the value found and the value expected, the first
-        `MOST_DIFFERENCES` of them.
+    Empty if they agree; else each names the field, the value found and the value expected, the first `MOST_DIFFERENCES`
+    of them.
     """
     if len(announced) > MOST_BYTES:
         return (f"descriptor has {len(announced)} bytes, expected at most {MOST_BYTES}",)

@@ -90,10 +90,7 @@ class Evaluation:
     def reason(self, *, told: bool) -> str:
         """Why no parameter could be read, every reason once; first what has changed, where channels alone are compared.
 
-        Parameters
-        ----------
-        told : bool
-            Whether the verdict says it: what has changed explains a window astride the change.
+        It is told already where the verdict says it: what has changed explains a window astride the change.
         """
         if self.deciding.unexplained or self.deciding.evaluable:
             return "" if told else self.deciding.unexplained
@@ -103,12 +100,8 @@ class Evaluation:
     def named(self, channels: Sequence[Channel], window: WindowStatistics, foreign: str) -> "Evaluation":
         """The same with sentences in the names of a machine's channels.
 
-        Parameters
-        ----------
-        window : WindowStatistics
-            What is evaluated: channels that reach the end of their range explain what does not fit.
-        foreign : str
-            What was seen that no change of a parameter makes: the first suspect. Empty if nothing.
+        What was seen that no change of a parameter makes (`foreign`, empty if nothing) is the first suspect. Channels
+        of the window that reach the end of their range explain what does not fit, too.
         """
         limited = [] if foreign or self.shapes or not self._doubtful else at_range_end([window], Naming(channels))
         ends = f"{'; '.join(limited)}, the end of its range" if limited else ""
@@ -144,14 +137,7 @@ class WindowEvaluator(ABC):
 
     @abstractmethod
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
-        """Evaluate one window.
-
-        Parameters
-        ----------
-        window : WindowStatistics
-            The full window.
-        newest : Newest, optional
-            Where its latest hops are evaluated for themselves, too.
+        """Evaluate one full window, and with `newest` its latest hops for themselves, too.
 
         Raises
         ------

@@ -63,10 +63,7 @@ class NoEvaluator(WindowEvaluator):
 class BaselineEvaluator(WindowEvaluator):
     """Compares the windows of one machine with what was learned on it when it was healthy.
 
-    Parameters
-    ----------
-    commissioned : Commissioned
-        With a baseline, or at least the healthy shape of every channel.
+    That is a baseline, or at least the healthy shape of every channel.
     """
 
     needs_lags = True  # relations hold between correlation functions
@@ -188,13 +185,8 @@ def _row_readings(deciding: Diagnosis, window: WindowStatistics) -> tuple[Equati
         own = tuple(readings[each.parameter] for each in row.own)
         reasons = dict.fromkeys(reading.reason for reading in own if reading.reason)
         reason = lacking or ("" if any(reading.relative_change is not None for reading in own) else "; ".join(reasons))
+        read = () if reason else own
         found.append(
-            Equation(
-                equation=row.number,
-                title=row.title,
-                evaluable=not reason,
-                parameters=() if reason else own,
-                reason=reason,
-            )
+            Equation(equation=row.number, title=row.title, evaluable=not reason, parameters=read, reason=reason)
         )
     return tuple(found)

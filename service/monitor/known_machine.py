@@ -45,13 +45,8 @@ _OUTSIDE = 4.0
 class KnownMachineEvaluator(WindowEvaluator):
     """Compares the windows of one machine with theory.
 
-    Parameters
-    ----------
-    bundle : Bundle or None
-        Without it the equations are reported as not evaluable.
-    commissioned : Commissioned, optional
-        Uncertainty of parameters that were identified, part of every reading; and the healthy windows' misfit, which
-        later ones are compared with.
+    Without a bundle the equations are reported as not evaluable. A commissioning says how uncertain the parameters are
+    that were identified, part of every reading; and the healthy windows' misfit, which later ones are compared with.
     """
 
     by = "likelihood"
@@ -102,9 +97,8 @@ class KnownMachineEvaluator(WindowEvaluator):
         if not deciding.unexplained:
             self._explained_ns = window.end_ns
         elif self._explained_ns is None and not self._commissioned:
-            deciding = replace(
-                deciding, unexplained=f"{deciding.unexplained}; if this is its healthy state, commission it"
-            )
+            unexplained = f"{deciding.unexplained}; if this is its healthy state, commission it"
+            deciding = replace(deciding, unexplained=unexplained)
         equations: tuple[Equation, ...] = ()
         opinions = []
         for other in self._others:
@@ -175,9 +169,8 @@ class KnownMachineEvaluator(WindowEvaluator):
         if times - _SURELY * error < _HEAVIEST:
             return decided
         why = f"{self._machine.title}: it would take {times:.1f} times the unbalance of the machine file, the limit is"
-        return replace(
-            decided, suspect="", unexplained=f"{why} {_HEAVIEST:g} times: check the units of the channels and e_m"
-        )
+        why = f"{why} {_HEAVIEST:g} times: check the units of the channels and e_m"
+        return replace(decided, suspect="", unexplained=why)
 
     def _judged(self, window: WindowStatistics, decided: Diagnosis) -> Diagnosis:
         """The diagnosis, unless it does not fit where the speed changed faster than the rotation can be taken out.

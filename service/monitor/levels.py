@@ -41,18 +41,7 @@ _NEARLY_ALL = 0.9
 
 
 class LevelWatch:
-    """Judges the levels of every window.
-
-    Parameters
-    ----------
-    plan : Plan
-        With levels.
-
-    Attributes
-    ----------
-    latest : tuple of ChannelLevels
-        Of the latest window; empty before the first hop.
-    """
+    """Judges the levels of every window, of a plan with levels."""
 
     def __init__(self, plan: Plan, machine: MachineFile, installed: Installed) -> None:
         if plan.levels is None:
@@ -66,19 +55,17 @@ class LevelWatch:
         self._by_theory = installed.known if installed.commissioned is None else None
         self._expected: LevelReference | None = None
         self._by_angle = plan.angle_column is not None
-        turns = self._by_angle or plan.speed_rad_s is not None
-        given = machine.levels
         self._first = FirstWindows(
             [one.name for one in channels],
-            given.reference_windows,
-            turns=turns,
-            since=given.reference_since,
+            machine.levels.reference_windows,
+            turns=self._by_angle or plan.speed_rad_s is not None,
+            since=machine.levels.reference_since,
             of=hashlib.sha256(machine.model_dump_json(include=_DEPENDS_ON).encode()).hexdigest()[:16],
         )
         self._contact = LatestContact(_WINDOWS_OF_CONTACT * plan.hops)
         self._lines = LatestLines()
         self._moved, self._moved_ns = False, 0  # from when on all has been at about the newest speed
-        self.latest: tuple[ChannelLevels, ...] = ()
+        self.latest: tuple[ChannelLevels, ...] = ()  # of the latest window; empty before the first hop
         self._found: WindowLevels | None = None
         self._states = [state_name(channel) for channel in channels]
         self._machine = machine
@@ -175,12 +162,7 @@ class LevelWatch:
         return {**self._first.checkpoint(), **self._contact.checkpoint(), **self._lines.checkpoint(), **moved}
 
     def restore(self, arrays: Mapping[str, np.ndarray], *, first_alone: bool) -> None:
-        """Go on where `checkpoint` was called.
-
-        Parameters
-        ----------
-        first_alone : bool
-            With nothing but the first windows, which outlast a commissioning.
+        """Go on where `checkpoint` was called, or with the first windows alone, which outlast a commissioning.
 
         Raises
         ------

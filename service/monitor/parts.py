@@ -24,13 +24,7 @@ _LARGE = 4096
 def divided(
     arrays: Mapping[str, np.ndarray], hops: Mapping[int, list[tuple[int, Stretch]]], kept: Collection[str]
 ) -> tuple[bytes, tuple[tuple[str, bytes], ...], tuple[str, ...]]:
-    """State, new parts by name, and the names of all parts.
-
-    Parameters
-    ----------
-    hops : mapping of int to list
-        `SequentialState.hops`.
-    """
+    """State, new parts by name, and the names of all parts; the hops are `SequentialState.hops`."""
     large = {name: array for name, array in arrays.items() if array.nbytes >= _LARGE}
     names = {f"{_HOP}{end_ns:019}": came for end_ns, came in hops.items()}
     known = frozenset(kept)

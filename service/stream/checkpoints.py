@@ -81,11 +81,6 @@ class StepWriter:
     Alarm events come first: whatever else cannot be put into words, remembered or written, they go into the log and out
     to operators. What the log refuses is tried again with the next step: it takes no event that comes after a missing
     one.
-
-    Attributes
-    ----------
-    refused : Exception or None
-        Why the latest step is not in the history as a whole; None if it is, or waits to be.
     """
 
     def __init__(self, history: MachineStore, identity: Identity) -> None:
@@ -94,6 +89,7 @@ class StepWriter:
         self._owed: tuple[AlarmEvent, ...] = ()
         self._kept: tuple[str, ...] = ()
         self._generation = 0
+        # Why the latest step is not in the history as a whole; None if it is, or waits to be.
         self.refused: Exception | None = None
 
     def keeps(self, parts: tuple[str, ...]) -> None:
@@ -113,15 +109,8 @@ class StepWriter:
     ) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...], bool]:
         """Commit windows, the events that are owed, and the state of the monitor; raises nothing.
 
-        Parameters
-        ----------
-        whole : bool
-            With all that is in the window, so that nothing has to be recalled.
-
-        Returns
-        -------
-        tuple
-            Reports and events as they are to be published, and whether all of it is in the database now.
+        With the `whole` that is in the window nothing has to be recalled. Returns reports and events as they are to be
+        published, and whether all of it is in the database now.
         """
         self.refused = None
         if (generation := self._history.generation) != self._generation:
@@ -178,20 +167,10 @@ def checkpoint_step(identity: Identity, state: MonitorState, recorded_ns: int) -
 def restored(
     build: Callable[[], MachineMonitor], identity: Identity, checkpoint: Checkpoint, next_sequence: int
 ) -> tuple[MachineMonitor, str]:
-    """A monitor that goes on from what was remembered, as far as that fits.
+    """A monitor that goes on from what was remembered, as far as that fits, and what became of the past, in a sentence.
 
-    Alarms are restored whatever else differs, and so are first windows while sensors and settings of levels are the
-    same; windows and tests only if the files and the program are.
-
-    Parameters
-    ----------
-    next_sequence : int
-        Number of the next alarm event, by the log.
-
-    Returns
-    -------
-    MachineMonitor, str
-        The monitor, and what became of the past, in a sentence.
+    Alarms are restored whatever else differs, with the number of the next event by the log, and so are first windows
+    while sensors and settings of levels are the same; windows and tests only if the files and the program are.
     """
     head, monitor = checkpoint.head, build()
     at = rfc3339(head.end_ns) if head.end_ns else "the beginning, before any data"

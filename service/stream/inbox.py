@@ -155,11 +155,8 @@ class Inbox:
     def get(self, enough: int = 1) -> RawBlock | Callable[[], None] | None:
         """Take what is to be called, or else the oldest block, waiting for one; None after `close`.
 
-        Parameters
-        ----------
-        enough : int
-            How many blocks a worker that has taken everything wants to wait for: to be woken for each of them costs
-            more than most have to say. It waits half a second at most, and a call lets it take what is there.
+        A worker that has taken everything may wait for enough blocks: to be woken for each of them costs more than most
+        have to say. It waits half a second at most, and a call lets it take what is there.
         """
         with self._changed:
             if not (self._calls or len(self)):

@@ -20,17 +20,9 @@ class Intake:
         self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
 
     def add(self, take: Callable[[], None]) -> Callable[[], None]:
-        """Have a channel emptied from now on.
+        """Have a channel emptied from now on; returns what ends it, after which nothing is called any more.
 
-        Parameters
-        ----------
-        take : callable
-            Takes what waits there and does not raise; everybody else waits for it.
-
-        Returns
-        -------
-        callable
-            Ends it; it is not called afterwards.
+        What takes what waits there does not raise; everybody else waits for it.
         """
         with self._lock:
             self._takers.append(take)

@@ -10,17 +10,9 @@ _LIMITS = {"after": (-1, 2**53), "limit": (1, MOST_EVENTS)}
 
 
 def read_log_query(parameters: str) -> tuple[int, int]:
-    """Read the parameters of a query: after which sequence number, and at most how many events.
+    """Read the parameters of a query: after which sequence number, or -1, and at most how many events, 100 by default.
 
-    Parameters
-    ----------
-    parameters : str
-        As they stand behind the question mark; names that begin with an underscore are Zenoh's own.
-
-    Returns
-    -------
-    tuple of int
-        `after`, -1 for the beginning if left out, and `limit`, 100 if left out.
+    They are as they stand behind the question mark; names that begin with an underscore are Zenoh's own.
 
     Raises
     ------

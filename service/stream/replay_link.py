@@ -105,14 +105,9 @@ class ReplayLink:
     def begin_pass(self, machines: dict[MachineKeys, bytes | None], prefix: str, *, wait: bool) -> None:
         """Declare what one pass needs, as a live publisher would.
 
-        Parameters
-        ----------
-        machines : dict of MachineKeys to bytes or None
-            Those whose messages are replayed, each with its recorded channel descriptor.
-        prefix : str
-            What goes before every key; empty is the original keys.
-        wait : bool
-            Subscribers slow the replay down instead of missing messages.
+        The machines whose messages are replayed come with their recorded channel descriptors. The prefix goes before
+        every key; empty is the original keys. If it waits, subscribers slow the replay down instead of missing
+        messages.
 
         Raises
         ------

@@ -32,19 +32,10 @@ class KnownSettings(LinkSettings):
 
 
 class ShardLink:
-    """The side of the process that monitors machines.
+    """The side of the process that monitors machines, on a link that must outlive it.
 
-    Parameters
-    ----------
-    link : Link
-        Open session; must outlive this object.
-    process : str
-        Where questions are asked: below it, of ``process/site/machine``.
-    places : sequence of str
-        ``site/machine`` of what it monitors.
-    answer : callable
-        Takes a place and a question and returns the answer; a `RotorwatchError` is told to whoever asked, with its
-        kind.
+    Questions are asked under ``process/site/machine``, places are the ``site/machine`` of what it monitors. A
+    `RotorwatchError` in place of an answer is told to whoever asked, with its kind.
     """
 
     def __init__(
@@ -103,14 +94,9 @@ def hear(link: Link, callback: Callable[[bytes], None]) -> Callable[[], object]:
 
 
 def ask(link: Link, key: str, question: bytes, errors: tuple[type[RotorwatchError], ...] = ()) -> bytes:
-    """Ask the process that monitors a machine.
+    """Ask the process that monitors a machine, under ``process/site/machine``.
 
-    Parameters
-    ----------
-    key : str
-        ``process/site/machine``.
-    errors : tuple of type
-        Kinds of error that are raised as what they were; others as `RotorwatchError`.
+    These kinds of error are raised as what they were; others as `RotorwatchError`.
 
     Raises
     ------

@@ -65,16 +65,9 @@ class LoadShedding:
         self._skipped_s = -math.inf  # when a window was last skipped
 
     def skips(self, waiting: int, to_hop: int, now_s: float) -> bool:
-        """Whether the window that a hop has completed is skipped.
+        """Whether the window that a hop has completed is skipped, at a monotonic time.
 
-        Parameters
-        ----------
-        waiting : int
-            Own blocks that wait, see `Inbox.behind`.
-        to_hop : int
-            Blocks that complete the next hop.
-        now_s : float
-            Monotonic time.
+        Own blocks that wait (`Inbox.behind`) are compared with how many complete the next hop.
         """
         if waiting < to_hop:
             self._fewest, self._fewer_s = math.inf, now_s

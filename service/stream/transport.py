@@ -143,14 +143,10 @@ class Link:
 
 
 class MachineLink:
-    """Everything declared for one machine.
+    """Everything declared for one machine, on a link that must outlive it.
 
-    Parameters
-    ----------
-    link : Link
-        Open session; must outlive this object.
-    wait_when_full : bool
-        `on_block` may wait, which slows the publisher down, and all others that take from the same link.
+    With `wait_when_full`, `on_block` may wait, which slows the publisher down, and all others that take from the same
+    link.
     """
 
     def __init__(self, link: Link, keys: MachineKeys, callbacks: MachineCallbacks, *, wait_when_full: bool) -> None:
@@ -237,18 +233,9 @@ class MachineLink:
 def tap(link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], None]) -> Callable[[], None]:
     """Hand on every message under a machine's keys as it is, whoever published it, this program included.
 
-    Parameters
-    ----------
-    link : Link
-        Open session; must outlive this.
-    on_message : callable
-        Takes each message on a thread of the link's: be short. Descriptors also come as answers to a query, at the
-        start and whenever a publisher appears, so that one announced earlier is known.
-
-    Returns
-    -------
-    callable
-        Ends it.
+    Messages are taken on a thread of the link's: be short. Descriptors also come as answers to a query, at the start
+    and whenever a publisher appears, so that one announced earlier is known. Returns what ends it; the link must
+    outlive it.
     """
 
     def take(sample: zenoh.Sample) -> None:
@@ -284,24 +271,11 @@ def tap(link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], N
 def follow(
     settings: LinkSettings, machines: str, topics: tuple[str, ...], callback: Callable[[TopicMessage], None]
 ) -> Iterator[Callable[[], bool]]:
-    """Follow what monitors publish, as a client.
+    """Follow what monitors publish, as a client; yields what says whether it is still connected to anybody.
 
-    Parameters
-    ----------
-    settings : LinkSettings
-        Where to connect; fails fast.
-    machines : str
-        ``<site>/<machine>``, where ``*`` stands for any.
-    topics : tuple of str
-        Fields of `MachineKeys`, such as ``report`` or ``alarm_event``.
-    callback : callable
-        Takes each message on a thread of Zenoh's. Latest health and alarm state come at once; events and reports from
-        now on.
-
-    Yields
-    ------
-    callable
-        Whether the session is still open and connected to anybody.
+    Machines are ``<site>/<machine>``, where ``*`` stands for any, topics fields of `MachineKeys`, such as ``report`` or
+    ``alarm_event``. Messages are taken on a thread of Zenoh's: latest health and alarm state at once, events and
+    reports from now on.
 
     Raises
     ------
@@ -310,13 +284,13 @@ def follow(
     """
     site, _, machine = machines.partition("/")
     suffixes = {name: getattr(MachineKeys("s", "m"), name).removeprefix(f"{PREFIX}/s/m/") for name in topics}
+
+    def take(sample: zenoh.Sample) -> None:
+        callback(TopicMessage(str(sample.key_expr), sample.payload.to_string()))
+
     with closing(Link(settings, fail_fast=True)) as link, ExitStack() as undo:
         for name, suffix in suffixes.items():
             current = name in {"health", "alarm_state"}
-
-            def take(sample: zenoh.Sample) -> None:
-                callback(TopicMessage(str(sample.key_expr), sample.payload.to_string()))
-
             subscriber = zenoh.ext.declare_advanced_subscriber(
                 link.session,
                 f"{PREFIX}/{site}/{machine}/{suffix}",

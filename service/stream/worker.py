@@ -234,12 +234,7 @@ class MachineWorker:
         return alarm_states(self.identity, snapshot.alarms, snapshot.sequence, include_normal=include_normal)
 
     def alarm_log(self, after: int, limit: int) -> str:
-        """Alarm events after a sequence number, as the JSON of an `AlarmLogPage`; from any thread.
-
-        Parameters
-        ----------
-        after : int
-            -1 for the beginning.
+        """Alarm events after a sequence number, -1 for the beginning, as JSON of an `AlarmLogPage`; from any thread.
 
         Raises
         ------

@@ -71,14 +71,9 @@ class AlarmBook:
     @property
     def severity(self) -> Severity | None:
         """Highest severity of what is raised on the machine; what is wrong with the data is none of the machine."""
-        raised = [
-            alarm.severity
-            for alarm in self._alarms.values()
-            if alarm.raised and alarm_kind(alarm.name).about == "machine"
-        ]
-        if not raised:
-            return None
-        return Severity.DANGER if Severity.DANGER in raised else Severity.ALERT
+        of_machine = (one for one in self._alarms.values() if one.raised and alarm_kind(one.name).about == "machine")
+        raised = {alarm.severity for alarm in of_machine}
+        return next((severity for severity in (Severity.DANGER, Severity.ALERT) if severity in raised), None)
 
     def present(self, name: str) -> bool:
         """Whether the condition of an alarm is there."""
@@ -194,12 +189,10 @@ class AlarmBook:
         evidence: Evidence | None = None,
         note: str = "",
     ) -> tuple[AlarmEvent, ...]:
-        """Judge one evaluated parameter at the end of a hop.
+        """Judge one evaluated parameter at the end of a hop, whose data time is given.
 
         Parameters
         ----------
-        time_ns : int
-            Data time of the end of the hop.
         named : bool
             Whether the parameter is among those found to have changed.
         taken_back : bool
@@ -207,8 +200,6 @@ class AlarmBook:
         growth : float, optional
             By how much the machine is loaded more, where that is not all of the change: an unbalance that has only
             turned, or has become smaller, is not dangerous.
-        note : str
-            The change in words, where a number does not say all.
         """
         if not (math.isfinite(change) and 0 < standard_error < math.inf):
             return ()
@@ -239,14 +230,9 @@ class AlarmBook:
         danger: bool = False,
         small: bool | None = None,
     ) -> tuple[AlarmEvent, ...]:
-        """Judge what is no parameter.
+        """Judge what is no parameter: without a delay if it is a fact rather than an estimate.
 
-        Parameters
-        ----------
-        at_once : bool
-            Without a delay: it is a fact rather than an estimate.
-        small : bool, optional
-            Whether it is gone for good; where it is not present without it.
+        Whether it is gone for good is said by `small`; without it, it is where it is not present.
         """
         if not present and name not in self._alarms:
             return ()
@@ -266,11 +252,8 @@ class AlarmBook:
         left = [alarm.name for alarm in self.alarms if alarm.rules]
         for name in dict.fromkeys((*ruled, *left)):
             alarm = self._known(name, time_ns)
-            holding = [
-                rule
-                for rule in self._settings.suppress
-                if name in rule.alarms and self._applies(rule, alarm, speed_rpm)
-            ]
+            about = [rule for rule in self._settings.suppress if name in rule.alarms]
+            holding = [rule for rule in about if self._applies(rule, alarm, speed_rpm)]
             rules = tuple(rule.identity for rule in holding)
             if rules == alarm.rules:
                 continue
@@ -306,12 +289,7 @@ class AlarmBook:
             )
 
     def operate(self, operation: OperatorAction, time_ns: int) -> tuple[AlarmEvent, ...]:
-        """Do what an operator asks for.
-
-        Parameters
-        ----------
-        time_ns : int
-            Data time that has been reached.
+        """Do what an operator asks for, at the data time that has been reached.
 
         Raises
         ------
@@ -354,11 +332,8 @@ class AlarmBook:
     def restore(self, text: str, next_sequence: int | None = None) -> None:
         """Go on from what `checkpoint` gave.
 
-        Parameters
-        ----------
-        next_sequence : int, optional
-            Number of the next event by the log. It may be ahead of what was remembered; it is behind only where
-            the log was begun anew.
+        The number of the next event by the log may be ahead of what was remembered; it is behind only where the log was
+        begun anew.
 
         Raises
         ------
@@ -416,8 +391,9 @@ class AlarmBook:
     ) -> tuple[AlarmEvent, ...]:
         """Let the delays run, and make happen what was asked for long enough."""
         settings = self._settings
-        beyond_ns = _since(alarm.beyond_ns, time_ns) if beyond and not alarm.present else None
-        small_ns = _since(alarm.small_ns, time_ns) if small and alarm.present else None
+        began_ns = [time_ns if since_ns is None else since_ns for since_ns in (alarm.beyond_ns, alarm.small_ns)]
+        beyond_ns = began_ns[0] if beyond and not alarm.present else None
+        small_ns = began_ns[1] if small and alarm.present else None
         alarm = replace(alarm, beyond_ns=beyond_ns, small_ns=small_ns)
         if beyond_ns is not None and (at_once or (time_ns - beyond_ns) / 1e9 >= settings.on_delay_s):
             alarm = replace(
@@ -478,8 +454,3 @@ class AlarmBook:
 def _candidate(one: Candidate, *, alone: bool) -> str:
     """A candidate, with its probability where there are none but parameters."""
     return f"{one.text} ({one.name}) {one.probability:.0%}" if alone else f"{one.text} ({one.name})"
-
-
-def _since(since_ns: int | None, time_ns: int) -> int:
-    """When a delay began: now, unless it runs already."""
-    return time_ns if since_ns is None else since_ns

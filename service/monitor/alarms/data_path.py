@@ -63,19 +63,9 @@ class DataPathAlarms:
             self._refused, self._refused_ns = verdict.text, start_ns
 
     def accepted(self, verdict: Admission, start_ns: int, dropped: int) -> str:
-        """A block was accepted.
+        """A block was accepted, before which the monitor itself threw so many away.
 
-        Parameters
-        ----------
-        start_ns : int
-            Its beginning.
-        dropped : int
-            Blocks before it that the monitor itself threw away.
-
-        Returns
-        -------
-        str
-            Why nothing has been evaluated for long, although data come; empty if it has.
+        Returns why nothing has been evaluated for long, although data come; empty if it has.
         """
         book, before_ns = self._book, start_ns - round(verdict.gap_s * 1e9)
         missing = Evidence(start_ns=before_ns, end_ns=start_ns) if verdict.gap_s > 0 else None
@@ -121,10 +111,7 @@ class DataPathAlarms:
     def hop(self, end_ns: int, *, skipped: bool) -> None:
         """A hop is complete, without a gap: what could have spoiled it is over, unless it is found again.
 
-        Parameters
-        ----------
-        skipped : bool
-            Whether its window is not evaluated, because the monitor cannot keep up.
+        Its window is skipped if it is not evaluated, because the monitor cannot keep up.
         """
         self._whole_ns = end_ns
         for name in (GAP, CLOCK) if skipped else (GAP, CLOCK, FAULT, OVERLOADED):
@@ -137,10 +124,7 @@ class DataPathAlarms:
     def sensors(self, findings: tuple[SensorFault, ...], statistics: WindowStatistics, *, standing: bool) -> None:
         """One alarm for each kind of fault, with a sentence for each channel it is found in.
 
-        Parameters
-        ----------
-        standing : bool
-            Whether the machine stood: nothing is seen then of most faults, and those that were there stay.
+        Where the machine stood nothing is seen of most faults, and those that were there stay.
         """
         said: dict[str, list[str]] = {}
         for found in findings:
@@ -175,9 +159,8 @@ class DataPathAlarms:
         refused = f"; the first block since was refused: {self._refused}" if known else ""
         note = f"no usable data for {self._silence_s:g} s; alarms already raised stay raised{refused}"
         due_ns = end_ns + self._silence_ns
-        self._book.update_state(
-            STREAM_LOST, True, due_ns, note, evidence=Evidence(start_ns=end_ns, end_ns=due_ns), at_once=True
-        )
+        evidence = Evidence(start_ns=end_ns, end_ns=due_ns)
+        self._book.update_state(STREAM_LOST, True, due_ns, note, evidence=evidence, at_once=True)
         self._book.suppress(None, due_ns)
 
     def _found_again_ns(self, start_ns: int) -> int:

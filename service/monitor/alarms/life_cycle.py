@@ -76,12 +76,8 @@ def follow(
 ) -> AlarmState | None:
     """The state an alarm goes to; None if that is refused in this state.
 
-    Parameters
-    ----------
-    present : bool
-        Whether the condition is there, after what happens.
-    owed : AlarmState
-        Where it comes back to after a rule, without its condition.
+    What counts is whether the condition is present after what happens. Without it, the alarm comes back after a rule to
+    what is owed.
 
     Examples
     --------
