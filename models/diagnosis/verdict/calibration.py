@@ -37,12 +37,7 @@ def _shared(probability: float, tests: int) -> float:
 
 
 def window_thresholds(rate: float, n_parameters: int) -> Thresholds:
-    """Thresholds of one window by itself.
-
-    Parameters
-    ----------
-    rate : float
-        Probability that a healthy window is called changed, over all parameters together, for example 0.01.
+    """Thresholds of one window by itself, at a probability that a healthy one is called changed, over all parameters.
 
     Raises
     ------
@@ -62,10 +57,7 @@ def window_thresholds(rate: float, n_parameters: int) -> Thresholds:
 def overshoot_correction(x: float) -> float:
     """Siegmund's ν(x): how much rarer a crossing is when time goes in steps.
 
-    Parameters
-    ----------
-    x : float
-        Threshold times the standard deviation of one step; 0 is continuous time, where ν = 1.
+    x is the threshold times the standard deviation of one step; 0 is continuous time, where ν = 1.
     """
     if x < 1e-6:
         return 1.0
@@ -78,19 +70,8 @@ def crossing_rate(threshold: float, overlap: int) -> float:
     """How often per hop a sliding window's test value newly exceeds a threshold, upwards only.
 
     The test value of a window of `overlap` hops is a moving average of independent hops: its autocorrelation falls
-    linearly to zero over the window. For such a process the rate is b φ(b) μ ν(b √(2μ)) with μ = 1/overlap.
-
-    Parameters
-    ----------
-    threshold : float
-        b, in standard errors.
-    overlap : int
-        Hops in a window; 1 for windows that do not overlap.
-
-    Returns
-    -------
-    float
-        Crossings per hop; of -b the same number again.
+    linearly to zero over the window, of one hop where windows do not overlap. For such a process the rate is b φ(b) μ
+    ν(b √(2μ)) with μ = 1/overlap and the threshold b, in standard errors; -b is crossed as often again.
     """
     tail = float(ndtr(-threshold))
     if overlap <= 1:
@@ -103,16 +84,10 @@ def crossing_rate(threshold: float, overlap: int) -> float:
 def month_thresholds(
     per_month: float, hop_s: float, overlap: int, n_parameters: int, n_stretches: int = 1
 ) -> Thresholds:
-    """Thresholds of a sliding window that is tested at every hop.
+    """Thresholds of a sliding window of `overlap` hops that is tested at every hop.
 
-    Parameters
-    ----------
-    per_month : float
-        Expected number of false alarms of the machine in 30 days of data.
-    overlap : int
-        Hops in the window.
-    n_stretches : int
-        Windows of different lengths tested side by side; each gets an equal share of the rate.
+    The machine is to have so many false alarms in 30 days of data. Windows of different lengths that are tested side by
+    side (`n_stretches`) get an equal share of the rate each.
 
     Raises
     ------
@@ -149,17 +124,9 @@ _RATE = 1e-3
 
 
 def agreements(first: Diagnosis, second: Diagnosis) -> tuple[Agreement, ...]:
-    """Compare two diagnosticians parameter by parameter.
+    """Compare what two diagnosticians say of one window, parameter by parameter, in the order of `PARAMETERS`.
 
-    Parameters
-    ----------
-    first, second : Diagnosis
-        Of the same window.
-
-    Returns
-    -------
-    tuple of Agreement
-        One per parameter that at least one of them could read, in the order of `PARAMETERS`.
+    What neither of them could read is left out.
     """
     one, other = ({reading.name: reading for reading in diagnosis.evaluable} for diagnosis in (first, second))
     between = (first.by, second.by)
@@ -203,13 +170,7 @@ def _scale(freedom: float) -> float:
 
 
 def widened(diagnosis: Diagnosis, rate: float) -> Diagnosis:
-    """The diagnosis with errors so wide that normal thresholds keep a declared rate, however few degrees of freedom.
-
-    Parameters
-    ----------
-    rate : float
-        Probability that a healthy window is called changed.
-    """
+    """The diagnosis with errors so wide that normal thresholds keep a declared rate, however few degrees of freedom."""
     if not diagnosis.freedom:
         return diagnosis
     readings = diagnosis.evaluable
@@ -253,14 +214,8 @@ def detectable_changes(
 
     In the scale of the errors the change is (threshold + quantile of the power) times the standard error. The standard
     error is the one with all other parameters free: the change shall not only be noticed, it shall be told from a
-    change of any other parameter, so where estimates hang together the power is higher than stated.
-
-    Parameters
-    ----------
-    stretch : Stretch
-        What the data says; the errors of a parameter hardly depend on its value.
-    power : float
-        Probability of finding the change.
+    change of any other parameter, so where estimates hang together the power, with which the change is found, is higher
+    than stated. The errors of a parameter hardly depend on its value.
     """
     distance, errors = thresholds.first + float(ndtri(power)), np.sqrt(np.diag(stretch.estimate()[1])).tolist()
     return tuple(
@@ -276,11 +231,6 @@ def detectable_changes(
 
 def length_to_find(found: Detectable, change: float) -> float:
     """Data, s, to find another change of the parameter: standard errors fall as one over the root of the length.
-
-    Parameters
-    ----------
-    change : float
-        Relative change that is to be found instead, not 0 and above -1.
 
     Raises
     ------

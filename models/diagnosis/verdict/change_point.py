@@ -38,31 +38,19 @@ _QUANTILES = (0.5, 0.025, 0.975)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Changes:
-    """What the named parameters have changed to, in the scale of the errors, and when.
+    """What the named parameters have changed to, in the scale of the errors, and when."""
 
-    Attributes
-    ----------
-    values, errors : ndarray, shape (n_named,)
-    since_ns : (int, int, int) or None
-        Median and 95 % limits of the moment, never closer than half a hop; None where it is before the data.
-    """
-
-    values: FloatArray
-    errors: FloatArray
+    values: FloatArray  # (n_named,)
+    errors: FloatArray  # (n_named,)
+    # Median and 95 % limits of the moment, never closer than half a hop; None where it is before the data.
     since_ns: tuple[int, int, int] | None
 
 
 def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, by_ns: int) -> Changes:
-    """Read what parameters have changed to by the end of the latest window.
+    """Read what parameters, named as indices into `PARAMETERS`, have changed to by the end of the latest window.
 
-    Parameters
-    ----------
-    windows : sequence of Stretch
-        Of as much data each, which overlap, the latest one last; all know the same parameters. A gap may be in some.
-    named : sequence of int
-        Parameters that changed, as indices into `PARAMETERS`.
-    by_ns : int
-        When they had changed at the latest.
+    The windows are of as much data each and overlap, the latest one last; all know the same parameters, and a gap may
+    be in some. The parameters had changed by `by_ns` at the latest.
     """
     last = windows[-1]
     known = list(last.known)

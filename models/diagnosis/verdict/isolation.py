@@ -68,13 +68,7 @@ def outside_confidence(misfit_z: float) -> float:
 
 
 def isolate_window(diagnosis: Diagnosis, rate: float) -> Isolation:
-    """Decide one window by itself at a declared rate of false alarms per window.
-
-    Parameters
-    ----------
-    rate : float
-        Probability that a healthy window is called changed; the test of the model has the same rate to itself.
-    """
+    """Decide one window by itself at a declared rate of false alarms per window; the test of the model has as much."""
     stretch = stretch_of(widened(diagnosis, rate), 0, 0).complete().believed()
     isolation = isolate(stretch, window_thresholds(rate, max(1, len(stretch.known))), by=diagnosis.by)
     return replace(isolation, changed=(), readings=(), outside=True) if stretch.unexplained else isolation
@@ -178,13 +172,7 @@ def _explained(J: FloatArray, b: FloatArray, members: FloatArray) -> FloatArray:
 
 
 def restricted(stretch: Stretch, names: tuple[str, ...], by: str) -> tuple[Parameter, ...]:
-    """Read some parameters with all others held at nominal.
-
-    Parameters
-    ----------
-    names : tuple of str
-        Parameters that may differ from nominal; those that were not evaluable are left out.
-    """
+    """Read some parameters with all others held at nominal; those that were not evaluable are left out."""
     chosen = [i for i in stretch.known if PARAMETERS[i] in names]
     if not chosen:
         return ()

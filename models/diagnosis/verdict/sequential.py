@@ -66,10 +66,7 @@ class SequentialSettings:
     ) -> "SequentialSettings":
         """Settings with which a machine is monitored, at its declared rate or at another one.
 
-        Parameters
-        ----------
-        short : bool
-            Whether stretches shorter than the window can be evaluated.
+        They are `short` where stretches shorter than the window can be evaluated.
         """
         return cls(
             hop_s=machine.window.hop_s,
@@ -97,17 +94,13 @@ class SequentialSettings:
 
 
 class SequentialTest:
-    """Looks at one hop after the other.
-
-    Attributes
-    ----------
-    unexplained : str
-        Why nothing can be said of parameters at the latest hop, see `Diagnosis`: then none is named, and none is read.
-    """
+    """Looks at one hop after the other."""
 
     def __init__(self, settings: SequentialSettings, by: str = "likelihood") -> None:
         self.settings = settings
         self.state = SequentialState()
+        # Why nothing can be said of parameters at the latest hop, see `Diagnosis`: then none is named, and none is
+        # read.
         self.unexplained = ""
         self._by = by
         self._thresholds = {hops: settings.thresholds(hops) for hops in settings.lengths}
@@ -256,14 +249,8 @@ class SequentialTest:
         While the window is outside, a short stretch takes back what has been said only if it is well inside: it has
         little power, and with a few hops none. What has been said for longer than any window is astride a change, a
         whole clean window alone takes back: on a machine that no parameters explain stretches contradict each other,
-        and a short one explains little of what it is asked.
-
-        Parameters
-        ----------
-        said : bool
-            By the longest clean stretch of a window at most.
-        by : Stretch or None
-            That stretch; None without one.
+        and a short one explains little of what it is asked. It is said by the longest clean stretch of a window at
+        most, if there is one.
         """
         state = self.state
         if said:

@@ -92,13 +92,7 @@ class Stretch:
         return np.asarray(covariance @ self.vector[known], dtype=np.float64), covariance
 
     def blurred(self, standard_error: float) -> "Stretch":
-        """Return the same with an error added that further data does not remove.
-
-        Parameters
-        ----------
-        standard_error : float
-            Of every parameter, in the scale of the errors.
-        """
+        """Return the same with an error, in their scale, added to every parameter that further data does not remove."""
         return self._widened(standard_error**2 * np.eye(len(self.known)), self.common)
 
     def complete(self) -> "Stretch":
@@ -194,10 +188,7 @@ _PLANES = {"k_by": "y", "c_by": "y", "k_bz": "z", "c_bz": "z"}  # plane in which
 def determined(diagnosis: Diagnosis, window: WindowStatistics, length_s: float) -> Diagnosis:
     """Return the diagnosis with every parameter in the order of `PARAMETERS`, read or with the reason why not.
 
-    Parameters
-    ----------
-    window : WindowStatistics
-        What it was made of. A stretch of a tenth of the window has three times its errors, and says as much as that.
+    A stretch of a tenth of the window has three times its errors, and says as much as that.
     """
     vague = _VAGUE * max(1.0, length_s / window.duration_s) ** 0.5
     found = {reading.name: reading for reading in diagnosis.parameters}
@@ -212,10 +203,8 @@ def determined(diagnosis: Diagnosis, window: WindowStatistics, length_s: float) 
 def with_shared_error(diagnosis: Diagnosis, covariance: FloatArray) -> Diagnosis:
     """Return the diagnosis with an error added that all windows share.
 
-    Parameters
-    ----------
-    covariance : ndarray, shape (6, 6)
-        Of the values that changes are relative to, in the scale of the errors, in the order of `PARAMETERS`.
+    It is the covariance, shape (6, 6), of the values that changes are relative to, in the scale of the errors, in the
+    order of `PARAMETERS`.
     """
     readings = diagnosis.evaluable
     at = [PARAMETERS.index(reading.name) for reading in readings]
