@@ -188,6 +188,8 @@ def _write(out: Path, made: Commissioning, replaces: Commissioned | None) -> Non
             return
         if replaces is not None:
             shutil.copyfile(out / FILE, out / _KEPT.format(version=replaces.version))
-        (out / FILE).write_text(made.commissioned.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        draft = out / (FILE + ".new")  # what is replaced stays whole until the new one is
+        draft.write_text(made.commissioned.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        draft.replace(out / FILE)
     except OSError as error:
         raise BundleError(f"{out}: cannot be written ({error.strerror})") from error

@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import re
+import resource
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,15 @@ def test_a_machine_is_commissioned_and_again_only_with_a_reason(folder: Path, mo
     again = run(folder, *arguments)
     assert again.exit_code == 2
     assert "kit holds version 1 of the commissioning of demo/lab: say why it is replaced" in again.stderr
+    assert load_commissioned(folder / "kit", machine) == first
+
+    most, size = resource.getrlimit(resource.RLIMIT_FSIZE), (folder / "kit" / "commissioned.json").stat().st_size
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, most[1]))  # a disk that is full at the end of the next one
+    try:
+        full = run(folder, *arguments, "--why", 200 * "x")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, most)
+    assert "kit: cannot be written (File too large)" in full.stderr
     assert load_commissioned(folder / "kit", machine) == first
 
     monkeypatch.setattr("simulator.commission.page.pictures_of", lambda *_: ())  # they were drawn above
