@@ -69,6 +69,7 @@ class HistoryFile:
             return False
         copy = self._beside(".rescued")
         try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)  # the whole folder may be gone
             copy.unlink(missing_ok=True)
             _make(copy)
             with closing(sqlite3.connect(copy)) as target:

@@ -69,25 +69,30 @@ def ticked(at: Bench) -> bool:
     return True
 
 
-def test_a_deleted_history_is_written_again_with_all_it_held(tmp_path: Path) -> None:
-    with bench(tmp_path) as at:
+@pytest.mark.parametrize("moved", [False, True], ids=["deleted", "moved"])
+def test_a_deleted_history_is_written_again_with_all_it_held(tmp_path: Path, moved: bool) -> None:
+    folder = tmp_path / "kept"
+    with bench(folder) as at:
         at.put(*map(block, range(12)), block(40, run=2, sequence=0))
         at.store.tokens.add(TOKEN)
         at.store.audit.append(**AUDIT)
         before = at.log()
         assert before
-        history_of(tmp_path).unlink()
+        if moved:
+            folder.rename(tmp_path / "moved")
+        else:
+            history_of(folder).unlink()
         assert "the file was deleted" in at.store.unreachable()
-        until(lambda: history_of(tmp_path).exists() and at.store.unreachable() == at.store.trouble == "", "a new file")
+        until(lambda: history_of(folder).exists() and at.store.unreachable() == at.store.trouble == "", "a new file")
         until(lambda: ticked(at) and len(at.log()) > len(before), "the alarm")
         at.put(*(block(40 + n, run=2, sequence=n) for n in range(1, 15)))
         log = at.log()
         assert log[: len(before) + 1] == [*before, (len(before), "raised", FAULT)]
         assert (at.store.lost, at.history.waiting) == ("", 0)
-    assert in_file(tmp_path, "SELECT sequence, kind, alarm FROM alarm_events ORDER BY sequence")[: len(log)] == log
-    assert in_file(tmp_path, "SELECT token_id FROM tokens") == [("aaaa",)]
-    assert in_file(tmp_path, "SELECT count(*) FROM audit_log") == [(1,)]
-    with bench(tmp_path) as at:
+    assert in_file(folder, "SELECT sequence, kind, alarm FROM alarm_events ORDER BY sequence")[: len(log)] == log
+    assert in_file(folder, "SELECT token_id FROM tokens") == [("aaaa",)]
+    assert in_file(folder, "SELECT count(*) FROM audit_log") == [(1,)]
+    with bench(folder) as at:
         assert at.worker.restart.startswith("resumed")
         assert at.log()[: len(log)] == log
 
