@@ -193,6 +193,8 @@ class MachineLink:
         keep(blocks.close)
         most = _AT_ONCE_HELD_UP if wait_when_full else _AT_ONCE
         keep(self._link.intake.add(partial(guarded(partial(blocks.take, guarded(self._take_block))), most)))
+        # Before there is one of its own.
+        alive.get(keys.monitor_alive, guarded(self._take_other_monitor), timeout=_QUERY_TIMEOUT_S)
         keep(alive.declare_token(keys.monitor_alive).undeclare)
 
     def publish(self, topic: Topic, text: str) -> None:
@@ -206,6 +208,13 @@ class MachineLink:
         with self._lock:
             self._closed = True
         self._undeclare.close()
+
+    def _take_other_monitor(self, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:  # with another history: one with the same is refused
+            _log.warning(
+                "another monitor of this machine is on the network: every alarm is told twice, from two logs",
+                machine=f"{self._keys.site}/{self._keys.machine}",
+            )
 
     def _take_replay(self, sample: zenoh.Sample) -> None:
         self._callbacks.on_replay(sample.kind == zenoh.SampleKind.PUT)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import pytest
 import zenoh
 import zenoh.ext
+from structlog.testing import capture_logs
 
 from models.signals.link import LinkSettings
 from rotorwatch.records.alarms import AlarmLogPage, AlarmStates
@@ -309,6 +310,17 @@ def test_publisher_is_seen_to_come_and_go_and_its_descriptor_is_asked_for() -> N
         until(lambda: not worker.health().stream.publisher_alive, "publisher gone")
         assert worker.health().stream.descriptor_mismatch == ()
         answer.undeclare()  # type: ignore[no-untyped-call]
+
+
+def test_a_monitor_says_that_another_one_of_its_machine_is_there() -> None:
+    def said() -> list[object]:
+        return [entry["machine"] for entry in logs if "another monitor" in entry["event"]]
+
+    address = endpoint()
+    with capture_logs() as logs, machine_link(address, ignore):
+        with machine_link(LinkSettings(mode="client", connect=(address,)), ignore):
+            until(lambda: bool(said()), "the warning")
+        assert said() == ["demo/lab"]  # of the second; the first was alone
 
 
 def test_unusable_endpoint_is_named() -> None:
