@@ -109,12 +109,11 @@ class MachineWorker:
         self._operated_ns = 0
         self.told = self._monitor.next_sequence  # of the first alarm event that `health` does not show yet
         self._begin_s = self._ticked_s = self._held_up_s = clocks.monotonic_s()
-        self._missed = 0
+        self._missed = self._dropped_logged = 0
         self._publisher_alive = self._replay_announced = False
         self._mismatch: tuple[str, ...] = ()
         self._outlet: Callable[[Topic, str], None] | None = None
         self._published_alarms: tuple[tuple[str, int, bool, bool], ...] = ()
-        self._dropped_logged = 0
         self._pulse = Pulse(self.inbox.call, self._tick)
         self._thread = threading.Thread(target=self._run, name=f"monitor {machine.title}", daemon=True)
 
@@ -290,7 +289,8 @@ class MachineWorker:
     @property
     def _silent(self) -> bool:
         """Whether no usable block has come for longer than a silence may last."""
-        return self._clocks.monotonic_s() - self._heard_s > self.machine.ingest.no_data_after_s
+        before_s = self._asleep_s if self._latest_data_s is None else 0.0
+        return self._clocks.monotonic_s() - self._heard_s + before_s > self.machine.ingest.no_data_after_s
 
     @property
     def _heard_s(self) -> float:

@@ -20,7 +20,7 @@ from models.signals.wire import encode_block
 from models.stream_settings import IngestSettings
 from rotorwatch.records.alarms import AlarmState
 from rotorwatch.records.example import example
-from rotorwatch.records.health import Report
+from rotorwatch.records.health import HealthState, Report
 from service.history.machine import MachineStore
 from service.history.records import Checkpoint, Step, StoreError
 from service.history.store import Store
@@ -384,16 +384,21 @@ def test_a_program_that_stood_still_calls_nobody_silent(tmp_path: Path) -> None:
 
 
 def test_a_stream_has_time_to_be_heard_again_after_a_restart(tmp_path: Path) -> None:
-    now_s = [0.0]
-    clocks = Clocks(monotonic_s=lambda: now_s[0])
+    now_s, now_ns = [0.0], [START_NS]
+    clocks = Clocks(monotonic_s=lambda: now_s[0], utc_ns=lambda: now_ns[0])
     with bench(tmp_path, clocks) as at:
         at.put(block(0))
+        assert at.worker.health().state is HealthState.WARMING
+    now_ns[0] += 3600 * S
     with bench(tmp_path, clocks) as at:
+        assert at.worker.health().state is HealthState.NO_DATA  # how it was an hour ago is not how it is
         for seconds, expected in ((19, []), (2, [(0, "raised", STREAM_LOST)])):
             for _ in range(seconds):
                 now_s[0] += 1.0
                 at.tick()
             assert at.log() == expected
+        at.put(block(1))
+        assert not at.worker.health().stream.silent
 
 
 def test_a_silence_is_longer_than_a_block() -> None:
