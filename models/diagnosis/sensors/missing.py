@@ -18,13 +18,9 @@ from rotorwatch.records.windows import SensorFault
 
 
 def completed(block: SampleBlock) -> SampleBlock:
-    """The block with 0 in channels without numbers. Depends on nothing else: recalled, it gives the same window."""
-    missing = ~np.isfinite(block.samples)
-    return (
-        replace(block, samples=np.where(missing, block.samples.dtype.type(0), block.samples))
-        if missing.any()
-        else block
-    )
+    """A block that was accepted, with 0 in channels without numbers; recalled, it gives the same window."""
+    there = np.isfinite(block.samples[0])  # of a channel, all samples are or none is
+    return block if there.all() else replace(block, samples=np.where(there, block.samples, block.samples.dtype.type(0)))
 
 
 class MissingNumbers:
@@ -43,7 +39,9 @@ class MissingNumbers:
 
     def take(self, block: SampleBlock) -> SampleBlock:
         """Take note of what a block lacks, and return it `completed`."""
-        lost = ~np.isfinite(block.samples).any(axis=0)
+        lost = ~np.isfinite(block.samples[0])
+        if not lost.any():
+            return block
         begun = lost & (self._times_ns[1] != block.start_ns)
         self._times_ns[0, begun], self._times_ns[1, lost] = block.start_ns, block.end_ns
         return completed(block)
