@@ -125,6 +125,7 @@ class LevelJudge:
         latest: LatestContact,
         *,
         named: bool,
+        faulty: Sequence[int] = (),
     ) -> Foreign:
         """What the levels of a window show that no change of a parameter makes.
 
@@ -139,9 +140,12 @@ class LevelJudge:
             Of the hops before the latest one, with which it goes on.
         named : bool
             Whether a parameter has been found to have changed, which this would cast doubt on.
+        faulty : sequence of int
+            Columns of sensors at fault: what they show is nothing of the machine, nor a gain.
         """
         if reference is None:
             return Foreign()
+        levels = levels.without(faulty, self._plan.pairs)
         state, seen = reference.at(levels.speed_rad_s)
         found = ""
         if seen:
@@ -161,8 +165,9 @@ class LevelJudge:
         if found or not seen:  # at another speed much is otherwise
             return Foreign(found)
         kurtosis, hidden = levels.random_kurtosis, levels.hidden_twice
-        told = judged if hidden is None else compress(judged, ~hidden)
-        twice = [one.limit("x2") for one in told]
+        told = np.full(len(judged), True) if hidden is None else ~hidden
+        told[[*faulty]] = False
+        twice = [one.limit("x2") for one in compress(judged, told)]
         grown = [limits.text for limits in twice if limits and limits.text and not limits.absolute]
         if grown or kurtosis is None:
             return Foreign(next(iter(grown), ""))

@@ -29,7 +29,7 @@ standard error of 1/(2√(BT)) (J. S. Bendat, A. G. Piersol, "Random Data", 4th 
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import TypeVar
 
@@ -314,6 +314,26 @@ class WindowLevels:
     # Of each hop, what `random_kurtosis` is made of, and the mean squares in the bands.
     moments: tuple[FloatArray, FloatArray, _ComplexArray, FloatArray] | None = None
     contact: FloatArray | None = None  # (n_hops, n), see `models.levels.contact`
+
+    def without(self, columns: Sequence[int], pairs: Sequence[tuple[int, int]]) -> "WindowLevels":
+        """The same, but nan for what some of the channels show, alone or as one of a pair of displacements.
+
+        That is for what is learned, or tells a fault; errors, vectors and lines stay.
+        """
+        if not columns or self.bands is None:
+            return self
+        gone = np.isin(np.arange(self.bands.rms.shape[1]), columns)
+        lone = gone.copy()
+        for pair in pairs:
+            lone[[*pair]] |= gone[[*pair]].any()
+        bands = replace(self.bands, rms=np.where(gone, np.nan, self.bands.rms))
+        values = {name: np.where(lone if name == "s_max" else gone, np.nan, one) for name, one in self.values.items()}
+        moments, contact = self.moments, self.contact
+        if moments is not None:
+            square, fourth, orders, in_bands = moments
+            moments = square, np.where(gone, np.nan, fourth), orders, np.where(gone, np.nan, in_bands)
+        contact = None if contact is None else np.where(lone, np.nan, contact)
+        return replace(self, values=values, bands=bands, moments=moments, contact=contact)
 
     @property
     def unsteady(self) -> float:

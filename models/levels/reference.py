@@ -169,7 +169,9 @@ def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingS
         hops=float(np.mean([one.hops for one in group])),
         varied=any(NEIGHBOURHOOD < one.unsteady < math.inf for one in group),
         bands={
-            channel: learn_bands(bands, column) for column, channel in enumerate(channels) if len(bands) == len(group)
+            channel: learn_bands(own, column)
+            for column, channel in enumerate(channels)
+            if len(bands) == len(group) and (own := [one for one in bands if np.isfinite(one.rms[:, column]).all()])
         },
         lines=dict(zip(channels, map(tuple, lines.T.round(3).tolist()), strict=False)),  # of all channels, or none
         kurtosis=_hops(channels, kurtosis),
@@ -191,9 +193,13 @@ def _hops(channels: Sequence[str], windows: Sequence[FloatArray | None]) -> dict
 
 
 def _reference(name: str, column: int, levels: Sequence[WindowLevels]) -> ReferenceLevel | None:
+    # Where a sensor was not connected in some windows, or its partner of a pair, the others tell.
+    levels = [one for one in levels if one.bands is None or np.isfinite(one.bands.rms[:, column]).all()]
+    if name == "s_max":
+        levels = [one for one in levels if np.isfinite(one.values[name][column])]
     values = np.array([one.values[name][column] for one in levels])
     errors = np.array([one.errors[name][column] for one in levels])
-    if not np.all(np.isfinite(values)):
+    if not levels or not np.all(np.isfinite(values)):
         return None
     vector, turned = None, 0.0
     if name == "x1" and all(one.vectors is not None for one in levels):
@@ -212,6 +218,8 @@ def _reference(name: str, column: int, levels: Sequence[WindowLevels]) -> Refere
 
 class FirstWindows:
     """Takes the first windows that are seen as a reference, where nothing was commissioned.
+
+    A channel whose values are nan in some of them is learned from the others.
 
     Where the machine was not seen to turn in them, and every channel vibrates four times as much once it is, it stood,
     and the first windows in which it turns are a reference besides.
@@ -265,7 +273,9 @@ class FirstWindows:
         stood, _ = reference.at(None)
         quiet = [stood.levels[name].get("overall") for name in self._channels]
         means = np.array([np.nan if one is None else one.mean for one in quiet])
-        return levels.speed_rad_s is not None and bool(np.all(QUIET * levels.values["overall"] > means))
+        # Not of channels that had no numbers then, or have none now.
+        still = QUIET * levels.values["overall"] <= means
+        return levels.speed_rad_s is not None and not still.any()
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything as named arrays."""

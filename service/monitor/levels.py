@@ -4,6 +4,7 @@ import hashlib
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ class LevelWatch:
     def __init__(self, plan: Plan, machine: MachineFile, installed: Installed) -> None:
         if plan.levels is None:
             raise ValueError(f"{machine.title}: no levels are planned")
-        self._columns = plan.columns
+        self._columns, self._pairs = plan.columns, plan.levels.pairs
         channels = [machine.sensors[column] for column in plan.columns]
         self._judge = LevelJudge(plan.levels, channels, machine.levels)
         of = machine.levels.reference or ("first windows" if installed.watching else "commissioned")
@@ -87,8 +88,8 @@ class LevelWatch:
         """Levels, channel by channel, against what limits there are."""
         return self._judge.judge(levels, self.reference)
 
-    def take(self, window: SlidingWindow) -> None:
-        """Take the levels of the window as it is after a hop."""
+    def take(self, window: SlidingWindow, missing: Collection[str] = ()) -> None:
+        """Take the levels of the window as it is after a hop, in which some channels lacked numbers."""
         found = window.levels(errors=self._takes_first and self._first.learning)
         if found is None:
             return
@@ -97,7 +98,13 @@ class LevelWatch:
         self._found = found
         stood = any(abs(hop.turned_rad) < _STILL_RAD for hop in window.hops)  # not where there is no angle: nan
         if self._takes_first and window.filled == 1 and not stood:
-            self._first.take(window.hops[0].start_ns, window.hops[-1].end_ns, found)
+            self._first.take(
+                window.hops[0].start_ns, window.hops[-1].end_ns, found.without(self._at(missing), self._pairs)
+            )
+
+    def _at(self, states: Collection[str]) -> list[int]:
+        """Columns of some channels."""
+        return [column for column, state in enumerate(self._states) if state in states]
 
     def _has_moved(self, found: WindowLevels, hops: Sequence[HopMoments]) -> bool:
         """Whether lines lay in other bands for a part of the window, as they did in no healthy one."""
@@ -115,16 +122,22 @@ class LevelWatch:
             return False
         return hops[0].start_ns < self._moved_ns <= hops[-1].end_ns  # it is later where the clock was set back
 
-    def foreign(self, window: SlidingWindow, statistics: WindowStatistics, *, named: bool) -> Foreign:
-        """What the latest window shows that no change of a parameter makes: a new line, or see `LevelJudge.foreign`."""
+    def foreign(
+        self, window: SlidingWindow, statistics: WindowStatistics, *, named: bool, faulty: Collection[str] = ()
+    ) -> Foreign:
+        """What the latest window shows that no change of a parameter makes: a new line, or see `LevelJudge.foreign`.
+
+        Nothing is made of what `faulty` channels show, none of which is one of the rotor's.
+        """
         turned = self.reference is not None and any(state.speed_rad_s for state in self.reference.states)
         if self._found is None:
             return Foreign()
         healthy, speed_rad_s = self.reference, statistics.speed_rad_s
+        judge = partial(self._judge.foreign, named=named, faulty=self._at(faulty))
         if not statistics.settled.all() or (turned and statistics.speed_source == "unknown"):
             # What turns with the shaft is in the random part, too, and in lines: what pushes it back is told by hop.
             bare = replace(self._found, moments=None, lines=None)
-            return self._judge.foreign(bare, self.latest, healthy, self._contact, named=named)
+            return judge(bare, self.latest, healthy, self._contact)
         if healthy is not None and healthy.lines is not None and math.isfinite(speed_rad_s) and speed_rad_s:
             lines = steady_lines(window.plan, window.hops, statistics)
             if healthy.faint:
@@ -147,7 +160,7 @@ class LevelWatch:
             healthy = self._expected or self._by_file(self._by_theory, self._found)
             if self._found.contact is not None and self._found.lines is not None:  # all of it can be told
                 self._expected = healthy
-        return self._judge.foreign(self._found, self.latest, healthy, self._contact, named=named)
+        return judge(self._found, self.latest, healthy, self._contact)
 
     def _by_file(self, machine: Machine, levels: WindowLevels) -> LevelReference:
         """What theory says of a machine that nobody has commissioned."""

@@ -417,11 +417,11 @@ class MachineMonitor:
     def _evaluated(self, end_ns: int, *, skipped: bool) -> Report:
         self._data_path.hop(end_ns, skipped=skipped)
         self._data_path.conflict(self._senders.conflict, end_ns)
-        self._levels.take(self._window)
+        missing = self._missing.found(self._window.first_ns, end_ns)
+        self._levels.take(self._window, implicated(missing))
         statistics, self.window = self._window.statistics(), self._window.again()
         there = statistics or self._window.statistics(len(self._window.hops))  # while it fills
         stood = "" if there is None else self._standstill.found(there)
-        missing = self._missing.found(self._window.hops[0].start_ns, end_ns)
         if statistics is None:
             self._levels.tell(self._alarms, end_ns, faulty=implicated(missing), standing=bool(stood))
             return Report(**self._window_now(end_ns, end_ns, self._state(HealthState.WARMING)))
@@ -446,7 +446,7 @@ class MachineMonitor:
             evaluation = self._evaluator.evaluate(statistics, (self._window, self._test))
         except EstimationError as error:
             return unread(HealthState.WATCHING if self.watching else HealthState.NOT_EVALUABLE, str(error))
-        foreign = self._levels.foreign(self._window, statistics, named=bool(self._test.state.findings))
+        foreign = self._levels.foreign(self._window, statistics, named=bool(self._test.state.findings), faulty=faulty)
         evaluation = evaluation.named(self.machine.sensors, statistics, foreign.text)
         looks = {n: stretch_of(one, self._window.hops[-n].start_ns, end_ns) for n, one in evaluation.short.items()}
         whole = self._test.settings.window_hops

@@ -39,21 +39,23 @@ class MissingNumbers:
 
     def take(self, block: SampleBlock) -> SampleBlock:
         """Take note of what a block lacks, and return it `completed`."""
+        self._times_ns[:, self._times_ns[1] > block.end_ns] = -1  # before the clock was set back
         lost = ~np.isfinite(block.samples[0])
         if not lost.any():
             return block
-        begun = lost & (self._times_ns[1] != block.start_ns)
+        apart_ns = np.abs(self._times_ns[1] - block.start_ns)  # not exactly 0 where a device counts its own time
+        begun = lost & (apart_ns > (block.end_ns - block.start_ns) // 2)
         self._times_ns[0, begun], self._times_ns[1, lost] = block.start_ns, block.end_ns
         return completed(block)
 
     def found(self, start_ns: int, end_ns: int) -> tuple[SensorFault, ...]:
-        """Channels that lacked numbers in a window; none where the clock has been set back since."""
+        """Channels that lacked numbers in a window, which may end within the latest block."""
         findings = []
         for state, first_ns, last_ns in zip(self._states, *self._times_ns.tolist(), strict=True):
-            if start_ns < last_ns <= end_ns:
-                lost_s = (last_ns - max(first_ns, start_ns)) / 1e9
+            if start_ns < last_ns and first_ns < end_ns:
+                lost_s = (min(last_ns, end_ns) - max(first_ns, start_ns)) / 1e9
                 text = (
-                    f"{self._naming.name(state)}: sent as NaN, the last time for {lost_s:.3g} s of the window, "
+                    f"{self._naming.name(state)}: sent as NaN, the last time for {lost_s:.3g} s of the window's data, "
                     "expected numbers: its sensor is not connected"
                 )
                 findings.append(SensorFault(states=(state,), kind=FaultKind.MISSING, text=text, value=lost_s))

@@ -72,6 +72,11 @@ class SlidingWindow:
         return tuple(self._hops)
 
     @property
+    def first_ns(self) -> int:
+        """When the oldest samples in the window begin: those that its first hop needs before it, too."""
+        return self._hops[0].start_ns - round((self.plan.need - self.plan.fresh) * 1e9 / self.plan.rate_hz)
+
+    @property
     def latest_hop(self) -> HopMoments | None:
         """The hop that was completed last."""
         return self._hops[-1] if self._hops else None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from models.alarm_names import PHASE_REFERENCE
-from models.commissioning.commissioned import install
+from models.commissioning.commissioned import Installed, install
 from models.diagnosis.sensors.missing import MissingNumbers
 from models.ingest import Reason
 from models.signals.block import SampleBlock
@@ -16,6 +16,7 @@ from models.signals.wire import encode_block
 from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
+from tests.commissioning.rotor_kit import commissioned, elsewhere, recording
 from tests.service.rig.live import LAB, scenario_blocks
 
 KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 20.0, "max_span_s": 40.0})})
@@ -23,12 +24,14 @@ Z1_DOT, THETA = 3, 8
 FROM_S, TO_S, END_S = 31.0, 33.0, 125.0
 
 
-def without(column: int, begin_s: float, end_s: float, value: float = np.nan) -> Iterator[SampleBlock]:
+def without(
+    column: int, from_s: float, to_s: float, value: float = np.nan, *, end_s: float = END_S
+) -> Iterator[SampleBlock]:
     """A stream in which a channel has no numbers for a time."""
-    stream = scenario_blocks(END_S)
+    stream = scenario_blocks(end_s)
     for block in stream:
         samples = block.samples.copy()
-        if begin_s <= (block.start_ns - stream[0].start_ns) / 1e9 < end_s:
+        if from_s <= (block.start_ns - stream[0].start_ns) / 1e9 < to_s:
             samples[:, column] = value
         yield replace(block, samples=samples)
 
@@ -61,7 +64,7 @@ def test_missing_samples_are_told_of_their_channel_until_the_window_has_left_the
     assert {(fault.states, fault.kind) for one in lacking for fault in one.sensors} == {(("z1_dot",), "missing")}
     fault = lacking[2].sensors[0]
     assert fault.value == pytest.approx(2.0)
-    assert fault.text.startswith("z1_dot: sent as NaN, the last time for 2 s of the window, expected numbers")
+    assert fault.text.startswith("z1_dot: sent as NaN, the last time for 2 s of the window's data, expected numbers")
     assert events == [(EventKind.RAISED, "data-missing"), (EventKind.CLEARED, "data-missing")]
     # Levels of the other channels are the same to the last bit, and the machine is diagnosed again.
     for one, other in zip(reports, usual, strict=True):
@@ -120,9 +123,62 @@ def test_a_restored_monitor_and_a_recalled_window_go_on_to_the_last_bit() -> Non
     assert windows(again, stream[half:]) == windows(monitor, stream[half:])
 
 
+def test_it_is_told_in_hops_that_end_within_a_block_and_of_blocks_whose_times_jitter() -> None:
+    simulated, size = scenario_blocks(61.0), 270
+    samples, first = np.concatenate([block.samples for block in simulated]), simulated[0]
+    samples[230 * size : 270 * size, Z1_DOT] = np.nan  # 31.05 s to 36.45 s
+    jitter_ns = np.random.default_rng(20263311).integers(-1_000, 1_000, len(samples) // size)
+    stream = [
+        replace(first, sequence=k, start_ns=first.start_ns + k * 135_000_000 + late_ns, samples=samples[at : at + size])
+        for k, (at, late_ns) in enumerate(zip(range(0, len(samples) - size, size), jitter_ns.tolist(), strict=False))
+    ]
+    reports = [one for one in windows(MachineMonitor(install(KIT, None)), stream) if one.filled == 1]
+    told = [[(fault.kind.value, round(fault.value or 0.0, 2)) for fault in one.sensors] for one in reports]
+    # What a hop needs before it counts, too: 2.5 s here.
+    lacking = ((1.45,), (5.4,), (5.4,), (5.4,), (5.4,), (1.45,))
+    assert told == [[], [], *([("missing", value) for value in values] for values in lacking)]
+
+
+def test_a_casing_sensor_that_is_unplugged_is_no_wrong_gain_of_its_place() -> None:
+    casing = Sensor(name="DE-H", quantity="acceleration", location="DE", direction="horizontal", unit="m/s2")
+    rig = KIT.model_copy(update={"sensors": (*KIT.sensors, casing)})
+    noise, stream = np.random.default_rng(20263312), list[SampleBlock]()
+    for block in scenario_blocks(END_S + 1):
+        shaken = np.diff(block.samples[:, 2:3], axis=0, append=block.samples[-1:, 2:3]) * block.rate_hz
+        own = shaken + noise.normal(scale=0.3, size=shaken.shape)
+        stream.append(replace(block, samples=np.hstack([block.samples, own]).astype(np.float32)))
+    made = commissioned(rig, recording(rig, stream[:800])).commissioned
+    assert made is not None
+    assert made.levels is not None
+    assert made.levels.gains is not None
+    for block in stream[1050:]:
+        block.samples[:, -1] = np.nan
+    reports = windows(MachineMonitor(Installed(rig, None, made)), stream[800:])
+    lacking = [one for one in reports if one.sensors]
+    assert {fault.states for one in lacking for fault in one.sensors} == {("@DE-H",)}
+    assert [one.reason for one in lacking] == [""] * 4
+    assert not any(one.verdict is None or one.verdict.outside_model for one in lacking)
+
+
+@pytest.mark.parametrize("missing_to_s", [30.0, 150.0])
+def test_the_first_windows_are_a_reference_of_the_channels_that_are_there(missing_to_s: float) -> None:
+    rig = elsewhere(KIT)
+    monitor, sound = MachineMonitor(Installed(rig)), MachineMonitor(Installed(rig))
+    usual, reports = windows(sound, scenario_blocks(170.0)), list[Report]()
+    for block in without(Z1_DOT, 0.0, missing_to_s, end_s=170.0):
+        reports += windows(monitor, [block])
+        assert not any(alarm.raised for alarm in monitor.health().alarms if alarm.name.startswith("level:"))
+    last, limited = reports[-1].levels, missing_to_s == 30.0
+    for level, other in zip(last, usual[-1].levels, strict=True):
+        assert (level == other) == (level.channel != "z1_dot")
+        assert len(level.limits) == (len(other.limits) if limited or level == other else 0)
+
+
 def test_what_was_missing_before_a_clock_was_set_back_is_not_told_for_hours() -> None:
     missing = MissingNumbers(LAB.sensors[:1])
-    block = SampleBlock(5_000, 0, 0, 1000.0, np.full((2, 1), np.nan))
+    block = SampleBlock(5_000_000_000, 0, 0, 1000.0, np.full((2, 1), np.nan))
     missing.take(block)
     assert missing.found(0, block.end_ns)
-    assert not missing.found(0, block.end_ns - 1)
+    assert not missing.found(0, block.start_ns)
+    missing.take(replace(block, start_ns=4_000_000_000, samples=np.zeros((2, 1))))
+    assert not missing.found(0, block.end_ns)
