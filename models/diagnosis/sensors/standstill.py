@@ -25,14 +25,14 @@ _STEADY = 0.15
 def runs_down(window: WindowStatistics) -> npt.NDArray[np.bool_]:
     """Which hops have little or nothing of a running machine, shape (n_hops,), beside others that do: a slow end, say.
 
-    None where no speed is known: hops may be quiet beside one that a blow or a disturbance has made loud. The window is
-    that of its sensors as they are mounted.
+    None where no speed is known: hops may be quiet beside one that a blow or a disturbance has made loud. A channel
+    that shows nothing in any hop says nothing. The window is that of its sensors as they are mounted.
     """
     hops, speeds = window.hop_waveform, np.abs(window.hop_speed_rad_s)
     vibrations = [column for column, state in enumerate(window.sensors) if state != "theta"]
     rms = hops.rms[:, vibrations]
     fastest = np.max(speeds, initial=0.0, where=np.isfinite(speeds))
-    return np.asarray((rms < QUIET * rms.max(axis=0)).all(axis=1) & ~(speeds >= _SLOW * fastest) & (fastest > 0))
+    return np.asarray((rms <= QUIET * rms.max(axis=0)).all(axis=1) & ~(speeds >= _SLOW * fastest) & (fastest > 0))
 
 
 class Standstill:

@@ -94,6 +94,19 @@ def test_what_is_lost_while_the_machine_runs_is_told(what: str, alarm: str) -> N
     assert events == [(EventKind.RAISED, alarm)]
 
 
+@pytest.mark.parametrize("dead", [0, 3])
+def test_beside_a_dead_channel_a_machine_that_stops_has_no_other_fault(dead: int) -> None:
+    name, stream = KIT.sensors[dead].name, list(stopping(KIT, "machine"))
+    silent = [
+        replace(block, samples=np.where(np.arange(len(KIT.sensors)) == dead, np.float32(0), block.samples))
+        for block in stream
+    ]
+    (usual, _), (reports, _) = watched(monitor_of(KIT), stream), watched(monitor_of(KIT), silent)
+    for one, other in zip(reports, usual, strict=True):
+        found, known = ({fault.states for fault in each.sensors} for each in (one, other))
+        assert found - {(name,)} == {states for states in known if name not in states}
+
+
 def test_without_a_shaft_angle_no_sensor_is_blamed_but_levels_have_fallen() -> None:
     reports, events = watched(monitor_of(WITHOUT_ANGLE), list(stopping(WITHOUT_ANGLE, "machine")))
     assert any("all its sensors have lost their supply" in one.reason for one in reports)
