@@ -454,9 +454,8 @@ class MachineMonitor:
         verdict = self._test.update(looks, foreign=foreign.text != "", rivals=evaluation.rivals(foreign))
         unexplained, suspect = evaluation.deciding.unexplained, evaluation.deciding.suspect
         astride_s = self._test.astride_s if evaluation.alone and not foreign.text else 0.0
-        self._alarms.found(verdict, self._test.unexplained, suspect, end_ns, hidden=foreign.hides, astride_s=astride_s)
-        explained = bool(verdict.changed) and not (verdict.outside_model or foreign.hides)
-        self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=explained)
+        explains = self._alarms.found(verdict, self._test.unexplained, suspect, end_ns, astride_s, hidden=foreign.hides)
+        self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=explains)
         reason = evaluation.reason(told=bool(verdict.current))
         if evaluation.shapes:
             changed, evidence = evaluation.unlike_healthy, Evidence(start_ns=start_ns, end_ns=end_ns)

@@ -17,6 +17,7 @@ from pydantic import TypeAdapter
 
 from models.alarm_names import ALARMS, CHANGED, MODEL, alarm_kind, is_alarm
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
+from models.diagnosis.readings import Z95
 from models.errors import CheckpointError
 from models.machine import AlarmSettings, SuppressRule
 from models.physics.rotor import PARAMETERS
@@ -96,11 +97,13 @@ class AlarmBook:
         unexplained: str,
         suspect: str,
         end_ns: int,
+        astride_s: float = 0.0,
         *,
         hidden: bool = False,
-        astride_s: float = 0.0,
-    ) -> None:
+    ) -> bool:
         """Judge what the sequential test has found at the end of a hop; without clean data alarms stay where they are.
+
+        Returns whether a change of a parameter explains the data without reserve.
 
         Parameters
         ----------
@@ -108,13 +111,14 @@ class AlarmBook:
             Why nothing can be said of parameters; empty if something can.
         suspect : str
             What explains data outside the model best; empty if nothing does.
+        astride_s : float
+            For how long the window may still hold the moment of a change, and be outside the model for that alone.
         hidden : bool
             Whether it hides what a parameter does: none is named then, and none that was named is taken back. Where a
             parameter explains the data as well, so that they are not outside the model, both may be.
-        astride_s : float
-            For how long the window may still hold the moment of a change, and be outside the model for that alone.
         """
         named = [finding.name for finding in verdict.changed]
+        unreserved = set(named)
         probability = {one.name: one.probability for one in verdict.candidates}
         another = verdict.outside_model and len(named) >= _ANOTHER
         nameless = another or hidden
@@ -128,7 +132,10 @@ class AlarmBook:
         for reading in verdict.current:
             if reading.relative_change is not None and reading.standard_error is not None:
                 larger = reading.relative_change if reading.vector is None else reading.vector.magnitude_change
-                held_stiff = reading.name == "EI" and larger > 0  # no fault of a shaft makes it stiffer
+                # No fault of a shaft makes it stiffer.
+                held_stiff = reading.name == "EI" and larger > Z95 * reading.standard_error
+                if held_stiff:
+                    unreserved.discard("EI")
                 self.update(
                     reading.name,
                     reading.relative_change,
@@ -174,6 +181,7 @@ class AlarmBook:
             note = "; ".join(filter(None, (unexplained, suspect and f"best explained by: {suspect}", at_once, just)))
             outside = verdict.outside_model
             self.update_state(MODEL, outside, end_ns, note, evidence=evidence)
+        return bool(unreserved) and not (verdict.outside_model or hidden)
 
     def update(  # noqa: PLR0913  # what one reading says
         self,

@@ -220,6 +220,23 @@ def test_where_a_wrong_gain_would_explain_it_as_well_both_are_told(change: float
     assert judged([SURE] * 3, outside=True, hidden=True) == ["raised model"]
 
 
+def test_a_shaft_that_reads_stiffer_explains_no_levels_and_one_that_is_repaired_has_no_reserve() -> None:
+    book = AlarmBook(SETTINGS)
+    changes = ({"EI": 0.99}, 0.2), ({"EI": 0.99}, -0.2), ({"EI": 0.99, "e": 0.99}, 0.2)
+    assert [book.found(verdict(of, change=change), "", "", 0) for of, change in changes] == [False, True, True]
+    crack = AlarmBook(SETTINGS)
+    for number in range(15):
+        crack.found(
+            verdict({"EI": 0.99 if number < 3 else 0.0}, change=-0.2 if number < 3 else 0.01),
+            "",
+            "",
+            number * 5_000_000_000,
+        )
+    assert [(event.kind, event.alarm.note, event.alarm.low_confidence) for event in crack.take()] == [
+        ("raised", "", False), ("cleared", "", False),
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("stiff", "by", "reserve"),
     [(("k_by",), "baseline", False), (("k_by", "k_bz"), "baseline", True), (("k_by", "k_bz"), "likelihood", False)],
