@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.commissioning.commissioned import Installed
-from models.diagnosis.sensors.missing import completed
+from models.diagnosis.sensors.missing import MissingNumbers
 from models.diagnosis.window.moments import plan_for
 from models.errors import WireError
 from models.ingest import Admission, Gate
@@ -52,7 +52,7 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
         list[SampleBlock](),
         list[Admission](),
     )
-    rates: set[float] = set()
+    rates, missing = set[float](), MissingNumbers(machine.sensors)
     for message in stream:
         try:
             block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
@@ -68,7 +68,7 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
             breaks.append(verdict)
         if not verdict.continuous or verdict.new_snapshot:
             accepted.clear()
-        accepted.append(completed(block))
+        accepted.append(missing.take(block))
     if len(breaks) > _MOST_BREAKS:
         missing_s = sum(one.gap_s for one in breaks)
         troubles.append(
@@ -84,6 +84,7 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
             f"sampling rate {', '.join(f'{rate:g}' for rate in sorted(rates))} Hz, expected {machine.rate_hz:g}"
         )
     if accepted:
+        troubles += [fault.text for fault in missing.found(accepted[0].start_ns, accepted[-1].end_ns)]
         lines += _of_samples(machine, accepted, troubles)
     return Arrival(tuple(lines), tuple(troubles))
 

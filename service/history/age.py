@@ -8,7 +8,14 @@ import structlog
 _FORWARD_NS = 3600 * 10**9  # what summer time or a correction at the start may be
 _BELIEVED_S = 86_400.0
 
+_SUSPENDED_TOO: int | None = getattr(time, "CLOCK_BOOTTIME", None)
+
 _log = structlog.get_logger("rotorwatch", part="history")
+
+
+def running_s() -> float:
+    """Seconds that only pass, on Linux also while the computer is suspended."""
+    return time.monotonic() if _SUSPENDED_TOO is None else time.clock_gettime(_SUSPENDED_TOO)
 
 
 class AgeClock:
@@ -25,9 +32,7 @@ class AgeClock:
         Seconds that only pass.
     """
 
-    def __init__(
-        self, now_ns: Callable[[], int] = time.time_ns, monotonic_s: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, now_ns: Callable[[], int] = time.time_ns, monotonic_s: Callable[[], float] = running_s) -> None:
         self._now_ns = now_ns
         self._monotonic_s = monotonic_s
         self._offset_ns = now_ns() - round(monotonic_s() * 1e9)

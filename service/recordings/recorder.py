@@ -23,7 +23,7 @@ from pathlib import Path
 from models.errors import RecordingError, RotorwatchError
 from models.machine import MachineFile
 from models.signals.recording import RecordedMessage, RecordingWriter, writing
-from service.history.age import AgeClock
+from service.history.age import AgeClock, running_s
 from service.history.records import StoredEvent
 from service.recordings.backlog import Backlog
 from service.recordings.catalogue import PART, SUFFIX, Catalogue, name_of
@@ -81,7 +81,7 @@ class MachineRecorder:
         machine: MachineFile,
         settings: RecordingSettings,
         committed: Callable[[int], Iterable[StoredEvent]],
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = running_s,
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         if settings.directory is None:

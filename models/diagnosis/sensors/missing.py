@@ -55,8 +55,8 @@ class MissingNumbers:
             if start_ns < last_ns and first_ns < end_ns:
                 lost_s = (min(last_ns, end_ns) - max(first_ns, start_ns)) / 1e9
                 text = (
-                    f"{self._naming.name(state)}: sent as NaN, the last time for {lost_s:.3g} s of the window's data, "
-                    "expected numbers: its sensor is not connected"
+                    f"{self._naming.name(state)}: sent as NaN, the last time for {lost_s:.3g} s, expected numbers: its "
+                    "sensor is not connected"
                 )
                 findings.append(SensorFault(states=(state,), kind=FaultKind.MISSING, text=text, value=lost_s))
         return tuple(findings)

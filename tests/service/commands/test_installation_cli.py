@@ -144,6 +144,18 @@ def test_the_doctor_sums_up_gaps_that_are_many(tmp_path: Path) -> None:
     assert sum("0.1 s" in one for one in troubles) == 3
 
 
+def test_the_doctor_says_for_how_long_a_sensor_was_not_connected(tmp_path: Path) -> None:
+    run(*FAN, "--folder", str(tmp_path))
+    machine = load_machine_file(tmp_path / "fan.toml")
+    messages = []
+    for block, _ in blocks(6.0):
+        if 4 <= block.sequence < 7:
+            block.samples[:, 1] = np.nan
+        messages.append(RecordedMessage(machine.keys.stream, *encode_block(block, ""), block.start_ns, block.start_ns))
+    (trouble,) = (one for one in examined(machine, messages).troubles if "NDE-V" in one)
+    assert trouble == "NDE-V: sent as NaN, the last time for 1.5 s, expected numbers: its sensor is not connected"
+
+
 def test_a_strangers_two_sensors_have_a_trend_in_three_commands(tmp_path: Path) -> None:
     run(*FAN, "--folder", str(tmp_path))
     address, settings = endpoint(), tmp_path / "rotorwatch.toml"

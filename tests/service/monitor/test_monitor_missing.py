@@ -64,7 +64,7 @@ def test_missing_samples_are_told_of_their_channel_until_the_window_has_left_the
     assert {(fault.states, fault.kind) for one in lacking for fault in one.sensors} == {(("z1_dot",), "missing")}
     fault = lacking[2].sensors[0]
     assert fault.value == pytest.approx(2.0)
-    assert fault.text.startswith("z1_dot: sent as NaN, the last time for 2 s of the window's data, expected numbers")
+    assert fault.text.startswith("z1_dot: sent as NaN, the last time for 2 s, expected numbers")
     assert events == [(EventKind.RAISED, "data-missing"), (EventKind.CLEARED, "data-missing")]
     # Levels of the other channels are the same to the last bit, and the machine is diagnosed again.
     for one, other in zip(reports, usual, strict=True):
