@@ -251,7 +251,7 @@ class Gate:
                 f"to {settings.block_to_s:g} s",
             )
         finite = np.isfinite(block.samples)
-        if self._partial and finite.any():
+        if self._partial and not finite.all() and finite.any():
             finite |= ~finite.any(axis=0)
         if not finite.all():
             row, column = (int(where) for where in np.argwhere(~finite)[0])
