@@ -95,14 +95,23 @@ class LevelJudge:
         self._growth = lru_cache(maxsize=16 * len(self._channels))(_growth_limit)
 
     def judge(
-        self, levels: WindowLevels, reference: LevelReference | None, *, moved: bool = False
+        self,
+        levels: WindowLevels,
+        reference: LevelReference | None,
+        *,
+        moved: bool = False,
+        missing: Sequence[int] = (),
     ) -> tuple[ChannelLevels, ...]:
-        """Levels of one window, channel by channel; no growth where lines `moved` to other bands within it."""
+        """Levels of one window, channel by channel, none in columns where samples are `missing`.
+
+        There is no growth where lines `moved` to other bands within it.
+        """
         alike = None if reference is None else self._alike(levels, reference)
         relative = None if alike is None else self._relatives[alike]
         grown: Sequence[Growth | None] = [None] * len(self._channels)
         if relative is not None and relative.bands is not None and levels.bands is not None and not moved:
             grown = growth(levels.bands, relative.bands)
+        grown = [None if column in missing else one for column, one in enumerate(grown)]
         values = np.full((len(_SHOWN), len(grown)), np.nan)
         values[: len(_MEASURED)] = [levels.values[name] for name in _MEASURED]
         values[: len(_MEASURED)] /= self._units
@@ -111,6 +120,7 @@ class LevelJudge:
         if vectors is not None and levels.speed_rad_s is not None:
             turned = 1.0 if levels.speed_rad_s >= 0 else -1.0
             values[-2:] = np.degrees(-turned * np.angle(vectors[1:3])) % 360
+        values[:, [*missing]] = np.nan
         shown = all_rounded(values.T)
         return tuple(
             self._channel(column, own, dict(zip(_SHOWN, shown[column], strict=True)), levels, alike, grown[column])

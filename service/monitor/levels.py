@@ -93,14 +93,12 @@ class LevelWatch:
         found = window.levels(errors=self._takes_first and self._first.learning)
         if found is None:
             return
-        self._moved = self._has_moved(found, window.hops)
-        self.latest = self._judge.judge(found, self.reference, moved=self._moved)
+        self._moved, columns = self._has_moved(found, window.hops), self._at(missing)
+        self.latest = self._judge.judge(found, self.reference, moved=self._moved, missing=columns)
         self._found = found
         stood = any(abs(hop.turned_rad) < _STILL_RAD for hop in window.hops)  # not where there is no angle: nan
         if self._takes_first and window.filled == 1 and not stood:
-            self._first.take(
-                window.hops[0].start_ns, window.hops[-1].end_ns, found.without(self._at(missing), self._pairs)
-            )
+            self._first.take(window.hops[0].start_ns, window.hops[-1].end_ns, found.without(columns, self._pairs))
 
     def _at(self, states: Collection[str]) -> list[int]:
         """Columns of some channels."""

@@ -66,6 +66,8 @@ def test_missing_samples_are_told_of_their_channel_until_the_window_has_left_the
     assert fault.value == pytest.approx(2.0)
     assert fault.text.startswith("z1_dot: sent as NaN, the last time for 2 s, expected numbers")
     assert events == [(EventKind.RAISED, "data-missing"), (EventKind.CLEARED, "data-missing")]
+    gone = [level for one in lacking for level in one.levels if level.channel == "z1_dot"]
+    assert {(one.overall, one.x1, one.growth) for one in gone} == {(None, None, None)}  # not 0
     # Levels of the other channels are the same to the last bit, and the machine is diagnosed again.
     for one, other in zip(reports, usual, strict=True):
         kept = [level for level in one.levels if level.channel != "z1_dot"]
