@@ -27,6 +27,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import combinations
 
+import numpy as np
+
 from models.ingest import EARLIER_COURSES, Course
 from models.signals.block import SampleBlock
 
@@ -97,7 +99,11 @@ class Arrivals:
         if self._bound == 0 or self._is_repetition(block):
             return (arrived,)
         if block.run == self._run and block.sequence >= self._next:
-            return self._place(arrived)
+            if block.sequence > self._next or self._waiting:
+                return self._place(arrived)
+            self._note(block)
+            self._next += 1
+            return (arrived,)
         # Another run, or a count that began anew: nothing of the old one will come in its place any more.
         gone_on = self.flush()
         known = 0 if block.run == self._run else self._known(block.run)
@@ -253,6 +259,8 @@ class Senders:
     @property
     def conflict(self) -> str:
         """Who contradicts whom, in words; empty if nobody does."""
+        if not self._disputed and len(self._senders) < 2:
+            return ""
         since_s = self._heard_s - _HORIZON_S
         self._disputed = {key: at for key, at in self._disputed.items() if at > since_s}
         for sender in self._senders:
@@ -289,4 +297,6 @@ class Senders:
 
 def _digest(block: SampleBlock) -> bytes:
     head = repr((block.start_ns, block.rate_hz, block.samples.shape, block.samples.dtype.str)).encode()
-    return hashlib.sha256(head + block.samples.tobytes()).digest()[:16]
+    digest = hashlib.sha256(head)
+    digest.update(np.ascontiguousarray(block.samples).data)
+    return digest.digest()[:16]

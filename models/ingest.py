@@ -102,7 +102,7 @@ class Course:
 
     def extended(self, block: SampleBlock) -> "Course":
         """Return the same up to the end of a later block."""
-        return replace(self, sequence=block.sequence + 1, start_ns=block.end_ns)
+        return Course(self.run, self.first, self.first_ns, block.sequence + 1, block.end_ns)
 
     def covers(self, block: SampleBlock) -> bool:
         """Whether a block lies within: it was received, or its place has been passed over."""
@@ -169,14 +169,14 @@ class Gate:
         expected = self._expected
         return expected is not None and expected.covers(block) and block.sequence == expected.sequence - 1
 
-    def could_use(self, payload: bytes, attachment: bytes, encoding: str) -> bool:
+    def could_use(self, payload: bytes, attachment: bytes, encoding: str, *, size_alone: bool = False) -> bool:
         """Whether a message may be one of the machine's blocks, whatever its time; of Arrow only the size is looked at.
 
         Takes microseconds and changes nothing: any thread may ask.
         """
         if not may_be_block(payload, attachment, encoding, self._n_channels, self._most_samples):
             return False
-        if encoding.startswith(ARROW_ENCODING):
+        if size_alone or encoding.startswith(ARROW_ENCODING):
             return True
         try:
             block, schema_hash = decode_block(payload, attachment, encoding)
@@ -184,15 +184,15 @@ class Gate:
             return False
         return self.form(block, schema_hash) is None
 
-    def judge(self, block: SampleBlock, schema_hash: str = "") -> Admission:
+    def judge(self, block: SampleBlock, schema_hash: str | None = "") -> Admission:
         """Accept or refuse a block.
 
         Parameters
         ----------
-        schema_hash : str
-            Schema hash the sender named, empty if it named none.
+        schema_hash : str or None
+            Schema hash the sender named, empty if it named none; None if the block's `form` has been found right.
         """
-        return self.form(block, schema_hash) or self._place(block)
+        return (None if schema_hash is None else self.form(block, schema_hash)) or self._place(block)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything that is remembered, as named arrays."""
@@ -251,7 +251,9 @@ class Gate:
                 f"to {settings.block_to_s:g} s",
             )
         finite = np.isfinite(block.samples)
-        if self._partial and not finite.all() and finite.any():
+        if finite.all():
+            return None
+        if self._partial and finite.any():
             finite |= ~finite.any(axis=0)
         if not finite.all():
             row, column = (int(where) for where in np.argwhere(~finite)[0])

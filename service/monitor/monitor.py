@@ -96,7 +96,7 @@ class MachineMonitor:
             ("gate", self._gate), ("evaluator", judge), ("standstill", self._standstill),
             ("data_path", self._data_path), ("missing", self._missing),
         )  # fmt: skip
-        self._quality = Quality()
+        self._quality, self._accepted = Quality(), 0
         self._latest: Report | None = None
         self._calm = HealthState.WARMING
         self.end_ns: int | None = None
@@ -151,8 +151,7 @@ class MachineMonitor:
         if self._dropped:
             self._drops[block.run, block.sequence], self._dropped = self._dropped, 0
         self._due.extend(self._arrivals.take(block, schema_hash))
-        done = self._step_due()
-        self.used = self._used is block
+        done, self.used = self._step_due(), self._used is block
         return done
 
     def recall(self, payload: bytes, attachment: bytes, encoding: str) -> bool:
@@ -207,17 +206,17 @@ class MachineMonitor:
         """Take what is due; a defect that one block brings to light leaves the others for the next time."""
         while self._due:
             one = self._due.popleft()
-            self._done.append(self.step(one.block, one.schema_hash))
+            self._done.append(self.step(one.block, None))
         done, self._done = tuple(self._done), []
         return done
 
-    def step(self, block: SampleBlock, schema_hash: str = "") -> MonitorReport:
+    def step(self, block: SampleBlock, schema_hash: str | None = "") -> MonitorReport:
         """Take one block: gate, window, evaluation, alarms.
 
         Parameters
         ----------
-        schema_hash : str
-            Hash of the channel descriptor the sender named, empty if none.
+        schema_hash : str or None
+            Hash of the channel descriptor the sender named, see `Gate.judge`.
 
         Returns
         -------
@@ -368,13 +367,13 @@ class MachineMonitor:
             self._window.filled,
             self._latest,
             self._alarms.alarms,
-            self._quality,
+            self._quality.model_copy(update={"accepted_blocks": self._accepted}),
             self._alarms.next_sequence - 1,
             self._fault or ("" if self._latest is None else self._latest.reason),
             self.end_ns,
         )
 
-    def _judged(self, block: SampleBlock, schema_hash: str, dropped: int) -> Admission:
+    def _judged(self, block: SampleBlock, schema_hash: str | None, dropped: int) -> Admission:
         """What the gate says; of the data that another monitor had before this one it knows nothing."""
         anew = not self._gate.courses
         verdict = self._gate.judge(block, schema_hash)
@@ -394,7 +393,9 @@ class MachineMonitor:
         return self._count(verdict)
 
     def _count(self, verdict: Admission) -> Admission:
-        self._quality = counted(self._quality, verdict)
+        self._accepted += verdict.accepted
+        if not verdict.continuous:
+            self._quality = counted(self._quality, verdict)
         return verdict
 
     def _evaluate(self, end_ns: int) -> Report:

@@ -39,18 +39,15 @@ def machine_hash(machine: MachineFile) -> str:
 
 
 def counted(quality: Quality, verdict: Admission) -> Quality:
-    """What has come in, with one more block."""
+    """What was refused or is missing, with one more block."""
     if verdict.reason is not None:
         refused = {**quality.refused_blocks}
         refused[verdict.reason.value] = refused.get(verdict.reason.value, 0) + 1
         return quality.model_copy(
             update={"refused_blocks": dict(sorted(refused.items())), "last_refusal": verdict.text}
         )
-    update: dict[str, object] = {"accepted_blocks": quality.accepted_blocks + 1}
-    if not verdict.continuous:
-        gap = {"gaps": quality.gaps + 1, "missing_s": quality.missing_s + verdict.gap_s, "last_gap": verdict.text}
-        update |= gap
-    return quality.model_copy(update=update)
+    gap = {"gaps": quality.gaps + 1, "missing_s": quality.missing_s + verdict.gap_s, "last_gap": verdict.text}
+    return quality.model_copy(update=gap)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +87,7 @@ class MachineHealth:
     end_ns: int | None = None  # end of the newest data; None before the first
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Tally:
     """What a worker has done since it started, for whoever measures the service."""
 

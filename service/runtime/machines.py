@@ -5,7 +5,7 @@
     one thread for all       one thread per machine              supervisor
     ------------------       ----------------------              ----------
     Intake ---------------> Inbox --> MachineMonitor.step_payload
-              (bounded, counts)   |        |        |            four times a second:
+              (bounded, counts)   |        |        |            twice a second:
                                   |                 '--> snapshot --> health topic, listener
                                   '--> Store (one thread, commits)
                                          '--> then report, alarm topics; listener
@@ -13,7 +13,7 @@
     queries on alarm/event <-- Store
 
 Only a machine's own thread touches its monitor; everybody else reads immutable snapshots, or asks it to do something
-between two blocks (operators; the passing of time, four times a second). Silence is noticed on the monotonic clock; the
+between two blocks (operators; the passing of time, twice a second). Silence is noticed on the monotonic clock; the
 time of day is used for what is recorded when, and for how long a restart took.
 """
 
@@ -39,7 +39,7 @@ from service.stream.transport import Link, MachineCallbacks, MachineLink, tap
 from service.stream.worker import MachineWorker
 from service.terminal.logs import logger
 
-_TICK_S = 0.25
+_TICK_S = 0.5
 
 _log = logger(part="runtime")
 

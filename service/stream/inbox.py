@@ -45,8 +45,9 @@ class Inbox:
     most_bytes : int
         Most bytes that wait.
     may_be_block : callable
-        Whether a message may be one of the machine's blocks. Of those that cannot, a few are handed on, so that
-        it can be said what is wrong with them; the others are counted.
+        Whether a message may be one of the machine's blocks; told whether it is of the publisher that is followed.
+        Of those that cannot, a few are handed on, so that it can be said what is wrong with them; the others are
+        counted.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class Inbox:
         bound: int,
         when_full: Literal["drop", "wait"],
         most_bytes: int = 2**26,
-        may_be_block: Callable[[RawBlock], bool] = lambda _: True,
+        may_be_block: Callable[[RawBlock, bool], bool] = lambda _, __: True,
     ) -> None:
         self._bound = bound
         self._wait = when_full == "wait"
@@ -97,7 +98,8 @@ class Inbox:
 
     def put(self, block: RawBlock) -> None:
         """Append a block; after `close` it is ignored."""
-        odd = not self._may_be_block(block)
+        known = block.source != "" and block.sender == self._followed  # a run alone is anybody's
+        odd = not self._may_be_block(block, known)
         with self._changed:
             if self._closed:
                 return

@@ -100,6 +100,8 @@ class BlockSubscription:
                 self._publishers[publisher] = self._publishers.pop(publisher)
             callback(sample)
         awaited = [(publisher, kept) for publisher, kept in self._publishers.items() if kept is not None]
+        if not awaited and len(self._publishers) <= _PUBLISHERS // 2:
+            return
         waits = not last and sum(len(kept.new) for _, kept in awaited) <= _WAITING_BLOCKS
         for publisher, kept in awaited:
             for sample in self._join(publisher, kept, most if waits else _WAITING_BLOCKS, waits=waits):

@@ -4,6 +4,7 @@ What a block brought and what the monitor remembers afterwards are committed to 
 anything published.
 """
 
+import math
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
@@ -43,6 +44,7 @@ _OPERATION_S = 10.0
 _HELD_UP_S = 2.0
 """Time passes in steps of a fraction of this; if not, the program itself stood still."""
 _AGAIN_S = 20.0  # to hear a stream again after a restart: of all machines, what publishers have kept comes first
+_SEEN_S = 0.5  # within which others see what a block changed, if more blocks wait
 _LATEST = 100
 _LONGEST_ERROR = 500
 
@@ -82,7 +84,7 @@ class MachineWorker:
             queue.blocks,
             queue.when_full,
             round(queue.mb * 1e6),
-            lambda one: self._monitor.could_use(one.payload, one.attachment, one.encoding),
+            lambda one, known: self._monitor.could_use(one.payload, one.attachment, one.encoding, size_alone=known),
         )
         self.history = history
         self.identity = identity_of(installed)
@@ -109,6 +111,7 @@ class MachineWorker:
         self._operated_ns = 0
         self.told = self._monitor.next_sequence  # of the first alarm event that `health` does not show yet
         self._begin_s = self._ticked_s = self._held_up_s = clocks.monotonic_s()
+        self._seen_s = -math.inf  # when others were last shown where the monitor stands
         self._missed = self._dropped_logged = 0
         self._publisher_alive = self._replay_announced = False
         self._mismatch: tuple[str, ...] = ()
@@ -223,7 +226,7 @@ class MachineWorker:
             queue_blocks=len(self.inbox),
             history_waiting=self.history.waiting,
             restart=self.restart,
-            tally=self.tally,
+            tally=replace(self.tally),
             recorder=None if self.recorder is None else self.recorder.status(),
         )
 
@@ -375,8 +378,8 @@ class MachineWorker:
         with in_turn(completes_hop=self._monitor.blocks_to_hop == 1):
             begin_s = self._clocks.monotonic_s()
             reports = self._monitor.step_payload(block.payload, block.attachment, block.encoding, block.dropped_before)
-            step_s = self._clocks.monotonic_s() - begin_s
-        self.tally = replace(self.tally, blocks=self.tally.blocks + 1, step_s=self.tally.step_s + step_s)
+            self.tally.step_s += self._clocks.monotonic_s() - begin_s
+        self.tally.blocks += 1
         if self._monitor.used:
             self.inbox.follow(block)
         self._conclude_reports(reports)
@@ -389,7 +392,7 @@ class MachineWorker:
                 if self._latest_data_s is None or not report.verdict.continuous:
                     self._operated_ns = 0  # perhaps by another clock
                 self._latest_data_s = self._clocks.monotonic_s()
-                self.tally = replace(self.tally, data_s=self.tally.data_s + report.data_s)
+                self.tally.data_s += report.data_s
             if report.fault is not None:
                 self._failed(report.fault)
             evaluated = any(not one.skipped for one in report.windows) and report.fault is None
@@ -404,12 +407,16 @@ class MachineWorker:
     ) -> None:
         """Commit, then let it be seen and publish."""
         events += self._monitor.take_events()  # left behind by a defect
+        now_s, news = self._clocks.monotonic_s(), bool(windows or events or always or whole)
+        if not news and len(self.inbox) and now_s - self._seen_s < _SEEN_S:
+            return
+        self._seen_s = now_s
         self.steps.owe(events)
         snapshot = self._monitor.health()
         reports: tuple[StoredReport, ...] = ()
         told: tuple[StoredEvent, ...] = ()
         try:
-            if windows or events or always or whole:
+            if news:
                 reports, told = self._commit(windows, whole=whole)
         finally:
             self._snapshot = snapshot
@@ -437,12 +444,8 @@ class MachineWorker:
             self._failed(self.steps.refused)
         elif not written:
             self._warn("history", "the history cannot be written; events wait in memory and are published")
-        tally = self.tally
-        self.tally = replace(
-            tally,
-            windows=tally.windows + sum(not one.skipped for one in windows),
-            commit_s=tally.commit_s + self._clocks.monotonic_s() - begin_s,
-        )
+        self.tally.windows += sum(not one.skipped for one in windows)
+        self.tally.commit_s += self._clocks.monotonic_s() - begin_s
         return reports, told
 
     @property

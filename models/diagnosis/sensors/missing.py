@@ -36,16 +36,21 @@ class MissingNumbers:
         self._states, self._naming = [state_name(channel) for channel in channels], Naming(channels)
         # Of each channel the newest time without numbers, from where to where.
         self._times_ns = np.full((2, len(self._states)), -1, dtype=np.int64)
+        self._newest_ns = -1  # of all of them
 
     def take(self, block: SampleBlock) -> SampleBlock:
         """Take note of what a block lacks, and return it `completed`."""
-        self._times_ns[:, self._times_ns[1] > block.end_ns] = -1  # before the clock was set back
-        lost = ~np.isfinite(block.samples[0])
-        if not lost.any():
+        if self._newest_ns > block.end_ns:  # before the clock was set back
+            self._times_ns[:, self._times_ns[1] > block.end_ns] = -1
+            self._newest_ns = int(self._times_ns.max())
+        there = np.isfinite(block.samples[0])
+        if there.all():
             return block
+        lost = ~there
         apart_ns = np.abs(self._times_ns[1] - block.start_ns)  # not exactly 0 where a device counts its own time
         begun = lost & (apart_ns > (block.end_ns - block.start_ns) // 2)
         self._times_ns[0, begun], self._times_ns[1, lost] = block.start_ns, block.end_ns
+        self._newest_ns = block.end_ns
         return completed(block)
 
     def found(self, start_ns: int, end_ns: int) -> tuple[SensorFault, ...]:
@@ -74,3 +79,4 @@ class MissingNumbers:
             If the array is missing or of another form.
         """
         self._times_ns = checked(arrays, "times_ns", np.int64, self._times_ns.shape).copy()
+        self._newest_ns = int(self._times_ns.max(initial=-1))

@@ -196,7 +196,7 @@ def raw(run: int, size: int = 4, encoding: str = BLOCK_ENCODING, source: str = "
 
 
 def test_what_cannot_be_a_block_costs_no_place() -> None:
-    inbox = Inbox(10, "drop", may_be_block=lambda one: one.encoding == BLOCK_ENCODING)
+    inbox = Inbox(10, "drop", may_be_block=lambda one, _: one.encoding == BLOCK_ENCODING)
     good = [raw(1) for _ in range(10)]
     for one in good:
         for _ in range(1000):

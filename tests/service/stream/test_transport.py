@@ -75,7 +75,7 @@ def test_a_worker_that_waits_for_blocks_is_woken_by_enough_or_by_a_call(monkeypa
 @pytest.mark.parametrize(("bound", "odd"), [(2, False), (100, True)])
 def test_nobody_waits_without_room_or_in_trouble(bound: int, odd: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.stream.inbox._PATIENCE_S", 600.0)
-    inbox, taken = Inbox(bound, "wait", may_be_block=lambda _: not odd), list[object]()
+    inbox, taken = Inbox(bound, "wait", may_be_block=lambda _, __: not odd), list[object]()
     thread = threading.Thread(target=lambda: taken.append(inbox.get(50)), daemon=True)
     thread.start()
     inbox.put(RawBlock(b"", b"", ""))
