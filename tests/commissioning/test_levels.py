@@ -46,7 +46,7 @@ from tests.commissioning.rotor_kit import (
     with_samples,
     without_angle,
 )
-from tests.service.monitor.test_monitor import feed
+from tests.service.rig.watching import feed
 from tests.sure import sure
 
 HEALTHY_S = 90.0

@@ -24,7 +24,6 @@ from rotorwatch.records.health import HealthState, Report
 from service.history.machine import MachineStore
 from service.history.records import Checkpoint, Step, StoreError
 from service.history.store import Store
-from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.operation import OperatorAction
 from service.monitor.monitor import MachineMonitor
@@ -34,9 +33,9 @@ from service.stream.checkpoints import checkpoint_step, restored, stored_reading
 from service.stream.inbox import RawBlock
 from service.stream.liveness import Clocks
 from service.stream.worker import MachineWorker
-from simulator.scenario import load_scenario
-from tests.service.rig.live import START_NS, until
+from tests.service.rig.live import LAB, START_NS, until
 from tests.service.rig.postgres import opened
+from tests.service.rig.watching import named, resumed
 from tests.sure import sure
 
 S = 10**9
@@ -48,7 +47,7 @@ YEAR_NS = 365 * 86400 * S
 
 def machine(**alarms: object) -> Machine:
     """The rotor kit; a data path that waits for up to 8 blocks."""
-    fields = load_scenario("healthy")[1].model_dump()
+    fields = LAB.model_dump()
     fields["ingest"] |= {"reorder_blocks": 8}
     fields["alarms"] |= alarms
     return Machine.model_validate(fields)
@@ -56,22 +55,13 @@ def machine(**alarms: object) -> Machine:
 
 def block(number: int, start_ns: int = START_NS, run: int = 1, sequence: int | None = None) -> SampleBlock:
     """Half a second of noise, so many blocks after `start_ns`."""
-    lab = load_scenario("healthy")[1]
-    samples = np.random.default_rng(number).normal(0, 1e-6, (round(lab.rate_hz / 2), len(lab.sensors)))
+    samples = np.random.default_rng(number).normal(0, 1e-6, (round(LAB.rate_hz / 2), len(LAB.sensors)))
     place = number if sequence is None else sequence
-    return SampleBlock(start_ns + number * BLOCK_NS, place, run, lab.rate_hz, samples.astype(np.float32))
+    return SampleBlock(start_ns + number * BLOCK_NS, place, run, LAB.rate_hz, samples.astype(np.float32))
 
 
 def order(kind: str, name: str, **more: object) -> OperatorAction:
     return OperatorAction(kind, name, "anna", **{"reason": "told so", **more})  # type: ignore[arg-type]
-
-
-def named(events: tuple[AlarmEvent, ...]) -> list[tuple[str, str]]:
-    return [(event.kind.value, event.alarm.name) for event in events]
-
-
-def found(monitor: MachineMonitor, name: str) -> Alarm:
-    return next(one for one in monitor.health().alarms if one.name == name)
 
 
 class Outlet:
@@ -310,9 +300,9 @@ def test_another_machine_file_keeps_the_time_of_the_alarms(later_ns: int, expect
     assert after.end_ns == end_ns
     report = after.step(block(1, end_ns + later_ns - BLOCK_NS))
     assert named(report.events) == expected
-    shelf = sure(found(after, "k_by").shelf)
+    (shelf,) = (one.shelf for one in after.health().alarms if one.name == "k_by")
     moved_ns = later_ns if abs(later_ns) == YEAR_NS else 0
-    assert shelf.until_ns == end_ns + 3600 * S + moved_ns
+    assert sure(shelf).until_ns == end_ns + 3600 * S + moved_ns
 
 
 def test_a_lost_stream_is_noticed_after_the_machine_file_has_changed() -> None:
@@ -330,11 +320,8 @@ def test_a_stream_of_which_nothing_is_of_use_says_why() -> None:
         one = block(number)
         one.samples[10, 2] = np.nan if number else 0.0
         assert monitor.step(one).verdict.accepted is (number == 0)
-    after, state = MachineMonitor(install(machine(), None)), monitor.state(whole=True)
-    after.restore(state.state, [part for _, part in state.new_parts])
-    end_ns = block(0).end_ns
-    for each in (monitor, after):
-        (event,) = each.passed(end_ns + 5 * S)
+    for each in (monitor, resumed(monitor, install(machine(), None))):
+        (event,) = each.passed(block(0).end_ns + 5 * S)
         assert event.alarm.name == STREAM_LOST
         assert "the first block since was refused: demo/lab: block 1, channel y1_dot: sample 10 is nan" in event.text
 

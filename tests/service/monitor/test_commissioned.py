@@ -21,7 +21,7 @@ from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, Rub, load_scenario
 from simulator.stream import blocks
 from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, samples_of, stream, with_samples
-from tests.service.monitor.test_monitor import feed
+from tests.service.rig.watching import feed
 from tests.sure import sure
 
 SEED = 71

@@ -15,7 +15,7 @@ from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
 from tests.commissioning.rotor_kit import LAB, PARTIAL, blind, commissioned, healthy, recording, without_angle
-from tests.service.monitor.test_monitor import feed
+from tests.service.rig.watching import feed, resumed
 
 SEED = 4_900_001
 
@@ -48,10 +48,8 @@ def test_the_healthy_machine_is_healthy_in_its_own_sense() -> None:
     full = [window for window in windows if window.filled == 1.0]
     assert {window.state for window in full} == {HealthState.HEALTHY}
     assert max(abs(one.relative_change or 0.0) for one in full[-1].parameters) < 0.05
-    state = going.state(whole=True)
-    restored = MachineMonitor(Installed(LAB))
-    restored.restore(state.state, [part for _, part in state.new_parts])
-    assert feed(restored, stream(75.0, SEED)[700:]) == feed(going, stream(75.0, SEED)[700:])
+    rest = stream(75.0, SEED)[700:]
+    assert feed(resumed(going, Installed(LAB)), rest) == feed(going, rest)
 
 
 def test_what_has_changed_from_the_beginning_is_named() -> None:

@@ -14,7 +14,7 @@ from rotorwatch.records.windows import Parameter
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
-from tests.service.monitor.test_monitor import feed
+from tests.service.rig.watching import feed, resumed
 
 LAB = load_machine("lab")
 SEED = 4_910_001
@@ -45,9 +45,7 @@ def test_where_the_file_does_not_say_where_the_heavy_spot_is_its_angle_is_no_unb
     windows, events = feed(going, parts[:750])
     assert not events
     assert abs(e_of(windows[-1].parameters)) < 0.05
-    state, restored = going.state(whole=True), MachineMonitor(Installed(LAB))
-    restored.restore(state.state, [part for _, part in state.new_parts])
-    windows, events = feed(restored, parts[750:])
+    windows, events = feed(resumed(going, Installed(LAB)), parts[750:])
     assert [event.alarm.name for event in events if event.kind == "raised"] == ["e"]
     assert e_of(windows[-1].parameters) == pytest.approx(0.5, abs=0.1)
 

@@ -10,38 +10,28 @@ import numpy as np
 import pytest
 
 from models.alarm_names import MODEL
-from models.commissioning.commissioned import install
+from models.commissioning.commissioned import Installed, install
 from models.diagnosis.readings import Diagnosis
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
-from rotorwatch.records.health import HealthState, Report
-from service.monitor.alarms.alarm import AlarmEvent
+from rotorwatch.records.health import HealthState
 from service.monitor.evaluation import Evaluation
 from service.monitor.monitor import MachineMonitor
-from simulator.scenario import Event, load_scenario
+from simulator.scenario import Event
 from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 from tests.commissioning import rotor_kit
-from tests.commissioning.rotor_kit import with_lines
+from tests.commissioning.rotor_kit import LAB, with_lines, with_samples
+from tests.service.rig.watching import feed, named, resumed
 from tests.sure import sure
 
 SEED = 7_700_002
+KIT = install(LAB, "lab")
 
 
 def monitor() -> MachineMonitor:
-    _, machine = load_scenario("healthy")
-    return MachineMonitor(install(machine, "lab"))
-
-
-def feed(target: MachineMonitor, stream: Sequence[SampleBlock]) -> tuple[list[Report], list[AlarmEvent]]:
-    windows: list[Report] = []
-    events: list[AlarmEvent] = []
-    for block in stream:
-        report = target.step(block)
-        windows += report.windows
-        events += report.events
-    return windows, events
+    return MachineMonitor(KIT)
 
 
 def stream(duration_s: float, *events: Event) -> Sequence[SampleBlock]:
@@ -186,16 +176,13 @@ def test_where_no_hop_is_whole_nothing_stays_healthy(torn: str) -> None:
         spoilt = [replace(block, start_ns=block.start_ns + 10**6 * (number % 3)) for number, block in enumerate(spoilt)]
     windows, events = feed(target, spoilt)
     assert not [window for window in windows if window.end_ns > spoilt[60].start_ns]
-    assert [(event.kind, event.alarm.name) for event in events] == [("raised", "data-gap")]
+    assert named(events) == [("raised", "data-gap")]
     assert "no 5 s without a gap for 2" in events[0].alarm.note
     assert target.health().state is HealthState.NOT_EVALUABLE
     assert "nothing is evaluated: blocks are lost, or their times" in target.health().reason
-    stopped, again = watching(), monitor()  # a restart in the middle of it delays nothing
+    stopped = watching()  # a restart in the middle of it delays nothing
     feed(stopped, spoilt[:100])
-    state = stopped.state(whole=True)
-    again.restore(state.state, [data for _, data in state.new_parts])
-    again.restore_alarms(state.alarms)
-    assert feed(again, spoilt[100:])[1] == events
+    assert feed(resumed(stopped, KIT), spoilt[100:])[1] == events
     windows, events = feed(target, after[400:])
     assert windows
     assert (target.health().state, target.health().reason) == (HealthState.HEALTHY, "")
@@ -204,19 +191,14 @@ def test_where_no_hop_is_whole_nothing_stays_healthy(torn: str) -> None:
 @pytest.mark.parametrize("restarted", [False, True])
 def test_a_phase_reference_that_jumps_is_no_unbalance_for_good(restarted: bool) -> None:
     """Nor after a restart; the same turn of the vectors without a jump of the angle is one."""
-    target, after = watching(), []
-    for block in healthy(180.0)[650:]:
-        samples = block.samples.copy()
-        samples[:, -1] = np.mod(samples[:, -1] + np.pi / 2, 2 * np.pi)
-        after.append(replace(block, samples=samples))
+    target, turned = watching(), rotor_kit.samples_of(healthy(180.0)[650:])
+    turned[:, -1] = np.mod(turned[:, -1] + np.pi / 2, 2 * np.pi)
+    after = with_samples(healthy(180.0)[650:], turned)
     windows, events = feed(target, after[:650])
     assert windows[-1].state is HealthState.HEALTHY
-    if restarted:
-        state, target = target.state(whole=True), monitor()
-        target.restore(state.state, [data for _, data in state.new_parts])
-        target.restore_alarms(state.alarms)
+    target = resumed(target, KIT) if restarted else target
     windows, more = feed(target, after[650:])
-    assert [(event.kind, event.alarm.name) for event in (*events, *more)] == [("raised", "data-phase-reference")]
+    assert named([*events, *more]) == [("raised", "data-phase-reference")]
     e = next(one for one in windows[-1].parameters if one.name == "e")
     assert e.vector is not None
     assert e.vector.turned_deg == pytest.approx(-90, abs=10)
@@ -241,19 +223,17 @@ def test_mains_hum_hides_no_rotor_and_another_line_is_told_with_its_frequency() 
 
 def test_a_machine_that_runs_down_raises_nothing() -> None:
     """On one source, where the least that is left of the rotation would be a misfit; nor when it hardly turns."""
-    _, machine = load_scenario("healthy")
-    draw = Draw(machine, SEED, Purpose.EVALUATION, 0, layout=Layout.ONE_SOURCE)
+    draw = Draw(LAB, SEED, Purpose.EVALUATION, 0, layout=Layout.ONE_SOURCE)
     scenario = draw_condition(draw, 1)
     stop = Event(at_s=65.0, ramp_s=60.0, speed_rpm=0.1)
     scenario = scenario.model_copy(update={"duration_s": 150.0, "events": (*scenario.events, stop)})
-    windows, events = feed(monitor(), [block for block, _ in blocks(scenario, machine)])
+    windows, events = feed(monitor(), [block for block, _ in blocks(scenario, LAB)])
     assert events == []
     assert windows[-1].state is HealthState.NOT_EVALUABLE
 
 
 def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
-    _, machine = load_scenario("healthy")
-    windows, events = feed(MachineMonitor(install(machine, None)), stream(75.0, Event(at_s=0.0, speed_rpm=2000.0)))
+    windows, events = feed(MachineMonitor(Installed(LAB)), stream(75.0, Event(at_s=0.0, speed_rpm=2000.0)))
     assert windows[-1].state is HealthState.NOT_EVALUABLE
     assert "speed is 2000 rpm, off 1320 rpm by 51.5 %, evaluation limit 20 %" in windows[-1].reason
     assert windows[-1].parameters == ()
@@ -262,9 +242,9 @@ def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
 
 @pytest.mark.slow
 def test_an_unsteady_speed_is_not_evaluable() -> None:
-    _, machine = load_scenario("healthy")
-    ramp = Event(at_s=20.0, ramp_s=10.0, speed_rpm=1580.0)
-    windows, events = feed(MachineMonitor(install(machine, None)), stream(98.0, ramp))
+    windows, events = feed(
+        MachineMonitor(Installed(LAB)), stream(98.0, Event(at_s=20.0, ramp_s=10.0, speed_rpm=1580.0))
+    )
     states = [window.state for window in windows]
     assert states[11] is HealthState.NOT_EVALUABLE
     assert "speed went from 1320 to 1580 rpm within the window" in windows[11].reason
@@ -281,29 +261,22 @@ def test_an_unsteady_speed_is_not_evaluable() -> None:
     ],
 )
 def test_sick_channels_are_stated_and_never_become_a_fault(kind: str) -> None:
-    target = monitor()
-    seen: list[Report] = []
-    events: list[AlarmEvent] = []
-    rng = np.random.default_rng(1)
-    for block in healthy(73.0):  # three full windows: long enough for an alarm
-        samples = block.samples.copy()
-        match kind:
-            case "stuck angle":
-                samples[:, 8] = 1.0
-            case "backwards":
-                samples[:, 8] = 2 * np.pi - samples[:, 8]
-            case "constant channel":
-                samples[:, 3] = 0.5
-            case "twins":
-                samples[:, 4] = samples[:, 5]
-            case "dead probe":
-                samples[:, 5] = 0.01 * rng.standard_normal(samples.shape[0])
-            case "clipped":
-                samples[:, 4] = np.clip(samples[:, 4], -1e-3, 1e-3)
-        report = target.step(replace(block, samples=samples))
-        assert report.verdict.accepted
-        seen += report.windows
-        events += report.events
+    healthy_ = healthy(73.0)  # three full windows: long enough for an alarm
+    samples = rotor_kit.samples_of(healthy_)
+    match kind:
+        case "stuck angle":
+            samples[:, 8] = 1.0
+        case "backwards":
+            samples[:, 8] = 2 * np.pi - samples[:, 8]
+        case "constant channel":
+            samples[:, 3] = 0.5
+        case "twins":
+            samples[:, 4] = samples[:, 5]
+        case "dead probe":
+            samples[:, 5] = 0.01 * np.random.default_rng(1).standard_normal(len(samples))
+        case "clipped":
+            samples[:, 4] = np.clip(samples[:, 4], -1e-3, 1e-3)
+    seen, events = feed(monitor(), with_samples(healthy_, samples))
     assert len(seen) == 14
     assert all(event.alarm.name.startswith("data-") for event in events)
     assert {window.state for window in seen[11:]} <= {HealthState.NOT_EVALUABLE, HealthState.DATA_HEALTH}
@@ -311,12 +284,10 @@ def test_sick_channels_are_stated_and_never_become_a_fault(kind: str) -> None:
 
 
 def test_parameters_that_the_sensors_cannot_see_are_not_read() -> None:
-    _, machine = load_scenario("healthy")
-    horizontal = [column for column, sensor in enumerate(machine.sensors) if sensor.direction != "z"]
-    part = machine.model_copy(update={"sensors": tuple(machine.sensors[column] for column in horizontal)})
+    horizontal = [column for column, sensor in enumerate(LAB.sensors) if sensor.direction != "z"]
+    part = LAB.model_copy(update={"sensors": tuple(LAB.sensors[column] for column in horizontal)})
     blocks_ = [replace(block, samples=block.samples[:, horizontal]) for block in healthy(63.0)]
-    window = feed(MachineMonitor(install(part, None)), blocks_)[0][-1]
-    readings = {reading.name: reading for reading in window.parameters}
+    readings = {one.name: one for one in feed(MachineMonitor(Installed(part)), blocks_)[0][-1].parameters}
     assert readings["k_bz"].relative_change is None
     assert readings["k_bz"].reason == "no displacement or velocity measured in z"
     assert abs(readings["k_by"].relative_change or 1.0) < 0.1
@@ -335,11 +306,11 @@ def test_where_peaks_are_cut_off_now_and_then_the_range_is_what_is_told() -> Non
     """Too few samples lie there to be called clipped, and enough to bend the spectra."""
     blocks = healthy(63.0)
     samples = rotor_kit.samples_of(blocks)
-    measured = samples[:, [channel.quantity != "shaft_angle" for channel in rotor_kit.LAB.sensors]]
+    measured = samples[:, [channel.quantity != "shaft_angle" for channel in LAB.sensors]]
     low, high = np.quantile(measured, [0.0015, 0.9985], axis=0)
     samples[:, : measured.shape[1]] = np.clip(measured, low, high)
     target = monitor()
-    windows, _ = feed(target, rotor_kit.with_samples(blocks, samples))
+    windows, _ = feed(target, with_samples(blocks, samples))
     assert not windows[-1].sensors
     for misfit_z, told in ((9.0, "y2 is at exactly"), (0.0, "a mass")):
         evaluation = Evaluation(Diagnosis("", misfit_z=misfit_z, suspect="a mass"), {}, (), (), None)
@@ -348,42 +319,35 @@ def test_where_peaks_are_cut_off_now_and_then_the_range_is_what_is_told() -> Non
 
 
 def test_without_a_bundle_the_equations_say_so() -> None:
-    _, machine = load_scenario("healthy")
-    window = feed(MachineMonitor(install(machine, None)), healthy(63.0))[0][-1]
+    window = feed(MachineMonitor(Installed(LAB)), healthy(63.0))[0][-1]
     assert {equation.reason for equation in window.equations} == {"no trained network"}
 
 
 def test_a_1x_that_no_unbalance_makes_is_outside_the_model() -> None:
-    _, machine = load_scenario("healthy")
-    blocks_, names = healthy(75.0), [channel.name for channel in machine.sensors]
-    samples = np.concatenate([block.samples for block in blocks_]).astype(np.float64)
+    blocks_, names = healthy(75.0), [channel.name for channel in LAB.sensors]
+    samples = rotor_kit.samples_of(blocks_)
     turning = np.exp(1j * samples[:, names.index("theta")])
     for place, side in (("y1", 1.0), ("z1", -1j)):  # at the bearing, where no force of the disc moves it alone
         at, rate = names.index(place), names.index(f"{place}_dot")
         wave = 1.4 * samples[:, at].std() * side * turning
         samples[:, at] += wave.real
-        samples[:, rate] += (1j * machine.operation.speed_rad_s * 1e-3 * wave).real
-    cuts = np.cumsum([len(block.samples) for block in blocks_])[:-1]
-    parts = zip(blocks_, np.split(samples.astype(np.float32), cuts), strict=True)
-    windows, events = feed(MachineMonitor(install(machine, None)), [replace(a, samples=b) for a, b in parts])
+        samples[:, rate] += (1j * LAB.operation.speed_rad_s * 1e-3 * wave).real
+    windows, events = feed(MachineMonitor(Installed(LAB)), with_samples(blocks_, samples))
     assert "the 1× vibration is not what an unbalance causes" in windows[-1].suspect
     assert [event.alarm.name for event in events if event.alarm.name in {MODEL, *PARAMETERS}] == [MODEL]
 
 
 def test_a_converter_that_samples_one_channel_after_the_other_is_told_where_nothing_is_read() -> None:
     """The rotor kit's displacements under one force, 60 µs from channel to channel, of which its file is silent."""
-    kit = rotor_kit.LAB
-    sensors = [one for one in kit.sensors if not one.name.endswith("_dot")]
+    sensors = [one for one in LAB.sensors if not one.name.endswith("_dot")]
     late = [
         one if one.name == "theta" else one.model_copy(update={"delay_us": -60.0 * number})
         for number, one in enumerate(sensors)
     ]
-    file, simulated = (kit.model_copy(update={"sensors": tuple(those)}) for those in (sensors, late))
+    file, simulated = (LAB.model_copy(update={"sensors": tuple(those)}) for those in (sensors, late))
     draw = Draw(simulated, SEED, Purpose.EVALUATION, 5, layout=Layout.ONE_SOURCE)
     scenario = draw_condition(draw, 0).overridden(duration_s=70.0)
-    windows, events = feed(
-        MachineMonitor(install(file, None)), [block for block, _ in blocks(scenario, simulated, 1.0)]
-    )
+    windows, events = feed(MachineMonitor(Installed(file)), [block for block, _ in blocks(scenario, simulated, 1.0)])
     assert "the theory does not explain this window" in windows[-1].reason
     assert "delay of each channel after the one before (-" in windows[-1].suspect
     (event,) = events

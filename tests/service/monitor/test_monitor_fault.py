@@ -11,7 +11,7 @@ from models.alarm_names import FAULT, GAP, OVERLOADED, STREAM_LOST
 from models.commissioning.commissioned import install
 from models.machine import Machine
 from models.signals.wire import ARROW_ENCODING, encode_block, write_arrow
-from rotorwatch.records.alarms import EventKind, Evidence
+from rotorwatch.records.alarms import Evidence
 from rotorwatch.records.health import HealthState
 from service.history.records import Checkpoint
 from service.monitor.alarms.alarm import AlarmEvent
@@ -19,7 +19,7 @@ from service.monitor.known_machine import KnownMachineEvaluator
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import identity_of
 from service.stream.checkpoints import checkpoint_step, restored
-from tests.service.monitor.test_alarm_trouble import bench, block, named, order
+from tests.service.monitor.test_alarm_trouble import bench, block, order
 from tests.service.rig.live import (
     IN_ORDER,
     LAB,
@@ -34,6 +34,7 @@ from tests.service.rig.live import (
     until,
 )
 from tests.service.rig.monitored import client
+from tests.service.rig.watching import named, raised
 
 DEFECT = "a defect of the evaluation"
 
@@ -52,10 +53,6 @@ def machine_in_order() -> Machine:
 def soon_over(machine: Machine) -> Machine:
     """The same machine, with alarms that clear after 10 s."""
     return machine.model_copy(update={"alarms": machine.alarms.model_copy(update={"off_delay_s": 10.0})})
-
-
-def raised(monitor: MachineMonitor) -> set[str]:
-    return {alarm.name for alarm in monitor.health().alarms if alarm.raised}
 
 
 def test_a_defect_in_evaluation_is_an_alarm_and_no_health(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,7 +74,7 @@ def test_a_defect_in_evaluation_is_an_alarm_and_no_health(monkeypatch: pytest.Mo
     assert DEFECT in health.reason
     # And when it is over, that is said as well.
     events = [event for one in stream[710:] for event in monitor.step(one).events]
-    assert named(tuple(events)) == [("cleared", FAULT)]
+    assert named(events) == [("cleared", FAULT)]
     assert (monitor.health().state, monitor.health().reason) == (HealthState.HEALTHY, "")
     # And before the evaluation.
     monkeypatch.setattr(monitor._window, "feed", defective)
@@ -138,10 +135,7 @@ def test_overload_clears_when_the_monitor_keeps_up() -> None:
     for number, one in enumerate(stream[:20] + stream[60:]):
         (report,) = monitor.step_payload(*encode_block(one, ""), 40 if number == 20 else 0)
         events += report.events
-    assert [(event.kind, event.alarm.name) for event in events] == [
-        (EventKind.RAISED, OVERLOADED),
-        (EventKind.CLEARED, OVERLOADED),
-    ]
+    assert named(events) == [("raised", OVERLOADED), ("cleared", OVERLOADED)]
 
 
 def test_a_full_queue_says_so_to_operators(tmp_path: Path) -> None:

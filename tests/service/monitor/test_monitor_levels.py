@@ -30,6 +30,7 @@ from service.stream.checkpoints import checkpoint_step, restored
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import NOTHING, commissioned, elsewhere, healthy, stream
 from tests.service.rig.live import LAB, scenario_blocks
+from tests.service.rig.watching import resumed
 from tests.sure import sure
 
 RATE_HZ, BLOCK_S, START_NS = 5120.0, 0.5, 1_767_225_600_000_000_000
@@ -141,10 +142,7 @@ def test_a_monitor_that_is_restarted_goes_on_to_the_last_bit() -> None:
     first = MachineMonitor(install(FAN, None))
     before = run(first, iter(stream[:90]))
     for whole in (True, False):
-        state = first.state(whole=whole)
-        second = MachineMonitor(install(FAN, None))
-        second.restore(state.state, tuple(data for _, data in state.new_parts))
-        second.restore_alarms(state.alarms)
+        second = resumed(first, install(FAN, None), whole=whole)
         for number, block in enumerate(() if whole else stream[:90]):
             second._window.recall(block.samples, block.start_ns, newest=number == 89)
         after = run(second, iter(stream[90:]))

@@ -13,13 +13,16 @@ from models.ingest import Reason
 from models.signals.block import SampleBlock
 from models.signals.sensor import Sensor
 from models.signals.wire import encode_block
-from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
 from tests.commissioning.rotor_kit import commissioned, elsewhere, recording
 from tests.service.rig.live import LAB, scenario_blocks
+from tests.service.rig.watching import feed, named, raised, resumed
+from tests.sure import sure
 
 KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 20.0, "max_span_s": 40.0})})
+CASING = Sensor(name="DE-H", quantity="acceleration", location="DE", direction="horizontal", unit="m/s2")
+RIG = KIT.model_copy(update={"sensors": (*KIT.sensors, CASING)})
 Z1_DOT, THETA = 3, 8
 FROM_S, TO_S, END_S = 31.0, 33.0, 125.0
 
@@ -36,10 +39,6 @@ def without(
         yield replace(block, samples=samples)
 
 
-def windows(monitor: MachineMonitor, stream: Sequence[SampleBlock]) -> list[Report]:
-    return [report for block in stream for report in monitor.step(block).windows]
-
-
 def ends_s(reports: Sequence[Report], first_ns: int) -> list[float]:
     return [(one.end_ns - first_ns) / 1e9 for one in reports]
 
@@ -47,14 +46,9 @@ def ends_s(reports: Sequence[Report], first_ns: int) -> list[float]:
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_missing_samples_are_told_of_their_channel_until_the_window_has_left_them(value: float) -> None:
     monitor, sound = MachineMonitor(install(KIT, None)), MachineMonitor(install(KIT, None))
-    stream, events = list(without(Z1_DOT, FROM_S, TO_S, value)), list[tuple[EventKind, str]]()
-    reports: list[Report] = []
-    usual = windows(sound, scenario_blocks(END_S))
-    for block in stream:
-        done = monitor.step(block)
-        assert done.verdict.accepted
-        reports += done.windows
-        events += [(event.kind, event.alarm.name) for event in done.events]
+    stream = list(without(Z1_DOT, FROM_S, TO_S, value))
+    (usual, _), (reports, events) = feed(sound, scenario_blocks(END_S)), feed(monitor, stream)
+    assert monitor.health().quality.refused_blocks == {}
     first_ns = stream[0].start_ns
     assert ends_s(reports, first_ns) == ends_s(usual, first_ns)
     lacking = [one for one in reports if one.sensors]
@@ -65,7 +59,7 @@ def test_missing_samples_are_told_of_their_channel_until_the_window_has_left_the
     fault = lacking[2].sensors[0]
     assert fault.value == pytest.approx(2.0)
     assert fault.text.startswith("z1_dot: sent as NaN, the last time for 2 s, expected numbers")
-    assert events == [(EventKind.RAISED, "data-missing"), (EventKind.CLEARED, "data-missing")]
+    assert named(events) == [("raised", "data-missing"), ("cleared", "data-missing")]
     gone = [level for one in lacking for level in one.levels if level.channel == "z1_dot"]
     assert {(one.overall, one.x1, one.growth) for one in gone} == {(None, None, None)}  # not 0
     # Levels of the other channels are the same to the last bit, and the machine is diagnosed again.
@@ -78,23 +72,20 @@ def test_missing_samples_are_told_of_their_channel_until_the_window_has_left_the
 
 
 def test_a_channel_that_is_not_connected_leaves_the_rotor_diagnosed_as_it_is_without_it() -> None:
-    casing = Sensor(name="DE-H", quantity="acceleration", location="DE", direction="horizontal", unit="m/s2")
-    rig = KIT.model_copy(update={"sensors": (*KIT.sensors, casing)})
-    monitor, alone = MachineMonitor(install(rig, None)), MachineMonitor(install(KIT, None))
+    monitor, alone = MachineMonitor(install(RIG, None)), MachineMonitor(install(KIT, None))
     stream = scenario_blocks(40.0)
     gap = np.full((len(stream[0].samples), 1), np.nan, np.float32)
     wider = [replace(one, samples=np.hstack([one.samples.astype(np.float32), gap])) for one in stream]
-    told = windows(monitor, wider)[-1]
-    plain = windows(alone, stream)[-1]
+    told, plain = feed(monitor, wider)[0][-1], feed(alone, stream)[0][-1]
     assert [(fault.states, fault.kind) for fault in told.sensors] == [(("@DE-H",), "missing")]
     assert (told.state, told.verdict, told.parameters) == (plain.state, plain.verdict, plain.parameters)
 
 
 def test_without_an_angle_the_phase_reference_is_lost() -> None:
     monitor = MachineMonitor(install(KIT, None))
-    reports = windows(monitor, list(without(THETA, 0.0, END_S)))
+    reports = feed(monitor, list(without(THETA, 0.0, END_S)))[0]
     assert [fault.states for fault in reports[-1].sensors] == [("theta",)]
-    assert [one.name for one in monitor.health().alarms if one.raised] == [PHASE_REFERENCE]
+    assert raised(monitor) == {PHASE_REFERENCE}
 
 
 @pytest.mark.parametrize(
@@ -115,14 +106,12 @@ def test_a_restored_monitor_and_a_recalled_window_go_on_to_the_last_bit() -> Non
     stream = list(without(Z1_DOT, FROM_S, TO_S))
     monitor = MachineMonitor(install(KIT, None))
     half = 340  # a second after the last sample that is missing
-    windows(monitor, stream[:half])
-    state = monitor.state()
-    again = MachineMonitor(install(KIT, None))
-    again.restore(state.state, [part for _, part in state.new_parts])
+    feed(monitor, stream[:half])[0]
+    again = resumed(monitor, install(KIT, None), whole=False)
     for block in stream[:half]:
         again.recall(*encode_block(block, ""))
     assert not again.recalled
-    assert windows(again, stream[half:]) == windows(monitor, stream[half:])
+    assert feed(again, stream[half:])[0] == feed(monitor, stream[half:])[0]
 
 
 def test_it_is_told_in_hops_that_end_within_a_block_and_of_blocks_whose_times_jitter() -> None:
@@ -134,7 +123,7 @@ def test_it_is_told_in_hops_that_end_within_a_block_and_of_blocks_whose_times_ji
         replace(first, sequence=k, start_ns=first.start_ns + k * 135_000_000 + late_ns, samples=samples[at : at + size])
         for k, (at, late_ns) in enumerate(zip(range(0, len(samples) - size, size), jitter_ns.tolist(), strict=False))
     ]
-    reports = [one for one in windows(MachineMonitor(install(KIT, None)), stream) if one.filled == 1]
+    reports = [one for one in feed(MachineMonitor(install(KIT, None)), stream)[0] if one.filled == 1]
     told = [[(fault.kind.value, round(fault.value or 0.0, 2)) for fault in one.sensors] for one in reports]
     # What a hop needs before it counts, too: 2.5 s here.
     lacking = ((1.45,), (5.4,), (5.4,), (5.4,), (5.4,), (1.45,))
@@ -142,20 +131,16 @@ def test_it_is_told_in_hops_that_end_within_a_block_and_of_blocks_whose_times_ji
 
 
 def test_a_casing_sensor_that_is_unplugged_is_no_wrong_gain_of_its_place() -> None:
-    casing = Sensor(name="DE-H", quantity="acceleration", location="DE", direction="horizontal", unit="m/s2")
-    rig = KIT.model_copy(update={"sensors": (*KIT.sensors, casing)})
     noise, stream = np.random.default_rng(20263312), list[SampleBlock]()
     for block in scenario_blocks(END_S + 1):
         shaken = np.diff(block.samples[:, 2:3], axis=0, append=block.samples[-1:, 2:3]) * block.rate_hz
         own = shaken + noise.normal(scale=0.3, size=shaken.shape)
         stream.append(replace(block, samples=np.hstack([block.samples, own]).astype(np.float32)))
-    made = commissioned(rig, recording(rig, stream[:800])).commissioned
-    assert made is not None
-    assert made.levels is not None
-    assert made.levels.gains is not None
+    made = sure(commissioned(RIG, recording(RIG, stream[:800])).commissioned)
+    assert sure(made.levels).gains is not None
     for block in stream[1050:]:
         block.samples[:, -1] = np.nan
-    reports = windows(MachineMonitor(Installed(rig, None, made)), stream[800:])
+    reports = feed(MachineMonitor(Installed(RIG, None, made)), stream[800:])[0]
     lacking = [one for one in reports if one.sensors]
     assert {fault.states for one in lacking for fault in one.sensors} == {("@DE-H",)}
     assert [one.reason for one in lacking] == [""] * 4
@@ -166,10 +151,10 @@ def test_a_casing_sensor_that_is_unplugged_is_no_wrong_gain_of_its_place() -> No
 def test_the_first_windows_are_a_reference_of_the_channels_that_are_there(missing_to_s: float) -> None:
     rig = elsewhere(KIT)
     monitor, sound = MachineMonitor(Installed(rig)), MachineMonitor(Installed(rig))
-    usual, reports = windows(sound, scenario_blocks(170.0)), list[Report]()
+    usual, reports = feed(sound, scenario_blocks(170.0))[0], list[Report]()
     for block in without(Z1_DOT, 0.0, missing_to_s, end_s=170.0):
-        reports += windows(monitor, [block])
-        assert not any(alarm.raised for alarm in monitor.health().alarms if alarm.name.startswith("level:"))
+        reports += feed(monitor, [block])[0]
+        assert not any(name.startswith("level:") for name in raised(monitor))
     last, limited = reports[-1].levels, missing_to_s == 30.0
     for level, other in zip(last, usual[-1].levels, strict=True):
         assert (level == other) == (level.channel != "z1_dot")

@@ -13,11 +13,11 @@ from models.commissioning.healthy import healthy_from_blocks
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from models.signals.channels import Quantity
-from rotorwatch.records.alarms import EventKind
-from rotorwatch.records.health import HealthState, Report
+from rotorwatch.records.health import HealthState
 from service.monitor.monitor import MachineMonitor
 from tests.commissioning.rotor_kit import commissioned, recording
 from tests.service.rig.live import LAB, scenario_blocks
+from tests.service.rig.watching import feed, named, resumed
 
 STOPS_S, STANDS_S, STARTS_S, RUNS_S, END_S = 40.0, 50.0, 110.0, 120.0, 170.0
 NOISE = 0.01
@@ -57,14 +57,6 @@ def stopping(machine: MachineFile, what: str) -> Iterator[SampleBlock]:
         first = last
 
 
-def watched(monitor: MachineMonitor, stream: list[SampleBlock]) -> tuple[list[Report], list[tuple[EventKind, str]]]:
-    done = [monitor.step(block) for block in stream]
-    return (
-        [report for one in done for report in one.windows],
-        [(event.kind, event.alarm.name) for one in done for event in one.events],
-    )
-
-
 def monitor_of(machine: MachineFile) -> MachineMonitor:
     return MachineMonitor(Installed(machine))
 
@@ -72,12 +64,10 @@ def monitor_of(machine: MachineFile) -> MachineMonitor:
 def test_a_machine_that_stops_and_starts_raises_nothing_and_is_healthy_again_after_a_restart_too() -> None:
     stream = list(stopping(KIT, "machine"))
     half = len(stream) // 2  # while it stands
-    monitor, after = monitor_of(KIT), monitor_of(KIT)
-    reports, events = watched(monitor, stream[:half])
-    state = monitor.state(whole=True)
-    after.restore(state.state, tuple(data for _, data in state.new_parts))
-    rest = watched(monitor, stream[half:])
-    assert watched(after, stream[half:]) == rest
+    monitor = monitor_of(KIT)
+    reports, events = feed(monitor, stream[:half])
+    after, rest = resumed(monitor, Installed(KIT)), feed(monitor, stream[half:])
+    assert feed(after, stream[half:]) == rest
     reports += rest[0]
     assert events + rest[1] == []
     states = {round((one.end_ns - stream[0].start_ns) / 1e9): one.state for one in reports}
@@ -90,8 +80,8 @@ def test_a_machine_that_stops_and_starts_raises_nothing_and_is_healthy_again_aft
 
 @pytest.mark.parametrize(("what", "alarm"), [("angle", PHASE_REFERENCE), ("signals", "data-stuck")])
 def test_what_is_lost_while_the_machine_runs_is_told(what: str, alarm: str) -> None:
-    _, events = watched(monitor_of(KIT), list(stopping(KIT, what)))
-    assert events == [(EventKind.RAISED, alarm)]
+    _, events = feed(monitor_of(KIT), stopping(KIT, what))
+    assert named(events) == [("raised", alarm)]
 
 
 @pytest.mark.parametrize("dead", [0, 3])
@@ -101,16 +91,16 @@ def test_beside_a_dead_channel_a_machine_that_stops_has_no_other_fault(dead: int
         replace(block, samples=np.where(np.arange(len(KIT.sensors)) == dead, np.float32(0), block.samples))
         for block in stream
     ]
-    (usual, _), (reports, _) = watched(monitor_of(KIT), stream), watched(monitor_of(KIT), silent)
+    (usual, _), (reports, _) = feed(monitor_of(KIT), stream), feed(monitor_of(KIT), silent)
     for one, other in zip(reports, usual, strict=True):
         found, known = ({fault.states for fault in each.sensors} for each in (one, other))
         assert found - {(name,)} == {states for states in known if name not in states}
 
 
 def test_without_a_shaft_angle_no_sensor_is_blamed_but_levels_have_fallen() -> None:
-    reports, events = watched(monitor_of(WITHOUT_ANGLE), list(stopping(WITHOUT_ANGLE, "machine")))
+    reports, events = feed(monitor_of(WITHOUT_ANGLE), stopping(WITHOUT_ANGLE, "machine"))
     assert any("all its sensors have lost their supply" in one.reason for one in reports)
-    assert {name for _, name in events} == {f"level:{one.name}" for one in WITHOUT_ANGLE.sensors}
+    assert {one.alarm.name for one in events} == {f"level:{one.name}" for one in WITHOUT_ANGLE.sensors}
 
 
 @cache
@@ -125,9 +115,9 @@ def test_a_level_has_fallen_while_the_first_window_fills_only_where_the_machine_
     first = [replace(block, samples=(block.samples * quiet).astype(np.float32)) for block in scenario_blocks(18.0)]
     if not turns:
         first = list(stopping(KIT, "machine"))[round(10 * STANDS_S) :][:180]
-    reports, events = watched(MachineMonitor(made_healthy()), first)
+    reports, events = feed(MachineMonitor(made_healthy()), first)
     assert {one.state for one in reports} <= {HealthState.WARMING, HealthState.ALERT}
-    assert {name for _, name in events} == {f"level:{one.name}" for one in KIT.sensors[:-1] if turns}
+    assert {one.alarm.name for one in events} == {f"level:{one.name}" for one in KIT.sensors[:-1] if turns}
 
 
 @pytest.mark.parametrize("machine", [NEW, WITHOUT_ANGLE])
@@ -136,10 +126,12 @@ def test_levels_of_a_machine_that_stands_are_no_reference_for_it_when_it_runs(ma
     stream = list(stopping(machine, "machine"))[round(10 * STANDS_S) :]
     starts, found = round(10 * (STARTS_S - STANDS_S)), []
     for part in (stream[:starts], stream[starts:]):
-        _, events = watched(monitor, part)
+        _, events = feed(monitor, part)
         reference = monitor._levels.reference
         states = () if reference is None else reference.states
-        found.append(([one.speed_rad_s is None for one in states], [name for _, name in events if "level" in name]))
+        found.append(
+            ([one.speed_rad_s is None for one in states], [name for _, name in named(events) if "level" in name])
+        )
     if machine is NEW:
         assert found[0] == ([], [])
         assert not any(found[1][0])

@@ -31,6 +31,7 @@ from simulator.scenario import Event, load_scenario
 from simulator.stream import DEFAULT_START_NS, blocks
 from tests.commissioning.rotor_kit import windows_of
 from tests.service.rig.live import LAB, scenario_blocks
+from tests.service.rig.watching import resumed
 from tests.sure import sure
 
 SECOND = 10**9
@@ -196,10 +197,7 @@ def test_a_monitor_stopped_between_or_in_snapshots_goes_on_to_the_last_bit(at: i
     sent = stream()[:360]
     first = MachineMonitor(install(KIT, None))
     done = run(first, sent[:at])
-    state = first.state(whole=whole)
-    again = MachineMonitor(install(KIT, None))
-    again.restore(state.state, [part for _, part in state.new_parts])
-    again.restore_alarms(state.alarms)
+    again = resumed(first, install(KIT, None), whole=whole)
     if not whole:
         for block in sent[:at]:
             again.recall(*encode_block(block, ""))

@@ -13,7 +13,7 @@ from simulator.scenario import Event, Scenario, Sensors, load_scenario
 from simulator.stream import blocks
 from tests.commissioning.rotor_kit import NOTHING, commissioned, recording
 from tests.diagnosis.sensors.test_sensor_checks import sources_along
-from tests.service.monitor.test_monitor import feed
+from tests.service.rig.watching import feed
 from tests.sure import sure
 
 LAB = load_machine("lab")

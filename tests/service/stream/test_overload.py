@@ -5,7 +5,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -35,6 +35,7 @@ from simulator.scenario import parse_fault
 from tests.service.rig.live import QUICK, START_NS, Feed, fed_service, machine_file, scenario_blocks, until
 from tests.service.rig.monitored import client
 from tests.service.rig.replaying import lines_of
+from tests.service.rig.watching import feed, named, raised, resumed
 
 S = 10**9
 LOUD_FROM_S, LOUD_TO_S = 60, 90
@@ -120,54 +121,36 @@ def kit(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     return install(load_machine(short_machine(tmp_path_factory.mktemp("kit"))), None)
 
 
-def fed(monitor: MachineMonitor, stream: Sequence[SampleBlock]) -> Iterator[tuple[Report, list[str]]]:
-    """Each window with what happened to alarms in it."""
-    for block in stream:
-        for report in monitor.step_payload(*encode_block(block, "")):
-            told = [f"{event.kind.value} {event.alarm.name}" for event in report.events]
-            yield from ((window, told) for window in report.windows)
-
-
 def test_a_skipped_window_is_not_healthy_and_an_alarm_says_why(kit: Installed) -> None:
     skipped = {START_NS + round(end_s * 1e9) for end_s in (42.5, 47.5)}
-    monitor, events, states = MachineMonitor(kit, skipped.__contains__), [], []
-    for window, told in fed(monitor, scenario_blocks(90.0)):
-        events += told
-        states.append((window.skipped, window.state))
-        if window.skipped:
-            assert (window.verdict, window.parameters, window.opinions, window.equations) == (None, (), (), ())
-            assert "cannot keep up" in window.reason
-            assert window.levels[0].overall
-        if window.end_ns == max(skipped):
-            (alarm,) = (one for one in monitor.health().alarms if one.raised)
-            assert alarm.name == OVERLOADED
-            assert alarm.note.endswith("windows skipped: 2")
-            assert monitor.health().quality.skipped_windows == 2
-    assert states[7:11] == [
-        (True, HealthState.NOT_EVALUABLE),
-        (True, HealthState.NOT_EVALUABLE),
-        (False, HealthState.HEALTHY),
-        (False, HealthState.HEALTHY),
-    ]
-    assert events == [f"raised {OVERLOADED}", f"cleared {OVERLOADED}"]
+    monitor, stream = MachineMonitor(kit, skipped.__contains__), scenario_blocks(90.0)
+    windows, events = feed(monitor, stream[:480])
+    for window in windows[-2:]:
+        assert (window.skipped, window.state) == (True, HealthState.NOT_EVALUABLE)
+        assert (window.verdict, window.parameters, window.opinions, window.equations) == (None, (), (), ())
+        assert "cannot keep up" in window.reason
+        assert window.levels[0].overall
+    (alarm,) = (one for one in monitor.health().alarms if one.raised)
+    assert alarm.note.endswith("windows skipped: 2")
+    assert monitor.health().quality.skipped_windows == 2
+    later, more = feed(monitor, stream[480:])
+    assert {(one.skipped, one.state) for one in later} == {(False, HealthState.HEALTHY)}
+    assert named([*events, *more]) == [("raised", OVERLOADED), ("cleared", OVERLOADED)]
 
 
 def test_a_defect_is_not_over_for_a_window_that_was_not_evaluated(kit: Installed) -> None:
     monitor = MachineMonitor(kit, lambda _: True)
-    list(fed(monitor, scenario_blocks(30.0)))
+    feed(monitor, scenario_blocks(30.0))
     monitor.fault("a defect", START_NS + 30 * S)
-    list(fed(monitor, scenario_blocks(90.0)[300:]))
-    assert FAULT in {one.name for one in monitor.health().alarms if one.raised}
+    feed(monitor, scenario_blocks(90.0)[300:])
+    assert FAULT in raised(monitor)
 
 
 def test_what_is_loud_is_heard_in_skipped_windows_as_soon_as_in_others(kit: Installed) -> None:
     def alarms(skips: Callable[[int], bool]) -> list[tuple[str, float]]:
         monitor = MachineMonitor(kit, skips)
-        told = [
-            (f"{event.kind.value} {event.alarm.name}", (event.time_ns - START_NS) / S)
-            for block in loud_in_between(LOUD_TO_S + 60.0)
-            for event in monitor.step(block).events
-        ]
+        _, events = feed(monitor, loud_in_between(LOUD_TO_S + 60.0))
+        told = [(f"{event.kind.value} {event.alarm.name}", (event.time_ns - START_NS) / S) for event in events]
         return [one for one in told if LEVEL in one[0]]
 
     skipped, evaluated = alarms(lambda _: True), alarms(lambda _: False)
@@ -180,9 +163,8 @@ def test_a_change_is_named_although_every_other_window_is_skipped(kit: Installed
     stream = scenario_blocks(90.0, parse_fault("k_by=-0.33@50"))
     hop_ns = round(kit.machine.window.hop_s * 1e9)
     monitor = MachineMonitor(kit, lambda end_ns: (end_ns - START_NS) // hop_ns % 2 == 0)
-    events = [one for _, told in fed(monitor, stream) for one in told]
-    parameters = [one for one in events if one.removeprefix("raised ") in PARAMETERS]
-    assert parameters == ["raised k_by"]
+    _, events = feed(monitor, stream)
+    assert [one for one in named(events) if one[1] in PARAMETERS] == [("raised", "k_by")]
 
 
 def test_a_monitor_goes_on_from_between_skipped_windows_as_if_nothing_had_happened(kit: Installed) -> None:
@@ -193,11 +175,9 @@ def test_a_monitor_goes_on_from_between_skipped_windows_as_if_nothing_had_happen
         return (end_ns - START_NS) // hop_ns % 3 == 0
 
     first, at = MachineMonitor(kit, every_third), 637
-    list(fed(first, stream[:at]))
-    state, second = first.state(whole=True), MachineMonitor(kit, every_third)
-    second.restore(state.state, [data for _, data in state.new_parts])
-    second.restore_alarms(state.alarms)
-    assert list(fed(second, stream[at:])) == list(fed(first, stream[at:])) != []
+    feed(first, stream[:at])
+    second = resumed(first, kit, skips=every_third)
+    assert feed(second, stream[at:]) == feed(first, stream[at:]) != ([], [])
 
 
 def test_what_grows_beside_a_named_change_is_heard_in_skipped_windows(kit: Installed) -> None:

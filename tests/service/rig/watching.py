@@ -1,0 +1,36 @@
+"""A monitor that is fed without any network, and what it says."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from models.commissioning.commissioned import Installed
+from models.signals.block import SampleBlock
+from rotorwatch.records.health import Report
+from service.monitor.alarms.alarm import AlarmEvent
+from service.monitor.monitor import MachineMonitor
+
+
+def feed(target: MachineMonitor, stream: Iterable[SampleBlock]) -> tuple[list[Report], list[AlarmEvent]]:
+    windows: list[Report] = []
+    events: list[AlarmEvent] = []
+    for block in stream:
+        report = target.step(block)
+        windows += report.windows
+        events += report.events
+    return windows, events
+
+
+def named(events: Iterable[AlarmEvent]) -> list[tuple[str, str]]:
+    return [(event.kind.value, event.alarm.name) for event in events]
+
+
+def raised(monitor: MachineMonitor) -> set[str]:
+    return {alarm.name for alarm in monitor.health().alarms if alarm.raised}
+
+
+def resumed(monitor: MachineMonitor, installed: Installed, *, whole: bool = True, **how: Any) -> MachineMonitor:
+    """Another one that goes on from what a monitor remembers, with its window or without."""
+    state, again = monitor.state(whole=whole), MachineMonitor(installed, **how)
+    again.restore(state.state, [data for _, data in state.new_parts])
+    again.restore_alarms(state.alarms)
+    return again
