@@ -4,10 +4,10 @@ import asyncio
 import logging
 import re
 import socket
-import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import httpx
 import pytest
@@ -18,11 +18,12 @@ from structlog.testing import capture_logs
 from service.access.audit import STARTED, AuditTrail
 from service.access.guard import Guard
 from service.access.scopes import Scope
-from service.history.records import Retention, TokenRecord
+from service.history.records import Retention
 from service.history.store import Store
 from service.settings.access import AccessSettings, LimitSettings
 from tests.service.rig.guarded import JSON, Guarded, application, basic, guarded, problem
 from tests.service.rig.live import until
+from tests.service.rig.postgres import executed
 
 READ, OPERATE, CONFIGURE = Scope
 
@@ -98,11 +99,15 @@ def test_so_many_requests_a_minute_of_a_caller(tmp_path: Path) -> None:
             assert one.get("/health").status_code == 200
 
 
-def test_tokens_cannot_be_tried_out(tmp_path: Path) -> None:
+def test_tokens_cannot_be_tried_out_and_are_looked_up_a_few_times_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with guarded(tmp_path, AccessSettings(limits=LimitSettings(failures_per_minute=3))) as monitor:
-        wrong = monitor.token(READ)[:-3] + "000"
+        wrong, find = monitor.token(READ)[:-3] + "000", Mock(wraps=monitor.store.tokens.find)
+        monkeypatch.setattr(monitor.store.tokens, "find", find)
         with monitor.client(wrong) as stranger:
             assert [stranger.get("/health").status_code for _ in range(5)] == [401] * 3 + [429] * 2
+            assert find.call_count == 3
             assert stranger.get("/health").headers["retry-after"] == "60"
             monitor.clock.now_s += 60.0
             assert stranger.get("/health").status_code == 401
@@ -118,22 +123,6 @@ def test_wrong_tokens_of_others_lock_nobody_out(tmp_path: Path) -> None:
         tried = [_asked(monitor, f"{old[:-3]}{number:03}") for number in range(20)]
         assert tried == [401] * 3 + [429] * 17
         assert [_asked(monitor, token) for token in (in_use, fresh, old)] == [200] * 3
-
-
-def test_a_wrong_token_is_looked_up_a_few_times_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with guarded(tmp_path, AccessSettings(limits=LimitSettings(failures_per_minute=3))) as monitor:
-        looked_up: list[str] = []
-        find = monitor.store.tokens.find
-
-        def counted(token_id: str) -> TokenRecord | None:
-            looked_up.append(token_id)
-            return find(token_id)
-
-        monkeypatch.setattr(monitor.store.tokens, "find", counted)
-        wrong = monitor.token(READ)[:-3] + "000"
-        for _ in range(20):
-            _asked(monitor, wrong)
-        assert len(looked_up) == 3
 
 
 def test_probes_are_never_limited_away(tmp_path: Path) -> None:
@@ -208,15 +197,16 @@ def test_a_clock_that_is_set_back_counts_for_what_is_done_then(monkeypatch: pyte
     assert at_ns == [5 * day_ns, 5 * day_ns + 1, 5 * day_ns + 2, day_ns, day_ns + 1]
 
 
+def audit_fails(folder: Path, when: str = "") -> None:
+    then = "BEGIN SELECT RAISE(ABORT, 'the disk is full'); END"
+    executed(f"sqlite:///{folder / 'history.sqlite'}", f"CREATE TRIGGER full BEFORE INSERT ON audit_log {when} {then}")
+
+
 def test_nothing_is_done_that_cannot_be_written_down(monitor: Guarded, tmp_path: Path) -> None:
     token = monitor.token(*Scope)
     with monitor.client(token) as client:
         assert client.get("/health").status_code == 200
-        with sqlite3.connect(tmp_path / "history.sqlite") as database:
-            database.execute(
-                "CREATE TRIGGER full BEFORE INSERT ON audit_log BEGIN SELECT RAISE(ABORT, 'the disk is full'); END"
-            )
-        database.close()
+        audit_fails(tmp_path)
         for answer in (client.delete("/machine"), client.post("/alarms/e/shelve", json={"reason": "r"})):
             assert "nothing was done" in problem(answer, 503)
         assert client.get("/health").status_code == 200
@@ -224,12 +214,7 @@ def test_nothing_is_done_that_cannot_be_written_down(monitor: Guarded, tmp_path:
 
 
 def test_an_outcome_that_cannot_be_written_is_in_the_log_at_least(monitor: Guarded, tmp_path: Path) -> None:
-    with sqlite3.connect(tmp_path / "history.sqlite") as database:
-        database.execute(
-            "CREATE TRIGGER full BEFORE INSERT ON audit_log WHEN NEW.status > 0 "
-            "BEGIN SELECT RAISE(ABORT, 'the disk is full'); END"
-        )
-    database.close()
+    audit_fails(tmp_path, "WHEN NEW.status > 0")
     with monitor.client(monitor.token(*Scope)) as client, capture_logs() as lines:
         assert client.delete("/machine").status_code == 200
     assert monitor.done == ["remove"]

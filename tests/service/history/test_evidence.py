@@ -37,8 +37,7 @@ def test_an_alarm_can_be_understood_long_after_its_window_is_gone(tmp_path: Path
 
         def feed_on(count: int) -> None:
             nonlocal sent
-            for block in blocks[sent : sent + count]:
-                feed.put(block)
+            feed.put(*blocks[sent : sent + count])
             sent += count
             until(lambda: worker.health().quality.accepted_blocks == sent, f"{sent} blocks")
             time.sleep(0.3)  # windows are looked at four times a second

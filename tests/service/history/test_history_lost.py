@@ -2,7 +2,7 @@
 
 import sqlite3
 import stat
-from dataclasses import astuple
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -10,16 +10,22 @@ from typer.testing import CliRunner
 
 from models.alarm_names import FAULT
 from service.commands.rotorwatch import app
-from service.history.records import StoredEvent, StoreError, TokenRecord
+from service.history.records import StoreError, TokenRecord
 from service.runtime.runtime import running as running_here
 from tests.service.history.test_store import AUDIT, T0, alarm_event
 from tests.service.monitor.test_alarm_trouble import Bench, bench, block
 from tests.service.rig.live import PATIENT, endpoint, kept_in, machine_file, settings, until
 from tests.service.rig.monitored import client
-from tests.service.rig.postgres import opened
+from tests.service.rig.postgres import executed, opened, opened_and_closed
 from tests.service.runtime.test_survives import do, running
 
 TOKEN = TokenRecord("aaaa", "control room", ("read",), b"hash", T0, None, None)
+
+
+@pytest.fixture(autouse=True)
+def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether the file is still there is looked at every two seconds otherwise."""
+    monkeypatch.setattr("service.history.writer._LOOK_S", 0.2)
 
 
 def test_a_monitor_that_could_not_write_the_last_of_it_says_what_is_lost(tmp_path: Path) -> None:
@@ -37,14 +43,10 @@ def test_a_monitor_that_could_not_write_the_last_of_it_says_what_is_lost(tmp_pat
 def test_a_monitor_whose_latest_step_was_refused_does_not_end_as_if_all_were_well(tmp_path: Path) -> None:
     with running(tmp_path, endpoint(), machine_file(tmp_path, PATIENT)) as at:
         at.url()
-        with sqlite3.connect(history_of(tmp_path)) as connection:  # another program took the number of the next event
-            columns = ", ".join(StoredEvent.__dataclass_fields__)
-            marks = ", ".join("?" * len(StoredEvent.__dataclass_fields__))
-            connection.execute(
-                f"INSERT INTO alarm_events (machine_id, {columns}) SELECT machine_id, {marks} FROM machines",  # noqa: S608
-                astuple(alarm_event(0)),
-            )
-        connection.close()
+        event = asdict(alarm_event(0))  # another program took the number of the next event
+        columns, values = ", ".join(event), ", ".join(f":{name}" for name in event)
+        took = f"INSERT INTO alarm_events (machine_id, {columns}) SELECT machine_id, {values} FROM machines"  # noqa: S608
+        in_file(tmp_path, took, **event)
         do(at, "shelve", "model", "normal", duration_s=3600)
         assert at.stop() == 1
         (said,) = [line for line in at.errors().splitlines() if line.startswith("the history refused the latest step")]
@@ -55,12 +57,9 @@ def history_of(folder: Path) -> Path:
     return folder / "history.sqlite"
 
 
-def in_file(folder: Path, query: str) -> list[tuple[object, ...]]:
+def in_file(folder: Path, query: str, **values: object) -> list[tuple[object, ...]]:
     """What is found at the path, by whoever opens it."""
-    with sqlite3.connect(history_of(folder)) as connection:
-        found = connection.execute(query).fetchall()
-    connection.close()
-    return found
+    return executed(f"sqlite:///{history_of(folder)}", query, **values)
 
 
 def ticked(at: Bench) -> bool:
@@ -103,8 +102,7 @@ def test_a_history_that_was_replaced_goes_on_with_the_numbers_of_the_alarms(tmp_
     if damaged:
         other.write_bytes(b"\xff no database " * 1000)
     else:
-        with opened(f"sqlite:///{other}"):
-            pass
+        opened_and_closed(f"sqlite:///{other}")
     with bench(tmp_path) as at:
         at.put(*map(block, range(12)), block(40, run=2, sequence=0))
         at.put(*(block(40 + n, run=2, sequence=n) for n in range(1, 35)))
@@ -134,9 +132,8 @@ def test_a_machine_without_a_new_alarm_keeps_its_numbers_in_a_file_begun_anew(tm
     with bench(tmp_path) as at:
         at.put(*map(block, range(12)), block(40, run=2, sequence=0))
         last = at.history.last_sequence()
-    with sqlite3.connect(history_of(tmp_path)) as connection:
-        connection.executescript("DROP TRIGGER alarm_events_no_delete; DELETE FROM alarm_events;")
-    connection.close()
+    for statement in ("DROP TRIGGER alarm_events_no_delete", "DELETE FROM alarm_events"):
+        in_file(tmp_path, statement)
     with bench(tmp_path) as at:
         assert at.history.last_sequence() == last
         at.put(block(90, run=3, sequence=0))

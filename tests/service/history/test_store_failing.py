@@ -8,7 +8,6 @@ import socketserver
 import sqlite3
 import tempfile
 import threading
-import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -25,7 +24,7 @@ from service.history.store import Store
 from service.history.tables import MIGRATING
 from tests.service.history.test_store import T0, alarm_event, head, hop_step
 from tests.service.rig.live import until
-from tests.service.rig.postgres import KINDS, USER, PostgresServer, database_url, postgres_server
+from tests.service.rig.postgres import KINDS, USER, PostgresServer, database_url, executed, postgres_server
 from tests.service.rig.postgres import opened as history_opened
 from tests.sure import sure
 
@@ -47,7 +46,7 @@ def parts(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Parts]:
     """A database, what makes it fail, and what brings it back."""
     if request.param == "postgresql":
         server: PostgresServer = request.getfixturevalue("server")
-        yield server.new_database(f"history_{uuid.uuid4().hex}"), server.stop, server.start
+        yield server.new_database(), server.stop, server.start
         return
     file = tmp_path / "history.sqlite"
     blocker = sqlite3.connect(file, isolation_level=None)  # another program that does not let go of the file
@@ -131,12 +130,11 @@ def test_what_waits_is_written_at_closing(parts: Parts) -> None:
 
 
 def test_one_machine_whose_step_fails_does_not_hold_up_the_others(tmp_path: Path) -> None:
-    with opened(f"sqlite:///{tmp_path}/history.sqlite") as store:
+    url = f"sqlite:///{tmp_path}/history.sqlite"
+    with opened(url) as store:
         lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
         # Something that only the database notices: the number of a step in the database that is no number any more.
-        with sqlite3.connect(tmp_path / "history.sqlite") as connection:
-            connection.execute("UPDATE machines SET reports = 'many' WHERE name = 'lab'")
-        connection.close()
+        executed(url, "UPDATE machines SET reports = 'many' WHERE name = 'lab'")
         assert not lab.commit(hop_step(0, events=(alarm_event(0),)))
         pump.commit(hop_step(0, events=(alarm_event(0),)))
         until(lambda: pump.waiting == 0, "the other machine's step")
@@ -145,9 +143,7 @@ def test_one_machine_whose_step_fails_does_not_hold_up_the_others(tmp_path: Path
         assert (lab.waiting, lab.trouble != "", pump.trouble) == (1, True, "")
         assert pump.commit(hop_step(1, events=(alarm_event(1),)))  # at once, whatever becomes of the other
         assert not lab.commit(hop_step(1, events=(alarm_event(1),)))
-        with sqlite3.connect(tmp_path / "history.sqlite") as connection:
-            connection.execute("UPDATE machines SET reports = 0 WHERE name = 'lab'")
-        connection.close()
+        executed(url, "UPDATE machines SET reports = 0 WHERE name = 'lab'")
         until(lambda: lab.waiting == 0, "the step")
         assert lab.trouble == ""
         assert len(lab.events()) == len(lab.reports()) == 2
@@ -199,9 +195,8 @@ def losing_proxy(server: PostgresServer) -> Iterator[tuple[LosingProxy, str]]:
 
 
 def test_a_step_whose_commit_was_not_answered_is_there_once(server: PostgresServer) -> None:
-    name = f"history_{uuid.uuid4().hex}"
-    server.new_database(name)
-    with losing_proxy(server) as (proxy, folder), opened(f"postgresql://{USER}@/{name}?host={folder}") as store:
+    url = server.new_database()
+    with losing_proxy(server) as (proxy, folder), opened(url.replace(str(server.folder), folder)) as store:
         lab = store.machine("demo", "lab")
         for number in range(20):
             if number % 3 == 1:
@@ -238,7 +233,7 @@ def test_a_database_that_cannot_hold_every_text_is_refused(server: PostgresServe
 
 
 def test_a_server_that_hangs_is_turned_away_from(server: PostgresServer) -> None:
-    with opened(server.new_database(f"history_{uuid.uuid4().hex}")) as store:
+    with opened(server.new_database()) as store:
         lab = store.machine("demo", "lab")
         written(lab, hop_step(0, events=(alarm_event(0),)))
         with hanging(store):
@@ -248,7 +243,7 @@ def test_a_server_that_hangs_is_turned_away_from(server: PostgresServer) -> None
 
 
 def test_no_reader_waits_for_a_server_that_hangs(server: PostgresServer) -> None:
-    database = Database(server.new_database(f"history_{uuid.uuid4().hex}"), QUICK_S)
+    database = Database(server.new_database(), QUICK_S)
     database.start()
     ((pid,),) = database.rows(select(func.pg_backend_pid()))  # of the one connection in the pool
     database.answer_s = 0.5
@@ -273,7 +268,7 @@ def test_no_reader_waits_for_a_server_that_hangs(server: PostgresServer) -> None
 
 
 def test_a_connection_that_the_server_has_ended_is_noticed_by_nobody(server: PostgresServer) -> None:
-    url = server.new_database(f"history_{uuid.uuid4().hex}")
+    url = server.new_database()
     database, other = Database(url, QUICK_S), Database(url, QUICK_S)
     database.start()
     other.start()
@@ -285,7 +280,7 @@ def test_a_connection_that_the_server_has_ended_is_noticed_by_nobody(server: Pos
 
 
 def test_a_start_waits_for_a_migration_as_long_as_it_takes(server: PostgresServer) -> None:
-    url = server.new_database(f"history_{uuid.uuid4().hex}")
+    url = server.new_database()
     with psycopg.connect(url) as migrating:
         migrating.execute("SELECT pg_advisory_lock(%s, %s)", MIGRATING)
         database = Database(url, QUICK_S)
@@ -300,7 +295,7 @@ def test_a_start_waits_for_a_migration_as_long_as_it_takes(server: PostgresServe
 
 
 def test_the_end_does_not_wait_for_a_server_that_hangs(server: PostgresServer) -> None:
-    with opened(server.new_database(f"history_{uuid.uuid4().hex}")) as store:
+    with opened(server.new_database()) as store:
         written(store.machine("demo", "lab"), hop_step(0))
         ending = threading.Thread(target=store.close, daemon=True)
         with hanging(store):

@@ -15,18 +15,12 @@ from service.history import claim, migrations
 from service.history.claim import unpack
 from service.history.records import Step, StoredReading, StoreError
 from service.history.tables import REVISION, metadata
-from tests.service.history.test_store import executed
-from tests.service.rig.postgres import KINDS, database_url, opened
+from tests.service.rig.postgres import KINDS, database_url, executed, opened, opened_and_closed
 
 
 @pytest.fixture(params=KINDS)
 def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     return database_url(request.param, tmp_path, empty=True)
-
-
-def opened_and_closed(url: str) -> None:
-    with opened(url):
-        pass
 
 
 def test_tables_change_with_their_revision() -> None:

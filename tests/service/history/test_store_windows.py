@@ -12,9 +12,9 @@ from service.history.machine import MachineStore
 from service.history.records import Retention, Step, StoredReading
 from service.history.store import Store
 from service.history.tables import buckets, machines
-from service.history.windows import READING, add_up, packed, singles, unpacked
-from tests.service.history.test_store import T0, executed
-from tests.service.rig.postgres import opened
+from service.history.windows import READING, packed, unpacked
+from tests.service.history.test_store import T0
+from tests.service.rig.postgres import executed, opened
 
 NS = 1_000_000_000
 BUCKET = 600 * NS
@@ -49,24 +49,6 @@ def test_readings_come_out_of_their_value_as_they_went_in(windows: list[list[tup
     places, found = unpacked([packed(each) for each in arrays], READING)
     assert found.tobytes() == b"".join(each.tobytes() for each in arrays)
     assert places.tolist() == [place for place, each in enumerate(windows) for _ in each]
-
-
-@pytest.mark.parametrize(("first", "apart"), [(-3, 1), (0, 1), (0, 1_000_000)])
-def test_what_is_added_up_is_what_numpy_says(first: int, apart: int) -> None:
-    rng = np.random.default_rng(3)
-    readings = np.zeros(1000, READING)
-    readings["series_id"], readings["value"] = apart * rng.integers(5, 9, 1000), rng.standard_normal(1000)
-    readings["standard_error"] = np.where(rng.random(1000) < 0.3, np.nan, rng.random(1000))
-    at = rng.integers(first, first + 7, 1000)
-    places, made = add_up(singles(readings), at)
-    keys = list(zip(places.tolist(), made["series_id"].tolist(), strict=True))
-    assert keys == [(place, apart * series_id) for place in range(first, first + 7) for series_id in range(5, 9)]
-    for place, one in zip(places, made, strict=True):
-        own = readings[(at == place) & (readings["series_id"] == one["series_id"])]
-        errors = own["standard_error"][~np.isnan(own["standard_error"])]
-        assert (one["count"], one["errors"]) == (len(own), len(errors))
-        assert (one["minimum"], one["maximum"]) == (own["value"].min(), own["value"].max())
-        assert (one["total"], one["errors_total"]) == pytest.approx((own["value"].sum(), errors.sum()), rel=1e-12)
 
 
 def test_windows_go_into_their_bucket_when_one_of_another_comes(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sqlalchemy import create_engine, make_url, text
+
 from service.history.records import Retention
 from service.history.store import Store
 from tests.sure import sure
@@ -40,8 +42,9 @@ class PostgresServer:
     def url(self, database: str) -> str:
         return f"postgresql://{USER}@/{database}?host={self.folder}"
 
-    def new_database(self, name: str, template: str = "template1") -> str:
+    def new_database(self, name: str = "", template: str = "template1") -> str:
         """Make a database, empty or a copy of another one, and return its address."""
+        name = name or f"history_{uuid.uuid4().hex}"
         self.run("createdb", "-S", "file_copy", "-h", str(self.folder), "-U", USER, "-T", template, name)
         return self.url(name)
 
@@ -89,8 +92,7 @@ def database_url(kind: str, folder: Path, *, empty: bool = False) -> str:
         if not empty:
             shutil.copy(_sqlite_template(), path)
         return f"sqlite:///{path}"
-    name, server = f"history_{uuid.uuid4().hex}", _shared_server()
-    return server.new_database(name) if empty else server.new_database(name, _postgres_template())
+    return _shared_server().new_database(template="template1" if empty else _postgres_template())
 
 
 @contextmanager
@@ -104,9 +106,22 @@ def opened(url: str, retention: Retention | None = None, **changes: Any) -> Iter
         store.close()
 
 
-def _filled(url: str) -> None:
+def opened_and_closed(url: str) -> None:
     with opened(url):
         pass
+
+
+def executed(url: str, statement: str, **values: object) -> list[tuple[Any, ...]]:
+    """Change the database, or look into it, behind the store's back."""
+    made = make_url(url)
+    drivers = {"sqlite": "sqlite", "postgresql": "postgresql+psycopg"}
+    engine = create_engine(made.set(drivername=drivers[made.drivername]))
+    try:
+        with engine.begin() as connection:
+            found = connection.execute(text(statement), values)
+            return [tuple(row) for row in found] if found.returns_rows else []
+    finally:
+        engine.dispose()
 
 
 @functools.cache
@@ -114,13 +129,13 @@ def _sqlite_template() -> Path:
     folder = tempfile.TemporaryDirectory(prefix="sqlite-")
     atexit.register(folder.cleanup)
     path = Path(folder.name, "template.sqlite")
-    _filled(f"sqlite:///{path}")
+    opened_and_closed(f"sqlite:///{path}")
     return path
 
 
 @functools.cache
 def _postgres_template() -> str:
-    _filled(_shared_server().new_database("tables"))
+    opened_and_closed(_shared_server().new_database("tables"))
     return "tables"
 
 

@@ -95,13 +95,3 @@ def test_alarms_and_what_operators_did_survive_kill_9(tmp_path: Path) -> None:
         assert states(third)["c_bz"] == "acknowledged"
         assert health.state in {"alert", "danger"}  # a raised alarm outranks warming
         assert third.stop() == 0
-
-
-def test_two_monitors_do_not_write_one_history(tmp_path: Path) -> None:
-    file = machine_file(tmp_path)
-    with running(tmp_path, endpoint(), file) as first:
-        first.wait_for("HTTP API")
-        with running(tmp_path, endpoint(), file) as second:
-            assert second.process.wait(180) == 1
-            assert "another monitor writes the history of demo/lab" in second.errors()
-        assert first.stop() == 0
