@@ -1,5 +1,6 @@
 """What the tests of the running service share: real sessions on loopback, real processes, waiting for conditions."""
 
+import json
 import os
 import signal
 import subprocess
@@ -189,8 +190,10 @@ class Feed:
         }  # fmt: skip
         return SampleBlock(**(fields | changes))  # type: ignore[arg-type]  # tests give fields of any kind
 
-    def put(self, block: SampleBlock, schema_hash: str | None = None) -> None:
-        self.put_raw(*encode_block(block, self.machine.descriptor.schema_hash if schema_hash is None else schema_hash))
+    def put(self, *blocks: SampleBlock, schema_hash: str | None = None) -> None:
+        known = self.machine.descriptor.schema_hash if schema_hash is None else schema_hash
+        for block in blocks:
+            self.put_raw(*encode_block(block, known))
 
     def put_raw(self, payload: bytes, attachment: bytes, encoding: str) -> None:
         self.session.put(
@@ -202,12 +205,13 @@ class Feed:
             congestion_control=zenoh.CongestionControl.BLOCK,
         )
 
-    def put_good(self) -> None:
-        """Publish the next good block and go on to the one after it."""
-        block = self.block()
-        self.put(block)
-        self.sequence += 1
-        self.start_ns = block.end_ns
+    def put_good(self, count: int = 1) -> None:
+        """Publish the next good blocks and go on to the one after them."""
+        for _ in range(count):
+            block = self.block()
+            self.put(block)
+            self.sequence += 1
+            self.start_ns = block.end_ns
 
     def skip(self, seconds: int = 3) -> None:
         """Leave out so much: a gap before the next block."""
@@ -246,6 +250,11 @@ class Program:
 
     def errors(self) -> str:
         return self.err.read_text(encoding="utf-8")
+
+    def latest(self) -> dict[str, Any]:
+        """The newest line that it has printed, of a program that prints JSON."""
+        lines = self.output().rpartition("\n")[0].splitlines()
+        return dict(json.loads(lines[-1])) if lines else {}
 
     def wait_for(self, text: str) -> None:
         """Wait until standard output holds a text."""

@@ -20,7 +20,7 @@ from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from models.signals.wire import ARROW_ENCODING, BLOCK_ENCODING, REPLAY_MARK, encode_arrow, encode_block, sender_of
-from rotorwatch.records.alarms import AlarmCloudEvent, EventKind
+from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.descriptor import MOST_BYTES, MOST_DIFFERENCES, descriptor_mismatch
@@ -43,6 +43,7 @@ from tests.service.rig.live import (
     until,
 )
 from tests.service.rig.monitored import PLACE, client
+from tests.service.rig.watching import feed, named, raised
 
 KB = 1024
 
@@ -89,16 +90,14 @@ def test_health_stays_small_whatever_is_sent() -> None:
         feed.put_raw(b"", b"", f"{BLOCK_ENCODING};" + "y" * 200)
         payload, header = b"\0" * 7200, b"\0" * 32
         feed.put_raw(payload, header, f"{BLOCK_ENCODING};" + "z" * 200)
-        feed.put(feed.block(), "h" * 200)
+        feed.put(feed.block(), schema_hash="h" * 200)
         descriptor, block = empty_channels(300_000), zenoh.CongestionControl.BLOCK
         feed.session.put(LAB.keys.descriptor, descriptor, congestion_control=block)
         until(lambda: sum(worker.health().quality.refused_blocks.values()) == 4, "refusals")
         until(lambda: worker.health().stream.descriptor_mismatch != (), "the descriptor")
         assert len(worker.health().model_dump_json()) < 100 * KB
-
-
-def raised(monitor: MachineMonitor) -> set[str]:
-    return {alarm.name for alarm in monitor.health().alarms if alarm.raised}
+        feed.session.put(LAB.keys.descriptor, LAB.descriptor.model_dump_json(), congestion_control=block)
+        until(lambda: worker.health().stream.descriptor_mismatch == (), "the right one")
 
 
 def test_two_publishers_on_one_key_are_named() -> None:
@@ -128,8 +127,9 @@ def test_a_forged_block_replaces_no_true_one(ahead: int) -> None:
     monitor.flush()
     health = monitor.health()
     assert dict(health.quality.refused_blocks)["conflict"] == 14
-    assert CONFLICT in raised(monitor)
-    assert {name for name in raised(monitor) if alarm_kind(name).about == "machine"} == set()
+    told = raised(monitor)
+    assert CONFLICT in told
+    assert {name for name in told if alarm_kind(name).about == "machine"} == set()
 
 
 def misshapen(good: SampleBlock, rng: np.random.Generator) -> SampleBlock:
@@ -195,7 +195,7 @@ def raw(run: int, size: int = 4, encoding: str = BLOCK_ENCODING, source: str = "
     return RawBlock(b"\0" * size, header, encoding, source)
 
 
-def test_what_cannot_be_a_block_costs_no_place() -> None:
+def test_what_cannot_be_a_block_costs_no_place_and_a_queue_is_bounded_in_bytes_too() -> None:
     inbox = Inbox(10, "drop", may_be_block=lambda one, _: one.encoding == BLOCK_ENCODING)
     good = [raw(1) for _ in range(10)]
     for one in good:
@@ -206,6 +206,11 @@ def test_what_cannot_be_a_block_costs_no_place() -> None:
     assert [inbox.get() for _ in range(10)] == good
     assert len(inbox) + inbox.unread == 10_000
     assert len(inbox) < 100  # a few are looked at
+    inbox = Inbox(1000, "drop", most_bytes=1_000_000)
+    for _ in range(50):
+        inbox.put(raw(1, size=100_000))
+    assert len(inbox) <= 10
+    assert inbox.dropped == 50 - len(inbox)
 
 
 @pytest.mark.parametrize("same_run", [False, True])
@@ -230,14 +235,6 @@ def test_a_block_that_was_used_is_followed_by_what_waits_of_its_publisher() -> N
     inbox.follow(raw(3))
     order = [inbox.get() for _ in range(4)]
     assert [sender_of(one.attachment, one.encoding)[1] for one in order if isinstance(one, RawBlock)] == [3, 3, 2, 2]
-
-
-def test_a_queue_is_bounded_in_bytes_too() -> None:
-    inbox = Inbox(1000, "drop", most_bytes=1_000_000)
-    for _ in range(50):
-        inbox.put(raw(1, size=100_000))
-    assert len(inbox) <= 10
-    assert inbox.dropped == 50 - len(inbox)
 
 
 def test_a_flood_of_bad_messages_costs_no_good_block(tmp_path: Path) -> None:
@@ -298,19 +295,16 @@ def test_a_replay_that_is_announced_silences_no_machine(first: str) -> None:
         early = None if first == "monitor" else announce(LAB.keys.replay_alive)
         with running(plan) as runtime, open_session(address, "client") as session:
             worker, feed = runtime.machines()[0], Feed(session)
-            for _ in range(5):
-                feed.put_good()
+            feed.put_good(5)
             token = early or announce(LAB.keys.replay_alive)
             until(lambda: worker.health().stream.replay_announced, "the announcement")
             assert "replay" in worker.health().reason
-            for _ in range(5):
-                feed.put_good()
+            feed.put_good(5)
             until(lambda: worker.health().quality.accepted_blocks == 10, "all blocks of the machine")
             token.undeclare()  # type: ignore[no-untyped-call]
             until(lambda: not worker.health().stream.replay_announced, "its end")
             assert "replay" not in worker.health().reason
-            for _ in range(5):
-                feed.put_good()
+            feed.put_good(5)
             until(lambda: worker.health().quality.accepted_blocks == 15, "what comes afterwards")
             assert worker.health().quality.gaps == 0
 
@@ -330,7 +324,7 @@ def test_what_others_say_in_the_monitors_name_stays_on_the_network(tmp_path: Pat
     """Nor does a token that nobody is behind hide that the data have stopped."""
     address, quick = endpoint(), ("[operation]", "[ingest]\nno_data_after_s = 1.0\nblock_to_s = 0.5\n\n[operation]")
     with service(address, machine_file(tmp_path, quick)) as (runtime, worker), open_session(address) as session:
-        token = session.liveliness().declare_token(LAB.keys.publisher_alive)
+        _token = session.liveliness().declare_token(LAB.keys.publisher_alive)
         feed, forged = Feed(session), AlarmCloudEvent.model_validate(example(AlarmCloudEvent)).model_dump_json()
         feed.put_good()
         until(lambda: worker.health().stream.publisher_alive, "the token")
@@ -345,7 +339,6 @@ def test_what_others_say_in_the_monitors_name_stays_on_the_network(tmp_path: Pat
             assert http.get(f"{PLACE}/reports").json()["reports"] == []
         assert (event["data"]["name"], health["state"]) == (STREAM_LOST, "no-data")
         assert health["stream"]["publisher_alive"]
-        token.undeclare()  # type: ignore[no-untyped-call]
 
 
 DURATION_S = 68.0
@@ -359,12 +352,8 @@ def watched(name: str, kind: Foreign, seed: int) -> tuple[list[Report], set[str]
     alarms = machine.alarms.model_copy(update={"on_delay_s": machine.window.hop_s})
     machine = machine.model_copy(update={"alarms": alarms})
     monitor = MachineMonitor(install(machine, None))
-    windows, raised = [], set()
-    for block in as_blocks(machine, foreign(machine, kind, seed, DURATION_S)):
-        report = monitor.step(block)
-        windows += [one for one in report.windows if one.filled == 1]
-        raised |= {event.alarm.name for event in report.events if event.kind is EventKind.RAISED}
-    return windows, raised
+    windows, events = feed(monitor, as_blocks(machine, foreign(machine, kind, seed, DURATION_S)))
+    return [one for one in windows if one.filled == 1], {name for what, name in named(events) if what == "raised"}
 
 
 # One sine far from every mode of the lightly damped machine passes for the one resonance of a softer shaft.
@@ -402,17 +391,17 @@ def test_no_parameter_is_blamed_where_the_file_is_of_another_rotor(factors: tupl
     })  # fmt: skip
     monitor = MachineMonitor(install(machine, None))
     samples = simulated(machine.model_copy(update={"rotor": other}), SEED, 110.0)
-    events = [one for block in as_blocks(machine, samples) for one in monitor.step(block).events]
-    assert {one.alarm.name for one in events if one.kind is EventKind.RAISED} == {MODEL}
+    _, events = feed(monitor, as_blocks(machine, samples))
+    assert {name for what, name in named(events) if what == "raised"} == {MODEL}
 
 
-@pytest.mark.parametrize(("gain", "unbalance", "named"), [(25.4, 1.0, MODEL), (1000.0, 1.0, MODEL), (1.0, 10.0, "e")])
-def test_an_unbalance_of_wrong_units_is_none(gain: float, unbalance: float, named: str) -> None:
+@pytest.mark.parametrize(("gain", "unbalance", "name"), [(25.4, 1.0, MODEL), (1000.0, 1.0, MODEL), (1.0, 10.0, "e")])
+def test_an_unbalance_of_wrong_units_is_none(gain: float, unbalance: float, name: str) -> None:
     machine = load_machine("lab")
     rotor = machine.rotor.model_copy(update={"e_m": unbalance * machine.rotor.e_m})
     samples = simulated(machine.model_copy(update={"rotor": rotor}), SEED, 80.0).copy()
     samples[:, [channel.name != "theta" for channel in machine.sensors]] *= gain
     monitor = MachineMonitor(install(machine, None))
-    events = [one for block in as_blocks(machine, samples) for one in monitor.step(block).events]
-    assert [one.alarm.name for one in events if one.kind is EventKind.RAISED] == [named]
-    assert ("check the units of the channels and e_m" in events[0].text) == (named == MODEL)
+    _, events = feed(monitor, as_blocks(machine, samples))
+    assert [alarm for what, alarm in named(events) if what == "raised"] == [name]
+    assert ("check the units of the channels and e_m" in events[0].text) == (name == MODEL)

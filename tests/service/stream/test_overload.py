@@ -234,8 +234,7 @@ def test_the_last_block_of_a_hop_waits_for_its_turn(tmp_path: Path, monkeypatch:
         feed.put(first)  # nobody knows yet how many blocks a hop has
         until(lambda: worker.tally.blocks == 1, "the first block")
         with in_turn(completes_hop=True):  # another machine's
-            for block in others:
-                feed.put(block)
+            feed.put(*others)
             until(lambda: worker.tally.blocks >= 74, "the blocks before the last one of the first hop, of 7.5 s")
             time.sleep(0.3)
             assert worker.tally.blocks == 74
@@ -281,8 +280,7 @@ def hurry(feed: Feed, worker: MachineWorker, stream: list[SampleBlock], until_se
     """Put blocks so that so many wait at the worker, whatever it does about it, until so many are sent."""
     while feed.sequence < until_sent:
         if len(worker.inbox) < ahead:
-            for block in stream[feed.sequence : feed.sequence + 50]:
-                feed.put(block)
+            feed.put(*stream[feed.sequence : feed.sequence + 50])
             feed.sequence += 50
         time.sleep(0.002)  # a loop that never rests takes the processor from the worker
 
@@ -303,8 +301,7 @@ def test_an_overloaded_service_loses_no_sample_and_is_replayed_the_same(
                 lambda known=known: len(worker.inbox) == 0 and worker.health().quality.accepted_blocks >= known,  # type: ignore[misc]  # bound now
                 "an idle worker",
             )
-            for block in stream[feed.sequence : end]:
-                feed.put(block)
+            feed.put(*stream[feed.sequence : end])
             feed.sequence = end
         until(lambda: worker.health().quality.accepted_blocks == len(stream), "all blocks")
         with client(runtime) as http:

@@ -44,42 +44,45 @@ def test_kept_and_live_blocks_arrive_each_once(wait: bool) -> None:
         publisher = advanced_publisher(session, LAB.keys.stream, KEPT, priority=zenoh.Priority.DATA_HIGH)
         for number in range(KEPT):
             publisher.put(_payload(number) * (SIZE // 4))
-        token = session.liveliness().declare_token(LAB.keys.publisher_alive)
+        _token = session.liveliness().declare_token(LAB.keys.publisher_alive)
         with machine_link(address, take, wait=wait):
             until(begun.is_set, "first block")
             for number in range(KEPT, KEPT + LIVE):
                 publisher.put(_payload(number) * (SIZE // 4))
             until(lambda: len(set(seen)) == KEPT + LIVE, "all blocks")
-        token.undeclare()  # type: ignore[no-untyped-call]
-        publisher.undeclare()  # type: ignore[no-untyped-call]
     assert sorted(seen) == list(range(KEPT + LIVE))
 
 
-def test_nothing_that_is_kept_is_lost_to_blocks_that_come_meanwhile() -> None:
-    address = endpoint()
-    over = threading.Event()
+# Zenoh would hold back 1200 until all are there.
+@pytest.mark.parametrize(
+    ("kept", "at_once", "turns"),
+    [(1199, KEPT, (False, True) * 2), (1, 0, (False,) * 6)],
+    ids=["all are kept", "one is kept"],
+)
+def test_blocks_that_come_meanwhile_cost_none(kept: int, at_once: int, turns: tuple[bool, ...]) -> None:
+    address, over = endpoint(), threading.Event()
     with session_of(LinkSettings(listen=(address,))) as session:
-        publisher = advanced_publisher(session, LAB.keys.stream, 1199)  # Zenoh would hold back 1200 until all are there
+        publisher = advanced_publisher(session, LAB.keys.stream, kept)
 
         def send() -> None:
-            for number in range(1199):
+            for number in range(kept) if at_once else count():
                 publisher.put(_payload(number) * (SIZE // 4))
-                if number >= KEPT and over.wait(0.005):
+                if number >= at_once and over.wait(0.005):
                     return
 
         sender = threading.Thread(target=send)
         sender.start()
         try:
-            for wait in (False, True) * 2:
+            for wait in turns:
                 seen: list[int] = []
                 numbered = partial(_numbered, seen)
                 with machine_link(LinkSettings(mode="client", connect=(address,)), numbered, wait=wait):
-                    until(partial(_more_than, seen, KEPT), "blocks")
-                assert seen == list(range(len(seen)))
+                    until(partial(_more_than, seen, at_once + LIVE), "blocks")
+                assert seen == list(range(seen[0], seen[0] + len(seen)))
+                assert seen[0] == 0 or not at_once
         finally:
             over.set()
             sender.join()
-            publisher.undeclare()  # type: ignore[no-untyped-call]
 
 
 @pytest.mark.parametrize("alive", [True, False], ids=["alive token", "no token"])
@@ -98,8 +101,6 @@ def test_a_publisher_that_appears_later_loses_nothing_that_it_has_kept(alive: bo
                 later.put(_payload(number))
                 time.sleep(0.01 * (number > LIVE // 2))
             until(lambda: len(seen) == 1 + LIVE, "all blocks")
-            later.undeclare()  # type: ignore[no-untyped-call]
-        first.undeclare()  # type: ignore[no-untyped-call]
     assert seen == [7, *range(LIVE)]
 
 
@@ -117,32 +118,8 @@ def test_what_a_publisher_kept_that_connects_again_after_a_start_is_not_lost() -
                 publisher.put(_payload(sent))
                 sent += 1
                 time.sleep(0.02)
-        publisher.undeclare()  # type: ignore[no-untyped-call]
     assert seen[0] < sent - KEPT // 2
     assert seen == list(range(seen[0], seen[0] + len(seen)))
-
-
-def test_a_small_cache_costs_none_of_the_blocks_that_came_meanwhile() -> None:
-    address, stop, sent = endpoint(), threading.Event(), count()
-    with session_of(LinkSettings(listen=(address,))) as session:
-        publisher = advanced_publisher(session, LAB.keys.stream, 1)
-
-        def send() -> None:
-            while not stop.wait(0.005):
-                publisher.put(_payload(next(sent)))
-
-        sender = threading.Thread(target=send)
-        sender.start()
-        try:
-            for _ in range(6):
-                seen: list[int] = []
-                with machine_link(LinkSettings(mode="client", connect=(address,)), partial(_numbered, seen)):
-                    until(partial(_more_than, seen, LIVE), "blocks")
-                assert seen == list(range(seen[0], seen[0] + len(seen)))
-        finally:
-            stop.set()
-            sender.join()
-            publisher.undeclare()  # type: ignore[no-untyped-call]
 
 
 def test_a_publisher_that_does_not_answer_holds_up_no_other() -> None:
@@ -159,7 +136,6 @@ def test_a_publisher_that_does_not_answer_holds_up_no_other() -> None:
             other.put(_payload(number))
         until(lambda: len(seen) >= LIVE, "the blocks of the other")
         assert seen == list(range(LIVE))
-        other.undeclare()  # type: ignore[no-untyped-call]
 
 
 def test_a_publisher_whose_new_blocks_do_not_follow_on_its_answers_is_asked_again() -> None:
@@ -176,7 +152,6 @@ def test_a_publisher_whose_new_blocks_do_not_follow_on_its_answers_is_asked_agai
             for number in range(2, 7):
                 publisher.put(_payload(number))
             until(lambda: 6 in seen, "what comes now")
-        publisher.undeclare()  # type: ignore[no-untyped-call]
     assert seen == list(range(7))
 
 
@@ -214,7 +189,6 @@ def test_blocks_of_a_publisher_that_gives_times_and_no_numbers_arrive_in_order()
                 publisher.put(_payload(number))
                 time.sleep(0.002)
             until(lambda: len(seen) >= KEPT + LIVE, "all blocks")
-        publisher.undeclare()  # type: ignore[no-untyped-call]
     assert seen == list(range(KEPT + LIVE))
 
 
@@ -244,8 +218,6 @@ def test_a_machine_that_holds_up_its_publisher_leaves_the_others_their_turns() -
             time.sleep(0.01)
         sender.join()
         declared.close()
-        for publisher in (flood, beside):
-            publisher.undeclare()  # type: ignore[no-untyped-call]
     turns = "".join(one[0] for one in order).split("o")
     assert max(len(turn) for turn in turns) < 200
 

@@ -103,8 +103,7 @@ def test_recipe_for_a_follower_takes_each_event_once_in_order(tmp_path: Path, mo
         def gap() -> None:
             latest = worker.alarms().sequence
             feed.skip(60)
-            for _ in range(60):  # the first ones wait for those that are missing
-                feed.put_good()
+            feed.put_good(60)  # the first ones wait for those that are missing
             until(lambda: worker.alarms().sequence > latest, "an alarm event")
 
         feed.put_good()
