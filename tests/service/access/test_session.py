@@ -1,34 +1,17 @@
 """Signing in with a browser: the token in a cookie, and what may not be done with it."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
-import pytest
-from fastapi import FastAPI
 
 from service.access.credentials import COOKIE
-from service.access.guard import Guard
 from service.access.scopes import Scope
-from service.api.routes.tokens import add_session_routes
 from service.settings.access import AccessSettings
-from tests.service.rig.guarded import Guarded, application, guarded, problem
+from tests.service.rig.guarded import Guarded, guarded, problem
 
 READ, OPERATE, _ = Scope
 SESSION = "/api/v1/session"
 BODY = {"reason": "known"}
-
-
-def with_sessions(guard: Guard, done: list[str]) -> FastAPI:
-    app = application(guard, done)
-    add_session_routes(app, guard)
-    return app
-
-
-@pytest.fixture
-def monitor(tmp_path: Path) -> Iterator[Guarded]:
-    with guarded(tmp_path, build=with_sessions) as running:
-        yield running
 
 
 def signed_in(monitor: Guarded, client: httpx.Client, token: str) -> httpx.Response:
@@ -82,13 +65,13 @@ def test_a_wrong_or_revoked_token_is_not_kept_and_one_that_was_kept_is_refused(m
 
 def test_wrong_cookies_are_counted_as_attempts(tmp_path: Path) -> None:
     settings = AccessSettings.model_validate({"limits": {"failures_per_minute": 2}})
-    with guarded(tmp_path, settings, build=with_sessions) as monitor, monitor.client() as client:
+    with guarded(tmp_path, settings) as monitor, monitor.client() as client:
         client.cookies.set(COOKIE, "rw_nothing")
         assert [client.get("/health").status_code for _ in range(4)] == [401, 401, 429, 429]
 
 
 def test_where_no_token_is_needed_none_is_kept(tmp_path: Path) -> None:
     settings = AccessSettings.model_validate({"open_on_loopback": True})
-    with guarded(tmp_path, settings, build=with_sessions) as monitor, monitor.client() as client:
+    with guarded(tmp_path, settings) as monitor, monitor.client() as client:
         assert client.post(SESSION, json={}).json()["name"] == "anonymous"
         assert not client.cookies

@@ -23,17 +23,7 @@ from service.stream.transport import Link, TopicMessage, follow
 from simulator.publisher import PublishError, PublishSettings, publish
 from tests.loopback import session_of
 from tests.service.access.plant import GRANTS, PUMP, Plant, at_once, kept, plant
-from tests.service.rig.live import (
-    LAB,
-    ROOT,
-    Program,
-    advanced_publisher,
-    endpoint,
-    program,
-    scenario_blocks,
-    until,
-    until_subscribed,
-)
+from tests.service.rig.live import LAB, ROOT, Program, advanced_publisher, endpoint, program, until, until_subscribed
 from tests.sure import sure
 
 
@@ -311,34 +301,6 @@ def test_a_granted_viewer_fetches_what_was_lost_on_the_way(router: Plant) -> Non
         until(lambda: len(texts) >= 10 and bool(plain), "events that were lost")
         assert texts == numbers
         assert plain == ["0"]
-
-
-def test_a_real_stream_reaches_only_whom_it_is_granted(router: Plant) -> None:
-    """The simulator's publisher, with descriptor, liveliness and the question that says it was heard."""
-    with router.client("monitor") as monitor, router.client("all") as viewer:
-        blocks, _ = collected(monitor, LAB.keys.stream, history=True, recovery=True)
-        nothing, _ = collected(viewer, LAB.keys.stream, history=True, recovery=True)
-        asked: list[str] = []
-
-        def fine(query: zenoh.Query) -> None:
-            asked.append(str(query.key_expr))
-            query.reply(LAB.keys.health, "fine")
-
-        monitor.declare_queryable(LAB.keys.health, fine)
-        alive: list[zenoh.SampleKind] = []
-        viewer.liveliness().declare_subscriber(
-            LAB.keys.publisher_alive, at_once(lambda sample: alive.append(sample.kind)), history=True
-        )
-        stream = scenario_blocks(3.0)
-        plan = PublishSettings(
-            link=router.link("lab"), pace=None, wait_for_subscriber_s=20.0, linger_s=0.0, drain_s=20.0
-        )
-        publish(LAB, ((block, ()) for block in stream), plan)
-        until(lambda: len(blocks) >= len(stream), "all blocks")
-        until(lambda: zenoh.SampleKind.DELETE in alive, "the publisher's end")
-    assert asked == [LAB.keys.health]
-    assert alive == [zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE]
-    assert nothing == []
 
 
 SHIPPED = ROOT / "deploy" / "zenoh"

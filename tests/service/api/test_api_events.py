@@ -98,8 +98,11 @@ def test_what_happens_arrives_with_an_id_to_go_on_from(shared: Runtime) -> None:
         assert (second.id, second.data) == (f"{LAB}={before[0] + 1},{HEAVY}={before[1] + 1}", log(heavy)[-1])
 
 
-@pytest.mark.parametrize("by_header", [True, False])
-def test_a_stream_goes_on_right_after_the_last_id(shared: Runtime, *, by_header: bool) -> None:
+@pytest.mark.parametrize(
+    ("query", "by_header"), [("", True), ("?last_event_id=LAST", False), (f"?last_event_id={LAB}=0", True)]
+)
+def test_a_stream_goes_on_right_after_the_last_id(shared: Runtime, query: str, by_header: bool) -> None:
+    """Of the header, if there are both."""
     lab, _ = shared.machines()
     with reading(shared) as reader:
         last = reader.next("start").id
@@ -107,22 +110,15 @@ def test_a_stream_goes_on_right_after_the_last_id(shared: Runtime, *, by_header:
         assert reader.next().id != last
     happen(lab, 4)
     missed = log(lab)[-5:]
-    query, headers = ("", {"last-event-id": last}) if by_header else (f"?last_event_id={last}", {})
-    with reading(shared, query, **headers) as reader:
+    headers = {"last-event-id": last} if by_header else {}
+    with reading(shared, query.replace("LAST", last), **headers) as reader:
         assert reader.next("start").id == last
         assert [reader.next().data for _ in missed] == missed
         happen(lab)
         assert reader.next().data == log(lab)[-1]
 
 
-def test_the_header_counts_if_there_are_both(shared: Runtime) -> None:
-    happen(shared.machines()[0], 2)
-    last = shared.machines()[0].history.last_sequence()
-    with reading(shared, f"?machine={LAB}&last_event_id={LAB}=0", **{"last-event-id": f"{LAB}={last - 1}"}) as reader:
-        assert reader.next().id == f"{LAB}={last}"
-
-
-def test_the_whole_log_from_the_beginning_machine_by_machine(shared: Runtime) -> None:
+def test_the_whole_log_from_the_beginning_also_of_a_machine_that_is_new_to_the_reader(shared: Runtime) -> None:
     lab, heavy = shared.machines()
     happen(lab, 230)  # more than two pages
     happen(heavy, 3)
@@ -136,11 +132,6 @@ def test_the_whole_log_from_the_beginning_machine_by_machine(shared: Runtime) ->
         assert found == expected
     with reading(shared, f"?from=beginning&machine={HEAVY}") as reader:
         assert [reader.next().data for _ in expected[HEAVY]] == expected[HEAVY]
-
-
-def test_a_machine_that_is_new_to_the_reader_is_told_from_its_beginning(shared: Runtime) -> None:
-    lab, heavy = shared.machines()
-    happen(heavy, 2)
     with reading(shared, **{"last-event-id": f"{LAB}={lab.history.last_sequence()},old/pump=7"}) as reader:
         assert [reader.next().data for _ in range(2)] == log(heavy)[:2]
 
@@ -180,8 +171,7 @@ def test_what_is_told_first_is_how_the_machine_is_now(tmp_path: Path) -> None:
         (worker,) = runtime.machines()
         with reading(runtime) as reader:
             assert Health.model_validate_json(reader.next("health").data).quality.accepted_blocks == 0
-            for _ in range(3):  # too little for a report: nothing is news
-                feed.put_good()
+            feed.put_good(3)  # too little for a report: nothing is news
             until(lambda: worker.health().quality.accepted_blocks == 3, "blocks")
         with reading(runtime) as reader:
             assert Health.model_validate_json(reader.next("health").data).quality.accepted_blocks == 3

@@ -54,27 +54,21 @@ def sequences(found: AlarmEventList) -> list[int]:
     return [event.data.sequence for event in found.events]
 
 
-def test_pages_back_give_the_whole_log(busy: tuple[Runtime, httpx.Client]) -> None:
-    found, before = [], ""
+def test_pages_back_and_forth_give_the_whole_log_once(busy: tuple[Runtime, httpx.Client]) -> None:
+    back, before = [], ""
     for _ in range(3):
         one = page(busy[1], f"limit=5{before}")
-        assert one.next_after is None
-        found += sequences(one)
+        back += sequences(one)
         before = f"&before={one.next_before}"
-    assert found == list(reversed(range(12)))
-    assert one.next_before is None
-
-
-def test_a_follower_gets_each_event_once(busy: tuple[Runtime, httpx.Client]) -> None:
-    found, after = [], -1
+    assert back == list(reversed(range(12)))
+    assert (one.next_before, one.next_after) == (None, None)
+    forth, after = [], -1
     while (one := page(busy[1], f"limit=5&after={after}")).events:
-        assert one.next_before is None
-        found += sequences(one)
+        forth += sequences(one)
         after = sure(one.next_after)
-    assert found == list(range(12))
-    assert one.next_after == 11
-    # What follows is asked for with the same number.
-    assert page(busy[1], "after=11") == one
+    assert forth == list(range(12))
+    assert (one.next_before, one.next_after) == (None, 11)
+    assert page(busy[1], "after=11") == one  # what follows is asked for with the same number
     assert sequences(page(busy[1], "after=3&before=6")) == [4, 5]
 
 
@@ -89,14 +83,11 @@ def test_events_are_filtered(busy: tuple[Runtime, httpx.Client], query: str, exp
     assert sequences(page(busy[1], query)) == expected
 
 
-def test_events_are_cut_by_data_time(busy: tuple[Runtime, httpx.Client]) -> None:
-    times = [event.data.time_ns for event in page(busy[1], "after=-1").events]
-    assert times == sorted(times)
-    assert sequences(page(busy[1], f"since_ns={times[3]}&until_ns={times[7]}")) == [6, 5, 4, 3]
-
-
-def test_events_are_served_as_they_were_published(busy: tuple[Runtime, httpx.Client]) -> None:
+def test_events_are_cut_by_data_time_and_served_as_they_were_published(busy: tuple[Runtime, httpx.Client]) -> None:
     runtime, http = busy
+    times = [event.data.time_ns for event in page(http, "after=-1").events]
+    assert times == sorted(times)
+    assert sequences(page(http, f"since_ns={times[3]}&until_ns={times[7]}")) == [6, 5, 4, 3]
     stored = runtime.machines()[0].history.events(after=-1)
     assert http.get(f"{PLACE}/alarms/events?after=-1").text == (
         f'{{"events":[{",".join(one.text for one in stored)}],"next_before":null,"next_after":11}}'
@@ -164,17 +155,15 @@ def test_no_data_is_said_beside_a_raised_alarm_and_hides_it_not() -> None:
     assert conversion.health(IDENTITY, calm, FLOWING).state == "healthy"
 
 
-def test_event_identity_is_stable_and_differs_between_events() -> None:
+def test_the_identity_of_an_event_is_stable_and_that_of_a_machine_file_follows_its_content() -> None:
     alarm = Alarm("k_by", AlarmState.UNACKNOWLEDGED, occurrence=2)
     same = {alarm_cloud_event(IDENTITY, AlarmEvent(EventKind.RAISED, 77, 3, alarm)).id for _ in range(2)}
     other = alarm_cloud_event(IDENTITY, AlarmEvent(EventKind.ESCALATED, 77, 4, alarm))
     assert len(same) == 1
     assert other.id not in same
     assert other.sequence > "00000000000000000003"
-    assert other.time == "1970-01-01T00:00:00.000000Z"
-
-
-def test_machine_hash_follows_the_content() -> None:
+    assert (other.time, other.subject) == ("1970-01-01T00:00:00.000000Z", "k_by")
+    assert (other.type, other.source) == ("org.rotorwatch.alarm.escalated", "/rotorwatch/demo/lab")
     changed = LAB.model_copy(update={"description": "another"})
     assert machine_hash(LAB) == IDENTITY["machine_hash"]
     assert machine_hash(changed) != IDENTITY["machine_hash"]
@@ -195,7 +184,7 @@ def feed_on(runtime: Runtime, feed: Feed, blocks: int) -> None:
     until(lambda: runtime.machines()[0].health().quality.accepted_blocks == accepted + blocks, "blocks")
 
 
-def test_a_path_has_no_samples_from_before_a_gap(tmp_path: Path) -> None:
+def test_samples_are_held_for_a_bounded_time_and_none_are_joined_across_a_gap(tmp_path: Path) -> None:
     with fed(tmp_path) as (runtime, feed), client(runtime) as http:
         feed_on(runtime, feed, 20)
         before = answered(http.get(f"{PLACE}/orbits?revolutions=30"), OrbitSnapshot)
@@ -207,11 +196,6 @@ def test_a_path_has_no_samples_from_before_a_gap(tmp_path: Path) -> None:
         assert sure(after.path_start_ns) >= begin_ns
         assert 9 <= after.revolutions <= 11
         assert after.path_reason.startswith(f"{after.revolutions} of 30 revolutions: there are 0.5 s of samples")
-
-
-def test_samples_are_held_for_a_bounded_time(tmp_path: Path) -> None:
-    """20 000 samples and no more, however long the machine runs."""
-    with fed(tmp_path) as (runtime, feed):
         feed_on(runtime, feed, 130)
         held = runtime.machines()[0].latest.blocks
         assert sum(block.samples.shape[0] for block in held) == 20_000

@@ -139,8 +139,7 @@ def test_shelving_and_its_end_and_an_alarm_that_never_was(plant: tuple[Runtime, 
 
 def test_latched_alarms_are_reset_and_who_configures_takes_out(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
     runtime, feed, http = plant
-    for _ in range(130):  # until a hop is complete: then the data are free of gaps again
-        feed.put_good()
+    feed.put_good(130)  # until a hop is complete: then the data are free of gaps again
     until(lambda: state(http) == "latched-unacknowledged", "end of the gap")
     answered(http.post(f"{GAP}/acknowledge", json={"expected_state": "latched-unacknowledged"}), OperationDone)
     done = answered(http.post(f"{GAP}/reset", json={"expected_state": "latched-acknowledged"}), OperationDone)

@@ -1,37 +1,21 @@
 """Tokens over HTTP: what is told of them, who may give which scopes, and what the audit log says."""
 
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from fastapi import FastAPI
 
 from rotorwatch.records.monitor import TokenCreated, TokenEntry, TokenList
-from service.access.guard import Guard
 from service.access.scopes import Scope
-from service.api.routes.tokens import add_token_routes
 from service.settings.access import AccessSettings
-from tests.service.rig.guarded import Guarded, application, guarded, problem
+from tests.service.rig.guarded import Guarded, guarded, problem
 from tests.sure import sure
 
 READ, OPERATE, CONFIGURE = Scope
 TOKENS = "/api/v1/tokens"
 DAY_NS = 86_400 * 10**9
-
-
-def with_tokens(guard: Guard, done: list[str]) -> FastAPI:
-    app = application(guard, done)
-    add_token_routes(app, guard)
-    return app
-
-
-@pytest.fixture
-def monitor(tmp_path: Path) -> Iterator[Guarded]:
-    with guarded(tmp_path, build=with_tokens) as running:
-        yield running
 
 
 def create(client: httpx.Client, name: str = "control room", **wish: Any) -> TokenCreated:
@@ -125,6 +109,6 @@ def test_wrong_wishes_are_refused(monitor: Guarded, wish: dict[str, Any], said: 
 
 def test_where_no_token_is_needed_that_is_said(tmp_path: Path) -> None:
     settings = AccessSettings.model_validate({"open_on_loopback": True})
-    with guarded(tmp_path, settings, build=with_tokens) as monitor, monitor.client() as client:
+    with guarded(tmp_path, settings) as monitor, monitor.client() as client:
         create(client, scopes=["read", "operate", "configure"])
         assert client.get(TOKENS).json()["needed"] is False

@@ -98,8 +98,11 @@ def test_alarms_and_their_log(plant: Client, seen: tuple[Runtime, MachineWorker]
 def test_pages_are_joined(plant: Client, seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyPatch) -> None:
     reports, forwards = list(plant.reports(PLACE)), list(plant.alarm_events(PLACE, after=-1))
     assert len(reports) == seen[1].tally.windows > 10
+    readings = list(plant.readings(PLACE, "parameter", "k_by"))
     monkeypatch.setattr("rotorwatch.client.client._PAGE", 3)
     assert list(plant.reports(PLACE)) == reports
+    assert list(plant.readings(PLACE, "parameter", "k_by")) == readings
+    assert list(plant.readings(PLACE, "parameter", "k_by", since_ns=readings[2].end_ns)) == readings[2:]
     end_ns = [report.end_ns for report in reports]
     assert [r.end_ns for r in plant.reports(PLACE, since_ns=end_ns[8], until_ns=end_ns[1])] == end_ns[2:9]
     monkeypatch.setattr("rotorwatch.client.client._PAGE", 1)
@@ -108,17 +111,15 @@ def test_pages_are_joined(plant: Client, seen: tuple[Runtime, MachineWorker], mo
     assert [entry.number for entry in entries] == sorted((entry.number for entry in entries), reverse=True)
 
 
-def test_readings_over_time(plant: Client) -> None:
+def test_readings_over_time_and_snapshots(plant: Client) -> None:
     readings = list(plant.readings(PLACE, "parameter", "k_by"))
-    shown = [r.parameters[0].relative_change for r in plant.reports(PLACE) if r.parameters]
-    assert [reading.value for reading in readings] == shown[::-1]
+    shown = [one.parameters[0] for one in plant.reports(PLACE) if one.parameters][::-1]
+    assert [one.value for one in readings] == [one.relative_change for one in shown]
+    assert [one.standard_error for one in readings] == [one.standard_error for one in shown]
     (bucket,) = plant.trend(PLACE, "parameter", ["k_by"], points=1)
     assert (bucket.count, bucket.minimum) == (len(readings), min(reading.value for reading in readings))
     assert {one.name for one in plant.trend(PLACE, "parameter", points=2)} >= {"k_by", "e", "EI"}
     assert len(list(plant.readings(PLACE, "speed"))) == len(readings)
-
-
-def test_snapshots(plant: Client) -> None:
     (pair,) = plant.correlations(PLACE, [("y1", "z1")]).pairs
     assert (pair.first, pair.second) == ("y1", "z1")
     spectra = plant.spectra(PLACE, ["y1", "y2"], from_hz=10.0, to_hz=50.0)
@@ -176,13 +177,10 @@ def test_tokens(seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyP
         assert "screen has read" in str(caught.value)
 
 
-@pytest.mark.parametrize("url", ["127.0.0.1:8080", "", "ftp://plant", "http://", "http://[::1", "http://plant:99999"])
-def test_an_address_that_no_service_can_have_is_an_error_of_the_client(url: str) -> None:
-    with pytest.raises(ClientError, match=re.escape(f"url is {url!r}, expected http://HOST:PORT")):
-        Client(url)
-
-
-def test_nobody_there() -> None:
+def test_nobody_there_or_an_address_that_no_service_can_have() -> None:
+    for url in ("127.0.0.1:8080", "", "ftp://plant", "http://", "http://[::1", "http://plant:99999"):
+        with pytest.raises(ClientError, match=re.escape(f"url is {url!r}, expected http://HOST:PORT")):
+            Client(url)
     url = endpoint().replace("tcp/", "http://")
     with Client(url, "rw_x") as plant:
         with pytest.raises(NoAnswer, match=url):

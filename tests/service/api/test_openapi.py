@@ -118,11 +118,6 @@ def described(description: dict[str, Any]) -> set[tuple[str, str]]:
     return {(method.upper(), path) for path, methods in description["paths"].items() for method in methods}
 
 
-def test_every_route_is_described(runtime: Runtime, described: set[tuple[str, str]]) -> None:
-    assert routes(application(runtime)) <= described | UNDESCRIBED
-    assert len(described) >= 30
-
-
 def test_no_route_answers_without_a_valid_token(runtime: Runtime, described: set[tuple[str, str]]) -> None:
     asked = 0
     for text in ("", "rw_000000000000_" + 43 * "0", "secret"):
@@ -138,16 +133,23 @@ def test_no_route_answers_without_a_valid_token(runtime: Runtime, described: set
     assert asked >= 3 * 30
 
 
-def test_a_method_that_a_path_has_not_is_refused_by_name(http: httpx.Client, description: dict[str, Any]) -> None:
+def test_a_wrong_method_and_an_unknown_machine_are_refused_by_name(http: httpx.Client, description: Any) -> None:
     for path, methods in description["paths"].items():
         for method in {"get", "post", "put", "patch", "delete"} - methods.keys():
-            answer = http.request(method, path.format(**VALUES))
-            problem(answer, 405)
-            assert answer.headers["allow"] == ", ".join(sorted(methods)).upper()
+            answer, allowed = http.request(method, path.format(**VALUES)), ", ".join(sorted(methods)).upper()
+            assert answer.headers["allow"] == allowed
+            assert all(told in problem(answer, 405).detail for told in (method.upper(), allowed))
+        for method in methods if path.startswith("/api/v1/machines/{site}") else ():
+            found = problem(ask(http, method.upper(), path.replace("{machine}", "pump")), 404)
+            assert found.detail == "no machine demo/pump; there are: demo/lab", path
 
 
-def test_every_route_asks_for_its_scope(runtime: Runtime, http: httpx.Client, description: Any, described: Any) -> None:
+def test_routes_are_described_and_ask_for_their_scope(
+    runtime: Runtime, http: httpx.Client, description: Any, described: Any
+) -> None:
     """With all scopes but the one a route is refused, with that one alone it is not."""
+    assert routes(application(runtime)) <= described | UNDESCRIBED
+    assert len(described) >= 30
     with_scope = {scope: token(runtime, scope, name=f"only {scope}") for scope in Scope}
     without = {scope: token(runtime, *(one for one in Scope if one != scope), name=f"no {scope}") for scope in Scope}
     for method, path in sorted(described | UNDESCRIBED):
@@ -166,13 +168,6 @@ def test_every_route_asks_for_its_scope(runtime: Runtime, http: httpx.Client, de
             in_browsers = any("browser" in part for part in route.get("security", []))
             assert in_browsers == (declared == [[READ]]), path
     assert http.get("/openapi.json").status_code == 200
-
-
-def test_an_unknown_machine_is_a_problem_that_names_others(http: httpx.Client, description: dict[str, Any]) -> None:
-    for path, methods in description["paths"].items():
-        for method in methods if path.startswith("/api/v1/machines/{site}") else ():
-            found = problem(ask(http, method.upper(), path.replace("{machine}", "pump")), 404)
-            assert found.detail == "no machine demo/pump; there are: demo/lab", path
 
 
 def test_the_page_of_the_api_loads_nothing_from_elsewhere(http: httpx.Client) -> None:

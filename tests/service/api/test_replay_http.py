@@ -269,21 +269,15 @@ def test_unknown_replays(client: httpx.Client) -> None:
     problem(client.delete(f"{REPLAYS}/nothing"), 404)
 
 
-def test_without_a_directory_the_answer_names_the_setting() -> None:
+def test_what_the_settings_do_not_allow_names_them(directory: Path) -> None:
     with running(plan(None)) as runtime, monitored.client(runtime) as client:
         assert "[recording] directory" in problem(client.get(RECORDINGS), 404).detail
         assert "[recording] directory" in problem(client.post(REPLAYS, json={"recordings": [ID]}), 404).detail
         assert get(client, REPLAYS, ReplayList).replays == ()
-
-
-def test_switched_off_nothing_can_be_started(directory: Path) -> None:
     with running(plan(directory, enabled=False)) as runtime, monitored.client(runtime) as client:
         found = problem(client.post(REPLAYS, json={"recordings": [ID]}), 403)
         assert "[replay] enabled" in found.detail
         assert len(get(client, RECORDINGS, RecordingList, until_ns=START_NS + DAY_NS).recordings) == 3
-
-
-def test_a_paced_replay_that_nobody_would_let_in_is_refused(directory: Path) -> None:
     guarded = plan(directory)
     grant = Grant(who=("logger",), publishes=("demo/lab",))
     guarded = guarded.model_copy(update={"link": guarded.link.model_copy(update={"grants": (grant,)})})

@@ -24,6 +24,7 @@ from service.access.problems import add_problems
 from service.access.scopes import Caller, Scope
 from service.access.tls import server_arguments
 from service.access.tokens import new_token
+from service.api.routes.tokens import add_session_routes, add_token_routes
 from service.history.records import TokenRecord
 from service.history.store import Store
 from service.settings.access import AccessSettings
@@ -107,6 +108,8 @@ def application(guard: Guard, done: list[str]) -> FastAPI:
         return []
 
     app.include_router(alarms)
+    add_session_routes(app, guard)
+    add_token_routes(app, guard)
 
     @app.delete("/machine", dependencies=[guard.configure])
     def remove() -> str:
