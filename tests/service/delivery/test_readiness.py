@@ -16,7 +16,7 @@ from service.settings.service import ServiceSettings
 from service.stream.liveness import Pulse
 from tests.service.delivery.hooked import hook, settings_for
 from tests.service.delivery.test_metrics import parsed
-from tests.service.rig.live import IN_ORDER, endpoint, feeding, kept_in, machine_file, service, settings, until
+from tests.service.rig.live import IN_ORDER, endpoint, feeding, ignore, kept_in, machine_file, service, settings, until
 from tests.service.rig.monitored import client
 
 
@@ -66,7 +66,7 @@ def test_a_stuck_worker_is_a_reason_until_it_goes_on(monkeypatch: pytest.MonkeyP
     with service(endpoint()) as (runtime, worker):
         until(lambda: worker.status().alive, "the thread")
         assert asked(runtime)[0] == 200
-        worker.inbox.call(lambda: void(release.wait(600.0)))
+        worker.inbox.call(lambda: ignore(release.wait(600.0)))
         until(lambda: not runtime.readiness().ready, "the thread that does not answer")
         status, found = asked(runtime)
         assert status == 503
@@ -81,10 +81,6 @@ def test_a_stuck_worker_is_a_reason_until_it_goes_on(monkeypatch: pytest.MonkeyP
         assert runtime.readiness().reasons == ("demo/lab: the thread that evaluates its blocks has stopped",)
         assert asked(runtime)[0] == 503
         assert httpx.get(f"{runtime.http_url}/healthz", trust_env=False, timeout=180.0).json() == {"alive": True}
-
-
-def void(_: object) -> None:
-    pass
 
 
 def test_webhooks_and_recorders_are_stated_and_no_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,10 +1,13 @@
 """What a receiver of webhooks gets, in which order, and what becomes of its answers: a real history, real HTTP."""
 
+import socket
+import ssl
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import trustme
@@ -18,7 +21,7 @@ from service.history.records import Step, StoredEvent, StoreError
 from service.history.shared import WebhookCursors
 from service.history.store import Store
 from service.settings.webhooks import WebhookSettings
-from tests.service.delivery.hooked import Got, alarm_event, hook, settings_for
+from tests.service.delivery.hooked import Answering, Got, Hook, alarm_event, hook, settings_for
 from tests.service.rig.guarded import Clock
 from tests.service.rig.live import until
 from tests.service.rig.postgres import opened
@@ -76,6 +79,14 @@ def turned(settings: WebhookSettings, plant: Plant, cursors: WebhookCursors | No
         receiver.close()
 
 
+@contextmanager
+def delivering(
+    folder: Path, plant: Plant, answer: Answering = lambda _: (200, {}), **settings: Any
+) -> Iterator[tuple[Hook, Turned]]:
+    with hook(answer) as receiver, turned(settings_for(receiver, folder, **settings), plant) as webhook:
+        yield receiver, webhook
+
+
 def test_the_receiver_gets_the_very_event_signed_as_the_specification_says(tmp_path: Path, history: Plant) -> None:
     secret, former = new_secret(), new_secret()
     with hook() as receiver, turned(settings_for(receiver, tmp_path, f"{secret}\n\n{former}"), history) as webhook:
@@ -104,7 +115,7 @@ def test_the_receiver_gets_the_very_event_signed_as_the_specification_says(tmp_p
 def test_events_come_in_order_over_one_connection_and_a_new_webhook_begins_now(tmp_path: Path, history: Plant) -> None:
     history.happen(*(alarm_event(number) for number in range(3)))
     baked = (200, {"set-cookie": "who=me; path=/"})
-    with hook(lambda _: baked) as receiver, turned(settings_for(receiver, tmp_path), history) as webhook:
+    with delivering(tmp_path, history, lambda _: baked) as (receiver, webhook):
         new = [alarm_event(number) for number in range(3, 253)]
         history.logs["demo/lab"].commit(Step(events=tuple(new)))
         pumps = [alarm_event(number, "demo/pump") for number in range(5)]
@@ -121,16 +132,8 @@ def test_events_come_in_order_over_one_connection_and_a_new_webhook_begins_now(t
 
 
 def test_only_what_is_wanted_is_sent(tmp_path: Path, history: Plant) -> None:
-    with (
-        hook() as receiver,
-        turned(
-            settings_for(
-                receiver, tmp_path, machines=["demo/l*"], kinds=["raised", "escalated"], severities=["danger"],
-                annunciated_only=True,
-            ),
-            history,
-        ) as webhook,
-    ):  # fmt: skip
+    wishes: dict[str, Any] = {"machines": ["demo/l*"], "kinds": ["raised", "escalated"], "severities": ["danger"]}
+    with delivering(tmp_path, history, annunciated_only=True, **wishes) as (receiver, webhook):
         wanted = alarm_event(4, severity="danger", kind="escalated")
         history.happen(
             alarm_event(0, severity="danger", kind="cleared"), alarm_event(1),
@@ -146,10 +149,7 @@ def test_only_what_is_wanted_is_sent(tmp_path: Path, history: Plant) -> None:
 def test_trouble_is_followed_by_ever_longer_pauses_and_nothing_is_left_out(tmp_path: Path, history: Plant) -> None:
     statuses = (500, 503, 429, 408, 425, 502, 500, 500)
     answers = iter((*statuses, *[200] * 4))
-    with (
-        hook(lambda _: (next(answers), {})) as receiver,
-        turned(settings_for(receiver, tmp_path, longest_pause_s=20.0), history) as webhook,
-    ):
+    with delivering(tmp_path, history, lambda _: (next(answers), {}), longest_pause_s=20.0) as (receiver, webhook):
         history.happen(*(alarm_event(number) for number in range(3)))
         history.happen(alarm_event(0, "demo/pump"), place="demo/pump")
         pauses = []
@@ -178,7 +178,7 @@ def test_a_refused_event_holds_up_its_own_machine_only(tmp_path: Path, history: 
     def answer(got: Got) -> tuple[int, Mapping[str, str]]:
         return (status, {"location": target}) if got.id.startswith("demo/lab/1/") and refuse else (200, {})
 
-    with hook() as elsewhere, hook(answer) as receiver, turned(settings_for(receiver, tmp_path), history) as webhook:
+    with hook() as elsewhere, delivering(tmp_path, history, answer) as (receiver, webhook):
         refuse, target = True, elsewhere.url
         history.happen(*(alarm_event(number) for number in range(3)))
         history.happen(*(alarm_event(number, "demo/pump") for number in range(4)), place="demo/pump")
@@ -210,10 +210,7 @@ def test_a_refused_event_holds_up_its_own_machine_only(tmp_path: Path, history: 
 def test_a_receiver_that_refuses_is_there(tmp_path: Path, history: Plant) -> None:
     """Pauses begin anew after it."""
     statuses = [500, 500, 500, 404, 500]
-    with (
-        hook(lambda _: (statuses.pop(0), {})) as receiver,
-        turned(settings_for(receiver, tmp_path), history) as webhook,
-    ):
+    with delivering(tmp_path, history, lambda _: (statuses.pop(0), {})) as (_, webhook):
         history.happen(alarm_event(0))
         history.happen(alarm_event(0, "demo/pump"), place="demo/pump")
         for pause in (1.0, 2.0, 4.0, 1.0):
@@ -223,7 +220,7 @@ def test_a_receiver_that_refuses_is_there(tmp_path: Path, history: Plant) -> Non
 
 
 def test_how_far_it_has_come_is_remembered_at_once(tmp_path: Path, history: Plant) -> None:
-    with hook() as receiver, turned(settings_for(receiver, tmp_path), history) as webhook:
+    with delivering(tmp_path, history) as (receiver, webhook):
         history.happen(alarm_event(0), alarm_event(1))
         for number in (1, 2):
             assert webhook.dispatcher.turn() == 0.0
@@ -322,7 +319,7 @@ def test_a_history_that_cannot_be_read_is_looked_into_again(tmp_path: Path) -> N
 
 
 @pytest.fixture
-def silent() -> Iterator[Callable[[Got], tuple[int, Mapping[str, str]]]]:
+def silent() -> Iterator[Answering]:
     """An answer that does not come before the test is over."""
     over = threading.Event()
 
@@ -334,10 +331,8 @@ def silent() -> Iterator[Callable[[Got], tuple[int, Mapping[str, str]]]]:
     over.set()
 
 
-def test_a_slow_receiver_is_left(
-    tmp_path: Path, history: Plant, silent: Callable[[Got], tuple[int, Mapping[str, str]]]
-) -> None:
-    with hook(silent) as receiver, turned(settings_for(receiver, tmp_path, timeout_s=2.0), history) as webhook:
+def test_a_slow_receiver_is_left(tmp_path: Path, history: Plant, silent: Answering) -> None:
+    with delivering(tmp_path, history, silent, timeout_s=2.0) as (receiver, webhook):
         history.happen(alarm_event(0))
         assert (webhook.turns(), webhook.dispatcher.status().last_error) == (1.0, "no answer within 2 s")
         receiver.answer = lambda _: (200, {})
@@ -349,8 +344,6 @@ def test_a_slow_receiver_is_left(
 
 def test_a_receiver_that_drips_is_left_as_well(tmp_path: Path, history: Plant) -> None:
     """Every byte comes in time, the answer never does."""
-    import socket  # noqa: PLC0415  # only here
-
     over = threading.Event()
     with socket.create_server(("127.0.0.1", 0)) as listening:
 
@@ -375,9 +368,7 @@ def test_a_receiver_that_drips_is_left_as_well(tmp_path: Path, history: Plant) -
         thread.join(180)
 
 
-def test_stopping_does_not_wait_for_a_receiver(
-    tmp_path: Path, history: Plant, silent: Callable[[Got], tuple[int, Mapping[str, str]]]
-) -> None:
+def test_stopping_does_not_wait_for_a_receiver(tmp_path: Path, history: Plant, silent: Answering) -> None:
     with hook(silent) as receiver:
         settings = settings_for(receiver, tmp_path, timeout_s=300.0)
         dispatcher = Dispatcher(settings, Receiver(settings), history.logs, history.store.webhooks)
@@ -400,8 +391,6 @@ def test_nobody_listens(tmp_path: Path, history: Plant) -> None:
 
 
 def test_https_and_whose_certificate_is_believed(tmp_path: Path, history: Plant) -> None:
-    import ssl  # noqa: PLC0415  # only here
-
     authority = trustme.CA(key_type=trustme.KeyType.ECDSA)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     authority.issue_cert("127.0.0.1", key_type=trustme.KeyType.ECDSA).configure_cert(context)

@@ -4,12 +4,10 @@ import re
 from pathlib import Path
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from models.errors import MachineFileError
-from service.commands import webhook as webhook_commands
-from service.commands.running import Commands
+from service.commands.rotorwatch import app
 from service.delivery.webhooks.answer import Answer, Meaning, answer_of, pause_s
 from service.delivery.webhooks.receiver import Receiver
 from service.delivery.webhooks.signature import new_secret, parse_secret, signing_keys
@@ -41,12 +39,14 @@ def written(folder: Path, text: str) -> Path:
     return file
 
 
-def test_paths_are_beside_the_settings_and_filters_are_kept(tmp_path: Path) -> None:
+def test_paths_are_beside_the_settings_filters_are_kept_and_http_elsewhere_is_to_be_said(tmp_path: Path) -> None:
     pager, here = load_settings(written(tmp_path, GOOD)).webhooks
     assert pager.secret_file == tmp_path / "pager.secret"
     assert (pager.machines, pager.kinds, pager.severities) == (("demo/*",), ("raised", "escalated"), ("danger",))
     assert (pager.on_this_computer, here.on_this_computer) == (False, True)
     assert (here.machines, here.kinds, here.severities) == (("*/*",), (), ())
+    fields = {"name": "a", "url": "http://pager.example/", "secret_variable": "S", "insecure": True}
+    assert WebhookSettings.model_validate(fields).target == "http://pager.example"
 
 
 @pytest.mark.parametrize(
@@ -80,11 +80,6 @@ def test_mistakes_are_named_and_show_no_secret(tmp_path: Path, old: str, new: st
     without_names = re.sub(r" \((pager|here|a b)\):", ":", str(caught.value))
     assert f"plant.toml: {named}" in without_names
     assert "hush" not in str(caught.value)
-
-
-def test_http_elsewhere_only_if_it_is_said() -> None:
-    fields = {"name": "a", "url": "http://pager.example/", "secret_variable": "S", "insecure": True}
-    assert WebhookSettings.model_validate(fields).target == "http://pager.example"
 
 
 def with_secret(folder: Path, text: str, mode: int = 0o600) -> WebhookSettings:
@@ -133,20 +128,7 @@ def test_an_authority_that_is_none(tmp_path: Path) -> None:
             Receiver(settings_for("https://pager.example/", tmp_path, ca_file=tmp_path / file))
 
 
-@pytest.fixture
-def command() -> typer.Typer:
-    app = typer.Typer(cls=Commands)
-    app.add_typer(webhook_commands.commands)
-    return app
-
-
-def test_command_makes_secrets(command: typer.Typer) -> None:
-    made = [CliRunner().invoke(command, ["webhook", "secret"]).output.strip() for _ in range(2)]
-    assert all(len(parse_secret(one)) == 32 for one in made)
-    assert made[0] != made[1]
-
-
-def test_command_sends_a_test_event_that_is_no_alarm(tmp_path: Path, command: typer.Typer) -> None:
+def test_commands_make_secrets_and_send_a_test_event_that_is_no_alarm(tmp_path: Path) -> None:
     secret = new_secret()
     with hook() as receiver:
         settings_for(receiver, tmp_path, secret)
@@ -154,7 +136,7 @@ def test_command_sends_a_test_event_that_is_no_alarm(tmp_path: Path, command: ty
             tmp_path, f'[[webhooks]]\nname = "pager"\nurl = "{receiver.url}?key=hush"\nsecret_file = "hook.secret"\n'
         )
         arguments = ["webhook", "test", "pager", "--config", str(file)]
-        done = CliRunner().invoke(command, arguments)
+        done = CliRunner().invoke(app, arguments)
         assert done.exit_code == 0, done.output
         assert "accepted the test event" in done.output
         (got,) = receiver.got
@@ -162,13 +144,16 @@ def test_command_sends_a_test_event_that_is_no_alarm(tmp_path: Path, command: ty
         assert (event["type"], event["id"]) == ("org.rotorwatch.webhook.test", got.id)
         assert "no machine" in event["data"]["text"]
         receiver.answer = lambda _: (404, {})
-        refused = CliRunner().invoke(command, arguments)
+        refused = CliRunner().invoke(app, arguments)
         assert (refused.exit_code, len(receiver.got)) == (1, 2)
         assert "did not accept the test event: 404 Not Found" in refused.output
         assert "hush" not in done.output + refused.output
-        unknown = CliRunner().invoke(command, ["webhook", "test", "lamp", "--config", str(file)])
+        unknown = CliRunner().invoke(app, ["webhook", "test", "lamp", "--config", str(file)])
         assert unknown.exit_code == 2
         assert "no webhook lamp; there are: pager" in unknown.output
+    made = [CliRunner().invoke(app, ["webhook", "secret"]).output.strip() for _ in range(2)]
+    assert all(len(parse_secret(one)) == 32 for one in made)
+    assert made[0] != made[1]
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """kill -9 of the recorder at random moments: what it called safe is there, the rest is bounded and stated."""
 
-import json
 import os
 import re
 import subprocess
@@ -55,9 +54,9 @@ class Victim:
     recorder: Program
     kill_at: int
 
-    def status(self, name: str) -> int:
-        lines = self.recorder.output().rpartition("\n")[0].splitlines()
-        return int(json.loads(lines[-1])[name]) if lines else 0
+    @property
+    def safe(self) -> int:
+        return int(self.recorder.latest().get("safe", 0))
 
 
 def on_disk(folder: Path, scratch: Path) -> list[tuple[bytes, bytes]]:
@@ -107,7 +106,7 @@ def test_nothing_that_was_safe_is_lost_when_the_recorder_is_killed_again_and_aga
                         alive.remove(victim)
                         losses.append(check(victim, send.sent, before, tmp_path))
                     until(
-                        lambda a=alive, s=send: all(len(s.sent) - one.status("safe") < WINDOW for one in a),  # type: ignore[misc]
+                        lambda a=alive, s=send: all(len(s.sent) - one.safe < WINDOW for one in a),  # type: ignore[misc]
                         "confirmation of what was sent",
                     )
     assert len(losses) == ROUNDS * BESIDE
@@ -136,7 +135,7 @@ def check(
     earlier = before[victim.folder]
     assert found[: len(earlier)] == earlier  # what earlier rounds left is still there, recovered by this recorder
     new = found[len(earlier) :]
-    assert len(new) >= victim.status("safe")
+    assert len(new) >= victim.safe
     if new:
         first = sent.index(new[0])
         assert new == sent[first : first + len(new)]  # byte by byte, none missing in between

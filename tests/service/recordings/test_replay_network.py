@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage, read_recording
 from service.recordings.replay.control import Control
@@ -18,7 +17,7 @@ from service.stream.inbox import RawBlock
 from service.stream.replay_link import LiveMachineError, NetworkPlan, replay_to_network
 from service.stream.transport import Link, MachineCallbacks, MachineLink, route
 from tests.loopback import session_of
-from tests.service.rig.live import LAB, endpoint, scenario_blocks, until
+from tests.service.rig.live import LAB, endpoint, ignore, no_events, scenario_blocks, until
 from tests.service.rig.replaying import recording, write
 
 Heard = list[tuple[str, bytes, bytes, str]]
@@ -124,14 +123,13 @@ def replay_until_refused(source: RecordingSource, what: NetworkPlan, errors: lis
 @pytest.mark.parametrize("who", ["publisher", "monitor"])
 def test_original_keys_are_left_as_soon_as_somebody_live_appears(source: RecordingSource, who: str) -> None:
     address, errors = endpoint(), list[str]()
-    keys = MachineKeys("demo", "lab")
-    with session(address) as other, hearing(other, keys.stream) as heard:
+    with session(address) as other, hearing(other, LAB.keys.stream) as heard:
         # Three seconds of recording at this pace would take half a minute.
         slow = plan(source, address, "", pace=0.1)
         thread = threading.Thread(target=replay_until_refused, args=(source, slow, errors))
         thread.start()
         until(lambda: bool(heard), "first block")
-        token = other.liveliness().declare_token(keys.publisher_alive if who == "publisher" else keys.monitor_alive)
+        token = other.liveliness().declare_token(getattr(LAB.keys, f"{who}_alive"))
         thread.join()
         token.undeclare()  # type: ignore[no-untyped-call]
     (error,) = errors
@@ -143,10 +141,7 @@ def test_original_keys_are_left_as_soon_as_somebody_live_appears(source: Recordi
 def test_a_monitor_that_starts_during_a_replay_on_the_original_keys_takes_none_of_it(source: RecordingSource) -> None:
     address, taken, errors = endpoint(), list[RawBlock](), list[str]()
 
-    def nothing(_: object) -> None:
-        return None
-
-    callbacks = MachineCallbacks(taken.append, nothing, nothing, nothing, lambda: "{}", lambda: "{}", lambda *_: "[]")
+    callbacks = MachineCallbacks(taken.append, ignore, ignore, ignore, lambda: "{}", lambda: "{}", no_events)
     with route(LinkSettings(listen=(address,))):
         other = Link(LinkSettings(mode="client", connect=(address,)))
         slow = plan(source, address, "", pace=0.5)

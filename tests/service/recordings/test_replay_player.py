@@ -88,15 +88,9 @@ def test_the_descriptor_of_a_time_is_the_latest_before_it(tmp_path: Path) -> Non
     key = "rotorwatch/demo/lab/descriptor"
     said = [message(at, key, str(at).encode()) for at in (1.0, 2.0, 3.0)]
     source = RecordingSource([write(tmp_path / "a.mcap", [message(0.5), *said])])
-    machine = source.machine()
-
-    def found(before_ns: int | None = None) -> bytes:
-        descriptor = sure(source.descriptor(machine, before_ns))
-        return descriptor.payload
-
-    assert found() == found(0) == b"1.0"
-    assert found(25 * SECOND // 10) == b"2.0"
-    assert found(9 * SECOND) == b"3.0"
+    for before_s, expected in ((None, b"1.0"), (0, b"1.0"), (2.5, b"2.0"), (9, b"3.0")):
+        found = source.descriptor(source.machine(), None if before_s is None else round(before_s * SECOND))
+        assert sure(found).payload == expected
 
 
 @pytest.mark.parametrize("missing", ["absent.mcap", "text.mcap", "empty.mcap: contains no message"])
@@ -122,31 +116,25 @@ def plan(pace: float | None = None, from_s: float = 0.0, to_s: float = 100.0) ->
     return PlayPlan({KEY}, pace, round(from_s * SECOND), round(to_s * SECOND))
 
 
-def test_messages_are_handed_out_as_they_were(tmp_path: Path) -> None:
-    said = [message(1.0), RecordedMessage(KEY, b"\0\xff", b"header", "a/b;c", 2 * SECOND, 3), message(2.5, "other")]
-    taker = Taker()
-    assert play(RecordingSource([write(tmp_path / "a.mcap", said)]), taker.put, plan(), Control()) == 2
-    assert taker.messages == said[:2]
-
-
-def test_seeking_forward_skips_and_back_repeats(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("at_s", "order", "where", "expected"),
+    [
+        (1.0, lambda control: control.seek_by(5.0), plan(), (*range(11), *range(60, 100))),
+        (2.0, lambda control: control.seek(SECOND), plan(pace=1000.0), (*range(21), *range(10, 100))),
+        (4.0, lambda control: control.seek_by(-60.0), plan(from_s=3.0, to_s=5.0), (*range(30, 41), *range(30, 50))),
+        (4.0, lambda control: control.seek_by(60.0), plan(from_s=3.0, to_s=5.0), (*range(30, 41),)),
+        (1.0, lambda control: control.stop("enough"), plan(), (*range(11),)),
+    ],
+    ids=["forward", "back", "before the beginning", "after the end", "stopped"],
+)
+def test_an_order_holds_from_the_next_message_on(
+    tmp_path: Path, at_s: float, order: Callable[[Control], object], where: PlayPlan, expected: tuple[int, ...]
+) -> None:
     source, control = RecordingSource([tens(tmp_path / "a.mcap", 0, 100)]), Control()
-    taker = Taker(1.0, lambda: control.seek_by(5.0))
-    play(source, taker.put, plan(), control)
-    assert taker.times == [at / 10 for at in (*range(11), *range(60, 100))]
-    taker = Taker(2.0, lambda: control.seek(SECOND))
-    play(source, taker.put, plan(pace=1000.0), control)
-    assert taker.times == [at / 10 for at in (*range(21), *range(10, 100))]
-
-
-def test_seeking_stays_within_what_is_replayed(tmp_path: Path) -> None:
-    source, control = RecordingSource([tens(tmp_path / "a.mcap", 0, 100)]), Control()
-    taker = Taker(4.0, lambda: control.seek_by(-60.0))
-    play(source, taker.put, plan(from_s=3.0, to_s=5.0), control)
-    assert taker.times == [at / 10 for at in (*range(30, 41), *range(30, 50))]
-    taker = Taker(4.0, lambda: control.seek_by(60.0))
-    play(source, taker.put, plan(from_s=3.0, to_s=5.0), control)
-    assert taker.times == [at / 10 for at in range(30, 41)]
+    taker = Taker(at_s, lambda: order(control))
+    assert play(source, taker.put, where, control) == len(expected)
+    assert taker.times == [at / 10 for at in expected]
+    assert control.reason == ("enough" if control.stopped else "")
 
 
 def test_a_paused_replay_says_where_it_was_moved_and_does_not_end_at_the_end(tmp_path: Path) -> None:
@@ -163,13 +151,6 @@ def test_a_paused_replay_says_where_it_was_moved_and_does_not_end_at_the_end(tmp
     control.resume()
     thread.join()
     assert taker.times == [at / 10 for at in (*range(21), *range(90, 100))]
-
-
-def test_stopping_ends_before_the_next_message(tmp_path: Path) -> None:
-    control = Control()
-    taker = Taker(1.0, lambda: control.stop("enough"))
-    assert play(RecordingSource([tens(tmp_path / "a.mcap", 0, 100)]), taker.put, plan(), control) == 11
-    assert (control.stopped, control.reason) == (True, "enough")
 
 
 def test_a_paused_replay_waits_and_its_clock_stands_still() -> None:
