@@ -94,7 +94,7 @@ def act(kind: str, name: str = "k_by", **more: object) -> OperatorAction:
     return OperatorAction(kind, name, "anna", **{"reason": "told so", **more})  # type: ignore[arg-type]
 
 
-def test_acknowledged_then_cleared_is_normal_and_cleared_then_acknowledged_too() -> None:
+def test_acknowledged_and_cleared_in_any_order_is_normal_and_danger_opens_it_again() -> None:
     book, now_s = raised()
     (event,) = book.operate(act("acknowledge"), now_s * S)
     assert (event.kind, event.actor, event.before, event.alarm.state) == (
@@ -107,9 +107,6 @@ def test_acknowledged_then_cleared_is_normal_and_cleared_then_acknowledged_too()
     assert state_of(book) is AlarmState.RETURNED
     book.operate(act("acknowledge"), (now_s + 30) * S)
     assert state_of(book) is AlarmState.NORMAL
-
-
-def test_danger_opens_the_acknowledgement_again() -> None:
     book, now_s = raised()
     book.operate(act("acknowledge"), now_s * S)
     (event,) = book.update("k_by", -0.7, 0.01, (now_s + 5) * S, named=True)
@@ -127,16 +124,7 @@ def test_shelving_ends_by_itself_and_what_is_there_then_is_unacknowledged() -> N
     assert state_of(book) is AlarmState.UNACKNOWLEDGED
 
 
-def test_one_shot_shelving_ends_with_the_condition() -> None:
-    book, now_s = raised()
-    book.operate(act("shelve", one_shot=True), now_s * S)
-    events = cleared(book, "k_by", now_s + 5)
-    assert [event.kind for event in events] == ["cleared", "unshelved"]
-    assert not events[0].alarm.state.annunciated
-    assert state_of(book) is AlarmState.NORMAL
-
-
-def test_shelved_without_one_shot_follows_its_condition_unheard() -> None:
+def test_one_shot_shelving_ends_with_the_condition_and_other_shelving_follows_it_unheard() -> None:
     book, now_s = raised()
     book.operate(act("shelve", duration_s=HOUR_S), now_s * S)
     assert [event.kind for event in cleared(book, "k_by", now_s + 5)] == ["cleared"]
@@ -145,6 +133,12 @@ def test_shelved_without_one_shot_follows_its_condition_unheard() -> None:
         ("raised", 2, AlarmState.SHELVED)
     ]
     assert "(shelved)" in told[0].text
+    book, now_s = raised()
+    book.operate(act("shelve", one_shot=True), now_s * S)
+    events = cleared(book, "k_by", now_s + 5)
+    assert [event.kind for event in events] == ["cleared", "unshelved"]
+    assert not events[0].alarm.state.annunciated
+    assert state_of(book) is AlarmState.NORMAL
 
 
 def test_shelving_needs_a_reason_and_has_a_longest_time() -> None:

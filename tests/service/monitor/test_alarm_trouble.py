@@ -393,15 +393,6 @@ def test_a_silence_is_longer_than_a_block() -> None:
         IngestSettings(block_to_s=30.0)
 
 
-def test_data_that_come_late_without_a_gap_end_the_silence_not_before_it_began() -> None:
-    monitor = MachineMonitor(install(machine(), None))
-    monitor.step(block(0))
-    (lost,) = monitor.passed(START_NS + 20 * S)
-    (again,) = monitor.step(block(1)).events
-    assert (lost.kind, again.kind) == ("raised", "cleared")
-    assert again.time_ns == lost.time_ns == block(0).end_ns + 5 * S
-
-
 def test_an_alarm_comes_back_when_its_rule_is_taken_out_of_the_machine_file() -> None:
     rules = [{"alarms": ["k_by"], "while_alarm": "data-stuck", "because": "a sensor is stuck"}]
     book = AlarmBook(AlarmSettings.model_validate({"suppress": rules}))
@@ -445,7 +436,7 @@ def test_danger_too_must_have_been_found() -> None:
     assert [event.kind for event in book.update("k_by", -0.9, 0.5, 2 * S, named=True)] == ["escalated"]
 
 
-def test_a_gap_and_a_silence_name_the_time_without_data() -> None:
+def test_a_gap_and_a_silence_name_the_time_without_data_and_do_not_end_before_they_began() -> None:
     monitor = MachineMonitor(install(machine(), None))
     monitor.step(block(0))
     lost, again, gap = monitor.step(block(21, sequence=21, run=2)).events
@@ -454,6 +445,12 @@ def test_a_gap_and_a_silence_name_the_time_without_data() -> None:
     for event, until_ns in ((lost, end_ns + 5 * S), (gap, block(21).start_ns)):
         assert event.alarm.evidence is not None
         assert (event.alarm.evidence.start_ns, event.alarm.evidence.end_ns) == (end_ns, until_ns)
+    monitor = MachineMonitor(install(machine(), None))
+    monitor.step(block(0))
+    (lost,) = monitor.passed(START_NS + 20 * S)
+    (again,) = monitor.step(block(1)).events
+    assert (lost.kind, again.kind) == ("raised", "cleared")
+    assert again.time_ns == lost.time_ns == block(0).end_ns + 5 * S
 
 
 def test_a_reading_that_is_no_number_is_left_out_and_holds_nothing_up() -> None:

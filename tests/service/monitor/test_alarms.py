@@ -98,15 +98,11 @@ def test_events_carry_occurrence_sequence_severity_and_a_sentence() -> None:
     assert events[3].text.startswith("DANGER: bearing stiffness, horizontal (k_by) changed further, now +60.0%")
     assert events[4].text.startswith("cleared: ")
     assert book.severity is None
-
-
-def test_severity_is_the_highest_of_the_raised_alarms() -> None:
-    _, book, _ = play("xxx")
-    severities = [book.severity]
+    _, both, _ = play("xxx")
     for number in range(4):
-        book.update("e", 0.9, 0.01, number * 5_000_000_000, named=True)
-    severities.append(book.severity)
-    assert severities == [Severity.ALERT, Severity.DANGER]
+        both.update("e", 0.9, 0.01, number * 5_000_000_000, named=True)
+    # The highest of the raised alarms.
+    assert [one.severity for one in (play("xxx")[1], both)] == [Severity.ALERT, Severity.DANGER]
 
 
 def test_own_limits_of_a_parameter() -> None:
@@ -132,15 +128,11 @@ def test_missing_data_and_data_health_are_alarms_of_their_own_and_not_of_the_mac
     (event,) = book.update_state(STREAM_LOST, False, 3 * 10**11, at_once=True)
     assert event.text == "cleared: data are arriving again"
     empty = AlarmBook(SETTINGS)
+    assert not empty.update_state("data-gap", False, 0)  # what was never seen makes no alarm
+    assert [*empty.alarms] == []
     empty.update_state("data-stuck", True, 0, "y1 stands still", at_once=True)
     assert empty.severity is None
     assert empty.alarms[0].raised
-
-
-def test_what_was_never_seen_makes_no_alarm() -> None:
-    book = AlarmBook(SETTINGS)
-    assert not book.update_state("data-gap", False, 0)
-    assert book.alarms == ()
 
 
 @pytest.mark.parametrize("kind", FaultKind)
@@ -199,7 +191,7 @@ def test_a_name_needs_to_be_as_good_as_certain() -> None:
     assert judged([NOT_SURE] * 3 + [SURE] * 6) == ["raised changed", "raised c_bz", "cleared changed"]
 
 
-def test_where_most_has_changed_outside_the_model_nothing_is_named() -> None:
+def test_where_most_has_changed_outside_the_model_or_a_line_hides_the_machine_nothing_is_named() -> None:
     most = dict.fromkeys(("k_by", "c_by", "k_bz", "c_bz"), 0.99)
     assert judged([most] * 3) == [f"raised {name}" for name in most]
     assert judged([most] * 3, outside=True) == ["raised model"]
@@ -207,6 +199,10 @@ def test_where_most_has_changed_outside_the_model_nothing_is_named() -> None:
     assert judged([SURE] * 3 + [most] * 9, outside=True)[-1] == "cleared c_bz"
     half = ["raised c_by", "raised k_bz", "raised c_bz", "raised model"]
     assert judged([most | {"k_by": 0.1}] * 3, outside=True) == half
+    assert judged([SURE] * 3, outside=True) == ["raised c_bz", "raised model"]
+    assert judged([SURE] * 9, outside=True, hidden=True) == ["raised model"]
+    nothing = {"c_by": 0.02, "c_bz": 0.04}
+    assert judged([nothing] * 9, outside=True, hidden=True) == ["raised model"]
 
 
 @pytest.mark.parametrize("change", [-0.08, 0.2, -0.6])  # below and above all limits
@@ -253,13 +249,6 @@ def test_an_unbalance_beside_both_stiffnesses_without_parameters_is_named_with_r
     assert named == dict.fromkeys(stiff, False) | {"e": reserve}
 
 
-def test_where_a_line_hides_the_machine_nothing_is_named() -> None:
-    assert judged([SURE] * 3, outside=True) == ["raised c_bz", "raised model"]
-    assert judged([SURE] * 9, outside=True, hidden=True) == ["raised model"]
-    nothing = {"c_by": 0.02, "c_bz": 0.04}
-    assert judged([nothing] * 9, outside=True, hidden=True) == ["raised model"]
-
-
 def test_a_name_is_held_with_reserve_once_nothing_explains_the_machine() -> None:
     book, named = AlarmBook(SETTINGS), verdict({"c_bz": 0.97})
     unexplained = named.model_copy(update={"current": (), "candidates": (), "outside_model": True})
@@ -271,21 +260,20 @@ def test_a_name_is_held_with_reserve_once_nothing_explains_the_machine() -> None
     assert reserves == [(False, False)] * 2 + [(True, False), (True, True), (True, True), (True, False)]
 
 
-def test_what_levels_show_is_told_while_nothing_can_be_read() -> None:
-    book, suspect = AlarmBook(SETTINGS), "a line at 65 Hz"
+@pytest.mark.parametrize(
+    ("suspect", "astride_s", "said"),
+    [
+        ("a line at 65 Hz", 0.0, "best explained by: a line at 65 Hz"),
+        ("", 60.0, "if a parameter has just changed, it can be named in 60 s"),
+    ],
+)
+def test_what_a_machine_outside_the_model_may_have_is_told(suspect: str, astride_s: float, said: str) -> None:
+    book, outside = AlarmBook(SETTINGS), verdict({}, outside=True, settled=False)
     for number in range(3):
-        book.found(verdict({}, outside=True, settled=False), "", suspect, number * 5_000_000_000)
+        left_s = max(0.0, astride_s - 5.0 * number)
+        book.found(outside, "", suspect, number * 5_000_000_000, astride_s=left_s)
     (event,) = book.take()
-    assert event.text == f"ALERT: outside the model: best explained by: {suspect}"
-
-
-def test_that_the_model_does_not_hold_may_be_the_moment_of_a_change() -> None:
-    book = AlarmBook(SETTINGS)
-    for number in range(3):
-        astride_s = 60.0 - 5.0 * number
-        book.found(verdict({}, outside=True, settled=False), "", "", number * 5_000_000_000, astride_s=astride_s)
-    (event,) = book.take()
-    assert event.text == "ALERT: outside the model: if a parameter has just changed, it can be named in 60 s"
+    assert event.text == f"ALERT: outside the model: {said}"
 
 
 def test_a_name_that_is_taken_back_is_cleared_however_large_its_reading() -> None:

@@ -14,7 +14,7 @@ from rotorwatch.records.windows import Parameter
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
-from tests.service.rig.watching import feed, resumed
+from tests.service.rig.watching import feed, named, resumed
 
 LAB = load_machine("lab")
 SEED = 4_910_001
@@ -38,33 +38,27 @@ def e_of(parameters: tuple[Parameter, ...]) -> float:
     return found
 
 
-@pytest.mark.parametrize("phase_rad", [0.15, 2.5])
-def test_where_the_file_does_not_say_where_the_heavy_spot_is_its_angle_is_no_unbalance(phase_rad: float) -> None:
-    larger = Event(at_s=80.0, parameter="e", relative_change=0.5)
-    going, parts = MachineMonitor(Installed(LAB)), stream(130.0, phase_rad, larger)
-    windows, events = feed(going, parts[:750])
-    assert not events
-    assert abs(e_of(windows[-1].parameters)) < 0.05
-    windows, events = feed(resumed(going, Installed(LAB)), parts[750:])
-    assert [event.alarm.name for event in events if event.kind == "raised"] == ["e"]
-    assert e_of(windows[-1].parameters) == pytest.approx(0.5, abs=0.1)
-
-
-@pytest.mark.parametrize("backward", [False, True])
-def test_without_a_shaft_angle_the_unbalance_is_judged_by_its_size(backward: bool) -> None:
-    """Whichever way the shaft turns; seen in a mirror it turns the other way."""
-    sensors = tuple(one for one in LAB.sensors if one.name != "theta")
+@pytest.mark.parametrize(
+    ("phase_rad", "angle", "backward"),
+    [(0.15, True, False), (2.5, True, False), (2.5, False, False), (2.5, False, True)],
+)
+def test_where_the_file_does_not_say_where_the_heavy_spot_is_its_angle_is_no_unbalance(
+    phase_rad: float, angle: bool, backward: bool
+) -> None:
+    """With a shaft angle or without, also after a restart, whichever way it turns; in a mirror it turns the other."""
+    sensors = tuple(one for one in LAB.sensors if angle or one.name != "theta")
     mirror = np.array([-1.0 if backward and one.direction == "z" else 1.0 for one in sensors], dtype=np.float32)
     larger = Event(at_s=80.0, parameter="e", relative_change=0.5)
-    parts = [replace(one, samples=one.samples[:, :-1] * mirror) for one in stream(145.0, 2.5, larger)]
-    going = MachineMonitor(Installed(LAB.model_copy(update={"sensors": sensors})))
+    parts = [replace(one, samples=one.samples[:, : len(sensors)] * mirror) for one in stream(145.0, phase_rad, larger)]
+    installed = Installed(LAB.model_copy(update={"sensors": sensors}))
+    going = MachineMonitor(installed)
     windows, events = feed(going, parts[:750])
     assert not events
     assert abs(e_of(windows[-1].parameters)) < 0.05
-    windows, events = feed(going, parts[750:])
-    assert [event.alarm.name for event in events if event.kind == "raised"] == ["e"]
+    windows, events = feed(resumed(going, installed), parts[750:])
+    assert [name for kind, name in named(events) if kind == "raised"] == ["e"]
     assert e_of(windows[-1].parameters) == pytest.approx(0.5, abs=0.1)
-    assert all(one.vector is None for one in windows[-1].parameters)  # it has no direction
+    assert angle or all(one.vector is None for one in windows[-1].parameters)  # without it, it has no direction
 
 
 @pytest.mark.parametrize("angle", [True, False])

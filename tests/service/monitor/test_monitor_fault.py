@@ -144,8 +144,7 @@ def test_a_full_queue_says_so_to_operators(tmp_path: Path) -> None:
         until(lambda: worker.health().quality.accepted_blocks == 1, "first block")
         held = np.zeros(1, dtype=bool)
         worker.inbox.call(lambda: until(lambda: bool(held[0]), "the end of the hold-up"))
-        for _ in range(40):
-            feed.put_good()
+        feed.put_good(40)
         until(lambda: worker.inbox.dropped == 30, "a queue that was thrown away")
         held[0] = True
         until(lambda: worker.health().quality.gaps == 1, "what came after")

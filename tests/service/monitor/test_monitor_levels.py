@@ -281,16 +281,13 @@ def test_a_machine_that_is_watched_says_what_would_have_been_seen() -> None:
     assert latest(monitor).level_growth is None  # an alert says more
 
 
-def test_status_says_what_would_have_been_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_status_says_what_would_have_been_seen_and_fits_narrow_terminals(monkeypatch: pytest.MonkeyPatch) -> None:
     growth = LevelGrowth.model_validate(example(LevelGrowth))
     report = Report.model_validate(example(Report)).model_copy(update={"level_growth": growth})
     health = Health.model_validate(example(Health)).model_copy(update={"report": report})
     monkeypatch.setattr(watching, "_fetch_healths", lambda *_: [health])
     said = CliRunner().invoke(app, ["status"]).stdout
     assert f"demo/lab: {growth.text}" in said
-
-
-def test_status_names_the_machines_in_a_narrow_terminal_too(monkeypatch: pytest.MonkeyPatch) -> None:
     health = Health.model_validate(example(Health)).model_copy(update={"site": "north", "machine": "feed-pump-7"})
     monkeypatch.setattr(watching, "_fetch_healths", lambda *_: [health])
     said = CliRunner().invoke(app, ["status"], env={"COLUMNS": "60"}).stdout
