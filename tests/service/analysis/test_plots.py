@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
 
 from models.commissioning.commissioned import install
 from models.diagnosis.networks.bundle import load_bundle
-from models.errors import MachineFileError, PictureError, RotorwatchError
+from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData
@@ -24,8 +23,7 @@ from service.analysis.correlation import correlations_of, latest_window
 from service.analysis.figures.spectrum import Lines, paint_spectrum, paint_waterfall
 from service.analysis.figures.style import Look, draw
 from service.analysis.figures.trend import paint_trend
-from service.analysis.orbit import phase_lag_deg, read_orbits
-from service.analysis.recorded import Recorded
+from service.analysis.orbit import read_orbits
 from service.analysis.spectrum import read_spectrum, read_waterfall, shown_as
 from service.analysis.trend import TrendSeries, read_trend, trend_of
 from service.recordings.replay.offline import OfflineReplay
@@ -55,8 +53,7 @@ def lines(faulty: Path) -> list[dict[str, object]]:
 
 @pytest.fixture(scope="module")
 def computed(faulty: Path) -> TrendSeries:
-    source = RecordingSource([faulty])
-    return read_trend(Recorded(source, LAB.keys, source.span().start_ns, source.span().end_ns + 1))
+    return read_trend(recorded(faulty))
 
 
 def reports_of(lines: list[dict[str, object]]) -> list[Report]:
@@ -80,27 +77,6 @@ def test_the_orbit_of_a_simulated_unbalance_is_the_ellipse_of_the_equations_of_m
         assert orbit.ellipse.precession == "forward"
         assert orbit.marks_um.shape == (9, 2)  # the pulse that begins and the one that ends, and between
         assert orbit.marks_um == pytest.approx(np.tile([y.real, z.real], (9, 1)), abs=0.01 * abs(y))
-
-
-def test_a_shaft_that_turns_backwards(tmp_path: Path) -> None:
-    """Angle falls; y peaks 90° after the pulse; the motion goes against the rotation."""
-    turn = 2 * np.pi * 25.0
-    signals = {
-        "theta": lambda t: (1.0 - turn * t) % (2 * np.pi),
-        "y1": lambda t: 30 * np.cos(turn * t - 1.0 - np.pi / 2) + 400,
-        "z1": lambda t: 10 * np.sin(turn * t - 1.0 - np.pi / 2) - 300,
-    }
-    found = read_orbits(made(tmp_path, signals, 3.0), 5)
-    bearing = found.orbits[0]
-    assert found.direction == -1
-    assert found.speed_rad_s == pytest.approx(-turn, rel=1e-3)
-    ellipse = bearing.ellipse
-    assert 2 * abs(ellipse.y) == pytest.approx(60, rel=1e-3)
-    assert phase_lag_deg(ellipse.y, found.direction) == pytest.approx(90, abs=0.2)
-    assert phase_lag_deg(ellipse.z, found.direction) == pytest.approx(180, abs=0.2)
-    assert (2 * ellipse.semi_major, 2 * ellipse.semi_minor) == pytest.approx((60, 20), rel=1e-3)
-    assert ellipse.precession == "backward"  # y to z, and the shaft turns from z to y
-    assert abs(bearing.y_um.mean()) < 1
 
 
 def test_orbits_need_so_many_revolutions_without_a_gap(tmp_path: Path) -> None:
@@ -223,21 +199,10 @@ def test_a_waterfall_follows_a_run_up_over_time_and_speed(tmp_path: Path) -> Non
     assert (strongest_hz < fast_hz + 0.76).all()
 
 
-def test_a_speed_axis_needs_a_speed_that_changes(faulty: Path) -> None:
-    stream = recorded(faulty, seconds=(0, 20))
-    found = read_waterfall(stream, stream.chosen(())[0], 4.0, 0.5, "amplitude")
-    assert found.values.shape[0] == 5
-    with pytest.raises(RotorwatchError, match=r"the speed stays at 1320 rpm"):
-        found.over_speed()
-    with pytest.raises(RotorwatchError, match="1 spectra of demo/lab over 20 s without a gap, expected at least 2"):
-        read_waterfall(stream, stream.chosen(())[0], 20.0, 0.5, "amplitude")
-
-
 @pytest.mark.parametrize("nth", [-1, 3])
 def test_correlation_panels_have_figures_of_the_report(faulty: Path, lines: list[dict[str, object]], nth: int) -> None:
     report = [one for one in reports_of(lines) if one.equations][nth]
-    source = RecordingSource([faulty])
-    window = latest_window(Recorded(source, LAB.keys, source.span().start_ns, report.end_ns + S), LAB)
+    window = latest_window(recorded(faulty, seconds=(0, (report.end_ns - START_NS) / S + 1)), LAB)
     panels = correlations_of(window, LAB, load_bundle("lab", LAB))
     assert (window.start_ns, window.end_ns) == (report.start_ns, report.end_ns)
     by_number = {panel.reading.equation: panel for panel in panels}
@@ -259,20 +224,13 @@ def test_correlation_panels_have_figures_of_the_report(faulty: Path, lines: list
 
 def test_curves_are_labelled_with_their_references(faulty: Path) -> None:
     """Each curve against the window's own correlation of that reference with the target."""
-    source = RecordingSource([faulty])
-    window = latest_window(Recorded(source, LAB.keys, source.span().start_ns, source.span().end_ns + 1), LAB)
+    window = latest_window(recorded(faulty), LAB)
     panel = correlations_of(window, LAB, load_bundle("lab", LAB))[0]
     lags = window.lags_s >= 0.0099
     for curve in panel.curves:
         i, j = window.states.index(f"{curve.label}_dot"), window.states.index("y1_dot")
         estimated = window.correlation[lags, i, j]
         assert np.corrcoef(curve.measured, estimated)[0, 1] == pytest.approx(1.0)
-
-
-def test_no_full_window_is_said(faulty: Path) -> None:
-    source = RecordingSource([faulty])
-    with pytest.raises(RotorwatchError, match=r"a window is 60 s, usable data are 30 s"):
-        latest_window(Recorded(source, LAB.keys, source.span().start_ns, START_NS + 30 * S), LAB)
 
 
 def test_a_computed_trend_is_that_of_the_reports(computed: TrendSeries, lines: list[dict[str, object]]) -> None:
@@ -329,20 +287,19 @@ def test_a_trend_of_recorded_reports_needs_no_samples(
     messages.append(RecordedMessage(LAB.keys.report, b"{}", b"", "application/json", START_NS + 1000, START_NS))
     path = write(tmp_path / "reports.mcap", [*messages, *messages[:3]])
     source = RecordingSource([path])
-    keys = source.machine(reports=True)
-    assert keys == LAB.keys
-    recorded = read_trend(Recorded(source, keys, source.span().start_ns, source.span().end_ns + 1))
-    assert (recorded.origin, recorded.limits) == ("as recorded", LAB.alarms)
-    assert recorded.end_ns.tolist() == computed.end_ns.tolist()
-    assert [alarm.time_ns for alarm in recorded.alarms] == [alarm.time_ns for alarm in computed.alarms]
-    for one, other in zip(recorded.parameters, computed.parameters, strict=True):
+    assert source.machine(reports=True) == LAB.keys
+    found = read_trend(recorded(path))
+    assert (found.origin, found.limits) == ("as recorded", LAB.alarms)
+    assert found.end_ns.tolist() == computed.end_ns.tolist()
+    assert [alarm.time_ns for alarm in found.alarms] == [alarm.time_ns for alarm in computed.alarms]
+    for one, other in zip(found.parameters, computed.parameters, strict=True):
         np.testing.assert_array_equal(one.change, other.change)
         np.testing.assert_array_equal(one.high, other.high)
-    levels = read_trend(Recorded(source, keys, source.span().start_ns, source.span().end_ns + 1), levels=True)
+    levels = read_trend(recorded(path), levels=True)
     assert (levels.parameters, levels.levels[0].title) == ((), "y1   overall, µm pp")  # instead of parameters
     assert all(np.isfinite(one.level).all() and np.isnan(one.danger).all() for one in levels.levels)
     with pytest.raises(RotorwatchError, match="no sample blocks to compute them from"):
-        read_trend(Recorded(source, keys, source.span().start_ns, source.span().end_ns + 1), "lab")
+        read_trend(recorded(path), "lab")
     with pytest.raises(MachineFileError, match="machines with reports or sample blocks: demo/lab"):
         source.machine("demo/fan", reports=True)
 
@@ -364,14 +321,8 @@ def test_names_of_alarms_can_be_read_however_close_they_are(computed: TrendSerie
 
 
 def test_a_trend_of_nothing_says_what_was_looked_for(faulty: Path) -> None:
-    source = RecordingSource([faulty])
-    filling = read_trend(Recorded(source, LAB.keys, source.span().start_ns, START_NS + 30 * S))
+    filling = read_trend(recorded(faulty, seconds=(0, 30)))
     assert (filling.parameters, len(filling.levels)) == ((), 8)
     bare = [Report.model_validate(example(Report) | {"levels": [], "parameters": [], "verdict": None, "reason": ""})]
     with pytest.raises(RotorwatchError, match=r"neither parameter nor level was read .*: 1 reports, while the window"):
         trend_of(bare, (), None, "as recorded")
-
-
-def test_a_picture_that_cannot_be_written_is_no_recording(tmp_path: Path) -> None:
-    with pytest.raises(PictureError, match="cannot be written"):
-        draw(tmp_path / "nowhere" / "empty.png", Look(), lambda _: Figure())

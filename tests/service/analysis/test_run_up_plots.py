@@ -106,15 +106,6 @@ def test_full_spectra_need_two_directions_and_orders_a_rotation(tmp_path: Path) 
         read_full_spectrum(data, recorded_pairs(data), 4.0, 0.5, orders=True)
 
 
-def test_pairs_are_found_at_any_place() -> None:
-    probes = [
-        Channel(name=f"{place}-{way}", quantity="displacement", location=place, direction=way, unit="um")
-        for place in ("NDE", "bearing")
-        for way in ("z", "y")
-    ]
-    assert [(y.name, z.name) for y, z in orbit_pairs(probes)] == [("bearing-y", "bearing-z"), ("NDE-y", "NDE-z")]
-
-
 def test_probes_at_an_angle_are_turned_to_y_and_z() -> None:
     """One 45° to the left of the top, one to its right, in different units; and a pair in y and z beside them."""
     left, right, y, z = (

@@ -7,25 +7,20 @@ from pathlib import Path
 
 import httpx
 import pytest
-import typer
 from typer.testing import CliRunner, Result
 
 from service.access.scopes import Scope
 from service.commands import access as access_commands
-from service.commands.running import Commands
+from service.commands.rotorwatch import app
 from service.settings.service import HistorySettings
 from tests.service.rig.guarded import Guarded, guarded
 from tests.service.rig.live import ROOT, endpoint, program
 from tests.service.rig.preloaded import ran
 
 
-@pytest.fixture
-def commands(monkeypatch: pytest.MonkeyPatch) -> typer.Typer:
+@pytest.fixture(autouse=True)
+def _wide(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "300")
-    app = typer.Typer(cls=Commands)
-    app.add_typer(access_commands.commands)
-    app.add_typer(access_commands.tokens)
-    return app
 
 
 @pytest.fixture
@@ -35,7 +30,7 @@ def config(tmp_path: Path) -> str:
     return str(path)
 
 
-def run(app: typer.Typer, *arguments: str) -> Result:
+def run(*arguments: str) -> Result:
     return CliRunner().invoke(app, arguments)
 
 
@@ -44,35 +39,33 @@ def status(monitor: Guarded, token: str, method: str = "GET", path: str = "/heal
         return client.request(method, path).status_code
 
 
-def test_a_token_works_at_once_and_not_a_request_longer(tmp_path: Path, commands: typer.Typer, config: str) -> None:
+def test_a_token_works_at_once_and_not_a_request_longer(tmp_path: Path, config: str) -> None:
     with guarded(tmp_path) as monitor:
-        created = run(
-            commands, "token", "create", "control room", "--scope", "read", "--days", "90", "--config", config
-        )
+        created = run("token", "create", "control room", "--scope", "read", "--days", "90", "--config", config)
         assert created.exit_code == 0, created.output
         token = created.stdout.strip()
         assert "shown this once" in created.stderr
         assert token not in created.stderr
         assert (status(monitor, token), status(monitor, token, "DELETE", "/machine")) == (200, 403)
 
-        listed = run(commands, "token", "list", "--config", config).stdout
+        listed = run("token", "list", "--config", config).stdout
         token_id, secret = token.split("_")[1:]
         assert token_id in listed
         assert "control room" in listed
         assert "valid" in listed
         assert secret not in listed
 
-        again = run(commands, "token", "create", "control room", "--scope", "read", "--config", config)
+        again = run("token", "create", "control room", "--scope", "read", "--config", config)
         assert again.exit_code == 2
         assert "already valid" in again.stderr
 
-        revoked = run(commands, "token", "revoke", token_id, "--config", config)
+        revoked = run("token", "revoke", token_id, "--config", config)
         assert revoked.exit_code == 0
         assert status(monitor, token) == 401
-        assert "was revoked at" in run(commands, "token", "revoke", token_id, "--config", config).stdout
-        assert "revoked" in run(commands, "token", "list", "--config", config).stdout
+        assert "was revoked at" in run("token", "revoke", token_id, "--config", config).stdout
+        assert "revoked" in run("token", "list", "--config", config).stdout
 
-        written = run(commands, "audit", "--config", config).stdout
+        written = run("audit", "--config", config).stdout
         assert "create-token" in written
         assert "revoke-token" in written
         assert secret not in written
@@ -90,33 +83,31 @@ def test_a_token_works_at_once_and_not_a_request_longer(tmp_path: Path, commands
         (("revoke", "000000000000"), "there is no token '000000000000'"),
     ],
 )
-def test_mistakes_exit_2_and_say_so(
-    commands: typer.Typer, config: str, arguments: tuple[str, ...], expected: str
-) -> None:
-    result = run(commands, "token", *arguments, "--config", config)
+def test_mistakes_exit_2_and_say_so(config: str, arguments: tuple[str, ...], expected: str) -> None:
+    result = run("token", *arguments, "--config", config)
     assert result.exit_code == 2
     assert expected in result.stderr
 
 
-def test_narrow_terminals_show_whole_lists(commands: typer.Typer, config: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_narrow_terminals_show_whole_lists(config: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     scopes = [word for scope in Scope for word in ("--scope", scope)]
-    token = run(commands, "token", "create", "a dashboard beside the door", *scopes, "--config", config).stdout
+    token = run("token", "create", "a dashboard beside the door", *scopes, "--config", config).stdout
     token_id = token.split("_")[1]
-    assert token_id in run(commands, "token", "list", "--config", config).stdout
-    (line,) = run(commands, "audit", "--config", config).stdout.splitlines()
+    assert token_id in run("token", "list", "--config", config).stdout
+    (line,) = run("audit", "--config", config).stdout.splitlines()
     assert line.endswith(f"create-token: {token_id}, a dashboard beside the door, {' '.join(Scope)}")
 
 
-def test_tokens_in_memory_make_no_sense(tmp_path: Path, commands: typer.Typer) -> None:
+def test_tokens_in_memory_make_no_sense(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text('[history]\nurl = "sqlite:///:memory:"\n', encoding="utf-8")
-    result = run(commands, "token", "list", "--config", str(path))
+    result = run("token", "list", "--config", str(path))
     assert result.exit_code == 2
     assert "in memory" in result.stderr
 
 
-def test_the_audit_log_shows_each_action_once(tmp_path: Path, commands: typer.Typer, config: str) -> None:
+def test_the_audit_log_shows_each_action_once(tmp_path: Path, config: str) -> None:
     with guarded(tmp_path) as monitor:
         token = monitor.token(*Scope, name="control room")
         with monitor.client(token) as client:
@@ -126,7 +117,7 @@ def test_the_audit_log_shows_each_action_once(tmp_path: Path, commands: typer.Ty
             nobody.get("/health")
         visit = monitor.guard.trail.visit("10.0.0.1", "POST", "/cut/short")
         monitor.guard.trail.start(visit)
-        lines = run(commands, "audit", "--config", config).stdout.splitlines()
+        lines = run("audit", "--config", config).stdout.splitlines()
         assert len(lines) == 4
         wanted = (
             "POST /cut/short", "GET /health", "DELETE /machine", "shelve demo/lab k_by: [bold]bolt[/bold] replaced",
@@ -135,11 +126,11 @@ def test_the_audit_log_shows_each_action_once(tmp_path: Path, commands: typer.Ty
             assert what in line
         assert "not known" in lines[0]
         assert "control room" in lines[-1]
-        chosen = run(commands, "audit", "--machine", "demo/lab", "--config", config).stdout
+        chosen = run("audit", "--machine", "demo/lab", "--config", config).stdout
         assert "k_by" in chosen
         assert "DELETE" not in chosen
-        assert "DELETE" not in run(commands, "audit", "--limit", "2", "--config", config).stdout
-        assert "GET /health" not in run(commands, "audit", "--actor", "control room", "--config", config).stdout
+        assert "DELETE" not in run("audit", "--limit", "2", "--config", config).stdout
+        assert "GET /health" not in run("audit", "--actor", "control room", "--config", config).stdout
 
 
 def test_the_command_that_a_monitor_prints_creates_a_token_that_it_takes(tmp_path: Path) -> None:

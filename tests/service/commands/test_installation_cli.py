@@ -132,27 +132,23 @@ def test_the_doctor_says_what_is_wrong(tmp_path: Path) -> None:
     assert "nothing arrived under rotorwatch/plant/fan/stream" in silent.stdout
 
 
-def test_the_doctor_sums_up_gaps_that_are_many(tmp_path: Path) -> None:
+def test_the_doctor_sums_up_gaps_and_says_for_how_long_a_sensor_was_not_connected(tmp_path: Path) -> None:
     run(*FAN, "--folder", str(tmp_path))
     machine = load_machine_file(tmp_path / "fan.toml")
-    messages = [
-        RecordedMessage(machine.keys.stream, *encode_block(block, ""), block.start_ns, block.start_ns)
-        for block, _ in blocks(12.0, every_s=0.6)
-    ]
-    troubles = examined(machine, messages).troubles
-    assert "19 times a block does not follow the previous one; 1.9 s of data are missing, for example:" in troubles
-    assert sum("0.1 s" in one for one in troubles) == 3
 
+    def troubles(sent: Iterator[tuple[SampleBlock, tuple[()]]]) -> tuple[str, ...]:
+        return examined(machine, [
+            RecordedMessage(machine.keys.stream, *encode_block(block, ""), block.start_ns, block.start_ns)
+            for block, _ in sent
+        ]).troubles  # fmt: skip
 
-def test_the_doctor_says_for_how_long_a_sensor_was_not_connected(tmp_path: Path) -> None:
-    run(*FAN, "--folder", str(tmp_path))
-    machine = load_machine_file(tmp_path / "fan.toml")
-    messages = []
-    for block, _ in blocks(6.0):
-        if 4 <= block.sequence < 7:
-            block.samples[:, 1] = np.nan
-        messages.append(RecordedMessage(machine.keys.stream, *encode_block(block, ""), block.start_ns, block.start_ns))
-    (trouble,) = (one for one in examined(machine, messages).troubles if "NDE-V" in one)
+    told = troubles(blocks(12.0, every_s=0.6))
+    assert "19 times a block does not follow the previous one; 1.9 s of data are missing, for example:" in told
+    assert sum("0.1 s" in one for one in told) == 3
+    whole = list(blocks(6.0))
+    for block, _ in whole[4:7]:
+        block.samples[:, 1] = np.nan
+    (trouble,) = (one for one in troubles(iter(whole)) if "NDE-V" in one)
     assert trouble == "NDE-V: sent as NaN, the last time for 1.5 s, expected numbers: its sensor is not connected"
 
 

@@ -96,6 +96,7 @@ def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path) -> No
         (("waterfall", "--channel", "theta"), "--channel is 'theta', which is the shaft angle"),
         (("waterfall", "--channel", "y1", "--channel", "y2"), "a waterfall is of one channel"),
         (("waterfall", "--axis", "speed"), "the speed stays at 1320 rpm"),
+        (("waterfall", "--to", "20", "--window", "20"), "1 spectra of demo/lab over 20 s without a gap, expected"),
         (("spectrum", "--window", "1"), "--window is 1 s, expected at least 2 s"),
         (("spectrum", "--window", "nan"), "--window is nan, expected a number above 0"),
         (("spectrum", "--resolution", "900"), "--resolution is 900 Hz, expected at most 250 Hz"),
@@ -168,16 +169,13 @@ def test_without_a_keyphasor_there_are_spectra_but_no_orbits(without_angle: Path
         assert code == 0, said
 
 
-def test_a_recording_without_samples_and_reports(tmp_path: Path) -> None:
+def test_a_recording_that_lacks_samples_reports_or_its_descriptor(faulty: Path, tmp_path: Path) -> None:
     path = write(
         tmp_path / "truth.mcap", [RecordedMessage(LAB.keys.truth, b"{}", b"", "application/json", START_NS, 0)]
     )
     for kind, message in (("trend", "contains no reports or sample blocks"), ("orbit", "contains no sample blocks")):
         code, said = run(kind, path, "--out", tmp_path / "picture.png")
         assert (code, message in said) == (2, True)
-
-
-def test_a_stream_without_its_descriptor(faulty: Path, tmp_path: Path) -> None:
     path = write(tmp_path / "bare.mcap", list(read_recording(faulty, keys={LAB.keys.stream}))[:50])
     code, said = run("spectrum", path, "--out", tmp_path / "picture.png")
     assert (code, "no channel descriptor on rotorwatch/demo/lab/descriptor" in said) == (1, True)

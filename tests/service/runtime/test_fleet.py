@@ -88,8 +88,7 @@ def test_a_computer_that_is_lost_and_one_that_comes(cluster: "Cluster", tmp_path
 
             def fed(chosen: Sequence[SampleBlock], counts: Callable[[int], bool]) -> None:
                 for feed in feeds:
-                    for block in chosen:
-                        feed.put(block)
+                    feed.put(*chosen)
                 for one in machines:
                     until(lambda: counts(one.status().tally.blocks), f"blocks of {one.machine.name}")  # noqa: B023
 

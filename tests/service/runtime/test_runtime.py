@@ -201,8 +201,7 @@ def test_nothing_is_left_behind_when_a_part_cannot_start() -> None:
 
 def test_stopped_service_has_no_thread_left() -> None:
     with fed_service(when_full="wait", bound=1) as (_, worker, feed):
-        for _ in range(50):
-            feed.put_good()
+        feed.put_good(50)
         until(lambda: worker.health().quality.accepted_blocks > 0, "blocks")
     assert not worker.status().alive
 

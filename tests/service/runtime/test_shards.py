@@ -19,15 +19,12 @@ from rotorwatch.records.alarms import AlarmStates
 from rotorwatch.records.health import Health, HealthState
 from rotorwatch.records.monitor import Readiness
 from rotorwatch.records.operations import OperationDone
-from service.analysis.snapshots.heading import LatestData
 from service.history.file import lock_file
 from service.runtime.runtime import Runtime, running
 from service.runtime.shards import Shards, shard_count
-from service.runtime.standing import latest_from_bytes, latest_to_bytes
 from service.settings.service import HistorySettings, MachineEntry, ServiceSettings, ShardSettings
 from service.stream.transport import relay_items
 from simulator.scenario import parse_fault
-from tests.service.analysis.snapshotting import latest
 from tests.service.commands.test_demo import children_of
 from tests.service.rig.live import (
     QUICK,
@@ -149,8 +146,7 @@ def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -
     with running(plan) as runtime, client(runtime) as http, open_session(plan.link.listen[0]) as session:
         lab, pump = runtime.machines()
         feed = Feed(session, lab.machine)
-        for block in blocks[:440]:
-            feed.put(block)
+        feed.put(*blocks[:440])
         until(lambda: lab.health().quality.accepted_blocks == 440, "the first blocks")
         until(lambda: lab.health().state is HealthState.ALERT, "the alarm")
         before = lab.history.events(after=-1)
@@ -192,8 +188,7 @@ def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -
         assert len(started) == 2
         until(lambda: lab.health().restart.startswith("resumed"), "that it goes on from where it stood")
         assert pump.health().restart == ""
-        for block in blocks[440:]:
-            feed.put(block)
+        feed.put(*blocks[440:])
         until(lambda: lab.status().tally.blocks == 10, "the other blocks")
         log = lab.history.events(after=-1)
         assert log[: len(before)] == before
@@ -226,21 +221,6 @@ def test_processes_end_with_the_monitor_that_started_them(tmp_path: Path) -> Non
     until(lambda: not any(Path(f"/proc/{one}").exists() for one in started), "end of all processes")
     with running(plan) as runtime:  # which has their machines at once
         assert runtime.readiness().ready
-
-
-def test_what_a_monitor_holds_survives_the_way_to_another_process() -> None:
-    data = latest()
-    again = latest_from_bytes(latest_to_bytes(data))
-    assert again.window is not None
-    assert data.window is not None
-    assert again.parameters == data.parameters
-    assert again.parameters
-    assert again.mark() == data.mark()
-    assert again.window.hop_correlation.tobytes() == data.window.hop_correlation.tobytes()
-    assert again.window.spectrum.tobytes() == data.window.spectrum.tobytes()
-    assert [one.start_ns for one in again.blocks] == [one.start_ns for one in data.blocks]
-    assert again.blocks[-1].samples.tobytes() == data.blocks[-1].samples.tobytes()
-    assert latest_from_bytes(latest_to_bytes(LatestData(lacking="nothing came"))) == LatestData(lacking="nothing came")
 
 
 def test_how_many_processes(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from models.machine import Machine, load_machine
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from models.signals.wire import encode_block
+from rotorwatch.records.alarms import Alarm
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import identity_of
 from service.stream.checkpoints import stored_event, stored_report
@@ -63,6 +64,7 @@ class Plant:
             text += f'[recording]\ndirectory = "{folder / "recordings"}"\n'
         self._settings.write_text(text, encoding="utf-8")
         self._publisher = advanced_publisher(session, self.machine.keys.stream, kept)
+        self.raised: list[Alarm] = []
 
     @contextmanager
     def monitor(self) -> Iterator[Program]:
@@ -96,23 +98,29 @@ def offline() -> tuple[list[str], list[str]]:
     return events, [stored_report(window).text for one in said for window in one.windows]
 
 
-@contextmanager
-def plant(folder: Path, *, recording: bool, kept: int) -> Iterator[Plant]:
-    address = endpoint()
-    # On a busy computer a queue may be full for longer than a link is held for.
-    patience = {"transport/link/tx/queue/congestion_control/block/wait_before_close": json.dumps(60_000_000)}
-    with session_of(LinkSettings(connect=(address,)), **patience) as session:
-        yield Plant(folder, session, address, recording, kept)
-
-
 def until_accepted(at: Program, count: int) -> None:
     until(lambda: at.health().quality.accepted_blocks >= count, f"{count} blocks")
 
 
-def put_first(here: Plant, first: Program) -> None:
-    for begin in range(0, FIRST, 13):  # no more on their way than an inbox takes
-        here.put(stream()[begin : begin + 13])
-        until_accepted(first, begin + 13)
+@contextmanager
+def again(folder: Path, *, recording: bool, kept: int, killed: bool = True) -> Iterator[tuple[Plant, Program]]:
+    """A monitor that has ended after the first blocks, and the one that is started then."""
+    address = endpoint()
+    # On a busy computer a queue may be full for longer than a link is held for.
+    patience = {"transport/link/tx/queue/congestion_control/block/wait_before_close": json.dumps(60_000_000)}
+    with session_of(LinkSettings(connect=(address,)), **patience) as session:
+        here = Plant(folder, session, address, recording, kept)
+        with here.monitor() as first:
+            for begin in range(0, FIRST, 13):  # no more on their way than an inbox takes
+                here.put(stream()[begin : begin + 13])
+                until_accepted(first, begin + 13)
+            here.raised = [one for one in first.health().alarms if one.raised]
+            if killed:
+                first.kill()
+            else:
+                assert first.stop() == 0
+        with here.monitor() as second:
+            yield here, second
 
 
 def until_evaluated(at: Program) -> None:
@@ -142,71 +150,53 @@ def raised(events: list[str]) -> list[str]:
 def test_killed_where_the_window_can_be_had_again_all_goes_on_as_if_not(
     tmp_path: Path, recording: bool, kept: int
 ) -> None:
-    with plant(tmp_path, recording=recording, kept=kept) as here:
-        with here.monitor() as first:
-            put_first(here, first)
-            first.kill()
-        with here.monitor() as second:
-            until(lambda: second.health().filled == 1.0, "full window")
-            assert second.health().restart == "resumed at 2026-01-01T00:00:37.500000Z"
-            here.put(stream()[FIRST:])
-            until_evaluated(second)
-            assert second.health().quality.gaps == 0
-            second.kill()
-        assert here.said() == (expected := offline())
-        assert raised(expected[0]) == ["c_bz", "k_by"]
+    with again(tmp_path, recording=recording, kept=kept) as (here, second):
+        until(lambda: second.health().filled == 1.0, "full window")
+        assert second.health().restart == "resumed at 2026-01-01T00:00:37.500000Z"
+        here.put(stream()[FIRST:])
+        until_evaluated(second)
+        assert second.health().quality.gaps == 0
+    assert here.said() == (expected := offline())
+    assert raised(expected[0]) == ["c_bz", "k_by"]
 
 
 @pytest.mark.slow
 def test_killed_with_recordings_alone_the_window_is_there_and_what_nobody_has_is_a_gap(tmp_path: Path) -> None:
-    with plant(tmp_path, recording=True, kept=0) as here:
-        with here.monitor() as first:
-            put_first(here, first)
-            first.kill()
-        with here.monitor() as second:
-            until(lambda: second.health().filled == 1.0, "full window")
-            here.put(stream()[FIRST + 4 :])
-            until_evaluated(second)
-            assert (second.health().quality.gaps, second.stop()) == (1, 0)
-        assert raised(here.said()[0]) == ["c_bz", "data-gap", "k_by"]
+    with again(tmp_path, recording=True, kept=0) as (here, second):
+        until(lambda: second.health().filled == 1.0, "full window")
+        here.put(stream()[FIRST + 4 :])
+        until_evaluated(second)
+        assert (second.health().quality.gaps, second.stop()) == (1, 0)
+    assert raised(here.said()[0]) == ["c_bz", "data-gap", "k_by"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kept", [pytest.param(0, marks=pytest.mark.long), 12])
 def test_killed_where_nobody_has_the_window_it_fills_anew_and_alarms_are_held(tmp_path: Path, kept: int) -> None:
-    with plant(tmp_path, recording=False, kept=kept) as here:
-        with here.monitor() as first:
-            put_first(here, first)
-            before = [one for one in first.health().alarms if one.raised]
-            first.kill()
-        with here.monitor() as second:
-            health = second.health()
-            assert health.filled < 1.0
-            assert [one for one in health.alarms if one.raised] == before != []
-            assert health.state in {"alert", "danger"}
-            here.put(stream()[FIRST:])
-            until_evaluated(second)
-            told = second.health().restart
-            assert "hops of the window were not received again, and it is filling anew" in told
-            assert second.stop() == 0
-        events, reports = here.said()
-        assert raised(events)[0] == "c_bz"
-        assert len(set(raised(events))) == len(raised(events))  # nothing is raised twice
-        assert len(reports) >= len(offline()[1]) - 2  # hops that the kill interrupted
+    with again(tmp_path, recording=False, kept=kept) as (here, second):
+        health = second.health()
+        assert health.filled < 1.0
+        assert [one for one in health.alarms if one.raised] == here.raised != []
+        assert health.state in {"alert", "danger"}
+        here.put(stream()[FIRST:])
+        until_evaluated(second)
+        told = second.health().restart
+        assert "hops of the window were not received again, and it is filling anew" in told
+        assert second.stop() == 0
+    events, reports = here.said()
+    assert raised(events)[0] == "c_bz"
+    assert len(set(raised(events))) == len(raised(events))  # nothing is raised twice
+    assert len(reports) >= len(offline()[1]) - 2  # hops that the kill interrupted
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kept", [0, 20])
 def test_stopped_in_order_the_window_is_kept(tmp_path: Path, kept: int) -> None:
-    with plant(tmp_path, recording=False, kept=kept) as here:
-        with here.monitor() as first:
-            put_first(here, first)
-            assert first.stop() == 0
-        with here.monitor() as second:
-            health = second.health()
-            assert (health.filled, health.restart) == (1.0, "resumed at 2026-01-01T00:00:39.000000Z")
-            here.put(stream()[FIRST:])
-            until_evaluated(second)
-            assert second.health().quality.refused_blocks == {}  # the cache was asked for what it sends again
-            assert second.stop() == 0
-        assert here.said() == offline()
+    with again(tmp_path, recording=False, kept=kept, killed=False) as (here, second):
+        health = second.health()
+        assert (health.filled, health.restart) == (1.0, "resumed at 2026-01-01T00:00:39.000000Z")
+        here.put(stream()[FIRST:])
+        until_evaluated(second)
+        assert second.health().quality.refused_blocks == {}  # the cache was asked for what it sends again
+        assert second.stop() == 0
+    assert here.said() == offline()
