@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable, Iterator
 
-from models.diagnosis.window.moments import Plan
+from models.diagnosis.window.moments import Plan, plan_for
 from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
-from models.signals.block import SampleBlock
+from models.machine import MachineFile
+from models.signals.block import FloatArray, SampleBlock
 from tests.sure import sure
 
 
@@ -15,6 +16,17 @@ def full_windows(window: SlidingWindow, stream: Iterable[SampleBlock]) -> Iterat
             full = window.statistics()
             if full is not None:
                 yield full
+
+
+def fed(plan: Plan, samples: FloatArray) -> SlidingWindow:
+    """After these samples, in the units of the machine, as one piece."""
+    window = SlidingWindow(plan)
+    tuple(window.feed(plan.to_si(samples), 0))
+    return window
+
+
+def statistics(machine: MachineFile, samples: FloatArray) -> WindowStatistics:
+    return sure(fed(plan_for(machine), samples).statistics())
 
 
 def last_window(plan: Plan, stream: Iterable[SampleBlock]) -> WindowStatistics:

@@ -12,7 +12,7 @@ from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import FloatArray
 from models.signals.recording import read_recording
 from models.signals.wire import decode_block
-from service.interchange.importing import Imported, import_file
+from service.interchange.importing import Imported, import_file, summary_lines
 from service.interchange.mapping import load_mapping
 
 START = "2026-01-31T12:00:00Z"
@@ -28,6 +28,9 @@ theta = { column = "a", unit = "rad" }
 TIME = f'[time]\ncolumn = "t"\nstart = "{START}"\n'
 TEXT = TIME + CHANNELS
 HEADER = "t,x,v,a"
+SAMPLED = f'[time]\nrate_hz = 2000.0\nstart = "{START}"\n'
+PULSES = SAMPLED + CHANNELS.replace("theta =", "# theta =") + "[keyphasor]\n"
+"""Of a file that has pulses in place of an angle."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,16 @@ def imported(folder: Path, source: Path, mapping: str, described: MachineFile | 
     file.write_text(mapping, encoding="utf-8")
     out = folder / "imported.mcap"
     return import_file(source, load_mapping(file, described), described, out, overwrite=True), out
+
+
+def archive(folder: Path, **columns: object) -> Path:
+    np.savez(folder / "run.npz", **columns)  # type: ignore[arg-type]
+    return folder / "run.npz"
+
+
+def summary(folder: Path, source: Path, mapping: str, described: MachineFile | None = None) -> str:
+    """What is told of an import."""
+    return "\n".join(summary_lines(imported(folder, source, mapping, described)[0]))
 
 
 def stretches(recording: Path, described: MachineFile | None = None) -> list[Stretch]:

@@ -1,6 +1,6 @@
 """A folder of snapshot files comes in as one recording, in the order of the files' times."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import pytest
 
 from service.interchange.importing import summary_lines
 from service.interchange.source import SourceError
-from tests.interchange.material import CHANNELS, RATE_HZ, START_NS, imported, machine, signals, stretches
+from tests.interchange.material import CHANNELS, RATE_HZ, START_NS, imported, machine, signals, stretches, summary
 
 ON_S, EVERY_S, FILES = 2.0, 20.0, 12
 COUNT = round(ON_S * RATE_HZ)
@@ -63,11 +63,19 @@ def write(folder: Path, name: Callable[[int], str], numbers: range = range(FILES
     return folder
 
 
+def times(numbers: Iterable[int]) -> list[int]:
+    return [START_NS + round(number * EVERY_S * 1e9) for number in sorted(numbers)]
+
+
+def begun(recording: Path) -> list[int]:
+    return [one.start_ns for one in stretches(recording, KIT)]
+
+
 @pytest.mark.parametrize(("name", "mapping"), [(by_date, NAMED), (by_number, NUMBERED), (by_number, DATED)])
 def test_snapshots_come_in_with_their_times_and_all(tmp_path: Path, name: Callable[[int], str], mapping: str) -> None:
     done, recording = imported(tmp_path, write(tmp_path / "files", name), mapping, KIT)
     found = stretches(recording, KIT)
-    assert [one.start_ns for one in found] == [START_NS + round(n * EVERY_S * 1e9) for n in range(FILES)]
+    assert [one.start_ns for one in found] == times(range(FILES))
     np.testing.assert_allclose(np.concatenate([one.samples[:, 0] for one in found]), _COLUMNS[0], atol=1e-9)
     assert (done.read.files, done.read.rows) == (FILES, FILES * COUNT)
     told = "\n".join(summary_lines(done))
@@ -95,11 +103,9 @@ def test_pulses_of_a_keyphasor_give_the_angle_in_every_file(tmp_path: Path, mapp
 
 
 def test_files_that_say_when_they_begin_are_joined_in_that_order_whatever_their_names(tmp_path: Path) -> None:
-    _, recording = imported(
-        tmp_path, write(tmp_path / "files", lambda number: f"{'dcba'[number]}.npz", range(4)), DATED, KIT
-    )
-    begun = [one.start_ns for one in stretches(recording, KIT)]
-    assert begun == [START_NS + round(number * EVERY_S * 1e9) for number in range(4)]
+    folder = write(tmp_path / "files", lambda number: f"{'dcba'[number]}.npz", range(4))
+    _, recording = imported(tmp_path, folder, DATED, KIT)
+    assert begun(recording) == times(range(4))
 
 
 @pytest.mark.parametrize("dated", [True, False])
@@ -116,8 +122,7 @@ def test_the_time_in_a_waveform_counts_more_than_the_one_in_the_name_of_its_file
             writer.write_segment([nptdms.ChannelObject("g", name, x[:COUNT], told) for name, x in columns])
     _, recording = imported(tmp_path, folder, CHANNELS, KIT)
     begin_ns = START_NS + (0 if dated else 3600 * 10**9)
-    begun = [one.start_ns for one in stretches(recording, KIT)]
-    assert begun == [begin_ns + round(number * EVERY_S * 1e9) for number in range(3)]
+    assert begun(recording) == [begin_ns + round(number * EVERY_S * 1e9) for number in range(3)]
 
 
 @pytest.mark.parametrize(
@@ -132,16 +137,14 @@ def test_a_snapshot_that_is_missing_is_told_and_the_others_keep_their_times(
     told = "\n".join(summary_lines(done))
     assert "gaps: 1, 38 s in all" in told
     assert f"\n  before row 1 of {name(6)}: 38 s from " in told
-    begun = [one.start_ns for one in stretches(recording, KIT)]
-    assert begun == [START_NS + round(n * EVERY_S * 1e9) for n in range(FILES) if n != 5]
+    assert begun(recording) == times(set(range(FILES)) - {5})
 
 
 @pytest.mark.parametrize(("rate_hz", "short"), [(RATE_HZ, False), (1000.0, True)])
 def test_snapshots_that_filters_leave_too_short_are_told(tmp_path: Path, rate_hz: float, short: bool) -> None:
     kit = machine(schedule={"on_s": ON_S, "every_s": EVERY_S}, window={}, ingest={}, rate_hz=rate_hz)
     mapping = NAMED.replace("rate_hz", "resample = true\nrate_hz")
-    done, _ = imported(tmp_path, write(tmp_path / "files", by_date), mapping, kit)
-    told = "\n".join(summary_lines(done))
+    told = summary(tmp_path, write(tmp_path / "files", by_date), mapping, kit)
     note = f"note: {FILES} of {FILES} snapshots are shorter than [schedule] on_s = 2 in the machine file"
     assert (note in told) == short
     assert ("the shortest has 1.978 s, the longest of them 1.978 s" in told) == short
@@ -161,8 +164,7 @@ def test_a_file_that_cannot_be_read_is_named_and_the_others_come_in_at_their_tim
     assert set(told) == {name(number), name(8)}
     assert "damaged, or no NumPy .npz file" in told[name(number)]
     assert "row 3001, column v: found nan" in told[name(8)]
-    begun = [one.start_ns for one in stretches(recording, KIT)]
-    assert begun == [START_NS + round(n * EVERY_S * 1e9) for n in range(FILES) if n not in {number, 8}]
+    assert begun(recording) == times(set(range(FILES)) - {number, 8})
     assert done.left_out == ["notes.docx"]
 
 
@@ -189,8 +191,7 @@ def test_a_serial_number_is_no_time(tmp_path: Path) -> None:
         return f"SN1402155779_{START_NS // 10**9 + round(number * EVERY_S)}.npz"
 
     _, recording = imported(tmp_path, write(tmp_path / "files", since_1970), NAMED, KIT)
-    begun = [one.start_ns for one in stretches(recording, KIT)]
-    assert begun == [START_NS + round(n * EVERY_S * 1e9) for n in range(FILES)]
+    assert begun(recording) == times(range(FILES))
     with pytest.raises(SourceError, match="the time of the first row is not known"):
         imported(tmp_path, write(tmp_path / "more", lambda number: f"SN1402155779_{number}.npz", range(3)), NAMED, KIT)
 
@@ -207,8 +208,7 @@ def test_a_time_column_that_runs_on_from_file_to_file_counts_once(
         np.savez(folder / name(number), **arrays)
     mapping = NAMED if name is by_date else NUMBERED
     _, recording = imported(tmp_path, folder, mapping.replace("rate_hz = 2000.0", 'column = "t"\nunit = "ns"'), KIT)
-    begun = [one.start_ns for one in stretches(recording, KIT)]
-    assert begun == [START_NS + round(n * EVERY_S * 1e9) for n in range(FILES)]
+    assert begun(recording) == times(range(FILES))
 
 
 def test_a_start_alone_is_enough_where_the_time_column_runs_on(tmp_path: Path) -> None:
@@ -225,12 +225,9 @@ def test_a_start_alone_is_enough_where_the_time_column_runs_on(tmp_path: Path) -
 
 
 def test_numbers_that_are_no_count_give_the_order_alone(tmp_path: Path) -> None:
-    numbers = [100, 119, 140, 160]
-    _, recording = imported(
-        tmp_path, write(tmp_path / "files", lambda n: f"after {numbers[n]} s.npz", range(4)), NUMBERED, KIT
-    )
-    begun = [one.start_ns for one in stretches(recording, KIT)]
-    assert begun == [START_NS + round(n * EVERY_S * 1e9) for n in range(4)]
+    folder = write(tmp_path / "files", lambda n: f"after {(100, 119, 140, 160)[n]} s.npz", range(4))
+    _, recording = imported(tmp_path, folder, NUMBERED, KIT)
+    assert begun(recording) == times(range(4))
 
 
 def test_files_that_follow_each_other_are_one_stretch(tmp_path: Path) -> None:
@@ -242,11 +239,11 @@ def test_files_that_follow_each_other_are_one_stretch(tmp_path: Path) -> None:
 
 def test_files_of_different_lengths_are_told(tmp_path: Path) -> None:
     folder = write(tmp_path / "files", by_date, range(3))
-    told = summary_lines(imported(tmp_path, folder, NAMED)[0])[0]
+    told = summary(tmp_path, folder, NAMED)
     assert f"files: 3 files, {3 * COUNT} rows" in told
     arrays = dict(np.load(folder / by_date(1)))
     np.savez(folder / by_date(1), **{name: column[:3000] for name, column in arrays.items()})
-    told = summary_lines(imported(tmp_path, folder, NAMED)[0])[0]
+    told = summary(tmp_path, folder, NAMED)
     assert f"files: 3 files of 3000 to {COUNT} rows, {2 * COUNT + 3000} rows" in told
 
 

@@ -20,12 +20,20 @@ from scipy.io import savemat, wavfile
 from models.signals.recording import read_recording
 from service.interchange.source import Reference, SourceError
 from service.interchange.tables import ParquetSource
-from tests.interchange.material import CHANNELS, RATE_HZ, START, START_NS, imported, machine, signals, stretches
+from tests.interchange.material import (
+    CHANNELS,
+    RATE_HZ,
+    SAMPLED,
+    START,
+    START_NS,
+    TIME,
+    imported,
+    machine,
+    signals,
+    stretches,
+)
 
 COUNT = 70_001  # more than one chunk of rows
-
-TIME_COLUMN = f'[time]\ncolumn = "t"\nstart = "{START}"\n'
-RATE = f'[time]\nrate_hz = 2000.0\nstart = "{START}"\n'
 
 Columns = dict[str, np.ndarray[tuple[int], np.dtype[np.float64]]]
 
@@ -165,17 +173,17 @@ BEGIN = f'[time]\nstart = "{START}"\n'
 GERMAN = '[csv]\ndelimiter = ";"\ndecimal = ","\nskip_lines = 1\nskip_lines_after_header = 1\nencoding = "latin-1"\n'
 TABLE = named('"table", index = 0', '"table", index = 1', '"table", index = 2')
 CASES: dict[str, tuple[str, Callable[[Path, Columns], None], str]] = {
-    "csv": ("run.csv", write_csv, TIME_COLUMN + CHANNELS),
-    "csv-packed": ("run.csv.gz", write_packed_csv, TIME_COLUMN + CHANNELS),
-    "csv-german": ("run.txt", write_german_csv, TIME_COLUMN + GERMAN + CHANNELS),
-    "parquet": ("run.parquet", write_parquet, TIME_COLUMN + CHANNELS),
+    "csv": ("run.csv", write_csv, TIME + CHANNELS),
+    "csv-packed": ("run.csv.gz", write_packed_csv, TIME + CHANNELS),
+    "csv-german": ("run.txt", write_german_csv, TIME + GERMAN + CHANNELS),
+    "parquet": ("run.parquet", write_parquet, TIME + CHANNELS),
     "npz": ("run.npz", write_npz, f'{BEGIN}rate_from = "fs"\n{CHANNELS}'),
-    "npz-table": ("run.npz", write_npz_table, RATE + TABLE),
+    "npz-table": ("run.npz", write_npz_table, SAMPLED + TABLE),
     "mat-5": ("run.mat", write_mat, f'{BEGIN}rate_from = "fs"\n' + named('"run.x"', '"run.v"')),
-    "mat-5-structs": ("run.mat", write_mat_of_structs, RATE + OF_STRUCTS),
-    "mat-7.3-structs": ("run.mat", write_mat73_of_structs, RATE + OF_STRUCTS),
-    "hdf5": ("run.h5", write_mat73, RATE + named('"run.x"', '"run.v"')),
-    "mat-7.3": ("run.mat", write_mat73, RATE + named('"run.x"', '"run.v"')),
+    "mat-5-structs": ("run.mat", write_mat_of_structs, SAMPLED + OF_STRUCTS),
+    "mat-7.3-structs": ("run.mat", write_mat73_of_structs, SAMPLED + OF_STRUCTS),
+    "hdf5": ("run.h5", write_mat73, SAMPLED + named('"run.x"', '"run.v"')),
+    "mat-7.3": ("run.mat", write_mat73, SAMPLED + named('"run.x"', '"run.v"')),
     "wav": ("run.wav", write_wav, BEGIN + named("1", "2", "3")),
     "uff": ("run.uff", write_uff, BEGIN + without_units(CHANNELS)),
     "tdms": ("run.tdms", write_tdms, without_units(named('"x"', '"run/v"'))),
@@ -218,23 +226,17 @@ def test_integers_of_a_wav_file_are_of_full_scale(tmp_path: Path, dtype: type[np
     )
 
 
-def test_dates_in_a_parquet_file_are_the_times(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("of", "zone", "late_h"), [("Europe/Berlin", "", 0), (None, "America/New_York", 5)])
+def test_dates_in_a_parquet_file_are_the_times_in_their_zone_or_that_of_the_mapping(
+    tmp_path: Path, of: str | None, zone: str, late_h: int
+) -> None:
     _, x, v, angle = signals(3000)
-    time = pa.array(START_NS + 500_000 * np.arange(3000), type=pa.timestamp("ns", tz="Europe/Berlin"))
+    time = pa.array(START_NS + 500_000 * np.arange(3000), type=pa.timestamp("ns", tz=of))
     pa.parquet.write_table(pa.table({"t": time, "x": x, "v": v, "a": angle}), tmp_path / "run.parquet")
-    mapping = '[time]\ncolumn = "t"\nunit = "datetime"\n' + CHANNELS
+    mapping = '[time]\ncolumn = "t"\nunit = "datetime"\n' + (f'zone = "{zone}"\n' if zone else "") + CHANNELS
     (found,) = stretches(imported(tmp_path, tmp_path / "run.parquet", mapping)[1])
-    assert found.start_ns == START_NS
+    assert found.start_ns == START_NS + late_h * 3600 * 10**9
     np.testing.assert_array_equal(found.samples, np.column_stack([x, v, angle]))
-
-
-def test_timestamps_without_a_zone_are_of_that_of_the_mapping(tmp_path: Path) -> None:
-    _, x, v, angle = signals(3000)
-    time = pa.array(START_NS + 500_000 * np.arange(3000), type=pa.timestamp("ns"))
-    pa.parquet.write_table(pa.table({"t": time, "x": x, "v": v, "a": angle}), tmp_path / "run.parquet")
-    mapping = '[time]\ncolumn = "t"\nunit = "datetime"\nzone = "America/New_York"\n' + CHANNELS
-    (found,) = stretches(imported(tmp_path, tmp_path / "run.parquet", mapping)[1])
-    assert found.start_ns == START_NS + 5 * 3600 * 10**9
 
 
 @pytest.mark.parametrize(
@@ -283,7 +285,7 @@ def test_a_long_parquet_file_is_not_kept_in_memory(tmp_path: Path) -> None:
 def test_pickled_objects_are_not_loaded(tmp_path: Path) -> None:
     np.savez(tmp_path / "run.npz", x=np.array([{"a": 1}], dtype=object))
     with pytest.raises(SourceError, match="no column 'x'; there are none"):
-        imported(tmp_path, tmp_path / "run.npz", RATE + CHANNELS)
+        imported(tmp_path, tmp_path / "run.npz", SAMPLED + CHANNELS)
 
 
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # pyuff's own
@@ -311,7 +313,7 @@ def test_a_file_that_is_none_of_its_kind_is_named(tmp_path: Path, suffix: str) -
     path = tmp_path / f"broken.{suffix}"
     path.write_bytes(b"\x00\xff\x13 this is not it" * 30)
     with pytest.raises(SourceError, match=r"broken\."):
-        imported(tmp_path, path, RATE + CHANNELS)
+        imported(tmp_path, path, SAMPLED + CHANNELS)
     assert not list(tmp_path.glob("*.mcap*"))
 
 
@@ -329,4 +331,4 @@ def test_a_measurement_that_is_cut_off_is_named_without_the_complaint_of_a_libra
 def test_an_unknown_format_says_which_ones_there_are(tmp_path: Path) -> None:
     (tmp_path / "run.xyz").write_text("1,2")
     with pytest.raises(SourceError, match=r"'\.xyz' is not known.*\.tdms"):
-        imported(tmp_path, tmp_path / "run.xyz", RATE + CHANNELS)
+        imported(tmp_path, tmp_path / "run.xyz", SAMPLED + CHANNELS)

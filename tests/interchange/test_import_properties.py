@@ -18,10 +18,12 @@ from service.interchange.importing import summary_lines
 from service.interchange.source import SourceError
 from tests.interchange.material import (
     CHANNELS,
+    PULSES,
     RATE_HZ,
     SPEED_HZ,
     START,
     START_NS,
+    archive,
     imported,
     machine,
     signals,
@@ -180,14 +182,6 @@ def test_another_rate_is_resampled_in_pieces_as_in_one(tmp_path: Path, rate_hz: 
     assert found.samples.shape[0] > 0.99 * 45 * RATE_HZ
 
 
-CHANNELS_OF_KEYPHASOR = """
-[channels]
-y1 = { column = "x", unit = "um" }
-y1_dot = { column = "v", unit = "mm/s" }
-"""
-TIME = f'[time]\nrate_hz = 2000.0\nstart = "{START}"\n'
-
-
 def off_by(angle: FloatArray, expected: FloatArray) -> FloatArray:
     """Difference of angles the short way round, rad."""
     return np.asarray(np.abs(np.angle(np.exp(1j * (angle - expected)))))
@@ -272,9 +266,9 @@ def test_a_chattering_edge_counts_once_with_hysteresis_and_often_without() -> No
 def test_pulse_times_of_a_file_become_its_shaft_angle(tmp_path: Path) -> None:
     _, x, v, angle = signals(20_000)
     pulses = np.arange(0, 10, 1 / SPEED_HZ)
-    np.savez(tmp_path / "run.npz", x=x, v=v, k=np.delete(pulses, 50) * 1e3)
-    mapping = TIME + CHANNELS_OF_KEYPHASOR + '[keyphasor]\npulse_times = "k"\nunit = "ms"\n'
-    done, recording = imported(tmp_path, tmp_path / "run.npz", mapping)
+    source = archive(tmp_path, x=x, v=v, k=np.delete(pulses, 50) * 1e3)
+    mapping = PULSES + 'pulse_times = "k"\nunit = "ms"\n'
+    done, recording = imported(tmp_path, source, mapping)
     (found,) = stretches(recording)
     assert sure(done.angle.pulses).missing == 1
     assert found.samples.shape == (20_000, 3)
@@ -283,19 +277,18 @@ def test_pulse_times_of_a_file_become_its_shaft_angle(tmp_path: Path) -> None:
 
 def test_pulses_of_a_time_column_count_from_its_zero(tmp_path: Path) -> None:
     time, x, v, angle = signals(20_000)
-    np.savez(tmp_path / "run.npz", t=time + 77, x=x, v=v, k=np.arange(0, 10, 1 / SPEED_HZ) + 77)
-    mapping = f'[time]\ncolumn = "t"\nstart = "{START}"\n' + CHANNELS_OF_KEYPHASOR + '[keyphasor]\npulse_times = "k"\n'
-    _, recording = imported(tmp_path, tmp_path / "run.npz", mapping)
+    source = archive(tmp_path, t=time + 77, x=x, v=v, k=np.arange(0, 10, 1 / SPEED_HZ) + 77)
+    mapping = PULSES.replace("rate_hz = 2000.0", 'column = "t"') + 'pulse_times = "k"\n'
+    _, recording = imported(tmp_path, source, mapping)
     assert off_by(stretches(recording)[0].samples[:, 2], angle).max() < 1e-6
 
 
 def test_a_sampled_tachometer_becomes_the_shaft_angle(tmp_path: Path) -> None:
     time, x, v, angle = signals(140_000)
     teeth = np.sin(8 * 2 * np.pi * SPEED_HZ * time)
-    np.savez(tmp_path / "run.npz", x=x, v=v, tacho=2 + teeth)
-    keyphasor = '[keyphasor]\ncolumn = "tacho"\nthreshold = 2.0\nhysteresis = 0.5\npulses_per_revolution = 8\n'
-    mapping = TIME + CHANNELS_OF_KEYPHASOR + keyphasor
-    _, recording = imported(tmp_path, tmp_path / "run.npz", mapping)
+    source = archive(tmp_path, x=x, v=v, tacho=2 + teeth)
+    keyphasor = 'column = "tacho"\nthreshold = 2.0\nhysteresis = 0.5\npulses_per_revolution = 8\n'
+    _, recording = imported(tmp_path, source, PULSES + keyphasor)
     (found,) = stretches(recording)
     # Which of the eight teeth is the first is not known: the angle is right but for a constant eighth.
     difference = np.angle(np.exp(1j * (found.samples[:, 2] - angle[-found.samples.shape[0] :])))
@@ -306,9 +299,9 @@ def test_a_sampled_tachometer_becomes_the_shaft_angle(tmp_path: Path) -> None:
 def test_where_the_shaft_stood_there_is_a_gap(tmp_path: Path) -> None:
     _, x, v, _ = signals(20_000)
     pulses = np.arange(0, 10, 1 / SPEED_HZ)
-    np.savez(tmp_path / "run.npz", x=x, v=v, k=pulses[(pulses < 4) | (pulses > 6)])
-    mapping = TIME + CHANNELS_OF_KEYPHASOR + '[keyphasor]\npulse_times = "k"\n'
-    done, recording = imported(tmp_path, tmp_path / "run.npz", mapping)
+    source = archive(tmp_path, x=x, v=v, k=pulses[(pulses < 4) | (pulses > 6)])
+    mapping = PULSES + 'pulse_times = "k"\n'
+    done, recording = imported(tmp_path, source, mapping)
     first, second = stretches(recording)
     assert first.samples.shape[0] + second.samples.shape[0] + done.angle.unknown == 20_000
     assert 2 * RATE_HZ - 2.1 * RATE_HZ / SPEED_HZ < done.angle.unknown < 2 * RATE_HZ
@@ -317,6 +310,6 @@ def test_where_the_shaft_stood_there_is_a_gap(tmp_path: Path) -> None:
 
 def test_pulses_that_do_not_ascend_are_named(tmp_path: Path) -> None:
     _, x, v, _ = signals(2000)
-    np.savez(tmp_path / "run.npz", x=x, v=v, k=np.array([0.0, 0.1, 0.05]))
+    source = archive(tmp_path, x=x, v=v, k=np.array([0.0, 0.1, 0.05]))
     with pytest.raises(SourceError, match="keyphasor k: pulse 3 at 50000000 is not later"):
-        imported(tmp_path, tmp_path / "run.npz", TIME + CHANNELS_OF_KEYPHASOR + '[keyphasor]\npulse_times = "k"\n')
+        imported(tmp_path, source, PULSES + 'pulse_times = "k"\n')

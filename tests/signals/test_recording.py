@@ -31,17 +31,18 @@ def _some(count: int, size: int = 7200) -> list[RecordedMessage]:
     ]
 
 
-def _write(path: Path, content: list[RecordedMessage]) -> None:
+def _write(folder: Path, content: list[RecordedMessage]) -> Path:
+    path = folder / "run.mcap"
     with RecordingWriter(path) as writer:
         for message in content:
             writer.write(message)
+    return path
 
 
 @settings(max_examples=40)
 @given(content=st.lists(messages, max_size=30))
 def test_messages_come_back_the_same(tmp_path_factory: pytest.TempPathFactory, content: list[RecordedMessage]) -> None:
-    path = tmp_path_factory.mktemp("recording") / "run.mcap"
-    _write(path, content)
+    path = _write(tmp_path_factory.mktemp("recording"), content)
     assert list(read_recording(path)) == content
     summary = summarize_recording(path)
     assert sum(summary.messages.values()) == len(content)
@@ -53,8 +54,7 @@ def test_messages_come_back_the_same(tmp_path_factory: pytest.TempPathFactory, c
 def test_a_first_time_and_keys_can_be_chosen(tmp_path: Path) -> None:
     truth = RecordedMessage("m/truth", b"{}", b"", "application/json", 150_000, 150_000)
     content = [*_some(150), truth, *_some(400)[150:]]
-    path = tmp_path / "run.mcap"
-    _write(path, content)
+    path = _write(tmp_path, content)
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert len(sure(summary).chunk_indexes) > 5
@@ -66,8 +66,7 @@ def test_a_first_time_and_keys_can_be_chosen(tmp_path: Path) -> None:
 
 
 def test_json_without_attachment_is_plain_json_for_any_viewer(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    _write(path, [RecordedMessage("m/truth", b'{"speed_rpm":1320}', b"", "application/json", 1, 1)])
+    path = _write(tmp_path, [RecordedMessage("m/truth", b'{"speed_rpm":1320}', b"", "application/json", 1, 1)])
     with path.open("rb") as file:
         ((schema, channel, message),) = make_reader(file).iter_messages()
     assert (sure(schema).encoding, channel.message_encoding) == ("jsonschema", "json")
@@ -101,8 +100,7 @@ def test_an_exception_leaves_a_readable_part(tmp_path: Path) -> None:
 
 
 def test_an_existing_recording_is_kept_unless_asked(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    _write(path, _some(1))
+    path = _write(tmp_path, _some(1))
     with pytest.raises(RecordingError, match=r"run\.mcap: already exists"):
         RecordingWriter(path)
     with RecordingWriter(path, overwrite=True):
@@ -110,17 +108,14 @@ def test_an_existing_recording_is_kept_unless_asked(tmp_path: Path) -> None:
     assert list(read_recording(path)) == []
 
 
-def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+    for read in (lambda path: list(read_recording(path)), summarize_recording):
+        with pytest.raises(RecordingError, match=r"none\.mcap: cannot be read \(No such file"):
+            read(tmp_path / "none.mcap")
     with pytest.raises(RecordingError, match=r"none/run\.mcap\.part: cannot be written"):
         RecordingWriter(tmp_path / "none" / "run.mcap")
     with pytest.raises(RecordingError, match="is a folder, expected the name of a recording"):
         RecordingWriter(Path())
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    for read in (lambda path: list(read_recording(path)), summarize_recording):
-        with pytest.raises(RecordingError, match=r"none\.mcap: cannot be read \(No such file"):
-            read(tmp_path / "none.mcap")
 
 
 @pytest.mark.parametrize(
@@ -144,9 +139,8 @@ def test_another_kind_of_file_is_named(tmp_path: Path, content: bytes, told: str
 @pytest.mark.parametrize("part", [0.0, 0.001, 0.3, 0.7, 0.999])
 def test_a_cut_off_recording_is_refused_and_can_be_recovered(tmp_path: Path, part: float) -> None:
     content = _some(400)
-    path, cut, new = (tmp_path / name for name in ("run.mcap", "cut.mcap", "new.mcap"))
-    _write(path, content)
-    whole = path.read_bytes()
+    cut, new = tmp_path / "cut.mcap", tmp_path / "new.mcap"
+    whole = _write(tmp_path, content).read_bytes()
     cut.write_bytes(whole[: int(len(whole) * part)])
     told = "the file is empty" if part == 0.0 else "its intact parts, if any"
     with pytest.raises(RecordingError, match=rf"cut\.mcap: .*{told}"):
@@ -162,9 +156,8 @@ def test_a_cut_off_recording_is_refused_and_can_be_recovered(tmp_path: Path, par
 
 
 def test_what_a_crash_left_is_kept_and_recovered_to_its_name(tmp_path: Path) -> None:
-    path, part = tmp_path / "run.mcap", tmp_path / "run.mcap.part"
-    _write(path, _some(400))
-    path.rename(part)
+    path = _write(tmp_path, _some(400))
+    part = path.rename(tmp_path / "run.mcap.part")
     part.write_bytes(part.read_bytes()[:-1000])
     with pytest.raises(RecordingError, match=r"run\.mcap\.part: already exists"):
         RecordingWriter(path)
@@ -195,8 +188,7 @@ def test_a_finished_chunk_is_safe_at_once(tmp_path: Path) -> None:
 
 def test_a_damaged_chunk_is_passed_over_and_counted(tmp_path: Path) -> None:
     content = _some(400)
-    path, new = tmp_path / "run.mcap", tmp_path / "new.mcap"
-    _write(path, content)
+    path, new = _write(tmp_path, content), tmp_path / "new.mcap"
     whole = inspect_recording(path)
     assert (whole.count, whole.complete, whole.lost_bytes, whole.damaged_chunks) == (400, True, 0, 0)
     assert (whole.start_ns, whole.end_ns) == (0, 399_000)
@@ -217,8 +209,7 @@ def test_a_damaged_chunk_is_passed_over_and_counted(tmp_path: Path) -> None:
 
 def test_the_chunk_that_names_the_keys_may_be_the_damaged_one(tmp_path: Path) -> None:
     content = _some(400)
-    path = tmp_path / "run.mcap"
-    _write(path, content)
+    path = _write(tmp_path, content)
     data = bytearray(path.read_bytes())
     data[1000] ^= 0xFF
     path.write_bytes(data)
@@ -238,8 +229,7 @@ def test_whatever_the_damage_what_comes_back_was_written(
 ) -> None:
     folder = tmp_path_factory.mktemp("damage")
     content = _some(150, 5000)
-    path = folder / "run.mcap"
-    _write(path, content)
+    path = _write(folder, content)
     data = bytearray(path.read_bytes())[: 8 + int(keep * path.stat().st_size)]
     for flip in range(flips):
         data[int(place * (len(data) - 1)) // (flip + 1)] ^= 0x55

@@ -13,7 +13,7 @@ import threading
 import time
 import tracemalloc
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -105,12 +105,6 @@ def test_big_endian_samples_are_sent_little_endian() -> None:
     assert payload == samples.astype("<f4").tobytes()
 
 
-def test_an_encoding_without_hash_is_accepted() -> None:
-    payload, header, _ = encode_block(_block(), "0123456789ab")
-    _, schema_hash = decode_block(payload, header, BLOCK_ENCODING)
-    assert schema_hash == ""
-
-
 PAYLOAD = b"\0" * 48
 
 
@@ -153,23 +147,22 @@ def _arrow_column(values: list[Any], kind: str) -> Any:
     return pa.FixedSizeListArray.from_arrays(pa.array(values, getattr(pa, kind)()), 3)
 
 
-@pytest.mark.parametrize("field", ["start_ns", "sequence", "run", "rate_hz"])
-@pytest.mark.parametrize("text", ["", "soon"])
-def test_arrow_metadata_must_be_numbers(field: str, text: str) -> None:
-    payload = _arrow(_arrow_column([1.0] * 6, "float32"), **{field: text})
-    with pytest.raises(WireError, match=f"metadata field '{field}'"):
-        decode_block(payload, b"", ARROW_ENCODING)
+_WORDS = pa.array(["a"] * 6).dictionary_encode()
 
 
-def test_arrow_columns_must_be_lists_of_floats() -> None:
-    with pytest.raises(WireError, match="'samples'"):
-        decode_block(_arrow(_arrow_column([1.0] * 6, "float32"), name="other"), b"", ARROW_ENCODING)
-    with pytest.raises(WireError, match="'samples'"):
-        decode_block(_arrow(pa.array([1.0, 2.0])), b"", ARROW_ENCODING)
-    with pytest.raises(WireError, match="float32 or float64"):
-        decode_block(_arrow(_arrow_column([1] * 6, "int32")), b"", ARROW_ENCODING)
-    with pytest.raises(WireError, match="samples is 0"):
-        decode_block(_arrow(_arrow_column([], "float32")), b"", ARROW_ENCODING)
+@pytest.mark.parametrize(
+    ("column", "name", "said"),
+    [
+        (_arrow_column([1.0] * 6, "float32"), "other", "'samples'"), (pa.array([1.0, 2.0]), "samples", "'samples'"),
+        (_arrow_column([1] * 6, "int32"), "samples", "float32 or float64"),
+        (_arrow_column([], "float32"), "samples", "samples is 0"),
+        (_WORDS, "samples", "Arrow"), (pa.FixedSizeListArray.from_arrays(_WORDS, 3), "samples", "Arrow"),
+        (pa.array([[[1.0]]]), "samples", "Arrow"),
+    ],
+)  # fmt: skip
+def test_arrow_columns_must_be_lists_of_floats(column: Any, name: str, said: str) -> None:
+    with pytest.raises(WireError, match=said):
+        decode_block(_arrow(column, name=name), b"", ARROW_ENCODING)
 
 
 @settings(max_examples=100)
@@ -305,6 +298,7 @@ def test_compressed_streams_are_refused_unread(codec: str) -> None:
     [
         ("sequence", "9" * 4300), ("sequence", str(2**64)), ("sequence", "-1"), ("run", "65536"),
         ("start_ns", str(2**63)), ("rate_hz", "1e-320"), ("rate_hz", "inf"), ("rate_hz", "nan"), ("rate_hz", "0"),
+        *product(("start_ns", "sequence", "run", "rate_hz"), ("", "soon")),
     ],
 )  # fmt: skip
 def test_numbers_have_the_same_bounds_in_both_encodings(field: str, text: str) -> None:
@@ -312,13 +306,6 @@ def test_numbers_have_the_same_bounds_in_both_encodings(field: str, text: str) -
     with pytest.raises(WireError, match=field) as refused:
         decode_block(payload, b"", ARROW_ENCODING)
     assert len(str(refused.value)) < 300
-
-
-def test_other_columns_and_dictionaries_are_refused_unread() -> None:
-    values = pa.array(["a"] * 6).dictionary_encode()
-    for column in (values, pa.FixedSizeListArray.from_arrays(values, 3), pa.array([[[1.0]]])):
-        with pytest.raises(WireError, match="Arrow"):
-            decode_block(_arrow(column), b"", ARROW_ENCODING)
 
 
 @settings(max_examples=300)
@@ -415,6 +402,8 @@ def test_keys_lie_below_the_machine() -> None:
     )  # fmt: skip
     assert all(name.startswith(f"{PREFIX}/plant-2/Pump_7/") for name in names)
     assert len(set(names)) == len(names)
+    for name in ("a", "7", "Z-", "0_x-9", "Pump_7-north", "q" * 64):
+        assert MachineKeys(name, name).root == f"{PREFIX}/{name}/{name}"
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "*", "a b", "$x", "-a", "ü", "a" * 65, "a\n"])
@@ -423,11 +412,6 @@ def test_names_that_would_break_a_key_are_refused(name: str) -> None:
         MachineKeys(name, "lab")
     with pytest.raises(MachineFileError, match="machine name"):
         MachineKeys("demo", name)
-
-
-@pytest.mark.parametrize("name", ["a", "7", "Z-", "0_x-9", "Pump_7-north", "q" * 64])
-def test_plain_names_are_accepted(name: str) -> None:
-    assert MachineKeys(name, name).root == f"{PREFIX}/{name}/{name}"
 
 
 def test_a_link_stays_local_and_quiet_by_default() -> None:

@@ -12,9 +12,9 @@ from models.machine import load_machine
 from models.signals.block import FloatArray
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
-from tests.diagnosis.window.test_equaliser import statistics
 from tests.signals.test_wire import page_blocks
 from tests.sure import sure
+from tests.windows import statistics
 
 LEVEL_V, PULSE_V, THRESHOLD_V, HYSTERESIS_V = -8.0, 6.0, -5.0, 1.0
 PULSE_S = 3e-3
