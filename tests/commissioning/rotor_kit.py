@@ -1,6 +1,6 @@
 """Healthy recordings of the shipped rotor kit, and machine files that tell less of it than is known."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -12,6 +12,7 @@ from models.commissioning.healthy import HealthyRecording, healthy_from_blocks
 from models.diagnosis.window.statistics import WindowStatistics, window_statistics
 from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import FloatArray, SampleBlock
+from models.signals.sensor import Sensor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
 
@@ -74,9 +75,22 @@ def with_samples(stream_: Sequence[SampleBlock], samples: FloatArray) -> list[Sa
     return found
 
 
+def with_sensors(
+    machine: MachineFile, stream_: Sequence[SampleBlock], kept: Callable[[Sensor], bool]
+) -> tuple[MachineFile, list[SampleBlock]]:
+    """The machine with some of its sensors alone, and what they measure."""
+    columns = [number for number, sensor in enumerate(machine.sensors) if kept(sensor)]
+    sensors = tuple(machine.sensors[number] for number in columns)
+    blocks_ = [replace(block, samples=block.samples[:, columns]) for block in stream_]
+    return machine.model_copy(update={"sensors": sensors}), blocks_
+
+
+def no_velocity(sensor: Sensor) -> bool:
+    return sensor.quantity != "velocity"
+
+
 def without_angle(stream_: Sequence[SampleBlock]) -> list[SampleBlock]:
-    column = LAB.descriptor.states.index("theta")
-    return [replace(block, samples=np.delete(block.samples, column, axis=1)) for block in stream_]
+    return with_sensors(LAB, stream_, lambda sensor: sensor.name != "theta")[1]
 
 
 def blind(machine: MachineFile, times: float = 1.0) -> MachineFile:
@@ -143,3 +157,8 @@ def commissioned(machine: MachineFile, *recordings: HealthyRecording, wished: fl
         if one.hops
     ]
     return commission(machine, recordings, entries, wished=wished)
+
+
+def told_of(made: Commissioning, check: str) -> tuple[str, str, str]:
+    """Verdict, text and advice of one check."""
+    return next((one.verdict, one.text, one.advice) for one in made.report.checks if one.name == check)

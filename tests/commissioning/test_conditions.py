@@ -1,17 +1,21 @@
-"""Several healthy recordings: one baseline where they agree, one for each speed where the bearing depends on it."""
+"""Several healthy recordings: whether they were excited in different ways, and one baseline or one for each speed."""
 
+from dataclasses import replace
 from functools import cache
 
 import pytest
 
+from models.commissioning.checks import Check, check_sources
 from models.commissioning.commission import Commissioning
 from models.commissioning.commissioned import Installed
 from models.commissioning.healthy import HealthyRecording
+from models.diagnosis.window.statistics import WindowStatistics
 from rotorwatch.records.windows import Parameter
 from service.monitor.evaluation import Evaluation
 from service.monitor.evaluators import evaluator_for
 from simulator.scenario import Event
-from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, stream, windows_of
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_scenario
+from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, stream, told_of, windows_of
 from tests.sure import sure
 
 SLOW = LAB.operation.speed_rpm
@@ -42,14 +46,10 @@ def reading(found: Evaluation, name: str) -> Parameter:
     return next(one for one in found.deciding.parameters if one.name == name)
 
 
-def verdict_of(made: Commissioning) -> tuple[str, str]:
-    return next((one.verdict, one.text) for one in made.report.checks if one.name == "recordings agree")
-
-
 @pytest.mark.slow
 def test_two_speeds_of_one_machine_make_one_baseline() -> None:
     made = made_of(("slow.mcap", 91, (at(SLOW),)), ("fast.mcap", 92, (at(FAST),)))
-    assert verdict_of(made)[0] == "passed"
+    assert told_of(made, "recordings agree")[0] == "passed"
     (baseline,) = sure(made.commissioned).baselines
     low, high = sure(baseline.conditions.speed_rpm)
     assert abs(low / SLOW - 1) < 0.001
@@ -64,7 +64,7 @@ def test_two_speeds_of_one_machine_make_one_baseline() -> None:
 def test_a_bearing_that_depends_on_the_speed_has_a_baseline_for_each() -> None:
     stiffer = Event(at_s=0.0, parameter="k_by", relative_change=0.3)
     made = made_of(("slow.mcap", 91, (at(SLOW),)), ("fast.mcap", 92, (at(FAST), stiffer)))
-    verdict, text = verdict_of(made)
+    verdict, text, _ = told_of(made, "recordings agree")
     assert verdict == "limited"
     assert "bearing stiffness, horizontal" in text
     assert "a baseline is kept for each speed" in text
@@ -80,6 +80,33 @@ def test_recordings_that_differ_at_one_speed_are_refused() -> None:
     softer = Event(at_s=0.0, parameter="k_by", relative_change=-0.3)
     made = made_of(("slow.mcap", 91, (at(SLOW),)), ("friday.mcap", 92, (at(SLOW), softer)))
     assert made.commissioned is None
-    verdict, text = verdict_of(made)
+    verdict, text, _ = told_of(made, "recordings agree")
     assert verdict == "refused"
     assert "at one speed" in text
+
+
+DRAW = Draw(LAB, 7_700_077, Purpose.EVALUATION, stream=0, layout=Layout.ONE_SOURCE)
+
+
+@cache
+def window(condition: int, seed: int) -> WindowStatistics:
+    scenario = draw_condition(DRAW, condition)
+    found = simulate_scenario(scenario.overridden(seed=seed), LAB)
+    return replace(found, speed_rad_s=LAB.operation.speed_rad_s)
+
+
+def checked(*recordings: WindowStatistics) -> Check:
+    return check_sources({f"{number}.mcap": [one] for number, one in enumerate(recordings)})
+
+
+def test_recordings_of_one_condition_are_one_way_of_excitation() -> None:
+    assert "in the only recording" in checked(window(0, 1)).text
+    alike = checked(window(0, 1), window(0, 2))
+    assert alike.verdict == "limited"
+    assert "in the same way in all 2 recordings" in alike.text
+
+
+def test_another_source_or_another_speed_is_another_way() -> None:
+    faster = replace(window(0, 2), speed_rad_s=1.1 * LAB.operation.speed_rad_s)
+    for other in (window(1, 3), faster):
+        assert checked(window(0, 1), other).verdict == "passed"

@@ -2,7 +2,7 @@
 
 import json
 import re
-from dataclasses import replace
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -38,12 +38,14 @@ from tests.commissioning.rotor_kit import (
     commissioned,
     elsewhere,
     healthy,
+    no_velocity,
     recording,
     samples_of,
     stream,
     windows_of,
     with_lines,
     with_samples,
+    with_sensors,
     without_angle,
 )
 from tests.service.rig.watching import feed
@@ -57,6 +59,15 @@ MACHINES = {"full": LAB, "partial": PARTIAL, "none": NOTHING}
 def made_at(level: str) -> Commissioning:
     """The rotor kit commissioned on one recording, as much of it known as this level of knowledge says."""
     return commissioned(MACHINES[level], healthy(MACHINES[level], HEALTHY_S if level == "none" else 70.0, 41))
+
+
+def assert_identified(made: Commissioning, names: Sequence[str]) -> list[float]:
+    """That these parameters are within four standard errors of the true ones, which it returns."""
+    errors = np.sqrt(np.diag(sure(sure(made.commissioned).identified).matrix())).tolist()
+    for name, error in zip(names, errors, strict=False):
+        found, true = (getattr(machine.rotor, FAULT_FIELDS[name]) for machine in (sure(made.machine), LAB))
+        assert abs(np.log(found / true)) < 4 * error, name
+    return list(errors)
 
 
 def test_a_machine_file_says_how_much_is_known() -> None:
@@ -100,10 +111,7 @@ def test_lines_of_the_healthy_machine_hide_no_rotor() -> None:
     made = commissioned(PARTIAL, recording(PARTIAL, with_lines(stream(70.0, 41), {50.03: 0.1, 37.3: 0.1}, order=2)))
     found = sure(made.commissioned)
     assert {round(line_hz) for line_hz, _ in found.lines} == {37, 44, 50}
-    errors = np.sqrt(np.diag(sure(found.identified).matrix()))
-    for name, error in zip(PARAMETERS[:4], errors.tolist(), strict=False):
-        known, true = (getattr(machine.rotor, FAULT_FIELDS[name]) for machine in (sure(made.machine), LAB))
-        assert abs(np.log(known / true)) < 4 * error, name
+    assert_identified(made, PARAMETERS[:4])
     assert Commissioned.model_validate_json(found.model_dump_json()) == found
 
 
@@ -136,19 +144,14 @@ def test_without_a_shaft_angle_windows_of_two_unbalances_identify_none() -> None
 def test_partial_knowledge_identifies_the_rotor_within_its_errors() -> None:
     made = made_at("partial")
     assert made.report.verdict in {"commissioned", "limited"}
-    assert made.machine is not None
-    assert made.commissioned is not None
-    errors = np.sqrt(np.diag(sure(made.commissioned.identified).matrix()))
-    for name, error in zip(PARAMETERS, errors.tolist(), strict=True):
-        found, true = (getattr(machine.rotor, FAULT_FIELDS[name]) for machine in (made.machine, LAB))
-        assert 0 < error < 0.03, name
-        assert abs(np.log(found / true)) < 4 * error, name
-    phase = made.machine.operation.unbalance_phase_rad
-    assert abs(phase - LAB.operation.unbalance_phase_rad) < 0.1
-    assert made.machine.operation.speed_rpm == pytest.approx(LAB.operation.speed_rpm, rel=1e-4)
-    summaries = {one.name: one for one in made.report.parameters}
-    assert summaries["k_by"].commissioning_error == pytest.approx(errors[0], rel=0.1)
-    assert summaries["k_by"].identified == made.machine.rotor.k_by_N_per_m
+    errors = assert_identified(made, PARAMETERS)
+    assert 0 < min(errors) <= max(errors) < 0.03
+    machine = sure(made.machine)
+    assert abs(machine.operation.unbalance_phase_rad - LAB.operation.unbalance_phase_rad) < 0.1
+    assert machine.operation.speed_rpm == pytest.approx(LAB.operation.speed_rpm, rel=1e-4)
+    k_by = next(one for one in made.report.parameters if one.name == "k_by")
+    assert k_by.commissioning_error == pytest.approx(errors[0], rel=0.1)
+    assert k_by.identified == machine.rotor.k_by_N_per_m
 
 
 def test_a_later_window_is_judged_by_how_the_healthy_ones_were_off() -> None:
@@ -300,9 +303,7 @@ def test_the_valid_band_of_what_is_derived_is_stated() -> None:
     assert linear.startswith("The relations are linear.")
     found = sure(re.search(r"up to (\d) derivatives .* valid from 0 to (\d+) Hz", note))
     assert 50 <= int(found[2]) <= NOTHING.window.band_hz[1]
-    displacements = [n for n, channel in enumerate(NOTHING.sensors) if channel.quantity != "velocity"]
-    few = NOTHING.model_copy(update={"sensors": tuple(NOTHING.sensors[n] for n in displacements)})
-    blocks = [replace(block, samples=block.samples[:, displacements]) for block in stream(HEALTHY_S, 41)[:700]]
+    few, blocks = with_sensors(NOTHING, stream(HEALTHY_S, 41)[:700], no_velocity)
     less, _ = commissioned(few, recording(few, blocks)).report.notes
     deeper = sure(re.search(r"up to (\d) derivatives", less))
     assert int(deeper[1]) > int(found[1])

@@ -1,7 +1,6 @@
 """Steady lines of the healthy machine, such as hum, are taken out of what relations are learned on and read in."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -15,7 +14,16 @@ from models.signals.block import SampleBlock
 from service.monitor.evaluators import BaselineEvaluator
 from simulator.scenario import load_scenario
 from simulator.stream import blocks
-from tests.commissioning.rotor_kit import NOTHING, PARTIAL, commissioned, recording, stream, with_lines
+from tests.commissioning.rotor_kit import (
+    NOTHING,
+    PARTIAL,
+    commissioned,
+    no_velocity,
+    recording,
+    stream,
+    with_lines,
+    with_sensors,
+)
 from tests.sure import sure
 
 HUM = {50.02: 0.03, 100.04: 0.02, 150.06: 0.02}
@@ -79,11 +87,8 @@ def test_a_rotor_is_identified_from_a_guess_without_them() -> None:
     own = {"k_by_N_per_m": 4.5e5, "k_bz_N_per_m": 6e5, "c_by_N_s_per_m": 180.0, "c_bz_N_s_per_m": 200.0}
     scenario, kit = load_scenario("healthy")
     rotor = kit.model_copy(update={"rotor": kit.rotor.model_copy(update=known | own)})
-    columns = [number for number, channel in enumerate(kit.sensors) if channel.quantity != "velocity"]
-    told = {"sensors": tuple(kit.sensors[number] for number in columns)}
-    machine = PARTIAL.model_copy(update=told | {"rotor": sure(PARTIAL.rotor).model_copy(update=known)})
+    told = PARTIAL.model_copy(update={"rotor": sure(PARTIAL.rotor).model_copy(update=known)})
     shown = [block for block, _ in blocks(scenario.overridden(duration_s=130.0, seed=5_270_042), rotor)]
-    lines = with_lines(shown, {50.02: 0.1, 100.04: 0.06, 150.06: 0.1})
-    seen = [replace(block, samples=block.samples[:, columns]) for block in lines]
+    machine, seen = with_sensors(told, with_lines(shown, {50.02: 0.1, 100.04: 0.06, 150.06: 0.1}), no_velocity)
     windows = [piece.window for piece in pieces_of([recording(machine, seen)])]
     assert identify(machine, windows).machine.rotor.c_by_N_s_per_m == pytest.approx(180, rel=0.1)
