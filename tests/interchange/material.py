@@ -50,12 +50,8 @@ def signals(count: int, rate_hz: float = RATE_HZ) -> tuple[FloatArray, FloatArra
     """Time, s; displacement, um; velocity, mm/s; shaft angle, rad."""
     time = np.arange(count) / rate_hz
     omega = 2 * np.pi * SPEED_HZ
-    return (
-        time,
-        40 * np.cos(omega * time) + 3 * np.sin(170.0 * time) - 12,
-        -40e-3 * omega * np.sin(omega * time),
-        np.mod(omega * time, 2 * np.pi),
-    )
+    displacement = 40 * np.cos(omega * time) + 3 * np.sin(170.0 * time) - 12
+    return time, displacement, -40e-3 * omega * np.sin(omega * time), np.mod(omega * time, 2 * np.pi)
 
 
 def imported(folder: Path, source: Path, mapping: str, described: MachineFile | None = None) -> tuple[Imported, Path]:

@@ -145,12 +145,8 @@ def test_reports_and_alarms_are_tables(tmp_path: Path) -> None:
     assert read.column(f"{reading.name}.relative_change").to_pylist() == [reading.relative_change] * 2
     assert read.column("e.relative_change").null_count == 2
     (levels,) = report.levels
-    for column, unit in (
-        ("overall", "m/s2 rms"),
-        ("velocity", "mm/s rms"),
-        ("x1_phase_lag_deg", "deg"),
-        ("crest", "1"),
-    ):
+    units = {"overall": "m/s2 rms", "velocity": "mm/s rms", "x1_phase_lag_deg": "deg", "crest": "1"}
+    for column, unit in units.items():
         assert read.column(f"{levels.channel}.{column}").to_pylist() == [getattr(levels, column)] * 2
         assert read.schema.field(f"{levels.channel}.{column}").metadata[b"unit"] == unit.encode()
     export(Selection((tmp_path / "run.mcap",)), "alarms", "csv", tmp_path / "alarms.csv")

@@ -1,6 +1,6 @@
 """A folder of snapshot files comes in as one recording, in the order of the files' times."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -102,9 +102,16 @@ def test_pulses_of_a_keyphasor_give_the_angle_in_every_file(tmp_path: Path, mapp
     assert done.angle.unknown == 0
 
 
-def test_files_that_say_when_they_begin_are_joined_in_that_order_whatever_their_names(tmp_path: Path) -> None:
-    folder = write(tmp_path / "files", lambda number: f"{'dcba'[number]}.npz", range(4))
-    _, recording = imported(tmp_path, folder, DATED, KIT)
+@pytest.mark.parametrize(
+    ("names", "mapping"),
+    [("dcba", DATED), (("after 100 s", "after 119 s", "after 140 s", "after 160 s"), NUMBERED)],
+    ids=["times in the files", "numbers that are no count"],
+)
+def test_files_are_joined_in_the_order_of_their_times_or_else_of_their_numbers(
+    tmp_path: Path, names: Sequence[str], mapping: str
+) -> None:
+    folder = write(tmp_path / "files", lambda number: f"{names[number]}.npz", range(4))
+    _, recording = imported(tmp_path, folder, mapping, KIT)
     assert begun(recording) == times(range(4))
 
 
@@ -168,13 +175,6 @@ def test_a_file_that_cannot_be_read_is_named_and_the_others_come_in_at_their_tim
     assert done.left_out == ["notes.docx"]
 
 
-def test_where_places_are_counted_a_file_that_may_not_be_one_of_them_stops_the_import(tmp_path: Path) -> None:
-    folder = write(tmp_path / "files", by_number, range(4))
-    (folder / "Calibration.npz").write_bytes(b"")
-    with pytest.raises(SourceError, match=r"Calibration\.npz: .*move it out of the folder"):
-        imported(tmp_path, folder, NUMBERED, KIT)
-
-
 @pytest.mark.parametrize(("zone", "ahead_h"), [("Europe/Berlin", 1.0), ("+05:30", 5.5), ("UTC", 0.0), (None, 0.0)])
 def test_times_in_names_are_of_the_zone_that_the_mapping_names(
     tmp_path: Path, zone: str | None, ahead_h: float
@@ -224,19 +224,6 @@ def test_a_start_alone_is_enough_where_the_time_column_runs_on(tmp_path: Path) -
     np.testing.assert_allclose(found.samples[:, 0], _COLUMNS[0][: 4 * COUNT], atol=1e-9)
 
 
-def test_numbers_that_are_no_count_give_the_order_alone(tmp_path: Path) -> None:
-    folder = write(tmp_path / "files", lambda n: f"after {(100, 119, 140, 160)[n]} s.npz", range(4))
-    _, recording = imported(tmp_path, folder, NUMBERED, KIT)
-    assert begun(recording) == times(range(4))
-
-
-def test_files_that_follow_each_other_are_one_stretch(tmp_path: Path) -> None:
-    folder = write(tmp_path / "files", by_number, range(4), ON_S)
-    _, recording = imported(tmp_path, folder, DATED)
-    (found,) = stretches(recording)
-    np.testing.assert_allclose(found.samples[:, 0], _COLUMNS[0][: 4 * COUNT], atol=1e-9)
-
-
 def test_files_of_different_lengths_are_told(tmp_path: Path) -> None:
     folder = write(tmp_path / "files", by_date, range(3))
     told = summary(tmp_path, folder, NAMED)
@@ -276,9 +263,13 @@ def test_what_is_wrong_with_a_folder_is_told(tmp_path: Path, mapping: str, every
         imported(tmp_path, folder, mapping, KIT)
 
 
-def test_a_start_alone_needs_a_schedule_and_a_folder_needs_files(tmp_path: Path) -> None:
+def test_a_start_alone_needs_a_schedule_and_nothing_but_files_that_count(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"time\.start is that of the first file; expected \[schedule\] every_s"):
         imported(tmp_path, write(tmp_path / "files", by_number, range(3)), NUMBERED)
     (tmp_path / "empty").mkdir()
     with pytest.raises(SourceError, match="empty: no file of a known format in it"):
         imported(tmp_path, tmp_path / "empty", NAMED)
+    folder = tmp_path / "files"
+    (folder / "Calibration.npz").write_bytes(b"")
+    with pytest.raises(SourceError, match=r"Calibration\.npz: .*move it out of the folder"):
+        imported(tmp_path, folder, NUMBERED, KIT)

@@ -215,15 +215,10 @@ def test_integers_of_a_wav_file_are_of_full_scale(tmp_path: Path, dtype: type[np
     offset = 128 if dtype is np.uint8 else 0
     whole = np.rint(fraction * largest) if largest > 1 else fraction
     wavfile.write(tmp_path / "run.wav", 2000, np.column_stack([(whole + offset).astype(dtype)] * 3))
-    _, recording = imported(
-        tmp_path,
-        tmp_path / "run.wav",
-        f'time.start = "{START}"\n[channels]\ny1 = {{ column = 1, unit = "um", scale = 250.0 }}\n'
-        'y1_dot = { column = 2, unit = "mm/s" }\ntheta = { column = 3, unit = "rad" }\n',
-    )
-    np.testing.assert_allclose(
-        stretches(recording)[0].samples[:, 0], whole / largest * 250, rtol=1e-6 if dtype is np.float32 else 1e-12
-    )
+    mapping = BEGIN + named("1", "2", "3").replace('"um"', '"um", scale = 250.0')
+    _, recording = imported(tmp_path, tmp_path / "run.wav", mapping)
+    exact = 1e-6 if dtype is np.float32 else 1e-12
+    np.testing.assert_allclose(stretches(recording)[0].samples[:, 0], whole / largest * 250, rtol=exact)
 
 
 @pytest.mark.parametrize(("of", "zone", "late_h"), [("Europe/Berlin", "", 0), (None, "America/New_York", 5)])

@@ -335,6 +335,11 @@ def test_a_folder_without_its_bad_file_is_exit_code_1(tmp_path: Path) -> None:
     assert found.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize("command", ["import", "export"])
+def test_help_has_an_example(command: str) -> None:
+    assert "Example" in run(command, "--help").stdout
+
+
 HIGH_PASS_HZ = 1.5
 MAPPING = f"""
 [time]

@@ -34,11 +34,8 @@ from tests.sure import sure
 STEP_NS = 500_000
 NANOSECONDS = '[time]\ncolumn = "t"\nunit = "ns"\nstart = "unix"\n'
 
-runs = st.lists(
-    st.tuples(st.integers(2, 900), st.integers(2, 40_000)),  # samples, then steps without any
-    min_size=1,
-    max_size=6,
-)
+samples_and_steps_without = st.tuples(st.integers(2, 900), st.integers(2, 40_000))
+runs = st.lists(samples_and_steps_without, min_size=1, max_size=6)
 
 
 def write(

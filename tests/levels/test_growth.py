@@ -79,11 +79,8 @@ def test_a_level_that_was_nothing_has_no_growth() -> None:
 
 
 def test_the_channel_that_is_watched_least_says_what_would_have_been_seen() -> None:
-    limits = [
-        {"channel": "A", "alert": 0.6},
-        {"channel": "V", "alert": 2.8},
-        {"channel": "D", "measure": "x2", "alert": 3},
-    ]
+    of_d = {"channel": "D", "measure": "x2", "alert": 3}
+    limits = [{"channel": "A", "alert": 0.6}, {"channel": "V", "alert": 2.8}, of_d]
     seen = growth_seen(judged(window(), limits=limits))
     assert (seen.channel, seen.measure) == ("D", "x2")
     assert seen.growth == pytest.approx(2.0)

@@ -43,6 +43,10 @@ def judged(
     return found
 
 
+def limits(levels: ChannelLevels) -> dict[str, LevelLimits]:
+    return {one.measure: one for one in levels.limits}
+
+
 @pytest.mark.parametrize(
     ("rms_mm_s", "zone", "state"),
     [(1.3, "A", "normal"), (2.7, "B", "normal"), (2.9, "C", "alert"), (4.4, "C", "alert"), (4.6, "D", "danger")],
@@ -81,44 +85,34 @@ def test_own_limits_are_in_the_unit_that_is_shown() -> None:
     assert (limits(found)["overall"].state, limits(found)["crest"].state) == ("alert", "normal")
 
 
-def limits(levels: ChannelLevels) -> dict[str, LevelLimits]:
-    return {one.measure: one for one in levels.limits}
-
-
 def reference(*levels: WindowLevels, channel: Channel = CASING) -> LevelReference:
     return learn_levels("commissioned", [channel.name], levels)
 
 
+STEADY, VARIED = (0.98, 1.0, 1.02), (0.5, 1.0, 2.0)
+
+
 @pytest.mark.parametrize(
-    ("factor", "state"), [(0.45, "alert"), (0.55, "normal"), (1.5, "normal"), (1.7, "alert"), (2.6, "danger")]
+    ("healthy", "error", "overall", "hops", "state"),
+    [
+        *((STEADY, 0.0, *one) for one in ((0.45, 16, "alert"), (0.55, 16, "normal"), (1.5, 16, "normal"))),
+        *((STEADY, 0.0, *one) for one in ((1.7, 16, "alert"), (2.6, 16, "danger"))),
+        # A window that is not full may scatter more.
+        *((STEADY, 0.1, *one) for one in ((3.0, 16, "danger"), (3.0, 1, "normal"))),
+        # What varied in the healthy windows may vary.
+        *((VARIED, 0.0, *one) for one in ((2.4, 16, "normal"), (0.41, 16, "normal"), (2.6, 16, "alert"))),
+        # A window that fills scatters about the loudest healthy one too.
+        *((VARIED, 0.058, *one) for one in ((2.6, 16, "alert"), (2.6, 8, "normal"), (2.8, 8, "alert"))),
+        *((VARIED, 0.058, *one) for one in ((0.35, 16, "alert"), (0.35, 8, "normal"))),
+    ],
 )
-def test_levels_relative_to_a_steady_reference(factor: float, state: str) -> None:
-    healthy = reference(*(window(overall=value * 1e-3) for value in (0.98, 1.0, 1.02)))
-    found = judged(CASING, window(overall=factor * 1e-3), healthy)
+def test_levels_relative_to_those_of_the_healthy_machine(
+    healthy: tuple[float, ...], error: float, overall: float, hops: int, state: str
+) -> None:
+    windows = [replace(window(error=1e-3 * error * one, overall=1e-3 * one), hops=16) for one in healthy]
+    found = judged(CASING, replace(window(overall=1e-3 * overall), hops=hops), reference(*windows))
     assert limits(found)["overall"].state == state
     assert channel_state(found).beyond == (state != "normal")
-
-
-def test_a_window_that_is_not_full_may_scatter_more() -> None:
-    healthy = reference(*(replace(window(error=1e-4, overall=1e-3), hops=16) for _ in range(3)))
-    full, first_hop = (judged(CASING, replace(window(overall=3e-3), hops=hops), healthy) for hops in (16, 1))
-    assert (limits(full)["overall"].state, limits(first_hop)["overall"].state) == ("danger", "normal")
-
-
-@pytest.mark.parametrize(("overall", "state"), [(2.4e-3, "normal"), (0.41e-3, "normal"), (2.6e-3, "alert")])
-def test_what_varied_in_the_healthy_windows_may_vary(overall: float, state: str) -> None:
-    healthy = reference(*(window(overall=value * 1e-3) for value in (0.5, 1.0, 2.0)))
-    assert limits(judged(CASING, window(overall=overall), healthy))["overall"].state == state
-
-
-@pytest.mark.parametrize(
-    ("overall", "hops", "state"),
-    [(2.6, 16, "alert"), (2.6, 8, "normal"), (2.8, 8, "alert"), (0.35, 16, "alert"), (0.35, 8, "normal")],
-)
-def test_a_window_that_fills_scatters_about_the_loudest_healthy_one_too(overall: float, hops: int, state: str) -> None:
-    healthy = reference(*(replace(window(error=0.058 * value, overall=value), hops=16) for value in (0.5, 1.0, 2.0)))
-    found = judged(CASING, replace(window(overall=overall), hops=hops), healthy)
-    assert limits(found)["overall"].state == state
 
 
 @pytest.mark.parametrize("speed_rad_s", [SPEED, None, np.nan])
@@ -135,18 +129,19 @@ def test_running_and_standing_are_each_compared_with_themselves(speed_rad_s: flo
     assert limits(judged(CASING, window(overall=0.1e-3), reference(*still)))["overall"].state == "normal"
 
 
-def test_a_line_that_was_noise_has_to_stand_out_of_it() -> None:
-    healthy = reference(*(window(error=1e-5, x2=value) for value in (1e-5, 2e-5, 1.5e-5)))
-    assert limits(judged(CASING, window(x2=6e-5), healthy))["x2"].state == "normal"
-    assert limits(judged(CASING, window(x2=9e-5), healthy))["x2"].state == "alert"
-
-
 @pytest.mark.parametrize(
-    ("x2", "state"), [(0.05e-3, "normal"), (0.11e-3, "alert"), (0.24e-3, "alert"), (0.26e-3, "danger")]
+    ("healthy", "overall", "x2", "state"),
+    [
+        *(((1e-5, 2e-5, 1.5e-5), np.nan, *one) for one in ((6e-5, "normal"), (9e-5, "alert"))),
+        *(((3e-5,) * 3, 1e-3, *one) for one in ((5e-5, "normal"), (1.1e-4, "alert"), (2.4e-4, "alert"))),
+        ((3e-5,) * 3, 1e-3, 2.6e-4, "danger"),
+    ],
 )
-def test_a_line_out_of_noise_is_a_danger_only_where_it_is_much_of_the_vibration(x2: float, state: str) -> None:
-    healthy = reference(*(window(error=1e-5, overall=1e-3, x2=3e-5) for _ in range(3)))
-    assert limits(judged(CASING, window(overall=1e-3, x2=x2), healthy))["x2"].state == state
+def test_a_line_that_was_noise_has_to_stand_out_and_is_a_danger_only_where_it_is_much_of_the_vibration(
+    healthy: tuple[float, ...], overall: float, x2: float, state: str
+) -> None:
+    was = reference(*(window(error=1e-5, overall=overall, x2=value) for value in healthy))
+    assert limits(judged(CASING, window(overall=overall, x2=x2), was))["x2"].state == state
 
 
 def test_a_1x_vector_that_turns_leaves_its_acceptance_region_at_the_same_size() -> None:
@@ -158,14 +153,10 @@ def test_a_1x_vector_that_turns_leaves_its_acceptance_region_at_the_same_size() 
     assert [one.source for one in turned.bounds] == ["commissioned"]
     without_reference_of_phase = judged(SHAFT, replace(window(x1=-10e-6), vectors=None), healthy)
     assert limits(without_reference_of_phase)["x1"].state == "normal"
-
-
-def test_a_vector_out_of_its_region_is_told_whichever_way_its_size_was_rounded() -> None:
-    healthy = reference(*(window(x1=10e-6 * np.exp(1j * turn)) for turn in (-0.05, 0.0, 0.05)), channel=SHAFT)
-    turned = window(x1=-10e-6)
-    for side in (0.0, np.inf):
-        rounded_size = {"x1": np.nextafter(turned.values["x1"], side)}
-        found = limits(judged(SHAFT, replace(turned, values={**turned.values, **rounded_size}), healthy))["x1"]
+    opposite = window(x1=-10e-6)
+    for side in (0.0, np.inf):  # whichever way its size was rounded
+        rounded_size = {"x1": np.nextafter(opposite.values["x1"], side)}
+        found = limits(judged(SHAFT, replace(opposite, values={**opposite.values, **rounded_size}), healthy))["x1"]
         assert (found.state, found.source) == ("alert", "1x vector")
 
 

@@ -175,16 +175,6 @@ def test_a_band_ends_where_the_sampling_rate_ends_it() -> None:
     assert np.isnan(found["high"]).all()
 
 
-def test_a_hop_goes_into_arrays_and_comes_back() -> None:
-    sizes = plan("acceleration", "displacement")
-    x = np.random.default_rng(86).standard_normal((12_800, 2))
-    hop = hop_levels(sizes, *waveform_of(x), 2 * np.pi * 25 * times(0.5))
-    again = type(hop).restored(hop.checkpoint())
-    np.testing.assert_array_equal(again.sums, hop.sums)
-    np.testing.assert_array_equal(again.orders, hop.orders)
-    assert again.n_samples == hop.n_samples
-
-
 @pytest.mark.parametrize(("angles", "location"), [((45, 135), "bearing"), ((20, 80), "DE"), ((-30, 190), "disc")])
 def test_the_largest_radius_is_the_same_for_probes_at_any_angle(angles: tuple[float, float], location: str) -> None:
     t = times(5.0, 2000.0)

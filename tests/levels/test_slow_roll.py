@@ -20,6 +20,7 @@ from rotorwatch.records.levels import ChannelLevels
 from simulator.scenario import load_scenario
 from simulator.stream import blocks
 from tests.sure import sure
+from tests.windows import fed
 
 PROBE = {"quantity": "displacement", "location": "DE", "unit": "mm"}
 RUNOUT = {"slow_roll_um_pp": 12.0, "slow_roll_phase_lag_deg": 250.0}
@@ -40,10 +41,7 @@ def at_1x(um_pp: float, lag_deg: float, theta: FloatArray, turned: int) -> Float
 
 
 def window_of(machine: MachineFile, samples: FloatArray) -> SlidingWindow:
-    window = SlidingWindow(plan_for(machine, levels=True, lagged=False))
-    for _ in window.feed(window.plan.to_si(samples), 0):
-        pass
-    return window
+    return fed(plan_for(machine, levels=True, lagged=False), samples)
 
 
 def levels(machine: MachineFile, samples: FloatArray) -> tuple[WindowLevels, tuple[ChannelLevels, ...]]:
@@ -70,13 +68,6 @@ def test_the_vector_sum_of_a_run_out_and_a_vibration_gives_back_the_vibration(tu
     for measure in ("overall", "peak", "not_x1", "x2", "crest"):
         assert getattr(x, measure) == getattr(y, measure)
     assert x.not_x1 == pytest.approx(0.003 / np.sqrt(2), rel=0.01)
-
-
-def test_at_slow_roll_nothing_is_left() -> None:
-    machine = MachineFile.model_validate(PUMP)
-    theta = 2 * np.pi * 5 * np.arange(20 * 1024) / 1024
-    _, (x, _) = levels(machine, np.column_stack([at_1x(12, 250, theta, 1)] * 2 + [theta % (2 * np.pi)]))
-    assert x.x1 == pytest.approx(0, abs=1e-6)
 
 
 @cache

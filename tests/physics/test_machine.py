@@ -8,7 +8,7 @@ import pytest
 
 from models.diagnosis.window.moments import plan_for
 from models.errors import MachineFileError
-from models.machine import load_machine, load_machine_file
+from models.machine import Machine, MachineFile, load_machine, load_machine_file
 from models.physics.response import synchronous_response
 from models.physics.rotor import PARAMETERS, changed, system_A
 from models.stream_settings import WindowSettings, time_scale
@@ -72,10 +72,15 @@ unit = "g"
 """
 
 
+def fan(folder: Path, *more: object, rate_hz: float = 25600.0) -> MachineFile:
+    """A machine of which nothing but its sensors is known, and what its file says besides."""
+    text = SENSORS_ALONE.replace("2000.0", repr(rate_hz))
+    return load_machine_file(write(folder, "\n".join([text, *map(str, more)]) + "\n"))
+
+
 @pytest.mark.parametrize("rate_hz", [50.0, 200.0, 256.0, 1666.67, 6400.5, 51200 / 7, 51200 / 3, 102400.0])
 def test_a_machine_file_with_nothing_but_sensors_goes_with_any_rate(tmp_path: Path, rate_hz: float) -> None:
-    machine = load_machine_file(write(tmp_path, SENSORS_ALONE.replace("2000.0", repr(rate_hz))))
-    window = machine.window
+    window = fan(tmp_path, rate_hz=rate_hz).window
     assert (window.segment_s, window.hop_s, window.length_s) == pytest.approx((2, 5, 60), rel=0.01)
     assert window.band_hz[0] == 3.0
     assert window.band_hz[1] < rate_hz / 2
@@ -98,18 +103,22 @@ def in_time(times: float, rate_hz: float, *more: str) -> str:
     return "\n".join([text, *more])
 
 
+def kit(folder: Path, times: float, rate_hz: float, *more: str) -> Machine:
+    return load_machine(write(folder, in_time(times, rate_hz, *more)))
+
+
 def test_a_window_that_is_not_given_goes_with_the_natural_frequencies(tmp_path: Path) -> None:
-    usual = load_machine(write(tmp_path, in_time(1, 2000.0)))
+    usual = kit(tmp_path, 1, 2000.0)
     assert (usual.window, usual.time_scale) == (WindowSettings(), 1)
 
-    fast = load_machine(write(tmp_path, in_time(15, 20000.0)))
+    fast = kit(tmp_path, 15, 20000.0)
     low_hz, high_hz = fast.window.band_hz
     assert low_hz < 0.1 * fast.rotor.modes_hz[0] < 1.2 * fast.rotor.modes_hz[3] < high_hz < 8000
     assert (fast.window.length_s, fast.window.hop_s, fast.window.segment_s) == (60, 5, 2)
     assert fast.window.lag_to_s == pytest.approx(0.125 * fast.time_scale)
     assert fast.window.lag_step_s * fast.rate_hz == 2
 
-    slow = load_machine(write(tmp_path, in_time(0.05, 200.0)))
+    slow = kit(tmp_path, 0.05, 200.0)
     assert slow.time_scale == pytest.approx(6 / slow.rotor.modes_hz[0], rel=0.05)
     low_hz, high_hz = slow.window.band_hz
     assert low_hz <= slow.rotor.modes_hz[0] / 2
@@ -120,10 +129,8 @@ def test_a_window_that_is_not_given_goes_with_the_natural_frequencies(tmp_path: 
 
 
 def test_a_window_that_is_given_is_taken(tmp_path: Path) -> None:
-    given = load_machine(write(
-        tmp_path,
-        in_time(15, 20000.0, "[window]", "hop_s = 10.0", "length_s = 120.0", "max_span_s = 200.0", "lag_to_s = 0.05"),
-    ))  # fmt: skip
+    lengths = ("hop_s = 10.0", "length_s = 120.0", "max_span_s = 200.0", "lag_to_s = 0.05")
+    given = kit(tmp_path, 15, 20000.0, "[window]", *lengths)
     assert (given.window.hop_s, given.window.length_s, given.window.segment_s) == (10, 120, 2)
     assert (given.window.lag_from_s, given.window.lag_to_s) == (0.01, 0.05)
     assert given.window.band_hz[1] > 1000
@@ -132,7 +139,7 @@ def test_a_window_that_is_given_is_taken(tmp_path: Path) -> None:
 @pytest.mark.parametrize("given", ["hop_s = 1.0", "segment_s = 1.0", "max_span_s = 120.0"])
 def test_a_slow_machine_whose_file_gives_one_length_has_the_usual_others(tmp_path: Path, given: str) -> None:
     """Longer lags would not go into a hop that is given, nor a longer window into a span that is."""
-    window = load_machine(write(tmp_path, in_time(0.01, 200.0, "[window]", given))).window
+    window = kit(tmp_path, 0.01, 200.0, "[window]", given).window
     usual = WindowSettings()
     assert (window.length_s, window.lag_to_s) == (usual.length_s, usual.lag_to_s)
 
@@ -140,10 +147,9 @@ def test_a_slow_machine_whose_file_gives_one_length_has_the_usual_others(tmp_pat
 @pytest.mark.parametrize("lag_to_s", [0.1, 0.125])
 def test_given_lags_of_a_usual_machine_are_what_a_fast_one_is_evaluated_by(tmp_path: Path, lag_to_s: float) -> None:
     """What was commissioned with such a file before goes on as it was."""
-    text = SENSORS_ALONE.replace("2000", "25600") + "[operation]\nspeed_rpm = 6000\n"
-    assert load_machine_file(write(tmp_path, text)).time_scale == 0.5
-    given = load_machine_file(write(tmp_path, f"{text}[window]\nlag_from_s = 0.01\nlag_to_s = {lag_to_s}\n"))
-    assert given.time_scale == 1
+    speed = "[operation]\nspeed_rpm = 6000"
+    assert fan(tmp_path, speed).time_scale == 0.5
+    assert fan(tmp_path, speed, "[window]\nlag_from_s = 0.01", f"lag_to_s = {lag_to_s}").time_scale == 1
 
 
 def test_the_usual_window_is_near_enough_for_a_machine_a_little_off() -> None:
@@ -154,7 +160,7 @@ def test_the_usual_window_is_near_enough_for_a_machine_a_little_off() -> None:
 
 
 def test_the_longest_segments_are_whole_numbers_of_samples_at_any_rate(tmp_path: Path) -> None:
-    assert 117 < load_machine(write(tmp_path, in_time(0.0035, 33.345))).window.segment_s < 120
+    assert 117 < kit(tmp_path, 0.0035, 33.345).window.segment_s < 120
 
 
 def test_a_rotor_without_natural_frequencies_is_refused(tmp_path: Path) -> None:
@@ -165,27 +171,20 @@ def test_a_rotor_without_natural_frequencies_is_refused(tmp_path: Path) -> None:
 
 def test_the_mean_is_no_part_of_the_band(tmp_path: Path) -> None:
     """Snapshots of a slow machine may be too short for segments that tell its slowest motion from rest."""
-    text = in_time(0.05, 200.0, "[schedule]", "on_s = 2.0", "every_s = 60.0")
-    machine = load_machine(write(tmp_path, text))
+    machine = kit(tmp_path, 0.05, 200.0, "[schedule]", "on_s = 2.0", "every_s = 60.0")
     assert round(machine.window.band_hz[0] * machine.window.segment_s) == 0
     assert plan_for(machine).bins[0] == 1
 
 
 def test_where_the_rotor_is_not_known_a_fast_speed_says_so_and_a_slow_one_nothing(tmp_path: Path) -> None:
-    windows = {
-        rpm: load_machine_file(
-            write(tmp_path, f"{SENSORS_ALONE.replace('2000', '25600')}[operation]\nspeed_rpm = {rpm}\n")
-        )
-        for rpm in (60, 1500, 3000, 15000)
-    }
+    windows = {rpm: fan(tmp_path, f"[operation]\nspeed_rpm = {rpm}") for rpm in (60, 1500, 3000, 15000)}
     assert [one.time_scale for one in windows.values()] == [1, 1, 1, 0.2]
     assert (windows[60].window, windows[15000].window.band_hz) == (windows[3000].window, (15, 750))
     assert windows[15000].window.lag_to_s == pytest.approx(0.025)
 
 
 def test_snapshots_of_a_fast_machine_have_its_band_and_lags(tmp_path: Path) -> None:
-    text = SENSORS_ALONE.replace("2000", "25600") + "[operation]\nspeed_rpm = 15000\n"
-    window = load_machine_file(write(tmp_path, f"{text}[schedule]\non_s = 4.0\nevery_s = 60.0\n")).window
+    window = fan(tmp_path, "[operation]\nspeed_rpm = 15000", "[schedule]\non_s = 4.0\nevery_s = 60.0").window
     assert (window.hop_s, window.length_s, window.segment_s) == (60, 720, 1)
     assert window.band_hz == (15, 750)
     assert (window.lag_from_s, window.lag_to_s) == pytest.approx((0.002, 0.025))
@@ -195,6 +194,5 @@ def test_snapshots_of_a_fast_machine_have_its_band_and_lags(tmp_path: Path) -> N
 def test_a_rate_that_shows_nothing_of_a_fast_machine_still_goes_with_the_usual_window(
     tmp_path: Path, rpm: int, rate_hz: float
 ) -> None:
-    text = SENSORS_ALONE.replace("2000.0", repr(rate_hz)) + "[operation]\nspeed_rpm = "
-    machine = load_machine_file(write(tmp_path, f"{text}{rpm}\n"))
-    assert (machine.window, machine.time_scale) == (load_machine_file(write(tmp_path, f"{text}1500\n")).window, 1)
+    machine, usual = (fan(tmp_path, f"[operation]\nspeed_rpm = {one}", rate_hz=rate_hz) for one in (rpm, 1500))
+    assert (machine.window, machine.time_scale) == (usual.window, 1)
