@@ -36,7 +36,9 @@ def windows(condition: Scenario) -> list[WindowStatistics]:
 
 
 @pytest.mark.slow
-def test_correlation_functions_agree_with_theory(condition: Scenario, windows: list[WindowStatistics]) -> None:
+def test_correlation_functions_and_synchronous_vectors_agree_with_theory(
+    condition: Scenario, windows: list[WindowStatistics]
+) -> None:
     """Twelve independent windows: every correlation at every lag within 5.5 standard errors of their mean.
 
     8064 correlated comparisons with t-distributed deviations of 11 degrees of freedom: 5.5 is exceeded twice in ten
@@ -53,18 +55,12 @@ def test_correlation_functions_agree_with_theory(condition: Scenario, windows: l
     assert np.mean(deviation > 5.5) < 1e-3
     scale = np.sqrt(np.diagonal(R0)[index])
     assert np.all(error / np.outer(scale, scale) < 0.05)  # or agreement would mean little
-
-
-@pytest.mark.slow
-def test_synchronous_vectors_agree_with_theory(condition: Scenario, windows: list[WindowStatistics]) -> None:
-    speed = next(event.speed_rpm for event in condition.events if event.speed_rpm is not None) * 2 * np.pi / 60
     q1, q2 = synchronous_response(MACHINE.rotor, speed)
-    index = [STATE_INDEX[name] for name in windows[0].states]
     expected = (q1 - 1j * q2)[index]
     found = np.stack([window.synchronous for window in windows if window.synchronous is not None])
-    error = np.sqrt(np.var(found, axis=0, ddof=1) / 12)
-    assert np.all(np.abs(found.mean(axis=0) - expected) < 5 * error)
-    assert np.all(error < 0.05 * np.abs(expected))
+    off = np.sqrt(np.var(found, axis=0, ddof=1) / 12)
+    assert np.all(np.abs(found.mean(axis=0) - expected) < 5 * off)
+    assert np.all(off < 0.05 * np.abs(expected))
     assert windows[0].speed_rad_s == pytest.approx(speed, rel=1e-6)
 
 

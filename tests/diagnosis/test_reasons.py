@@ -178,7 +178,4 @@ def test_of_an_unexplained_window_what_accounts_for_much_of_it_is_told() -> None
     assert mostly.suspected(unexplained=True) == "delay of y1 (+40 µs)"
     assert not hardly.suspected(unexplained=True)
     assert hardly.suspected(unexplained=False) == "delay of y1 (+40 µs)"
-
-
-def test_a_misfit_of_which_nothing_could_be_tried_is_that_of_the_spectra() -> None:
     assert Goodness(4.5, (), 1).misfit_z == pytest.approx(4.5)

@@ -1,5 +1,6 @@
 """The overhung rotor of `benchmarks.finite_elements`, for tests of what must not depend on six degrees of freedom."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -45,6 +46,19 @@ def simulate(
     )
     condition = observed.RunCondition(forces, rotor.speed_rad_s, {}, noise, noise_corner_hz)
     return observed.sampled(rotor, condition, duration_s, seed, PROBES)
+
+
+SIZES = observed.WindowSizes(length_s=30.0, hop_s=2.5, segment_s=2.5)
+
+
+def windows_under(
+    rotor: BeamRotor, run: observed.RunCondition, count: int, seed: int, change: Callable[[FloatArray], object] = len
+) -> list[WindowStatistics]:
+    """Windows of 30 s that follow on each other, of samples that may be changed in place."""
+    sizes = observed.plan(rotor, SIZES)
+    samples = observed.sampled(rotor, run, 30.0 * count + sizes.preamble / sizes.rate_hz + 0.1, seed)
+    change(samples)
+    return observed.windows_of(samples, sizes)
 
 
 def plan(hops: int = 12, states: tuple[str, ...] = observed.MOTION, speed_rad_s: float | None = None) -> Plan:

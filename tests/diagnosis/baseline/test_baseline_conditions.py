@@ -30,7 +30,7 @@ def baseline() -> Baseline:
 
 
 @pytest.mark.slow
-def test_every_commissioned_speed_has_its_own_unbalance() -> None:
+def test_every_commissioned_speed_has_its_own_unbalance_and_conditions_that_agree_leave_no_doubt() -> None:
     assert [round(one.speed_rad_s / 2 / np.pi) for one in baseline().rotations] == [24, 33]
     monitor = BaselineDiagnostician(baseline())
     for seed, rotor in ((83, ROTOR), (84, FAST)):
@@ -41,9 +41,6 @@ def test_every_commissioned_speed_has_its_own_unbalance() -> None:
     between = replace(ROTOR, speed_rad_s=2 * np.pi * 28.0)
     found = {one.name: one.reason for one in monitor.diagnose(*recorded(between, OTHER, 85, 1)).parameters}
     assert (found["e"], found["k_by"]) == ("speed 1680 rpm, the baseline was learned at 1440, 1980 rpm", "")
-
-
-def test_conditions_that_agree_leave_no_doubt() -> None:
     assert {one.condition for one in baseline().consistency} == {"slow", "fast"}
     assert max(abs(each.z) for one in baseline().consistency for each in one.agreements) < 4
     assert disagreements(baseline()) == ()
@@ -121,15 +118,12 @@ def suspected(k: float, c: float, states: tuple[str, ...] = ("y1", "y2")) -> str
     return "" if found is None else f"{found.sentence} {100 * found.factor:.0f} {found.z > 5}"
 
 
-def test_equal_changes_of_stiffness_and_damping_look_like_a_gain() -> None:
+def test_equal_changes_of_stiffness_and_damping_look_like_a_gain_which_all_sensors_of_a_place_may_share() -> None:
     assert suspected(-0.1, -0.1) == "gain of y1 or of y2 -10 True"
     assert suspected(0.2, 0.19) == "gain of y1 or of y2 20 True"
     assert suspected(-0.1, 0.0) == ""
     assert suspected(0.0, -0.3) == ""
     assert suspected(-0.1, -0.3) == suspected(0.001, 0.01) == ""
-
-
-def test_all_sensors_of_a_place_may_share_a_wrong_gain() -> None:
     both = ("y1", "y1_dot", "y2", "y2_dot")
     assert suspected(-0.1, -0.1, both) == "gain of y1 and y1_dot or of y2 and y2_dot -10 True"
     assert suspected(-0.1, 0.0, both) == ""

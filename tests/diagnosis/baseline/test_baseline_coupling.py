@@ -37,37 +37,25 @@ def later(name: str, changes: dict[str, float], number: int) -> WindowStatistics
 @pytest.mark.slow
 def test_a_film_that_couples_the_planes_is_learned_and_its_changes_are_named() -> None:
     learned = baseline("fluid-film")
-    assert learned.rows == COUPLED_ROWS
+    again = BaselineRecord.model_validate_json(BaselineRecord.of(learned).model_dump_json()).baseline()
+    assert learned.rows == again.rows == COUPLED_ROWS
+    assert learned.force.size
+    assert np.array_equal(again.force, learned.force)
     for relation, across in zip(learned.relations, (0.09, -0.07), strict=True):
         assert relation is not None
         assert relation.misfit < 1.5
         # -k_yz/k_y of the bearing and of what else holds the shaft
         assert relation.coefficients[4] == pytest.approx(-across, abs=0.03)
-    monitor = BaselineDiagnostician(learned)
+    monitor = BaselineDiagnostician(again)
     assert [isolate_window(monitor.diagnose(later("fluid-film", {}, n)), 0.01).changed for n in range(3)] == [()] * 3
     softer = [isolate_window(monitor.diagnose(later("fluid-film", {"k_by": -0.1}, n)), 0.01) for n in range(2)]
     assert all(one.changed == ("k_by",) for one in softer)
 
 
-@pytest.mark.slow
-def test_a_machine_whose_planes_are_apart_keeps_its_relations() -> None:
-    assert not planes_coupled(healthy("overhung"))
-    assert baseline("overhung").rows == ROWS
-
-
-def test_a_restored_baseline_of_coupled_planes_reads_the_same() -> None:
-    again = BaselineRecord.model_validate_json(BaselineRecord.of(baseline("fluid-film")).model_dump_json())
-    window = later("fluid-film", {}, 0)
-    one, other = (
-        each.diagnose(window) for each in (BaselineDiagnostician(baseline("fluid-film")), again.diagnostician())
-    )
-    assert one.parameters == other.parameters
-    assert np.array_equal(again.baseline().force, baseline("fluid-film").force)
-    assert baseline("fluid-film").force.size
-
-
 def test_each_condition_that_a_relation_holds_in_makes_it_surer_elsewhere() -> None:
     learned, window = baseline("overhung"), later("overhung", {}, 0)
+    assert not planes_coupled(healthy("overhung"))
+    assert learned.rows == ROWS
     half = tuple(replace(one, condition=str(one.window % 2)) for one in learned.consistency)
     found = [BaselineDiagnostician(each).diagnose(window) for each in (learned, replace(learned, consistency=half))]
     assert found[0].unexplained == ""  # although the force is another one

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.finite_elements.machines import rotor_named
-from benchmarks.finite_elements.observed import RunCondition, WindowSizes, plan, sampled, windows_of
+from benchmarks.finite_elements.observed import RunCondition
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
 from models.commissioning.levels import learned_baseline
 from models.diagnosis.baseline import relation
@@ -19,10 +19,10 @@ from models.diagnosis.readings import Diagnosis
 from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
+from tests.diagnosis.baseline.fe_rotor import windows_under
 from tests.sure import sure
 
 ROTOR = rotor_named("overhung")
-SIZES = WindowSizes(length_s=30.0, hop_s=2.5, segment_s=2.5)
 
 
 def condition(seed: int, **changes: float) -> RunCondition:
@@ -30,9 +30,7 @@ def condition(seed: int, **changes: float) -> RunCondition:
 
 
 def windows(run: RunCondition, count: int, seed: int) -> list[WindowStatistics]:
-    sizes = plan(ROTOR, SIZES)
-    lead_s = sizes.preamble / sizes.rate_hz + 0.1
-    return windows_of(sampled(ROTOR, run, 30.0 * count + lead_s, seed), sizes)
+    return windows_under(ROTOR, run, count, seed)
 
 
 @cache
@@ -76,13 +74,10 @@ def test_damping_is_sharper_while_the_commissioned_force_moves_the_machine() -> 
         assert reading.relative_change == pytest.approx(changes.get("c_by", 0.0), abs=3 * error_of(here, "c_by"))
 
 
-def test_several_healthy_conditions_are_not_one_force() -> None:
+def test_several_conditions_are_not_one_force_and_without_one_a_record_is_as_it_was_before_there_was_any() -> None:
     both = [*windows(condition(3), 2, 1), *windows(condition(4), 2, 2)]
     assert baseline(3).force.shape == (18, 2, 2)
     assert learn_baseline(both, ["one", "one", "two", "two"]).force.size == 0
-
-
-def test_a_record_without_a_force_is_written_as_it_was_before_there_was_one() -> None:
     record = BaselineRecord.of(baseline(3).without_force).model_dump(mode="json")
     assert "force" not in record
     assert all("lag_from_s" not in relation for relation in record["relations"])
@@ -95,9 +90,7 @@ def test_where_a_relation_does_not_fit_longer_lags_are_used(monkeypatch: pytest.
     longer = learn_baseline(healthy)
     monkeypatch.setattr(relation, "_LONGER_LAGS_S", ())
     before = learn_baseline(healthy)
-    for one, other in zip(longer.relations, before.relations, strict=True):
-        assert one is not None
-        assert other is not None
+    for one, other in zip(map(sure, longer.relations), map(sure, before.relations), strict=True):
         assert other.lag_from_s == 0
         if one.lag_from_s:
             assert one.misfit < other.misfit

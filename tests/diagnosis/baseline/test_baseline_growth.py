@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from benchmarks.finite_elements.machines import rotor_named
-from benchmarks.finite_elements.observed import WindowSizes, plan, sampled, windows_of
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
 from benchmarks.studies.subjects.machines import subject_named
 from models.commissioning.levels import learned_baseline
@@ -18,6 +17,8 @@ from models.diagnosis.baseline.rows import COUPLED_ROWS
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window.statistics import WindowStatistics
+from models.signals.block import FloatArray
+from tests.diagnosis.baseline.fe_rotor import windows_under
 from tests.sure import sure
 
 _SEED = 6101
@@ -76,28 +77,18 @@ def test_a_window_of_another_force_that_the_relations_do_not_hold_in_names_nothi
     assert verdict.changed == ()
 
 
-SIZES = WindowSizes(length_s=30.0, hop_s=2.5, segment_s=2.5)
-
-
 @cache
 def with_a_force_that_hides_a_plane() -> tuple[Baseline, tuple[WindowStatistics, ...]]:
     """Learned in two conditions; and later windows of the one that hardly determines the horizontal plane."""
-    rotor = rotor_named("plain-bearings")
-    scene, planned = replace(COMMISSIONED, cutoff_hz=(130.0, 130.0)), plan(rotor, SIZES)
+    rotor, scene = rotor_named("plain-bearings"), replace(COMMISSIONED, cutoff_hz=(130.0, 130.0))
 
     def windows(layout: SourceLayout, count: int, seed: int) -> list[WindowStatistics]:
         run = drawn_condition(rotor, layout, scene, {}, np.random.default_rng(1))
-        duration_s = 30.0 * count + planned.preamble / planned.rate_hz + 0.1
-        return windows_of(sampled(rotor, run, duration_s, seed), planned)
+        return windows_under(rotor, run, count, seed)
 
     healthy = [*windows(SourceLayout.ONE_SOURCE, 3, 2), *windows(SourceLayout.INDEPENDENT, 3, 101)]
     learned = learn_baseline(healthy, ["one"] * 3 + ["other"] * 3, COUPLED_ROWS)
     return learned, tuple(windows(SourceLayout.ONE_SOURCE, 4, 7))
-
-
-def test_windows_that_hardly_determine_a_stiffness_show_no_growth_of_it() -> None:
-    horizontal = sure(with_a_force_that_hides_a_plane()[0].growth[0])
-    assert abs(horizontal.slope) < min(2.0, 2 * horizontal.standard_error)
 
 
 def test_what_a_healthy_window_does_not_determine_is_not_evaluable_and_no_fault_of_a_sensor() -> None:
@@ -117,13 +108,17 @@ def test_what_a_healthy_window_does_not_determine_is_not_evaluable_and_no_fault_
             assert not diagnosis.unexplained
             assert not diagnosis.suspect
             assert sure(diagnosis.misfit_z) < 3
+    horizontal = sure(learned.growth[0])
+    assert abs(horizontal.slope) < min(2.0, 2 * horizontal.standard_error)
 
 
 def test_a_reversed_sensor_is_suspected_although_the_force_that_it_leaves_hides_the_plane() -> None:
     learned, _ = with_a_force_that_hides_a_plane()
-    rotor, planned = rotor_named("plain-bearings"), plan(rotor_named("plain-bearings"), SIZES)
+    rotor = rotor_named("plain-bearings")
     run = drawn_condition(rotor, SourceLayout.INDEPENDENT, COMMISSIONED, {}, np.random.default_rng(1))
-    samples = sampled(rotor, run, 30.0 + planned.preamble / planned.rate_hz + 0.1, 99)
-    samples[:, 0] *= -1
-    diagnosis = BaselineDiagnostician(learned).diagnose(windows_of(samples, planned)[0])
+
+    def reversed_(samples: FloatArray) -> None:
+        samples[:, 0] *= -1
+
+    diagnosis = BaselineDiagnostician(learned).diagnose(*windows_under(rotor, run, 1, 99, reversed_))
     assert "swapped, reversed or delayed" in diagnosis.unexplained

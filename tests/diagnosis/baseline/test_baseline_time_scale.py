@@ -17,15 +17,12 @@ _TIMES = 5.0
 def faster(window: WindowStatistics) -> WindowStatistics:
     """The window of a machine that makes the same motion in a fifth of the time."""
     rates = np.array([_TIMES if name.endswith("_dot") else 1.0 for name in window.states])
-    both, turning = np.outer(rates, rates), window.synchronous
-    assert turning is not None
-    assert window.hop_synchronous is not None
-    slowest, fastest = window.speed_range
+    both, (slowest, fastest) = np.outer(rates, rates), window.speed_range
     return replace(
         window, lags_s=window.lags_s / _TIMES, correlation=window.correlation * both,
         hop_correlation=window.hop_correlation * both, spectrum=window.spectrum * both / _TIMES,
-        frequencies_hz=window.frequencies_hz * _TIMES, synchronous=turning * rates,
-        hop_synchronous=window.hop_synchronous * rates, speed_rad_s=window.speed_rad_s * _TIMES,
+        frequencies_hz=window.frequencies_hz * _TIMES, synchronous=sure(window.synchronous) * rates,
+        hop_synchronous=sure(window.hop_synchronous) * rates, speed_rad_s=window.speed_rad_s * _TIMES,
         speed_range=(slowest * _TIMES, fastest * _TIMES), hop_speed_rad_s=window.hop_speed_rad_s * _TIMES,
         duration_s=window.duration_s / _TIMES, time_scale=1 / _TIMES,
     )  # fmt: skip

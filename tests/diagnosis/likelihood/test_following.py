@@ -62,7 +62,7 @@ def test_followed_or_at_a_glance_a_window_reads_what_a_search_reads(layout: Layo
         np.testing.assert_allclose(glanced_error, error, rtol=0.15)
 
 
-def test_news_is_not_read_at_a_glance() -> None:
+def test_news_is_not_read_at_a_glance_nor_anything_before_a_window_was_searched() -> None:
     window, windows = slid(Layout.INDEPENDENT, ("k_by", -0.2))
     fits, fit = LengthFits(LAB), LikelihoodFit(LAB, follow=True)
     for full in windows:
@@ -72,6 +72,7 @@ def test_news_is_not_read_at_a_glance() -> None:
     assert fit.glance(stretch) is None
     change, error = values(fits.short(2, stretch))
     assert abs(change[0] + 0.2) < 4 * error[0] < 0.2
+    assert LikelihoodFit(LAB, follow=True).glance(stretch) is None
 
 
 @pytest.mark.parametrize("step", [None, ("k_by", -0.2), ("EI", -0.1), ("e", 0.3)])
@@ -80,12 +81,6 @@ def test_latest_hops_are_read_where_they_may_say_more(step: tuple[str, float] | 
     fits = LengthFits(LAB)
     fits.window(windows[-1])
     assert all(fits.has_news(sliding, windows[-1], (hops,)) == (step is not None) for hops in (2, 4, 7))
-
-
-def test_nothing_is_glanced_at_before_a_window_was_searched() -> None:
-    window, _ = slid(Layout.INDEPENDENT)
-    stretch = sure(window.statistics(2))
-    assert LikelihoodFit(LAB, follow=True).glance(stretch) is None
 
 
 @pytest.mark.parametrize("kind", ["drift", "late copy"])

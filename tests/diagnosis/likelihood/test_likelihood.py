@@ -13,17 +13,19 @@ from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN, BinGroups, Mot
 from models.diagnosis.likelihood.scoring import FisherScoring
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed
 from models.diagnosis.readings import Diagnosis
-from models.diagnosis.window.moments import plan_for
-from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.moments import ComplexArray, plan_for
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.rotor import M_matrix, P_matrix, Q_matrix, changed
+from models.signals.block import FloatArray
 from models.signals.channels import parts_seen, with_channel_names
 from simulator.training.draws import Anomaly, Draw, Excitation, Layout, Purpose, simulate_window
 from tests.commissioning.rotor_kit import mounted
 from tests.sure import sure
+from tests.windows import statistics
 
+LAB = load_machine("lab")
 SEED = 7_700_001
 """Of this file's windows alone: neither training, calibration nor the shipped scenarios use it."""
 
@@ -34,9 +36,8 @@ def groups_of(machine: Machine, widest_hz: float = 1.0) -> BinGroups:
 
 
 def test_groups_hold_every_bin_once_and_average_like_their_kernel() -> None:
-    machine = load_machine("lab")
-    frequencies_hz = plan_for(machine).frequencies_hz
-    groups = groups_of(machine)
+    frequencies_hz = plan_for(LAB).frequencies_hz
+    groups = groups_of(LAB)
     held = [k for first, end in groups.edges for k in range(first, end)]
     assert held == [k for k, f in enumerate(frequencies_hz) if abs(f - 22) >= 1.6]
     np.testing.assert_allclose(groups.weights.sum(axis=1), 1, rtol=1e-12)
@@ -79,10 +80,10 @@ def test_the_receptance_is_the_inverse_of_the_dynamic_matrix(name: str) -> None:
 
 
 def test_derivatives_of_the_spectra() -> None:
-    machine, rng = load_machine("lab"), np.random.default_rng(0)
-    states = plan_for(machine).states
+    rng = np.random.default_rng(0)
+    states = plan_for(LAB).states
     scale = np.where([name.endswith("dot") for name in states], 0.04, 2e-4)
-    model = SpectralModel(machine, Motions(states, scale), groups_of(machine, 8.0), 2.0)
+    model = SpectralModel(LAB, Motions(states, scale), groups_of(LAB, 8.0), 2.0)
     theta = rng.normal(0, 0.2, model.size)
     theta[model.cutoff_at], theta[model.order_at] = np.log(80), np.log(2.5)
     theta[model.noise_at] -= 5
@@ -108,11 +109,10 @@ def test_derivatives_of_the_spectra() -> None:
 
 def test_the_score_is_the_slope_of_the_likelihood() -> None:
     """Steps follow the gradient by T, with the pulls: the value must rise along it as much as it says."""
-    machine = load_machine("lab")
-    window = simulate_window(Draw(machine, SEED, Purpose.EVALUATION, 30, layout=Layout.ONE_SOURCE), 0)
-    groups = groups_of(machine, 4.0)
+    window = simulate_window(Draw(LAB, SEED, Purpose.EVALUATION, 30, layout=Layout.ONE_SOURCE), 0)
+    groups = groups_of(LAB, 4.0)
     power = np.einsum("fii->i", window.spectrum).real / window.spectrum.shape[0]
-    model = SpectralModel(machine, Motions(window.states, np.sqrt(power)), groups, 1.0)
+    model = SpectralModel(LAB, Motions(window.states, np.sqrt(power)), groups, 1.0)
     observed = model.motions.spectra(groups.average(window.spectrum), model.centre)
     search = FisherScoring(model, observed, window.n_segments, window.speed_rad_s, 80.0)
     rng = np.random.default_rng(1)
@@ -130,14 +130,9 @@ def test_the_score_is_the_slope_of_the_likelihood() -> None:
 def read(draw: Draw, numbers: range, faults: dict[str, float]) -> tuple[np.ndarray, list[Diagnosis]]:
     """Errors of the readings in their own standard errors, shape (n_windows, 6)."""
     diagnoses = [LikelihoodFit(draw.machine).diagnose(simulate_window(draw, number)) for number in numbers]
-    z = [
-        [
-            ((one.relative_change or 0) - faults.get(one.name, 0.0)) / (one.standard_error or 1)
-            for one in diagnosis.parameters
-        ]
-        for diagnosis in diagnoses
-    ]
-    return np.array(z), diagnoses
+    read = [one for diagnosis in diagnoses for one in diagnosis.parameters]
+    z = [((one.relative_change or 0) - faults.get(one.name, 0.0)) / (one.standard_error or 1) for one in read]
+    return np.reshape(z, (len(numbers), -1)), diagnoses
 
 
 def assert_honest(z: np.ndarray) -> None:
@@ -181,47 +176,40 @@ def test_readings_are_without_bias_and_their_errors_honest(name: str, layout: La
 
 @pytest.mark.slow
 def test_a_wrong_gain_and_an_added_mass_are_outside_the_model() -> None:
-    machine = load_machine("lab")
-    gain = Draw(machine, SEED, Purpose.EVALUATION, 3, anomaly=Anomaly.GAIN_DRIFT)
-    diagnosis = LikelihoodFit(machine).diagnose(simulate_window(gain, 0))
+    gain = Draw(LAB, SEED, Purpose.EVALUATION, 3, anomaly=Anomaly.GAIN_DRIFT)
+    diagnosis = LikelihoodFit(LAB).diagnose(simulate_window(gain, 0))
     assert (diagnosis.misfit_z or 0) > 5
     assert diagnosis.suspect.startswith("gain of ")
-    mass = Draw(machine, SEED, Purpose.EVALUATION, 4, anomaly=Anomaly.ADDED_MASS)
-    assert (LikelihoodFit(machine).diagnose(simulate_window(mass, 0)).misfit_z or 0) > 3
+    mass = Draw(LAB, SEED, Purpose.EVALUATION, 4, anomaly=Anomaly.ADDED_MASS)
+    assert (LikelihoodFit(LAB).diagnose(simulate_window(mass, 0)).misfit_z or 0) > 3
 
 
 def test_a_warm_start_ends_where_a_cold_one_does() -> None:
-    machine = load_machine("lab")
-    draw = Draw(machine, SEED, Purpose.EVALUATION, 20, layout=Layout.INDEPENDENT)
+    draw = Draw(LAB, SEED, Purpose.EVALUATION, 20, layout=Layout.INDEPENDENT)
     first, second = simulate_window(draw, 0), simulate_window(draw, 1)
-    warm = LikelihoodFit(machine)
+    warm = LikelihoodFit(LAB)
     warm.diagnose(first)
-    from_first, cold = warm.diagnose(second), LikelihoodFit(machine).diagnose(second)
+    from_first, cold = warm.diagnose(second), LikelihoodFit(LAB).diagnose(second)
     assert from_first.steps <= 15
     for one, other in zip(from_first.parameters, cold.parameters, strict=True):
         assert abs((one.relative_change or 0) - (other.relative_change or 0)) < 0.4 * (other.standard_error or 0)
 
 
 def test_windows_of_the_same_size_at_other_frequencies_have_groups_of_their_own() -> None:
-    machine = load_machine("lab")
-    window = simulate_window(Draw(machine, SEED, Purpose.EVALUATION, 20, layout=Layout.INDEPENDENT), 0)
+    window = simulate_window(Draw(LAB, SEED, Purpose.EVALUATION, 20, layout=Layout.INDEPENDENT), 0)
     stretched = replace(window, frequencies_hz=1.1 * window.frequencies_hz, speed_rad_s=1.1 * window.speed_rad_s)
-    used = LikelihoodFit(machine)
+    used = LikelihoodFit(LAB)
     used.diagnose(window)
     used.reset()
-    assert used.diagnose(stretched).parameters == LikelihoodFit(machine).diagnose(stretched).parameters
+    assert used.diagnose(stretched).parameters == LikelihoodFit(LAB).diagnose(stretched).parameters
 
 
 def test_a_dead_channel_is_named() -> None:
-    machine = load_machine("lab")
-    plan, window = plan_for(machine), SlidingWindow(plan_for(machine))
+    plan = plan_for(LAB)
     samples = np.random.default_rng(0).standard_normal((plan.preamble + plan.hops * plan.hop, 9))
     samples[:, 3] = 0.0
-    for _ in window.feed(samples, 0):
-        pass
-    statistics = sure(window.statistics())
-    with pytest.raises(EstimationError, match="lab: no fluctuation in z2"):
-        LikelihoodFit(machine).diagnose(statistics)
+    with pytest.raises(EstimationError, match="lab: no fluctuation in z1_dot"):
+        LikelihoodFit(LAB).diagnose(statistics(LAB, samples))
 
 
 def test_the_bound_of_a_single_mass_on_a_spring() -> None:
@@ -232,17 +220,16 @@ def test_the_bound_of_a_single_mass_on_a_spring() -> None:
     c = 2ζ√(km) and k = (2πf)²m, those of k and c are 2ζ/(πfT) and, to first order in ζ, 1/(2πζfT). A finite band of
     ±20 bandwidths costs a few percent.
     """
-    machine = load_machine("lab")
     mass, f_hz, damping, length_s = 1.0, 50.0, 0.01, 600.0
     k = (2 * np.pi * f_hz) ** 2 * mass
     c = 2 * damping * np.sqrt(k * mass)
-    rotor = machine.rotor.model_copy(update={
+    rotor = LAB.rotor.model_copy(update={
         "m1_kg": mass - 1e-6, "m2_kg": 1e-6, "I2_kg_m2": 1e-9, "I2p_kg_m2": 1e-12, "k_by_N_per_m": k, "k_bz_N_per_m": k,
         "c_by_N_s_per_m": c, "c_bz_N_s_per_m": c,
     })  # fmt: skip
-    window = machine.window.model_copy(update={"segment_s": 20.0, "hop_s": 10.0, "band_hz": (20.0, 80.0)})
-    sensors = tuple(one for one in machine.sensors if one.name in {"y1", "z1", "theta"})
-    single = machine.model_copy(update={"rotor": rotor, "window": window, "sensors": sensors})
+    window = LAB.window.model_copy(update={"segment_s": 20.0, "hop_s": 10.0, "band_hz": (20.0, 80.0)})
+    sensors = tuple(one for one in LAB.sensors if one.name in {"y1", "z1", "theta"})
+    single = LAB.model_copy(update={"rotor": rotor, "window": window, "sensors": sensors})
     levels = np.diag([1.0, 0, 0, 1.0, 0, 0])
     true = TrueCondition({}, 2 * np.pi * 22, 1e5, levels, np.full(2, 1e-24), np.zeros(2))
     bound = cramer_rao(single, ("y1", "z1"), true, length_s)
@@ -252,13 +239,12 @@ def test_the_bound_of_a_single_mass_on_a_spring() -> None:
 
 
 def test_the_bound_falls_with_the_root_of_time_and_rises_with_what_is_unknown() -> None:
-    machine = load_machine("lab")
-    states = plan_for(machine).states
+    states = plan_for(LAB).states
     levels = np.diag([1.0, 1.0, 0, 1.0, 1.0, 0]) * 1e-4
     noise = np.where([name.endswith("dot") for name in states], 1e-10, 1e-15)
     true = TrueCondition({}, 138.0, 80.0, levels, noise, np.zeros(len(states)))
-    short, long = (cramer_rao(machine, states, true, length_s) for length_s in (60.0, 240.0))
-    unknown = cramer_rao(machine, states, true, 60.0, shape_known=False)
+    short, long = (cramer_rao(LAB, states, true, length_s) for length_s in (60.0, 240.0))
+    unknown = cramer_rao(LAB, states, true, 60.0, shape_known=False)
     for name in (*STRUCTURAL, "e"):
         assert short[name] == pytest.approx(2 * long[name], rel=1e-3)
         assert short[name] * 0.999 < unknown[name] < 2 * short[name]
@@ -266,9 +252,8 @@ def test_the_bound_falls_with_the_root_of_time_and_rises_with_what_is_unknown() 
 
 @pytest.mark.parametrize("state", ["y1", "y2"])
 def test_one_sensor_is_enough_and_what_it_does_not_show_is_no_misfit(state: str) -> None:
-    lab = load_machine("lab")
-    (sensor,) = (one for one in lab.sensors if one.name == state)
-    lone = lab.model_copy(update={"sensors": (sensor, lab.sensors[-1])})
+    (sensor,) = (one for one in LAB.sensors if one.name == state)
+    lone = LAB.model_copy(update={"sensors": (sensor, LAB.sensors[-1])})
     for number in range(4):
         window = simulate_window(Draw(lone, SEED, Purpose.EVALUATION, 0, layout=Layout.INDEPENDENT), number)
         diagnosis = LikelihoodFit(lone).diagnose(window)
@@ -278,11 +263,11 @@ def test_one_sensor_is_enough_and_what_it_does_not_show_is_no_misfit(state: str)
 
 def test_a_sensor_that_shows_some_of_the_other_plane_is_told() -> None:
     """y1 is turned by 1.7° towards z1: it was no misfit, and a gain where it was one."""
-    window = simulate_window(Draw(load_machine("lab"), 7_700_021, Purpose.EVALUATION, 0, layout=Layout.ONE_SOURCE), 2)
+    window = simulate_window(Draw(LAB, 7_700_021, Purpose.EVALUATION, 0, layout=Layout.ONE_SOURCE), 2)
     mixed = np.eye(len(window.states))
     mixed[window.states.index("y1"), window.states.index("z1")] = 0.03
     seen = replace(window, spectrum=mixed @ window.spectrum @ mixed.T, synchronous=mixed @ sure(window.synchronous))
-    assert LikelihoodFit(load_machine("lab")).diagnose(seen).suspect.startswith("share of z1 in y1 (+")
+    assert LikelihoodFit(LAB).diagnose(seen).suspect.startswith("share of z1 in y1 (+")
 
 
 def late(machine: Machine, window: WindowStatistics, delays_s: list[float]) -> WindowStatistics:
@@ -303,27 +288,23 @@ def told(machine: Machine, window: WindowStatistics) -> tuple[str, float]:
 @cache
 def probes_of_lab(layout: Layout) -> tuple[Machine, WindowStatistics]:
     """The rotor kit with its displacements alone, which do not check each other, healthy."""
-    lab = load_machine("lab")
-    probes = lab.model_copy(update={"sensors": tuple(one for one in lab.sensors if not one.name.endswith("_dot"))})
+    probes = LAB.model_copy(update={"sensors": tuple(one for one in LAB.sensors if not one.name.endswith("_dot"))})
     window = simulate_window(Draw(probes, SEED, Purpose.EVALUATION, 21, layout=layout), 0)
     assert not LikelihoodFit(probes).diagnose(window).suspect
     return probes, window
 
 
-@pytest.mark.parametrize("layout", [Layout.ONE_SOURCE, Layout.INDEPENDENT])
-def test_a_converter_that_samples_one_channel_after_the_other_is_told(layout: Layout) -> None:
+@pytest.mark.parametrize(
+    ("layout", "apart_us"), [(Layout.ONE_SOURCE, 30), (Layout.INDEPENDENT, 30), (Layout.ONE_SOURCE, 60)]
+)
+def test_a_converter_that_samples_one_channel_after_the_other_is_told(layout: Layout, apart_us: int) -> None:
     """Its delays pass for damping: it was named, without reserve where independent forces shake the machine."""
     machine, window = probes_of_lab(layout)
-    name, delay_us = told(machine, late(machine, window, [3e-5 * number for number in range(len(machine.sensors))]))
+    seen = late(machine, window, [1e-6 * apart_us * number for number in range(len(machine.sensors))])
+    name, delay_us = told(machine, seen)
     assert name == "delay of each channel after the one before"
-    assert delay_us == pytest.approx(30, rel=0.3)
-
-
-def test_delays_that_leave_a_window_unexplained_are_told() -> None:
-    machine, window = probes_of_lab(Layout.ONE_SOURCE)
-    seen = late(machine, window, [6e-5 * number for number in range(len(machine.sensors))])
-    assert LikelihoodFit(machine).diagnose(seen).unexplained
-    assert told(machine, seen)[0] == "delay of each channel after the one before"
+    assert apart_us < 60 or LikelihoodFit(machine).diagnose(seen).unexplained
+    assert delay_us == pytest.approx(apart_us, rel=0.3)
 
 
 @pytest.mark.parametrize("at", [{}, {"y1": (45, 135), "y2": (30, 120)}])
@@ -347,3 +328,50 @@ def test_an_accelerometer_that_comes_late_is_told() -> None:
     name, delay_us = told(machine, late(machine, replace(accelerated, synchronous=None), [0.0, 0.0, 4e-5, 0.0, 0.0]))
     assert with_channel_names(name, machine.sensors) == "delay of y2"
     assert delay_us == pytest.approx(40, rel=0.15)
+
+
+STATES = ("y1", "z1", "y1_dot")
+SCALE = np.array([2e-6, 3e-6, 4e-4])
+W = 2 * np.pi * np.linspace(5.0, 150.0, 60)
+
+
+def spectra(motion: FloatArray, noise: FloatArray, gains: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> ComplexArray:
+    """Expected cross-spectra of y1, z1 and the rate of y1, with white noise in units of SCALE."""
+    shape = np.zeros((W.size, 3, 2), dtype=np.complex128)
+    shape[:, 0, 0], shape[:, 1, 1], shape[:, 2, 0] = 1, 1, 1j * W
+    seen = np.array(gains)[:, None] * shape
+    return np.asarray(seen @ (motion * np.eye(2)) @ seen.conj().swapaxes(1, 2) + np.diag(noise * SCALE**2))
+
+
+def test_noise_of_equal_size_stays_one_and_white() -> None:
+    motions = Motions(STATES, SCALE)
+    assert motions.n == 2
+    seen = motions.spectra(spectra(np.array(0.0), np.ones(3)), W)
+    np.testing.assert_allclose(seen, np.broadcast_to(np.eye(2), seen.shape), atol=1e-12)
+
+
+def test_a_motion_holds_what_both_sensors_say_of_it() -> None:
+    """Its signal-to-noise ratio is the sum of the sensors' own: nothing is lost, nothing counted twice."""
+    motions = Motions(STATES, SCALE)
+    power = 1e-12
+    seen = motions.spectra(spectra(np.array(power), np.zeros(3)), W)
+    np.testing.assert_allclose(seen[:, 0, 0].real, power / SCALE[0] ** 2 + power * W**2 / SCALE[2] ** 2)
+    np.testing.assert_allclose(seen[:, 1, 1].real, power / SCALE[1] ** 2)
+    np.testing.assert_allclose(np.abs(motions.factor(W, W)[:, 0]) ** 2 * power, seen[:, 0, 0].real)
+
+
+def test_shares_of_a_motion_add_up_to_one() -> None:
+    shares = Motions(STATES, SCALE).shares(W)
+    assert {state: number for state, (number, _) in shares.items()} == {"y1": 0, "z1": 1, "y1_dot": 0}
+    np.testing.assert_allclose(shares["y1"][1] + shares["y1_dot"][1], 1.0)
+    np.testing.assert_allclose(shares["z1"][1], 1.0)
+
+
+@pytest.mark.parametrize("gain", [0.9, 1.0, 1.1])
+def test_a_wrong_gain_shows_in_the_rest_of_its_pair(gain: float) -> None:
+    motions = Motions(STATES, SCALE)
+    states = spectra(np.array(1e-10), np.full(3, 1e-3), gains=(1.0, 1.0, gain))
+    (found,) = motions.mismatches(states, W, np.full(W.size, 11.0))
+    assert found.states == ("y1", "y1_dot")
+    assert found.change == pytest.approx(gain - 1, abs=0.02)
+    assert (abs(found.z) > 5) == (gain != 1.0)

@@ -83,10 +83,8 @@ def test_a_rotor_that_was_balanced_has_lost_its_unbalance_and_no_more() -> None:
 
 def test_an_angle_that_is_rounded_to_nothing_has_no_sign() -> None:
     vector = UnbalanceVector(1.5, -1e-3, 1e-8, 0.0, 1e-8)
-    assert (
-        vector.sentence
-        == "a vector of 50 % of the nominal unbalance at 0° from the heavy spot (size +50 %, turned by 0°)"
-    )
+    said = "a vector of 50 % of the nominal unbalance at 0° from the heavy spot (size +50 %, turned by 0°)"
+    assert vector.sentence == said
     assert "(size +0 %, turned by −57°: the heavy spot" in UnbalanceVector(0.54, -0.84, 1e-8, 0.0, 1e-8).sentence
 
 
@@ -152,12 +150,8 @@ def test_the_parts_of_the_vector_have_honest_errors(layout: Layout) -> None:
     z = []
     for number in range(8):
         _, vector = e_of(turned(drawn(100 + number, 0.3, layout), 60.0))
-        z.append(
-            (
-                (vector.magnitude_change - 0.3) / vector.magnitude_error,
-                (sure(vector.turned_deg) - 60) / sure(vector.turned_error_deg),
-            )
-        )
+        turned_z = (sure(vector.turned_deg) - 60) / sure(vector.turned_error_deg)
+        z.append(((vector.magnitude_change - 0.3) / vector.magnitude_error, turned_z))
     assert np.sqrt(np.mean(np.square(z))) < 1.8
     assert np.all(np.sqrt(np.mean(np.square(z), axis=0)) < 2.1)
     assert np.all(np.abs(np.mean(z, axis=0)) < 4 / np.sqrt(8) * 1.1)

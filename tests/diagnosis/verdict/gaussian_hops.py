@@ -9,21 +9,15 @@ from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTe
 from models.diagnosis.verdict.stretch import Stretch, to_scale
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import Verdict
 
 
 @dataclass(frozen=True, slots=True)
 class DelayStudy:
-    """Delays of independent trials.
+    """Of independent trials: from the change to the hop at which it was detected, and named alone, or infinity.
 
-    Attributes
-    ----------
-    detected_s, named_s : ndarray, shape (trials,)
-        From the change to the hop at which something was detected, and to the one at which the changed parameter and no
-        other was named, s; infinity where that did not happen in the time of the trial.
-    wrong : int
-        Trials in which, at any hop after the change, a parameter was named that did not change.
-    early : int
-        Trials in which something was detected before the change: false alarms; they take no part in the delays.
+    `wrong` trials name at some hop a parameter that did not change; `early` ones detect something before the change,
+    and take no part in the delays.
     """
 
     detected_s: FloatArray
@@ -35,20 +29,12 @@ class DelayStudy:
 class GaussianHops:
     """Hops that carry the information of a machine, without the machine.
 
-    Every hop's estimate is normal around the mean of the true values in it; stretches are means of hops.
-
-    Parameters
-    ----------
-    settings : SequentialSettings
-        Hop and lengths.
-    covariance : ndarray, shape (6, 6)
-        Of one full window, in the scale of the errors.
-    rng : numpy.random.Generator
-        Where the realisation comes from.
+    Every hop's estimate is normal around the mean of the true values in it; stretches are means of hops. The covariance
+    is that of one full window, in the scale of the errors.
     """
 
     def __init__(self, settings: SequentialSettings, covariance: FloatArray, rng: np.random.Generator) -> None:
-        self._settings, self._rng = settings, rng
+        self.settings, self._rng = settings, rng
         self._factor = np.linalg.cholesky(covariance * settings.window_hops)
         self._information = np.linalg.inv(covariance * settings.window_hops)
         self._hops: list[FloatArray] = []
@@ -56,7 +42,7 @@ class GaussianHops:
 
     def looks(self, true: FloatArray) -> dict[int, Stretch]:
         """Stretches after one more hop with these mean true values; empty while the window is not full."""
-        settings = self._settings
+        settings = self.settings
         self._hops.append(true + self._factor @ self._rng.standard_normal(len(PARAMETERS)))
         self._hops = self._hops[-settings.window_hops :]
         self._count += 1
@@ -72,61 +58,44 @@ class GaussianHops:
         return looks
 
 
-def detection_delays(
-    settings: SequentialSettings,
-    covariance: FloatArray,
-    changes: Mapping[str, float],
-    *,
-    trials: int,
-    seed: int,
-    before_hops: int = 36,
-    after_hops: int = 120,
-) -> DelayStudy:
-    """Play step changes at random moments within a hop.
-
-    Parameters
-    ----------
-    settings : SequentialSettings
-        The test.
-    covariance : ndarray, shape (6, 6)
-        Of one full window, in the scale of the errors.
-    changes : mapping of str to float
-        Relative changes of the parameters that step.
-    trials : int
-        Independent trials.
-    seed : int
-        Of all trials together.
-    before_hops, after_hops : int
-        Healthy hops before the change, hops after it.
-    """
-    step = np.zeros(len(PARAMETERS))
+def true(**changes: float) -> FloatArray:
+    """Relative changes of parameters, in the scale of the errors."""
+    values = np.zeros(len(PARAMETERS))
     for name, change in changes.items():
-        step[PARAMETERS.index(name)] = to_scale(name, change)
-    detected, named = [], []
+        values[PARAMETERS.index(name)] = to_scale(name, change)
+    return values
+
+
+def play(test: SequentialTest, hops: GaussianHops, *story: tuple[int, FloatArray]) -> list[tuple[int, Verdict]]:
+    """Verdicts and their hops, of so many hops with these true values and then so many with those."""
+    verdicts, number = [], 0
+    for count, values in story:
+        for _ in range(count):
+            looks = hops.looks(values)
+            if looks:
+                wanted = (*test.wanted(), hops.settings.window_hops)
+                verdicts.append((number, test.update({h: look for h, look in looks.items() if h in wanted})))
+            number += 1
+    return verdicts
+
+
+def detection_delays(
+    settings: SequentialSettings, covariance: FloatArray, changes: Mapping[str, float], *, trials: int, seed: int,
+    before_hops: int, after_hops: int,
+) -> DelayStudy:  # fmt: skip
+    """Play relative changes that step at random moments within a hop, after so many healthy hops."""
+    step, detected, named = true(**changes), [], []
     wrong = early = 0
     for rng in (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(trials)):
-        test, hops = SequentialTest(settings), GaussianHops(settings, covariance, rng)
-        share = float(rng.uniform())
-        detected_s = named_s = np.inf
-        false, misnamed = False, False
-        for number in range(before_hops + after_hops):
-            weight = 0.0 if number < before_hops else share if number == before_hops else 1.0
-            looks = hops.looks(weight * step)
-            if not looks:
-                continue
-            wanted = (*test.wanted(), settings.window_hops)
-            verdict = test.update({hops: look for hops, look in looks.items() if hops in wanted})
-            delay_s = (number - before_hops + share) * settings.hop_s
-            if number < before_hops:
-                false = false or verdict.detected
-                continue
-            said = {finding.name for finding in verdict.changed}
-            misnamed = misnamed or bool(said - set(changes))
-            detected_s = min(detected_s, delay_s if verdict.detected else np.inf)
-            named_s = min(named_s, delay_s if said == set(changes) else np.inf)
-        early += false
-        wrong += misnamed and not false
-        if not false:
-            detected.append(detected_s)
-            named.append(named_s)
+        hops, share = GaussianHops(settings, covariance, rng), float(rng.uniform())
+        story = ((before_hops, 0 * step), (1, share * step), (after_hops - 1, step))
+        verdicts = play(SequentialTest(settings), hops, *story)
+        if any(verdict.detected for number, verdict in verdicts if number < before_hops):
+            early += 1
+            continue
+        later = [((number - before_hops + share) * settings.hop_s, one) for number, one in verdicts[-after_hops:]]
+        said = [(delay_s, {finding.name for finding in one.changed}) for delay_s, one in later]
+        wrong += any(names - set(changes) for _, names in said)
+        detected.append(min((delay_s for delay_s, one in later if one.detected), default=np.inf))
+        named.append(min((delay_s for delay_s, names in said if names == set(changes)), default=np.inf))
     return DelayStudy(np.array(detected), np.array(named), wrong, early)

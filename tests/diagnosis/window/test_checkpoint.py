@@ -114,36 +114,11 @@ def test_a_monitor_stopped_at_any_block_goes_on_to_the_last_bit(machine: str, re
     assert sum(not report.verdict.continuous for report in expected) == 3  # two gaps, one repetition
 
 
-def test_what_the_likelihood_remembers_matters() -> None:
-    """The test above would notice: from another maximum the next readings differ in their last digits at least."""
-    machine = "no phase reference"
-    blocks, expected = stream(machine), uninterrupted(machine)
-    evaluated = [number for number, report in enumerate(expected) if any(one.parameters for one in report.windows)]
-    running = monitor(machine)
-    for block in blocks[: evaluated[1] + 1]:
-        running.step(block)
-    state = running.state(whole=True)
-    arrays = from_bytes(state.state)
-    name = "evaluator/likelihood/window/line/searched"
-    arrays[name] = arrays[name] * (1 + 1e-9)
-    again = monitor(machine)
-    again.restore(to_bytes(arrays), [data for _, data in state.new_parts])
-    again.restore_alarms(state.alarms)
-    reports = [again.step(block) for block in blocks[evaluated[1] + 1 : evaluated[2] + 1]]
-    (now,), (then,) = reports[-1].windows, expected[evaluated[2]].windows
-    assert now.parameters != then.parameters
-    for one, other in zip(now.parameters, then.parameters, strict=True):
-        if one.relative_change is not None:
-            assert abs(one.relative_change - sure(other.relative_change)) < sure(other.standard_error)
-
-
 @lru_cache
 def windows() -> tuple[WindowStatistics, ...]:
     """Sixteen windows at speeds that are never quite the same, but always between the same two frequencies."""
-    rng, stream = (
-        np.random.default_rng(3),
-        scenario_blocks(138.0, Event(at_s=130.0, parameter="c_bz", relative_change=0.6)),
-    )
+    rng, looser = np.random.default_rng(3), Event(at_s=130.0, parameter="c_bz", relative_change=0.6)
+    stream = scenario_blocks(138.0, looser)
     return tuple(
         replace(full, speed_rad_s=full.speed_rad_s * (1.002 + 1e-4 * rng.standard_normal()))
         for full in full_windows(SlidingWindow(plan_for(LAB, lagged=False)), stream)
@@ -300,25 +275,16 @@ states = st.builds(
 def test_the_state_of_the_sequential_test_is_restored_exactly(state: SequentialState) -> None:
     hops = [from_bytes(to_bytes(hop_arrays(came))) for _, came in sorted(state.hops().items())]
     again = SequentialState.restored(from_bytes(to_bytes(state.checkpoint())), hops)
-    dates = [(one.change_ns, one.dated_ns, one.outside_ns) for one in (again, state)]
-    assert dates[0] == dates[1]
-    assert (repr(again.before), repr(again.findings)) == (repr(state.before), repr(state.findings))
-    assert again.sums.keys() == state.sums.keys()
+    assert shown(again) == shown(state)
     older = {name: array for name, array in state.checkpoint().items() if name not in {"dated_ns", "between_ns"}}
     without = SequentialState.restored(older, hops)  # as an earlier version stored it
     assert (without.dated_ns, {one.between_ns for one in without.findings} - {None}) == (None, set())
-    for windows, ring in state.sums.items():
-        for one, other in zip(again.sums[windows], ring, strict=True):
-            assert (one.start_ns, one.end_ns, repr(one.misfit_z)) == (
-                other.start_ns,
-                other.end_ns,
-                repr(other.misfit_z),
-            )
-            for found, wanted in ((one.vector, other.vector), (one.information, other.information)):
-                assert_same_bits(found, wanted)
-            assert (one.common is None) == (other.common is None)
-            if one.common is not None and other.common is not None:
-                assert_same_bits(one.common, other.common)
+
+
+def shown(state: SequentialState) -> str:
+    """All of it, every number in all its digits."""
+    with np.printoptions(floatmode="unique", threshold=1000):
+        return repr(replace(state, sums=dict(sorted(state.sums.items()))))
 
 
 def assert_same_bits(one: np.ndarray, other: np.ndarray) -> None:
@@ -345,11 +311,13 @@ def test_arrays_come_back_as_they_were(arrays: dict[str, np.ndarray]) -> None:
     assert data == to_bytes(again)
 
 
-def test_how_an_array_lies_in_memory_is_kept() -> None:
+def test_how_an_array_lies_in_memory_is_kept_and_objects_are_refused() -> None:
     across = np.asfortranarray(np.arange(12.0).reshape(3, 4))
     again = from_bytes(to_bytes({"across": across}))["across"]
     assert again.flags.f_contiguous
     assert not again.flags.c_contiguous
+    with pytest.raises(CheckpointError, match="nothing: an array of type object"):
+        to_bytes({"nothing": np.array([None])})
 
 
 @settings(max_examples=60)
@@ -376,11 +344,6 @@ def test_damaged_bytes_are_refused(data: st.DataObject) -> None:
 def test_foreign_bytes_are_refused(foreign: bytes, says: str) -> None:
     with pytest.raises(CheckpointError, match=says):
         from_bytes(foreign)
-
-
-def test_objects_are_refused() -> None:
-    with pytest.raises(CheckpointError, match="nothing: an array of type object"):
-        to_bytes({"nothing": np.array([None])})
 
 
 def test_parts_are_kept_apart() -> None:

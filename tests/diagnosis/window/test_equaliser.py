@@ -10,13 +10,13 @@ from pydantic import ValidationError
 from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.window.moments import plan_for
-from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import FloatArray
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
 from tests.sure import sure
+from tests.windows import fed, statistics
 
 # Velocities behind geophones and AC-coupled inputs; channels one after the other.
 SIGNAL: dict[str, dict[str, Any]] = {
@@ -61,17 +61,6 @@ def behind_sensors(samples: FloatArray) -> FloatArray:
     return seen
 
 
-def fed(of: Machine, samples: FloatArray) -> SlidingWindow:
-    window = SlidingWindow(plan_for(of))
-    for _ in window.feed(window.plan.to_si(samples), 0):
-        pass
-    return window
-
-
-def statistics(of: Machine, samples: FloatArray) -> WindowStatistics:
-    return sure(fed(of, samples).statistics())
-
-
 def apart(found: WindowStatistics, true: WindowStatistics) -> tuple[float, float, float]:
     """Largest differences relative to the channels' sizes: spectra at their strongest bins, correlations, vectors."""
     density = np.sqrt(np.einsum("fii->fi", true.spectrum).real)
@@ -100,7 +89,7 @@ def test_the_latest_hops_say_behind_declared_sensors_what_they_say() -> None:
     scenario = scenario.overridden(duration_s=64.0, seed=31_302)
     samples = np.concatenate([block.samples for block, _ in blocks(scenario, machine(declared=False), 1.0)])
     for of, seen in ((machine(declared=False), samples), (machine(declared=True), behind_sensors(samples))):
-        sliding, fits = fed(of, seen), LengthFits(of)
+        sliding, fits = fed(plan_for(of), seen), LengthFits(of)
         window = sure(sliding.statistics())
         fits.window(window)
         # By chance four hops may say something; what the sensors do not show as it is would, in all of them.

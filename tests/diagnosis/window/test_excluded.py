@@ -1,4 +1,4 @@
-"""Which lines of a window say nothing of the machine, and are left out of the comparison with theory."""
+"""Which lines of a window are left out, as they say nothing of the machine; and what is a change of the load."""
 
 from collections.abc import Sequence
 
@@ -7,9 +7,25 @@ import pytest
 
 from models.diagnosis.window.excluded import ExcludedLine, KnownLine, excluded_lines
 from models.diagnosis.window.moments import ComplexArray
-from models.diagnosis.window.stationarity import summed
+from models.diagnosis.window.stationarity import segment_levels, summed
 from models.signals.block import FloatArray
-from tests.diagnosis.window.test_stationarity import BINS, SEGMENTS, segments
+from tests.sure import sure
+
+BINS, SEGMENTS = 736, 24
+STEP: FloatArray = np.repeat([1.0, 9.0], (18, 6))
+
+
+def segments(level: FloatArray, *, sources: int = 4) -> ComplexArray:
+    """Of four motions that some sources make, with a little noise of each; coloured from bin to bin."""
+    rng = np.random.default_rng(5100)
+
+    def white(channels: int) -> ComplexArray:
+        pair = rng.standard_normal((2, BINS, SEGMENTS, channels))
+        return np.asarray(pair[0] + 1j * pair[1], dtype=np.complex128)
+
+    mixing = rng.standard_normal((sources, 4)) / np.linspace(1, 5, BINS)[:, None, None]
+    return np.asarray((np.sqrt(level)[:, None] * white(sources)) @ mixing + 0.01 * white(4), dtype=np.complex128)
+
 
 STEP_HZ, EVERY_S = 0.2, 2.5
 FREQUENCIES_HZ: FloatArray = np.linspace(3, 150, BINS)
@@ -144,3 +160,27 @@ def test_what_is_kept_of_a_line_is_near_enough_on_a_slow_machine_too() -> None:
     for line_hz, speed_hz in ((0.5349, 1.5), (1.534, 0.75), (119.98, 22.0)):
         kept = ExcludedLine(line_hz, 1.0).known(-2 * np.pi * speed_hz)
         assert kept == pytest.approx((line_hz, line_hz / speed_hz), rel=0.005)
+
+
+def levels_of(found: ComplexArray) -> FloatArray | None:
+    return segment_levels(found, summed(found), range(4))
+
+
+def test_a_load_that_steps_is_read_from_the_segments() -> None:
+    found = sure(levels_of(segments(STEP)))
+    np.testing.assert_allclose(found, STEP / STEP.mean(), rtol=0.15)
+    assert found.mean() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("kind", ["line", "a tenth of the band", "dead channels", "too large", "steady"])
+def test_what_is_not_the_load(kind: str) -> None:
+    found = segments(np.ones(SEGMENTS))
+    if kind == "line":
+        found[100, 18:] += 1000.0
+    elif kind == "a tenth of the band":
+        found[660:, 18:] *= 3
+    elif kind == "dead channels":
+        found[:] = 0
+    elif kind == "too large":
+        found[:, 5] = np.nan
+    assert levels_of(found) is None

@@ -81,11 +81,13 @@ def test_a_line_is_found_with_its_share_and_kept_by_frequency_and_order() -> Non
     assert found.known(2 * np.pi * SPEED_HZ) == pytest.approx((30.0, 30.0 / 22.0), abs=0.01)
 
 
-def test_neither_a_multiple_of_the_speed_nor_a_narrow_resonance_is_one() -> None:
+def test_neither_a_multiple_of_the_speed_nor_its_pulsation_nor_a_resonance_nor_a_burst_is_one() -> None:
     assert lines(line(2 * SPEED_HZ)) == lines(line(2 * SPEED_HZ), turns=-1) == ()
     root = np.exp(2 * np.pi * (-0.003 + 1j) * 40 / RATE_HZ)  # damped by 0.3 %
     resonance = lfilter([1.0], [1, -2 * root.real, abs(root) ** 2], noise(20))
     assert not any(one.certain for one in lines(resonance / resonance.std()))
+    assert not any(one.certain for one in lines(line(30.0, 5.0) * (T // 5 == 4)))
+    assert not lines(line(SPEED_HZ, 1.5) * slow(0.48))
 
 
 def taken(latest: LatestLines, made: HealthyRecording, after: float) -> tuple[Line, ...]:
@@ -133,24 +135,17 @@ def test_one_impact_or_burst_in_each_window_is_none(damping: float) -> None:
         assert check_lines(machine, [made]).verdict == "passed"
 
 
-def test_a_burst_is_none() -> None:
-    assert not any(one.certain for one in lines(line(30.0, 5.0) * (T // 5 == 4)))
-
-
-@pytest.mark.parametrize(("hz", "new"), [(30.0, False), (30.4, False), (33.0, True)])
-def test_new_is_what_is_at_another_frequency(hz: float, new: bool) -> None:
-    found = new_line(lines(line(hz)), healthy(), 2 * np.pi * SPEED_HZ)
-    assert (found is not None) is new
-
-
-def test_a_line_that_turns_with_the_shaft_is_the_same_at_another_speed() -> None:
-    faster = 1.1 * SPEED_HZ
-    (found,) = lines(line(33.0))
-    assert new_line([found], healthy(), 2 * np.pi * faster) is None
-
-
-def test_one_that_is_weak_is_not_told() -> None:
-    assert new_line(lines(line(33.0, 0.1)), healthy(), 2 * np.pi * SPEED_HZ) is None
+@pytest.mark.parametrize(
+    ("hz", "amplitude", "speed_hz", "new"),
+    [
+        (30.0, 0.5, SPEED_HZ, False), (30.4, 0.5, SPEED_HZ, False), (33.0, 0.5, SPEED_HZ, True),
+        (33.0, 0.1, SPEED_HZ, False), (33.0, 0.5, 1.1 * SPEED_HZ, False),
+    ],
+)  # fmt: skip
+def test_new_is_what_stands_out_at_another_frequency_and_order(
+    hz: float, amplitude: float, speed_hz: float, new: bool
+) -> None:
+    assert (new_line(lines(line(hz, amplitude)), healthy(), 2 * np.pi * speed_hz) is not None) is new
 
 
 @pytest.mark.parametrize(("hz", "beside"), [(21.55, 1), (22.08, 1), (65.9, 3)])
@@ -195,10 +190,6 @@ def test_a_multiple_that_changes_has_no_line_beside_it(how: str, segment_s: floa
     made = recording(more[how], machine=with_segments(segment_s))
     assert not any(one.beside or one.certain for one in lines_of(made))
     assert check_lines(MACHINE, [made]).verdict == "passed"
-
-
-def test_the_two_sides_of_a_pulsation_in_bins_of_their_own_are_no_lines() -> None:
-    assert not lines(line(SPEED_HZ, 1.5) * slow(0.48))
 
 
 @pytest.mark.parametrize(("speed_hz", "segment_s"), [(2.2, 5.0), (3.3, 1.0)])

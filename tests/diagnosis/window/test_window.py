@@ -306,16 +306,6 @@ def test_readings_stay_unbiased_while_the_speed_goes_through_a_flank() -> None:
 
 
 @pytest.mark.slow
-def test_one_set_of_coefficients_would_not_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    samples, plan = run_of_lab(40, 0.15), plan_for(LAB, lagged=False)
-    monkeypatch.setattr("models.diagnosis.window.moments.STEADY", 1.0)
-    (window,) = feed(SlidingWindow(plan), samples)
-    assert not window.removed_by_hop
-    misfit = sure(LikelihoodFit(LAB).diagnose(window).misfit_z)
-    assert misfit > 4
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("change", [0.0, 0.1])
 def test_the_speed_is_found_without_a_phase_reference(change: float) -> None:
     samples, plan = run_of_lab(50, change), plan_for(LAB, lagged=False)
