@@ -3,27 +3,24 @@
 import json
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
 from io import StringIO
 from pathlib import Path
 
-import numpy as np
 import pytest
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from rich.console import Console
 
 from models.commissioning.commission import Commissioning, CommissioningReport, ParameterSummary
-from models.commissioning.healthy import HealthyRecording
+from models.commissioning.healthy import HealthyRecording, healthy_from_blocks
 from models.errors import RecordingError
-from models.machine import MachineFile, Operation
+from models.machine import Machine, MachineFile, Operation
 from simulator.commission.command import print_report
 from simulator.commission.page import HTML, JSON, write_report
 from simulator.commission.verdict import (
     budget_sentences,
-    channel_text,
     dominant,
     duration,
     growth_sentence,
@@ -33,6 +30,8 @@ from simulator.commission.verdict import (
     percent,
     smallest_change,
 )
+from simulator.scenario import load_scenario
+from simulator.stream import blocks
 from tests.commissioning.rotor_kit import (
     LAB,
     NOTHING,
@@ -41,8 +40,10 @@ from tests.commissioning.rotor_kit import (
     elsewhere,
     healthy,
     humming,
+    mounted,
     recording,
     stream,
+    with_sensors,
 )
 from tests.sure import sure
 
@@ -96,47 +97,37 @@ class Page(HTMLParser):
         return " ".join(" ".join(self.texts).split())
 
 
-def without_reference(operation: Operation | None) -> tuple[MachineFile, HealthyRecording]:
+def without_reference(operation: Operation | None) -> tuple[MachineFile, tuple[HealthyRecording]]:
     """Displacements alone, no shaft angle, and a block is missing."""
-    keep = [n for n, state in enumerate(LAB.descriptor.states) if state in ("y1", "z1", "y2", "z2")]
-    sensors = tuple(NOTHING.sensors[n] for n in keep)
-    machine = NOTHING.model_copy(update={"sensors": sensors, "operation": operation})
-    blocks = [
-        replace(block, samples=np.asarray(block.samples[:, keep], dtype=np.float32))
-        for number, block in enumerate(stream(85.0, 63))
-        if number != 100
-    ]
-    return machine, recording(machine, blocks)
+    whole = [block for number, block in enumerate(stream(85.0, 63)) if number != 100]
+    machine, blocks = with_sensors(NOTHING, whole, lambda sensor: sensor.quantity == "displacement")
+    machine = machine.model_copy(update={"operation": operation})
+    return machine, (recording(machine, blocks),)
+
+
+MADE_OF: dict[str, Callable[[], tuple[MachineFile, tuple[HealthyRecording, ...]]]] = {
+    "full": lambda: (LAB, (healthy(LAB, 70.0, 64),)),
+    "partial": lambda: (PARTIAL, (healthy(PARTIAL, 70.0, 66, RUDE),)),
+    "none": lambda: (NOTHING, (healthy(NOTHING, 70.0, 67), healthy(NOTHING, 40.0, 68, RUDE))),
+    # Of which all is known, but for what its sensors are to do with it.
+    "casing": lambda: (elsewhere(LAB), (healthy(elsewhere(LAB), 70.0, 60105),)),
+    "too short": lambda: (NOTHING, (healthy(NOTHING, 30.0, 69),)),
+    "no hop": lambda: (NOTHING, (healthy(NOTHING, 3.0, 70),)),
+    "second excitation": lambda: (NOTHING, (recording(NOTHING, humming(stream(70.0, 61), 41.4), RUDE),)),
+    "no speed": lambda: without_reference(None),
+    "no phase reference": lambda: without_reference(Operation(speed_rpm=1320.0)),
+}
 
 
 @cache
 def case(name: str) -> Case:
-    machine: MachineFile
-    recordings: tuple[HealthyRecording, ...]
-    if name == "full":
-        machine, recordings = LAB, (healthy(LAB, 70.0, 64),)
-    elif name == "partial":
-        machine, recordings = PARTIAL, (healthy(PARTIAL, 70.0, 66, RUDE),)
-    elif name == "none":
-        machine, recordings = NOTHING, (healthy(NOTHING, 70.0, 67), healthy(NOTHING, 40.0, 68, RUDE))
-    elif name == "casing":  # of which all is known, but for what its sensors are to do with it
-        machine = elsewhere(LAB)
-        recordings = (healthy(machine, 70.0, 60105),)
-    elif name == "too short":
-        machine, recordings = NOTHING, (healthy(NOTHING, 30.0, 69),)
-    elif name == "no hop":
-        machine, recordings = NOTHING, (healthy(NOTHING, 3.0, 70),)
-    elif name == "second excitation":
-        machine, recordings = NOTHING, (recording(NOTHING, humming(stream(70.0, 61), 41.4), RUDE),)
-    else:
-        machine, one = without_reference(None if name == "no speed" else Operation(speed_rpm=1320.0))
-        recordings = (one,)
+    machine, recordings = MADE_OF[name]()
     return commissioned(machine, *recordings), recordings, machine
 
 
 LEVELS = ("full", "partial", "none")
 REFUSED = ("too short", "no hop", "second excitation", "no speed")
-CASES = (*LEVELS, *REFUSED, "no phase reference", "casing")
+CASES = tuple(MADE_OF)
 DRAWN = ("none", "no speed", "casing")
 """Cases whose pictures become SVG, which takes seconds; those of the others are painted and no more."""
 
@@ -333,20 +324,14 @@ def test_pictures(folder: Path) -> None:
     for name in ("too short", "second excitation", "no speed"):
         assert list(pictures(written(folder, name)[0])) == everything[2:]
     assert pictures(written(folder, "no hop")[0]) == pictures(written(folder, "casing")[0]) == {}
-    spectra = {
-        name: pictures(written(folder, name)[0])["Spectra of the recordings"]
-        for name in CASES
-        if name not in ("no hop", "casing")
-    }
+    of = {name: pictures(written(folder, name)[0]) for name in CASES if name not in ("no hop", "casing")}
+    spectra = {name: found["Spectra of the recordings"] for name, found in of.items()}
     assert "Shaded: the band that is used, 3 to 150 Hz. Grey: the rotation at 22.0 Hz" in spectra["none"]
     assert "speed is not known" in spectra["no speed"]
     assert "Grey: the rotation at 22.0 Hz" in spectra["no phase reference"]
     assert "A frequency in orange is a steady line" in spectra["second excitation"]
     assert "in orange" not in spectra["none"]
-    levels = {
-        name: pictures(written(folder, name)[0])["Speed and level over time"]
-        for name in ("no phase reference", "full", "none")
-    }
+    levels = {name: found["Speed and level over time"] for name, found in of.items()}
     assert "broken where data are missing" in levels["no phase reference"]
     assert "broken" not in levels["full"]
     assert "number at the top" in levels["none"]
@@ -405,14 +390,9 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 def test_which_error_is_said_to_dominate() -> None:
     one = next(each for each in case("partial")[0].report.parameters if each.name == "k_by")
     own = sure(one.window_error)
-    for shared, which in (
-        (0.0, "window"),
-        (own / 2.1, "window"),
-        (own, "both"),
-        (1.9 * own, "both"),
-        (2.1 * own, "commissioning"),
-    ):
-        assert dominant(one.model_copy(update={"commissioning_error": shared})) == which
+    shares = {0.0: "window", 1 / 2.1: "window", 1.0: "both", 1.9: "both", 2.1: "commissioning"}
+    for share, which in shares.items():
+        assert dominant(one.model_copy(update={"commissioning_error": share * own})) == which
     assert not dominant(one.model_copy(update={"commissioning_error": None}))
 
 
@@ -435,12 +415,6 @@ def test_square_brackets_are_no_markup_of_the_terminal() -> None:
     assert "[red]all[/red] of it [/]" in printed(report.model_copy(update={"checks": (check,)}))
 
 
-def test_every_channel_has_words() -> None:
-    for state in ("y1", "z2_ddot", "psi", "phi_dot", "theta"):
-        assert channel_text(state) != state
-    assert channel_text("x9") == "x9"
-
-
 def test_what_growth_of_a_level_raises_an_alert_stands_on_the_page_and_in_the_terminal(folder: Path) -> None:
     text, report = written(folder, "no phase reference")
     assert {one.channel for one in report.levels} == {channel.name for channel in case("no phase reference")[2].sensors}
@@ -455,9 +429,51 @@ def test_what_growth_of_a_level_raises_an_alert_stands_on_the_page_and_in_the_te
         assert one.windows > 0
         assert f"{one.channel} {one.measure} " in told
         assert f"{100 * one.growth:.0f}%" in told
-    out = StringIO()
-    print_report(report, Console(file=out, width=400))
-    assert "not in the recordings, stronger or from another direction, makes some channels louder" in out.getvalue()
-    assert "A level raises an alert, relative to the healthy machine, once it has grown by 60%" in out.getvalue()
+    out = printed(report, 400)
+    assert "not in the recordings, stronger or from another direction, makes some channels louder" in out
+    assert "A level raises an alert, relative to the healthy machine, once it has grown by 60%" in out
     refused, _ = written(folder, "no hop")
     assert 'id="levels"' not in refused
+
+
+TURNED = mounted(LAB, dict.fromkeys(("y1", "y2", "y1_dot", "y2_dot"), (45, 135)))
+
+
+@cache
+def kit(*, turned: bool, full: bool) -> tuple[Commissioning, HealthyRecording, MachineFile]:
+    machine: MachineFile = TURNED if turned else LAB
+    scenario, _ = load_scenario("healthy")
+    sensors = scenario.sensors.model_copy(update={"noise_relative": 1e-6})
+    scenario = scenario.model_copy(update={"duration_s": 100.0, "seed": 77_205, "sensors": sensors})
+    assert isinstance(machine, Machine)
+    stream = [(block, "") for block, _ in blocks(scenario, machine, 1.0)]
+    if not full:
+        without = machine.model_dump(exclude={"rotor", "operation", "condition"})
+        machine = MachineFile.model_validate(without)
+    recording = healthy_from_blocks("healthy.mcap", machine, stream)
+    return commissioned(machine, recording), recording, machine
+
+
+@pytest.mark.parametrize("full", [True, pytest.param(False, marks=pytest.mark.long)])
+def test_probes_at_an_angle_are_commissioned_as_probes_in_y_and_z(
+    full: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, *_ = kit(turned=False, full=full)
+    turned, recording, machine = kit(turned=True, full=full)
+    assert turned.report.verdict == plain.report.verdict != "refused"
+    for one, other in zip(plain.report.parameters, turned.report.parameters, strict=True):
+        assert other.name == one.name
+        if one.window_error is None:
+            assert other.window_error is None
+        else:
+            assert other.window_error == pytest.approx(one.window_error, rel=0.05)
+    assert turned.commissioned is not None
+    sensors = sure(turned.commissioned.sensors)
+    assert {"bearing@45", "bearing@135_dot"} <= {one.state for one in sensors.channels}
+    assert {(one.first, one.second) for one in sensors.pairs} >= {("disc@45", "disc@45_dot")}
+    assert set(sure(turned.commissioned.levels).states[0].levels) == {one.name for one in LAB.sensors[:-1]}
+    for picture in ("draw_readings", "draw_budget", "draw_levels"):  # they take long and name no channel
+        monkeypatch.setattr(f"simulator.commission.page.{picture}", lambda *_: None)
+    page = write_report(tmp_path, turned.report, [recording], machine=machine, commissioned=turned.commissioned)
+    assert json.loads((tmp_path / JSON).read_text())["verdict"] == turned.report.verdict
+    assert "bearing, at 135°, velocity" in page.read_text(encoding="utf-8")

@@ -71,14 +71,6 @@ def test_a_drifting_level_doubles_or_halves_the_vibration() -> None:
         assert ratio == pytest.approx(end, rel=0.35)
 
 
-@pytest.mark.parametrize("anomaly", list(Anomaly)[1:])
-def test_an_anomaly_of_no_size_is_the_healthy_window(anomaly: Anomaly) -> None:
-    healthy = draw_condition(_plain(), 5)
-    none = draw_condition(_plain(anomaly=anomaly, anomaly_size=0.0), 5)
-    short = {"duration_s": 5.0}
-    np.testing.assert_array_equal(_samples(healthy.model_copy(update=short)), _samples(none.model_copy(update=short)))
-
-
 def test_anomalies_have_their_effect() -> None:
     """20 s each, of the same noise: only the anomaly differs."""
     healthy = draw_condition(_plain(), 5)

@@ -12,7 +12,6 @@ import zenoh
 import zenoh.ext
 
 from models.errors import MachineFileError
-from models.machine import Machine
 from models.signals.block import FloatArray
 from models.signals.channels import ChannelDescriptor
 from models.signals.link import LinkSettings
@@ -23,11 +22,8 @@ from simulator.stream import DEFAULT_START_NS, RunSummary, TruthRecord, blocks
 from tests.loopback import endpoint, session_of
 from tests.service.rig.live import until
 
-
-@pytest.fixture(scope="module")
-def loaded() -> tuple[Scenario, Machine]:
-    scenario, machine = load_scenario("healthy")
-    return scenario.overridden(duration_s=6.0, faults=[parse_fault("k_by=-0.25@3")]), machine
+HEALTHY, MACHINE = load_scenario("healthy")
+SENT = HEALTHY.overridden(duration_s=6.0, faults=[parse_fault("k_by=-0.25@3")])
 
 
 @pytest.fixture(name="endpoint")
@@ -65,20 +61,16 @@ class _Received:
 
 @contextmanager
 def _publishing(
-    loaded: tuple[Scenario, Machine],
-    endpoint: str,
-    on_block: Callable[[RunSummary], None] | None = None,
-    **settings: Any,
+    endpoint: str, on_block: Callable[[RunSummary], None] | None = None, scenario: Scenario = SENT, **settings: Any
 ) -> Iterator[tuple[threading.Event, list[RunSummary | Exception]]]:
-    scenario, machine = loaded
     stop = threading.Event()
     outcome: list[RunSummary | Exception] = []
     link = LinkSettings(connect=(endpoint,))
 
     def run() -> None:
         try:
-            made = blocks(scenario, machine, run=7)
-            outcome.append(publish(machine, made, PublishSettings(link, **settings), stop=stop, on_block=on_block))
+            made = blocks(scenario, MACHINE, run=7)
+            outcome.append(publish(MACHINE, made, PublishSettings(link, **settings), stop=stop, on_block=on_block))
         except Exception as error:  # handed to the test
             outcome.append(error)
 
@@ -92,17 +84,16 @@ def _publishing(
         assert not thread.is_alive()
 
 
-def test_a_late_subscriber_gets_all(loaded: tuple[Scenario, Machine], endpoint: str, monitor: zenoh.Session) -> None:
-    scenario, machine = loaded
+def test_a_late_subscriber_gets_all(endpoint: str, monitor: zenoh.Session) -> None:
     half = threading.Event()
-    with _publishing(loaded, endpoint, lambda s: half.set() if s.blocks >= 40 else None, pace=20.0, linger_s=60.0) as (
+    with _publishing(endpoint, lambda s: half.set() if s.blocks >= 40 else None, pace=20.0, linger_s=60.0) as (
         stop,
         outcome,
     ):
         assert half.wait(180)
-        stream = _Received(monitor, machine.keys.stream)
-        truth = _Received(monitor, machine.keys.truth)
-        descriptor = _Received(monitor, machine.keys.descriptor)
+        stream = _Received(monitor, MACHINE.keys.stream)
+        truth = _Received(monitor, MACHINE.keys.truth)
+        descriptor = _Received(monitor, MACHINE.keys.descriptor)
         until(lambda: len(stream.samples) >= 60, "60 blocks")
         until(lambda: len(truth.samples) >= 2, "two truth records")
         until(lambda: len(descriptor.samples) >= 1, "descriptor")
@@ -111,47 +102,39 @@ def test_a_late_subscriber_gets_all(loaded: tuple[Scenario, Machine], endpoint: 
     assert isinstance(summary, RunSummary)
     assert (summary.blocks, summary.data_s) == (60, 6.0)
     assert stream.sequences == list(range(60))
-    for sample, (block, _) in zip(stream.samples, blocks(scenario, machine, run=7), strict=True):
+    for sample, (block, _) in zip(stream.samples, blocks(SENT, MACHINE, run=7), strict=True):
         received, schema_hash = decode_block(*sample)
-        assert schema_hash == machine.descriptor.schema_hash
+        assert schema_hash == MACHINE.descriptor.schema_hash
         assert (received.run, received.start_ns) == (7, block.start_ns)
         np.testing.assert_array_equal(received.samples, block.samples)
     records = [TruthRecord.model_validate_json(payload) for payload, _, _ in truth.samples]
     assert [record.relative_changes["k_by"] for record in records] == [0.0, -0.25]
     assert {encoding for _, _, encoding in truth.samples} == {"application/json"}
-    assert ChannelDescriptor.model_validate_json(descriptor.samples[0][0]) == machine.descriptor
+    assert ChannelDescriptor.model_validate_json(descriptor.samples[0][0]) == MACHINE.descriptor
 
 
-def test_the_descriptor_answers_a_query_and_the_token_shows_who_is_there(
-    loaded: tuple[Scenario, Machine], endpoint: str, monitor: zenoh.Session
-) -> None:
-    _, machine = loaded
+def test_the_descriptor_answers_a_query_and_the_token_shows_who_is_there(endpoint: str, monitor: zenoh.Session) -> None:
     changes: list[zenoh.SampleKind] = []
     monitor.liveliness().declare_subscriber(
-        machine.keys.publisher_alive, lambda s: changes.append(s.kind), history=True
+        MACHINE.keys.publisher_alive, lambda s: changes.append(s.kind), history=True
     )
-    with _publishing(loaded, endpoint, pace=1.0) as (stop, _):
+    with _publishing(endpoint, pace=1.0) as (stop, _):
         until(lambda: changes == [zenoh.SampleKind.PUT], "publisher")
-        replies = [reply.ok for reply in monitor.get(machine.keys.descriptor, timeout=60)]
+        replies = [reply.ok for reply in monitor.get(MACHINE.keys.descriptor, timeout=60)]
         stop.set()
     ok = [reply for reply in replies if reply is not None]
     assert [str(reply.encoding) for reply in ok] == ["application/json"]
-    assert ChannelDescriptor.model_validate_json(ok[0].payload.to_bytes()) == machine.descriptor
+    assert ChannelDescriptor.model_validate_json(ok[0].payload.to_bytes()) == MACHINE.descriptor
     until(lambda: changes == [zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE], "end of the publisher")
 
 
-def test_an_unpaced_stream_waits_for_a_slow_subscriber_and_loses_nothing(
-    loaded: tuple[Scenario, Machine], endpoint: str, monitor: zenoh.Session
-) -> None:
+def test_an_unpaced_stream_waits_for_a_slow_subscriber_and_loses_nothing(endpoint: str, monitor: zenoh.Session) -> None:
     """More than cache and sockets hold, to a subscriber slower than the simulation; the session closes at once."""
-    scenario, machine = loaded
-    long = scenario.overridden(duration_s=150.0)
-    with monitor.declare_queryable(machine.keys.health, lambda query: query.reply(machine.keys.health, b"{}")):
-        stream = _Received(monitor, machine.keys.stream, delay_s=0.003)
-        with _publishing((long, machine), endpoint, pace=None, wait_for_subscriber_s=30.0, linger_s=0.0) as (
-            _,
-            outcome,
-        ):
+    with monitor.declare_queryable(MACHINE.keys.health, lambda query: query.reply(MACHINE.keys.health, b"{}")):
+        stream = _Received(monitor, MACHINE.keys.stream, delay_s=0.003)
+        with _publishing(
+            endpoint, scenario=SENT.overridden(duration_s=150.0), pace=None, wait_for_subscriber_s=30.0, linger_s=0.0
+        ) as (_, outcome):
             until(lambda: len(outcome) == 1, "end of the stream", 60.0)
             until(lambda: len(stream.samples) >= 1500, "last block", 60.0)
     assert isinstance(outcome[0], RunSummary)
@@ -159,53 +142,51 @@ def test_an_unpaced_stream_waits_for_a_slow_subscriber_and_loses_nothing(
     assert stream.sequences == list(range(1500))
 
 
-def test_arrow_streams_are_the_same(loaded: tuple[Scenario, Machine], endpoint: str, monitor: zenoh.Session) -> None:
-    scenario, machine = loaded
-    stream = _Received(monitor, machine.keys.stream)
-    with _publishing(loaded, endpoint, pace=None, encoding="arrow", wait_for_subscriber_s=30.0):
+def test_arrow_streams_are_the_same(endpoint: str, monitor: zenoh.Session) -> None:
+    stream = _Received(monitor, MACHINE.keys.stream)
+    with _publishing(endpoint, pace=None, encoding="arrow", wait_for_subscriber_s=30.0):
         until(lambda: len(stream.samples) >= 60, "60 blocks")
     received = [decode_block(*sample) for sample in stream.samples]
-    assert {sample[2] for sample in stream.samples} == {f"{ARROW_ENCODING};{machine.descriptor.schema_hash}"}
-    for (one, _), (other, _) in zip(received, blocks(scenario, machine), strict=True):
+    assert {sample[2] for sample in stream.samples} == {f"{ARROW_ENCODING};{MACHINE.descriptor.schema_hash}"}
+    for (one, _), (other, _) in zip(received, blocks(SENT, MACHINE), strict=True):
         np.testing.assert_array_equal(one.samples, other.samples)
 
 
-def test_nothing_is_sent_to_nobody(loaded: tuple[Scenario, Machine], endpoint: str, monitor: zenoh.Session) -> None:
-    _, machine = loaded
+def test_nothing_is_sent_to_nobody(endpoint: str, monitor: zenoh.Session) -> None:
     alive = threading.Event()
-    monitor.liveliness().declare_subscriber(machine.keys.publisher_alive, lambda _: alive.set(), history=True)
+    monitor.liveliness().declare_subscriber(MACHINE.keys.publisher_alive, lambda _: alive.set(), history=True)
     sent = threading.Event()
-    with _publishing(loaded, endpoint, lambda _: sent.set(), pace=1.0, wait_for_subscriber_s=60.0) as (stop, outcome):
+    with _publishing(endpoint, lambda _: sent.set(), pace=1.0, wait_for_subscriber_s=60.0) as (stop, outcome):
         assert alive.wait(180)
         # Answered by the waiting publisher: it is up, and has had every occasion to send.
-        assert len(list(monitor.get(machine.keys.descriptor, timeout=60))) == 1
+        assert len(list(monitor.get(MACHINE.keys.descriptor, timeout=60))) == 1
         assert not sent.is_set()
-        stream = _Received(monitor, machine.keys.stream)
+        stream = _Received(monitor, MACHINE.keys.stream)
         assert sent.wait(180)
         stop.set()
     assert isinstance(outcome[0], RunSummary)
     until(lambda: stream.sequences[:1] == [0], "first block")
 
 
-def test_nobody_in_time_is_an_error(loaded: tuple[Scenario, Machine], endpoint: str) -> None:
-    with _publishing(loaded, endpoint, pace=1.0, wait_for_subscriber_s=0.1) as (_, outcome):
+def test_nobody_in_time_is_an_error(endpoint: str) -> None:
+    with _publishing(endpoint, pace=1.0, wait_for_subscriber_s=0.1) as (_, outcome):
         until(lambda: len(outcome) == 1, "outcome")
     assert isinstance(outcome[0], PublishError)
     assert "nobody subscribed to rotorwatch/demo/lab/stream within 0.1 s" in str(outcome[0])
 
 
 @pytest.mark.parametrize("settings", [{"wait_for_subscriber_s": 1e6}, {"pace": 1e-6}, {"pace": None, "linger_s": 1e6}])
-def test_a_stop_ends_every_wait(loaded: tuple[Scenario, Machine], endpoint: str, settings: dict[str, Any]) -> None:
-    with _publishing(loaded, endpoint, **settings) as (stop, outcome):
+def test_a_stop_ends_every_wait(endpoint: str, settings: dict[str, Any]) -> None:
+    with _publishing(endpoint, **settings) as (stop, outcome):
         stop.set()
     assert isinstance(outcome[0], RunSummary)
     assert outcome[0].blocks <= 60
 
 
-def test_pace_follows_the_data_time(loaded: tuple[Scenario, Machine], endpoint: str) -> None:
+def test_pace_follows_the_data_time(endpoint: str) -> None:
     """A block goes out after its last sample: never early, however fast the machine is."""
     summaries: list[RunSummary] = []
-    with _publishing(loaded, endpoint, summaries.append, pace=30.0, linger_s=0.0) as (_, outcome):
+    with _publishing(endpoint, summaries.append, pace=30.0, linger_s=0.0) as (_, outcome):
         until(lambda: len(outcome) == 1, "end of the stream")
     assert [summary.blocks for summary in summaries] == list(range(1, 61))
     assert all(summary.elapsed_s >= summary.data_s / 30.0 - 1e-3 for summary in summaries)
@@ -217,34 +198,25 @@ EVENTS = (
     Event(at_s=2.2, sensor="y1", sensor_fault="none"), Event(at_s=3.0111, speed_rpm=1500.0),
     Event(at_s=3.3, source="disc y", force_rms_N=2.0), Event(at_s=3.5, parameter="e", relative_change=0.3),
 )  # fmt: skip
+SCENARIO = HEALTHY.overridden(duration_s=4.2345, faults=EVENTS)
 
 
-@pytest.fixture(scope="module")
-def machine() -> Machine:
-    return load_scenario("healthy")[1]
-
-
-@pytest.fixture(scope="module")
-def scenario() -> Scenario:
-    return load_scenario("healthy")[0].overridden(duration_s=4.2345, faults=EVENTS)
-
-
-def _all(scenario: Scenario, machine: Machine, block_s: float = 0.1) -> tuple[FloatArray, list[TruthRecord]]:
-    stream = list(blocks(scenario, machine, block_s))
+def _all(scenario: Scenario, block_s: float = 0.1) -> tuple[FloatArray, list[TruthRecord]]:
+    stream = list(blocks(scenario, MACHINE, block_s))
     samples = np.concatenate([block.samples for block, _ in stream])
     return np.asarray(samples, dtype=np.float64), [entry for _, truth in stream for entry in truth]
 
 
 @pytest.mark.parametrize("block_s", [0.0005, 0.37, 100.0])
-def test_the_cut_into_blocks_changes_no_bit(scenario: Scenario, machine: Machine, block_s: float) -> None:
-    samples, truth = _all(scenario, machine)
-    again, truth_again = _all(scenario, machine, block_s)
+def test_the_cut_into_blocks_changes_no_bit(block_s: float) -> None:
+    samples, truth = _all(SCENARIO)
+    again, truth_again = _all(SCENARIO, block_s)
     assert again.tobytes() == samples.tobytes()
     assert truth_again == truth
 
 
-def test_blocks_are_contiguous(scenario: Scenario, machine: Machine) -> None:
-    made = [block for block, _ in blocks(scenario, machine, start_ns=5, run=9)]
+def test_blocks_are_contiguous() -> None:
+    made = [block for block, _ in blocks(SCENARIO, MACHINE, start_ns=5, run=9)]
     assert [block.sequence for block in made] == list(range(43))
     assert {(block.run, block.rate_hz, block.samples.dtype.str) for block in made} == {(9, 2000.0, "<f4")}
     assert made[0].start_ns == 5
@@ -253,16 +225,16 @@ def test_blocks_are_contiguous(scenario: Scenario, machine: Machine) -> None:
     assert made[-1].end_ns == 5 + 4_234_500_000
 
 
-def test_a_rate_that_is_no_whole_number_of_nanoseconds_does_not_drift(scenario: Scenario, machine: Machine) -> None:
-    odd = machine.model_copy(update={"rate_hz": 2048.0 / 3})
-    made = [block for block, _ in blocks(scenario, odd, 0.05)]
+def test_a_rate_that_is_no_whole_number_of_nanoseconds_does_not_drift() -> None:
+    odd = MACHINE.model_copy(update={"rate_hz": 2048.0 / 3})
+    made = [block for block, _ in blocks(SCENARIO, odd, 0.05)]
     first, last = made[0], made[-1]
     count = sum(len(block.samples) for block in made[:-1])
     assert last.start_ns - first.start_ns == round(count * 3e9 / 2048)
 
 
-def test_truth_tells_what_happens_when(scenario: Scenario, machine: Machine) -> None:
-    _, truth = _all(scenario, machine)
+def test_truth_tells_what_happens_when() -> None:
+    _, truth = _all(SCENARIO)
     assert [entry.data_s for entry in truth] == [0, 1, 1.2345, 2, 2.2, 3, 3.011, 3.3, 3.5]
     assert [entry.time_ns - DEFAULT_START_NS for entry in truth] == [round(entry.data_s * 1e9) for entry in truth]
     by_time = {entry.data_s: entry for entry in truth}
@@ -277,16 +249,13 @@ def test_truth_tells_what_happens_when(scenario: Scenario, machine: Machine) -> 
     assert (last.relative_changes["k_by"], last.relative_changes["e"], last.ramping) == (-0.3, 0.3, ())
     assert (last.machine, last.scenario, last.seed, last.run) == ("lab", "healthy", 1, 1)
     assert TruthRecord.model_validate_json(last.model_dump_json()) == last
+    for block, came_with in blocks(SCENARIO, MACHINE, 0.013):
+        assert all(block.start_ns <= entry.time_ns < block.end_ns for entry in came_with)
 
 
-def test_each_truth_record_comes_with_the_block_it_begins_in(scenario: Scenario, machine: Machine) -> None:
-    for block, truth in blocks(scenario, machine, 0.013):
-        assert all(block.start_ns <= entry.time_ns < block.end_ns for entry in truth)
-
-
-def test_samples_show_what_the_truth_says(scenario: Scenario, machine: Machine) -> None:
-    samples, _ = _all(scenario, machine)
-    column = {channel.name: samples[:, n] for n, channel in enumerate(machine.sensors)}
+def test_samples_show_what_the_truth_says() -> None:
+    samples, _ = _all(SCENARIO)
+    column = {channel.name: samples[:, n] for n, channel in enumerate(MACHINE.sensors)}
     assert np.array_equal(np.flatnonzero(np.isnan(column["z2"])), np.arange(4000, 8469))
     held = column["y1"][2469:4400]
     assert np.ptp(held) == 0
@@ -297,41 +266,33 @@ def test_samples_show_what_the_truth_says(scenario: Scenario, machine: Machine) 
     assert np.allclose(turns[6022:], 1500.0, atol=0.1)
 
 
-def test_sensors_never_change_how_the_machine_moves(scenario: Scenario, machine: Machine) -> None:
+def test_sensors_never_change_how_the_machine_moves() -> None:
     plain = Scenario.model_validate({
-        **scenario.model_dump(),
+        **SCENARIO.model_dump(),
         "sensors": Sensors(channels={"z1": ChannelSettings(noise_relative=1.0, gain=2.0)}).model_dump(),
         "events": [event.model_dump() for event in EVENTS if event.sensor is None],
     })  # fmt: skip
-    noiseless = scenario.model_copy(update={"sensors": Sensors()})
-    one, _ = _all(noiseless, machine)
-    other, _ = _all(plain, machine)
-    names = [channel.name for channel in machine.sensors]
+    noiseless = SCENARIO.model_copy(update={"sensors": Sensors()})
+    one, _ = _all(noiseless)
+    other, _ = _all(plain)
+    names = [channel.name for channel in MACHINE.sensors]
     same = [name for name, a, b in zip(names, one.T, other.T, strict=True) if np.array_equal(a, b)]
     assert same == [name for name in names if name not in ("y1", "z1", "z2")]
     np.testing.assert_array_equal(one[:4000, names.index("z2")], other[:4000, names.index("z2")])
 
 
-def test_another_seed_is_another_realisation(scenario: Scenario, machine: Machine) -> None:
-    one, _ = _all(scenario, machine)
-    other, _ = _all(scenario.overridden(seed=99), machine)
-    correlation = np.corrcoef(one[:2000, 0], other[:2000, 0])[0, 1]
-    assert abs(correlation) < 0.8
-    np.testing.assert_array_equal(one[:, -1], other[:, -1])  # the shaft turns as it did
-
-
-def test_channels_have_noise_of_their_own(scenario: Scenario, machine: Machine) -> None:
-    quiet = scenario.model_copy(update={"events": (), "duration_s": 20.0, "sensors": Sensors()})
-    clean, _ = _all(quiet, machine)
-    noisy, _ = _all(quiet.model_copy(update={"sensors": Sensors(noise_relative=0.5)}), machine)
+def test_channels_have_noise_of_their_own() -> None:
+    quiet = SCENARIO.model_copy(update={"events": (), "duration_s": 20.0, "sensors": Sensors()})
+    clean, _ = _all(quiet)
+    noisy, _ = _all(quiet.model_copy(update={"sensors": Sensors(noise_relative=0.5)}))
     noise = (noisy - clean)[:, :8]
     correlations = np.corrcoef(noise.T) - np.eye(8)
     assert np.abs(correlations).max() < 5 / np.sqrt(40_000)
 
 
-def test_a_machine_without_the_channel_is_refused(scenario: Scenario, machine: Machine) -> None:
-    short = machine.model_copy(update={"sensors": machine.sensors[1:]})
+def test_a_machine_without_the_channel_is_refused() -> None:
+    short = MACHINE.model_copy(update={"sensors": MACHINE.sensors[1:]})
     with pytest.raises(MachineFileError, match=r"events\.1\.sensor: 'y1' is not a channel of machine lab"):
-        blocks(scenario, short)
+        blocks(SCENARIO, short)
     with pytest.raises(ValueError, match="holds no sample"):
-        blocks(scenario, machine, 1e-4)
+        blocks(SCENARIO, MACHINE, 1e-4)

@@ -3,8 +3,6 @@
 import json
 import signal
 import socket
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -30,20 +28,13 @@ def _run(*arguments: str | float | Path) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
-def test_help_of_the_module_shows_examples_and_scenarios() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "simulator.rotorsim", "record", "--help"],
-        cwd=ROOT, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert "rotorsim record c_by c_by.mcap" in done.stdout
+def test_help_shows_examples_and_scenarios() -> None:
+    assert "rotorsim record c_by c_by.mcap" in _run("record", "--help").output
     assert "k_bz" in _run("--help").output
 
 
 def test_a_recording_holds_what_the_publisher_would_send(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    result = _run("record", "k_by", path, "--duration", 12, "--seed", 5, "--fault", "e=0.3@3", "--block-s", 0.25)
-    assert (result.exit_code, result.stdout) == (2, "")  # the scenario's own fault comes at 140 s
-    assert "ends at 140 s, after duration_s 12" in result.stderr
     result = _run("record", "healthy", path, "--duration", 12, "--seed", 5, "--fault", "e=0.3@3", "--block-s", 0.25)
     assert result.exit_code == 0, result.output
     assert result.stdout == f"recorded 48 blocks, 12.0 s of data, in {path}\n"
@@ -89,24 +80,6 @@ def test_start_run_machine_and_arrow_are_options(tmp_path: Path) -> None:
     assert (block.start_ns, block.run) == (1_804_133_167_500_000_000, 9)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["publish", "--duration", "-1"], "duration_s"),
-        (["publish", "--pace", "0"], "--pace is '0', expected a number above 0"),
-        (["record", "healthy", str(Path(__file__))], "already exists; --overwrite replaces it"),
-        (["publish", "--run", "70000"], "--run"),
-        (["publish", "--speed", "1"], "--speed"),
-    ],
-)
-def test_unusable_arguments_exit_2_with_one_message(arguments: list[str], message: str) -> None:
-    result = _run(*arguments)
-    assert result.exit_code == 2
-    assert message in result.stderr
-    assert "Traceback" not in result.stderr
-    assert result.stdout == ""
-
-
 def test_a_run_time_failure_exits_1() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -124,12 +97,8 @@ def test_a_signal_ends_publishing_cleanly(tmp_path: Path, number: signal.Signals
     gone = threading.Event()
 
     def keep(sample: zenoh.Sample) -> None:
-        if (
-            decode_block(sample.payload.to_bytes(), sure(sample.attachment).to_bytes(), str(sample.encoding))[
-                0
-            ].sequence
-            >= 3
-        ):
+        block, _ = decode_block(sample.payload.to_bytes(), sure(sample.attachment).to_bytes(), str(sample.encoding))
+        if block.sequence >= 3:
             three.set()
 
     def watch(sample: zenoh.Sample) -> None:
@@ -159,7 +128,7 @@ def test_publishing_shows_how_far_it_is_and_whether_anybody_listens(listened: bo
     with session_of(LinkSettings(listen=(where,))) as session:
         if listened:
             session.declare_subscriber("rotorwatch/demo/lab/stream", lambda _: None)
-        result = _run("publish", "healthy", "--duration", 4, "--connect", where, "--linger", 0)
+        result = _run("publish", "healthy", "--duration", 2.5, "--connect", where, "--linger", 0)
     assert result.exit_code == 0, result.output
-    assert "of 4.0 s of data" in result.stderr
+    assert "of 2.5 s of data" in result.stderr
     assert ("rotorwatch/demo/lab/stream has no subscriber" in result.stderr) is not listened

@@ -47,15 +47,8 @@ ANGLE = {"name": "A", "quantity": "shaft_angle", "location": "shaft", "direction
 def test_channels_come_in_the_file_order_in_their_units() -> None:
     plant = _plant()
     samples = _bank(_machine(ANGLE, VELOCITY, TILT, TILT_RATE), Sensors()).measure(plant, 0)
-    expected = np.stack(
-        [
-            plant.theta_rad,
-            plant.states[:, STATES.index("z2_dot")] / 0.0254,
-            plant.states[:, STATES.index("phi")] * 1e3,
-            plant.states[:, STATES.index("psi_dot")],
-        ],
-        axis=1,
-    )
+    z2_dot, phi, psi_dot = (plant.states[:, STATES.index(name)] for name in ("z2_dot", "phi", "psi_dot"))
+    expected = np.column_stack([plant.theta_rad, z2_dot / 0.0254, phi * 1e3, psi_dot])
     np.testing.assert_allclose(samples, expected, rtol=1e-12)
     assert samples.dtype == np.float64
     assert _bank(_machine(ANGLE, dtype="float32"), Sensors()).measure(plant, 0).dtype == np.float32
@@ -125,22 +118,6 @@ def test_a_stuck_sensor_holds_until_it_is_released() -> None:
     np.testing.assert_allclose(sensor.measure(2 * VALUES, zero, stuck), 5.0)
     np.testing.assert_allclose(sensor.measure(3 * VALUES, zero, stuck), 5.0)
     np.testing.assert_allclose(sensor.measure(VALUES, zero, {}), VALUES * 1e6)
-
-
-def test_faults_begin_and_end_at_their_samples() -> None:
-    channel = DISPLACEMENT.model_dump()
-    other = {**channel, "name": "ZE", "direction": "z"}
-    faults: dict[str, list[tuple[int, SensorFaults]]] = {
-        "XE": [(103, {"offset": 1.0}), (110, {"offset": 1.0, "dropout": None}), (120, {})]
-    }
-    bank = _bank(_machine(channel, other), Sensors(), faults)
-    plant = PlantSamples(np.zeros((10, 12)), np.zeros(10))
-    column = np.concatenate([bank.measure(plant, first)[:, 0] for first in (90, 100, 110, 120)])
-    expected = np.zeros(40)
-    expected[13:20], expected[20:30] = 1e6, np.nan
-    np.testing.assert_array_equal(column, expected)
-    assert (bank.faults_at(102), bank.faults_at(103)) == ({}, {"XE": {"offset": 1.0}})
-    assert (bank.faults_at(115), bank.faults_at(120)) == ({"XE": {"offset": 1.0, "dropout": None}}, {})
 
 
 def test_an_unused_noise_is_drawn_all_the_same() -> None:
