@@ -96,28 +96,22 @@ def files_of(*packages: str) -> set[str]:
     }
 
 
-def test_one_wheel_brings_the_programs_with_all_their_files(wheels: dict[str, Path]) -> None:
+def test_one_wheel_brings_the_programs_with_all_their_files_and_the_client_is_one_of_its_own(
+    wheels: dict[str, Path],
+) -> None:
     assert set(contents(wheels["rotorwatch"])) == files_of(*PACKAGES)
-
-
-def test_the_client_is_a_wheel_of_its_own(wheels: dict[str, Path]) -> None:
     assert set(contents(wheels["rotorwatch_client"])) == files_of("rotorwatch")
-    needed = [
-        line for line in metadata(wheels["rotorwatch_client"]).get_all("Requires-Dist", []) if "extra" not in line
-    ]
+    needed = [line for line in requirements(wheels["rotorwatch_client"]) if "extra" not in line]
     assert {line.split("<")[0].split(">")[0] for line in needed} == {"httpx", "httpx-sse", "pydantic"}
 
 
-def test_both_wheels_say_version_and_licence(wheels: dict[str, Path]) -> None:
+def test_both_wheels_say_version_and_licence_and_agree_on_what_they_need(wheels: dict[str, Path]) -> None:
     for wheel in wheels.values():
         found = metadata(wheel)
         assert (found["Version"], found["License-Expression"]) == (rotorwatch.__version__, "Apache-2.0")
         with zipfile.ZipFile(wheel) as archive:
             (licence,) = (name for name in archive.namelist() if name.endswith("licenses/LICENSE"))
             assert archive.read(licence) == (ROOT / "LICENSE").read_bytes()
-
-
-def test_the_wheels_agree_on_what_they_need(wheels: dict[str, Path]) -> None:
     client = {line.split(";")[0] for line in requirements(wheels["rotorwatch_client"])}
     assert client <= set(requirements(wheels["rotorwatch"]))
 

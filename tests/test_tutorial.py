@@ -39,27 +39,25 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def reports(folder: Path, name: str) -> list[dict[str, Any]]:
+def messages(folder: Path, name: str, topic: str) -> list[dict[str, Any]]:
     lines = (folder / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
-    messages = [json.loads(line) for line in lines]
-    return [entry["message"] for entry in messages if entry["topic"].endswith("/report")]
+    return [entry["message"] for entry in map(json.loads, lines) if topic in entry["topic"]]
 
 
-def alarms(folder: Path, name: str) -> list[dict[str, Any]]:
-    lines = (folder / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
-    return [entry["message"]["data"] for entry in map(json.loads, lines) if "/alarm/event" in entry["topic"]]
+def full(folder: Path, name: str) -> list[dict[str, Any]]:
+    return [report for report in messages(folder, name, "/report") if report["filled"] == 1.0]
 
 
 def test_nothing_is_raised_on_the_healthy_half_that_was_not_seen(folder: Path) -> None:
-    found = [report for report in reports(folder, "healthy") if report["filled"] == 1.0]
+    found = full(folder, "healthy")
     assert len(found) > 15
     assert {report["state"] for report in found} == {"healthy"}
-    assert not alarms(folder, "healthy")
+    assert not messages(folder, "healthy", "/alarm/event")
     assert all(not report["verdict"]["changed"] for report in found)
 
 
 def test_the_changed_stiffness_is_named_alone_and_at_once(folder: Path) -> None:
-    first, second, *rest = [report for report in reports(folder, "changed") if report["filled"] == 1.0]
+    first, second, *rest = full(folder, "changed")
     named = [[finding["name"] for finding in report["verdict"]["changed"]] for report in (first, second, *rest)]
     assert named[1] == ["k_by"]
     assert all(names in ([], ["k_by"]) for names in named)
@@ -70,7 +68,7 @@ def test_the_changed_stiffness_is_named_alone_and_at_once(folder: Path) -> None:
         assert abs(by_name["k_bz"]["z"]) < 3.5
         for name in ("c_by", "c_bz", "e"):  # where they are read at all
             assert abs(by_name[name]["z"] or 0.0) < 3.5, name
-    (alarm,) = alarms(folder, "changed")
+    (alarm,) = (one["data"] for one in messages(folder, "changed", "/alarm/event"))
     assert (alarm["name"], alarm["kind"]) == ("k_by", "raised")
     assert alarm["text"] in PAGE
 

@@ -5,9 +5,8 @@ import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
-from tests.faults.measure import Outcome, carried_out
-from tests.faults.page import PAGE, written
-from tests.faults.scenarios import ROWS, Row
+from tests.faults.faults import ROWS, Row
+from tests.faults.measure import PAGE, Outcome, carried_out, written
 
 
 def main() -> int:

@@ -1,4 +1,4 @@
-"""How each fault is brought about and mended, and what is waited for in between."""
+"""What is broken on purpose and mended; what that may cost, and what has to be said, stands in docs/reliability.md."""
 
 import os
 import resource
@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from models.alarm_names import CLOCK, CONFLICT, FAULT, STREAM_LOST
@@ -352,3 +353,39 @@ def flood(plant: Plant) -> None:
             if not plant.stated_s and (seen := plant.look()) and sum(seen.health.quality.refused_blocks.values()):
                 plant.stated_now()
         plant.over(lambda seen: seen.well and sum(seen.health.quality.refused_blocks.values()) > 1000)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One fault: its name in the page, what breaks and mends it, and what comes before the monitor is started."""
+
+    name: str
+    run: Callable[[Plant], None]
+    prepare: Callable[[Plant], None] = lambda plant: None
+
+
+ROWS = (
+    Row("The publisher is killed and restarted", publisher_killed),
+    Row("The publisher is paused", publisher_stands),
+    Row("The publisher is restarted an hour later by its clock", restarted_at(3600.0)),
+    Row("The publisher is restarted an hour earlier by its clock", restarted_at(-3600.0)),
+    Row("The publisher's clock is set forward", clock_set(3600.0)),
+    Row("The publisher's clock is set back", clock_set(-3600.0)),
+    Row("Two publishers send on one machine's key", two_publishers),
+    Row("The network link is cut", link_cut, through_router),
+    Row("The monitor is killed, three times", monitor_killed),
+    Row("The monitor is shut down cleanly", monitor_stopped),
+    Row("The monitor is paused", monitor_stands),
+    Row("A second monitor is started with the same machine and history", second_monitor),
+    Row("The history is locked by another program", history_locked),
+    Row("The history stays locked until the monitor has stopped", locked_to_the_end),
+    Row("The disk is full", disk_full, small_disk),
+    Row("A write fails in the middle of a commit, and the monitor is killed", torn_write),
+    Row("The history is deleted", deleted),
+    Row("The history is replaced by another file", replaced),
+    Row("The history is damaged while it is in use", damaged_in_use),
+    Row("The history is damaged before the monitor starts", damaged_at_start),
+    Row("The history refuses the entries of one machine", refused_step),
+    Row("A webhook's receiver is unavailable", receiver_away, receiver),
+    Row("A flood of bad messages", flood),
+)

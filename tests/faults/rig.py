@@ -286,11 +286,9 @@ class Plant:
 
         def found() -> int:
             seen = self.look()
-            return (
-                0
-                if seen is None
-                else seen.health.quality.accepted_blocks + round(seen.health.quality.missing_s / BLOCK_S)
-            )
+            if seen is None:
+                return 0
+            return seen.health.quality.accepted_blocks + round(seen.health.quality.missing_s / BLOCK_S)
 
         deadline = time.monotonic() + 20.0
         while found() < published and time.monotonic() < deadline:
