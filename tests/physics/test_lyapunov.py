@@ -115,10 +115,7 @@ def test_advance_equals_the_recursion() -> None:
 
 
 def test_process_noise_of_a_double_integrator_has_its_closed_form() -> None:
-    """White force of intensity S on a barely bound mass: G Gᵀ = S/m² [[T³/3, T²/2], [T²/2, T]], to every digit.
-
-    An unscaled factorisation loses the displacement part, which is 10⁸ times smaller than the velocity part.
-    """
+    """White force of intensity S on a barely bound mass: G Gᵀ = S/m² [[T³/3, T²/2], [T²/2, T]]."""
     S, m, T = 4.0, 2.0, 1e-4
     A = np.array([[0.0, 1.0], [-1e-6, -1e-3]])
     system = discretise(A, np.array([[0.0], [np.sqrt(S) / m]]), T)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -288,7 +289,10 @@ def test_the_stream_gives_the_windows_that_the_rotor_gives() -> None:
     rotor, sizes = rotor_named("overhung"), WindowSizes(length_s=20.0)
     samples = sampled(rotor, RunCondition(forces(rotor), rotor.speed_rad_s), 23.0, 3)
     machine = machine_of(rotor, sizes)
-    found = last_window(plan_for(machine), blocks(samples, machine.descriptor))
+    sent = list(blocks(samples, machine.descriptor))
+    assert [block.sequence for block in sent] == list(range(len(sent)))
+    assert all(after.start_ns == before.end_ns for before, after in pairwise(sent))
+    found = last_window(plan_for(machine), sent)
     (direct,) = windows_of(samples, plan(rotor, sizes))
     scale = np.sqrt(np.outer(np.diag(direct.correlation[0]), np.diag(direct.correlation[0])))
     assert found.correlation / scale == pytest.approx(direct.correlation / scale, abs=1e-5)
