@@ -146,31 +146,31 @@ def test_secrets_that_everybody_may_read_are_refused(tmp_path: Path, mode: int) 
         inserted(link)
 
 
+PASSWORDS = {"listen": ENDPOINT, "grants": [GRANT], "passwords_file": "all"}
+PASSWORD = {"connect": ENDPOINT, "user": "lab", "password_file": "all"}
+
+
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("fields", "text", "said"),
     [
-        ("", "no users"), ("lab", "line 1: expected name:password"),
-        (f"lab:{HIDDEN}\n\npump:x", "line 2: expected name:password"), (f"lab:{HIDDEN}\n# pump:x", "line 2"),
-        (f"lab:{HIDDEN}\n:x", "line 2"), (f"lab:{HIDDEN}\npump:", "line 2"),
-        (f"lab:{HIDDEN}\nlab:{HIDDEN}", "line 2: the user lab already has a line"),
-        (f"pump:{HIDDEN}", "who: lab has no line in"),
+        (PASSWORDS, "", "no users"), (PASSWORDS, "lab", "line 1: expected name:password"),
+        (PASSWORDS, f"lab:{HIDDEN}\n\npump:x", "line 2: expected name:password"),
+        (PASSWORDS, f"lab:{HIDDEN}\n# pump:x", "line 2"), (PASSWORDS, f"lab:{HIDDEN}\n:x", "line 2"),
+        (PASSWORDS, f"lab:{HIDDEN}\npump:", "line 2"),
+        (PASSWORDS, f"lab:{HIDDEN}\nlab:{HIDDEN}", "line 2: the user lab already has a line"),
+        (PASSWORDS, f"pump:{HIDDEN}", "who: lab has no line in"),
+        (PASSWORD, "", "found 0 lines"), (PASSWORD, f"{HIDDEN}\n{HIDDEN}\n", "found 2 lines"),
     ],
 )  # fmt: skip
-def test_a_file_of_passwords_that_is_none_is_refused_and_not_shown(tmp_path: Path, text: str, said: str) -> None:
+def test_a_file_of_passwords_that_is_none_is_refused_and_not_shown(
+    tmp_path: Path, fields: dict[str, Any], text: str, said: str
+) -> None:
     passwords = secret_file(tmp_path / "all", text)
-    link = LinkSettings.model_validate({"listen": ENDPOINT, "passwords_file": passwords, "grants": [GRANT]})
+    link = in_folder(LinkSettings.model_validate(fields), tmp_path)
     with pytest.raises(MachineFileError, match=said) as caught:
         link.zenoh_items()
     assert HIDDEN not in str(caught.value)
     assert str(passwords) in str(caught.value)
-
-
-@pytest.mark.parametrize(("text", "said"), [("", "found 0 lines"), (f"{HIDDEN}\n{HIDDEN}\n", "found 2 lines")])
-def test_a_password_is_one_line(tmp_path: Path, text: str, said: str) -> None:
-    link = LinkSettings(connect=ENDPOINT, user="lab", password_file=secret_file(tmp_path / "p", text))
-    with pytest.raises(MachineFileError, match=said) as caught:
-        link.zenoh_items()
-    assert HIDDEN not in str(caught.value)
 
 
 @pytest.mark.parametrize(

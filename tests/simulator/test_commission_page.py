@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from models.commissioning.commission import Commissioning, CommissioningReport, ParameterSummary
-from models.commissioning.healthy import HealthyRecording, healthy_from_blocks
+from models.commissioning.healthy import HealthyRecording
 from models.errors import RecordingError
-from models.machine import Machine, MachineFile, Operation
+from models.machine import MachineFile, Operation
 from simulator.commission.command import print_report
 from simulator.commission.page import HTML, JSON, write_report
 from simulator.commission.verdict import (
@@ -441,17 +441,14 @@ TURNED = mounted(LAB, dict.fromkeys(("y1", "y2", "y1_dot", "y2_dot"), (45, 135))
 
 @cache
 def kit(*, turned: bool, full: bool) -> tuple[Commissioning, HealthyRecording, MachineFile]:
-    machine: MachineFile = TURNED if turned else LAB
+    rotor = TURNED if turned else LAB
     scenario, _ = load_scenario("healthy")
     sensors = scenario.sensors.model_copy(update={"noise_relative": 1e-6})
     scenario = scenario.model_copy(update={"duration_s": 100.0, "seed": 77_205, "sensors": sensors})
-    assert isinstance(machine, Machine)
-    stream = [(block, "") for block, _ in blocks(scenario, machine, 1.0)]
-    if not full:
-        without = machine.model_dump(exclude={"rotor", "operation", "condition"})
-        machine = MachineFile.model_validate(without)
-    recording = healthy_from_blocks("healthy.mcap", machine, stream)
-    return commissioned(machine, recording), recording, machine
+    without = rotor.model_dump(exclude={"rotor", "operation", "condition"})
+    machine = rotor if full else MachineFile.model_validate(without)
+    seen = recording(machine, [block for block, _ in blocks(scenario, rotor, 1.0)])
+    return commissioned(machine, seen), seen, machine
 
 
 @pytest.mark.parametrize("full", [True, pytest.param(False, marks=pytest.mark.long)])
@@ -459,7 +456,7 @@ def test_probes_at_an_angle_are_commissioned_as_probes_in_y_and_z(
     full: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plain, *_ = kit(turned=False, full=full)
-    turned, recording, machine = kit(turned=True, full=full)
+    turned, seen, machine = kit(turned=True, full=full)
     assert turned.report.verdict == plain.report.verdict != "refused"
     for one, other in zip(plain.report.parameters, turned.report.parameters, strict=True):
         assert other.name == one.name
@@ -474,6 +471,6 @@ def test_probes_at_an_angle_are_commissioned_as_probes_in_y_and_z(
     assert set(sure(turned.commissioned.levels).states[0].levels) == {one.name for one in LAB.sensors[:-1]}
     for picture in ("draw_readings", "draw_budget", "draw_levels"):  # they take long and name no channel
         monkeypatch.setattr(f"simulator.commission.page.{picture}", lambda *_: None)
-    page = write_report(tmp_path, turned.report, [recording], machine=machine, commissioned=turned.commissioned)
+    page = write_report(tmp_path, turned.report, [seen], machine=machine, commissioned=turned.commissioned)
     assert json.loads((tmp_path / JSON).read_text())["verdict"] == turned.report.verdict
     assert "bearing, at 135°, velocity" in page.read_text(encoding="utf-8")
