@@ -163,12 +163,14 @@ def no_pair(channels: Iterable[Channel]) -> str:
 
 
 def recorded_pairs(data: Described, place: str | None = None) -> list[tuple[Channel, Channel]]:
-    """Pairs of the channels of some data, all or those at one place.
+    """Pairs of the channels of some data, all or those at one place, of which both have numbers.
 
     Raises
     ------
     MachineFileError
         If there are none.
+    RotorwatchError
+        If of every pair one has no numbers.
     """
     pairs = orbit_pairs(data.descriptor.channels)
     if not pairs:
@@ -179,7 +181,10 @@ def recorded_pairs(data: Described, place: str | None = None) -> list[tuple[Chan
             f"--place is {place!r}, where {data.name} has no displacements in y and z; expected one of "
             f"{', '.join(there)}"
         )
-    return [pair for pair in pairs if place in (None, pair[0].location)]
+    pairs = [pair for pair in pairs if place in (None, pair[0].location)]
+    if not (sent := [pair for pair in pairs if data.sent(pair) == pair]):
+        raise RotorwatchError(f"{data.place}: {data.lacking}")
+    return sent
 
 
 def read_orbits(data: Recorded, revolutions: int) -> Orbits:

@@ -7,8 +7,10 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import ValidationError
 
+from models.diagnosis.sensors.missing import no_data
 from models.errors import MachineFileError, RecordingError, WireError
 from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
@@ -21,6 +23,7 @@ from service.recordings.replay.source import RecordingSource, parse_moment
 
 _TOLERANCE_S = 2e-4
 _RATE_TOLERANCE = 1e-4
+_SOON_NS = 10_000_000_000
 
 
 def begins_again(end_ns: int, start_ns: int) -> bool:
@@ -43,6 +46,16 @@ class Described(ABC):
     def has_angle(self) -> bool:
         """Whether the shaft angle is measured."""
         return "theta" in self.descriptor.states
+
+    def sent(self, channels: Sequence[Channel]) -> tuple[Channel, ...]:
+        """Those of some channels that have numbers."""
+        return tuple(channels)
+
+    @property
+    def lacking(self) -> str:
+        """What is said of channels that have no numbers; empty if all have."""
+        there = self.descriptor.channels
+        return no_data([one.name for one in there if one not in self.sent(there)])
 
     def channels(self, names: Sequence[str]) -> tuple[Channel, ...]:
         """Channels by name.
@@ -69,10 +82,17 @@ class Described(ABC):
         ------
         MachineFileError
             If there is no such channel, or none but the shaft angle.
+        RecordingError
+            If one that is named has no numbers.
         """
-        there = self.descriptor.channels
+        if names:
+            asked = self.channels(names)
+            if self.sent(asked) != asked:
+                raise RecordingError(f"{self.place}: {self.lacking}")
+            return asked
+        there = self.sent(self.descriptor.channels)
         first = min((one.quantity for one in there), key=list(Quantity).index)  # the shaft angle is the last
-        return self.channels(names or [one.name for one in there if one.quantity is first])
+        return self.channels([one.name for one in there if one.quantity is first])
 
 
 class Sampled(Described):
@@ -81,6 +101,22 @@ class Sampled(Described):
     from_ns: int
     to_ns: int
     end_ns: int  # of the newest data before `to_ns`
+
+    @property
+    @abstractmethod
+    def newest(self) -> npt.NDArray[np.floating]:
+        """The newest sample of every channel; empty without any."""
+
+    @property
+    def has_angle(self) -> bool:
+        """Whether the shaft angle is measured, and is there."""
+        there = self.descriptor.channels
+        return any(one.quantity is Quantity.SHAFT_ANGLE for one in self.sent(there))
+
+    def sent(self, channels: Sequence[Channel]) -> tuple[Channel, ...]:
+        """Those of some channels that have numbers in the newest sample."""
+        names, found = [one.name for one in self.descriptor.channels], self.newest
+        return tuple(one for one in channels if not found.size or np.isfinite(found[names.index(one.name)]))
 
     @abstractmethod
     def stretches(
@@ -168,6 +204,12 @@ class Recorded(Sampled):
         except ValidationError as error:
             raise RecordingError(f"{self.place}: the channel descriptor on {key} cannot be read: {error}") from error
 
+    @cached_property
+    def newest(self) -> npt.NDArray[np.floating]:
+        """The newest sample of every channel."""
+        found = [block for block, _ in self._blocks(max(self.from_ns, self.end_ns - _SOON_NS), [])]
+        return found[-1].samples[-1] if found else np.empty(0)
+
     def messages(self, key: str) -> Iterator[RecordedMessage]:
         """What was recorded under a key."""
         return self.source.messages({key}, from_ns=self.from_ns, to_ns=self.to_ns)
@@ -246,14 +288,22 @@ class Held(Sampled):
         """Names and units of the channels."""
         return self._descriptor
 
+    @property
+    def newest(self) -> npt.NDArray[np.floating]:
+        """The newest sample of every channel."""
+        newest: FloatArray = self._excerpt.samples[-1]
+        return newest
+
     def stretches(
         self, channels: Sequence[Channel], longest_s: float | None = None, from_ns: int | None = None
     ) -> Iterator[Excerpt]:
-        """Samples of some channels, cut after `longest_s`."""
+        """Samples of some channels after the last that has no number, cut after `longest_s`."""
         names = [channel.name for channel in self._descriptor.channels]
         columns = [names.index(channel.name) for channel in channels]
         whole = replace(self._excerpt, samples=self._excerpt.samples[:, columns])
         begin = 0 if from_ns is None else max(0, round((from_ns - self.from_ns) / 1e9 * whole.rate_hz))
+        lacking = np.flatnonzero(~np.isfinite(whole.samples).all(axis=1))
+        begin = max(begin, int(lacking[-1]) + 1 if lacking.size else 0)
         size = len(whole.samples) if longest_s is None else max(1, round(longest_s * whole.rate_hz))
         for first in range(begin, len(whole.samples), size):
             yield whole.part(first, first + size)

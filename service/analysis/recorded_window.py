@@ -1,16 +1,20 @@
 """A window of recorded samples, as the monitor held it when they were live."""
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
+from models.diagnosis.sensors.missing import no_data
 from models.diagnosis.window.moments import Plan, plan_for
 from models.diagnosis.window.sliding import SlidingWindow
 from models.errors import RotorwatchError
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
-from models.signals.channels import ChannelDescriptor
+from models.signals.channels import Channel, ChannelDescriptor, state_name
 from rotorwatch.records.health import Report
+from rotorwatch.records.sensor_faults import FaultKind
+from rotorwatch.records.windows import SensorFault
 from service.analysis.recorded import Recorded
 from service.analysis.revolutions import Excerpt
 from service.analysis.snapshots.heading import LatestData
@@ -60,19 +64,24 @@ def recorded_window(
     _check(data.descriptor, machine, data.place)
     window = SlidingWindow(plan)
     newest: Excerpt | None = None
-    for stretch in data.stretches(data.descriptor.channels):
+    channels = data.descriptor.channels
+    sent = data.sent(channels)
+    for stretch in data.stretches(sent):
         part = _between(stretch, first_ns, end_ns)
         if not part.samples.size:
             continue
-        newest = part
+        whole = np.full((len(part.samples), len(channels)), np.nan)
+        whole[:, [channels.index(one) for one in sent]] = part.samples
+        newest = replace(part, samples=whole)
         window.gap()
-        deque(window.feed(plan.to_si(part.samples), part.start_ns), maxlen=0)
+        deque(window.feed(plan.to_si(np.nan_to_num(whole)), part.start_ns), maxlen=0)
     return LatestData(
         window=None if (judged := window.again()) is None else judged(),
         filled=window.filled if report is None else report.filled,
         parameters=() if report is None else report.parameters,
         why_not=_NOT_EVALUATED if report is None else report.reason,
         blocks=() if newest is None else (_block(newest),),
+        sensors=tuple(_missing(one) for one in channels if one not in sent) if report is None else report.sensors,
     )
 
 
@@ -92,6 +101,10 @@ def _between(stretch: Excerpt, first_ns: int, end_ns: int) -> Excerpt:
 def _block(stretch: Excerpt) -> SampleBlock:
     newest = stretch.part(max(0, stretch.samples.shape[0] - _NEWEST_SAMPLES), stretch.samples.shape[0])
     return SampleBlock(newest.start_ns, 0, 0, newest.rate_hz, np.asarray(newest.samples, dtype=np.float64))
+
+
+def _missing(channel: Channel) -> SensorFault:
+    return SensorFault(states=(state_name(channel),), kind=FaultKind.MISSING, text=no_data([channel.name]), value=None)
 
 
 def _check(found: ChannelDescriptor, machine: MachineFile, place: str) -> None:

@@ -52,6 +52,8 @@ class Excerpt:
         samples, states = np.concatenate([block.samples for block in blocks]).astype(np.float64), described.states
         start_ns = blocks[-1].end_ns - round(samples.shape[0] / described.rate_hz * 1e9)
         angle_rad = samples[:, states.index("theta")] if "theta" in states else None
+        if angle_rad is not None and not np.isfinite(angle_rad).all():
+            angle_rad = None  # its sensor is not connected, or was not
         return cls(start_ns, described.rate_hz, samples, angle_rad)
 
 

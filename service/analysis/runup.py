@@ -157,6 +157,8 @@ class Centreline:
 
 def _past_centreline(data: Past, pairs: Sequence[tuple[Channel, Channel]]) -> Centreline:
     """Mean positions in the windows of the history, as the monitor reported them."""
+    told = {one.channel for report in data.reports for one in report.levels if one.mean is not None}
+    pairs = [pair for pair in pairs if told.issuperset(one.name for one in pair)] or pairs
     channels = [channel for pair in pairs for channel in pair]
     rows = []
     for report in data.reports:

@@ -129,7 +129,10 @@ class _Picture:
             raise MachineFileError("--history: this picture needs samples, which a history lacks; name recordings")
         if not self.files:
             raise MachineFileError("no recordings are named: expected FILE...")
-        return Recorded.find(self.files, self.key, (self.from_, self.to), at, reports=reports)
+        found = Recorded.find(self.files, self.key, (self.from_, self.to), at, reports=reports)
+        if not reports and found.lacking:
+            typer.echo(found.lacking, err=True)
+        return found
 
     def known(self, *, reports: bool = False) -> "Recorded | Past":
         """The recorded data it is of, or what the history has."""

@@ -244,7 +244,7 @@ class MachineMonitor:
         joined = verdict.continuous and not verdict.new_snapshot
         if not joined:
             self._window.gap()
-        self._newest.add(block, continuous=joined and not verdict.clock_step_s)
+        self._newest.add(self._used or block, continuous=joined and not verdict.clock_step_s)
         if verdict.clock_step_s:
             self._window.clear()
             self._kept_is_valid = False  # hops may end at the same times as before
@@ -426,8 +426,8 @@ class MachineMonitor:
         if statistics is None:
             self._levels.tell(self._alarms, end_ns, faulty=implicated(missing), standing=bool(stood))
             return Report(**self._window_now(end_ns, end_ns, self._state(HealthState.WARMING)))
-        speed_rad_s = statistics.speed_rad_s
-        self._alarms.suppress(float(speed_rad_s * _RPM) if np.isfinite(speed_rad_s) else None, end_ns)
+        speed = float(statistics.speed_rad_s) if np.isfinite(statistics.speed_rad_s) else None
+        self._alarms.suppress(None if speed is None else speed * _RPM, end_ns)
         findings = sensor_findings(statistics, self._sensors, self.machine.sensors, missing, standing=bool(stood))
         self._data_path.sensors(findings, statistics, standing=bool(stood))
         self._evaluator.heard(findings)
@@ -436,7 +436,8 @@ class MachineMonitor:
         def unread(state: HealthState, reason: str) -> Report:
             """Of the levels and the sensors alone."""
             self._levels.tell(self._alarms, end_ns, faulty=faulty, standing=bool(stood))
-            return Report(**self._window_now(start_ns, end_ns, self._state(state)), sensors=findings, reason=reason)
+            now = self._window_now(start_ns, end_ns, self._state(state))
+            return Report(**now, speed_rad_s=None if "theta" in faulty else speed, sensors=findings, reason=reason)
 
         # A fault of a channel elsewhere says nothing of the equations, but it is all there is where they are none.
         if findings and (not self._plan.states or faulty - set(self._plan.others)):

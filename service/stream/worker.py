@@ -420,7 +420,7 @@ class MachineWorker:
                 reports, told = self._commit(windows, whole=whole)
         finally:
             self._snapshot = snapshot
-            self._held = partial(_held, self._monitor.window, snapshot, self._monitor.blocks)
+            self._held = partial(held_now, self._monitor.window, snapshot, self._monitor.blocks)
         texts = tuple(one.text for one in told if one.sequence >= self.told)
         for event in events:
             self._log.warning("alarm", kind=event.kind.value, text=event.text, time_ns=event.time_ns)
@@ -485,13 +485,15 @@ class MachineWorker:
         self._limiter.say(kind, self._log.warning, text, **details)
 
 
-def _held(
+def held_now(
     window: Callable[[], WindowStatistics] | None, health: MachineHealth, blocks: tuple[SampleBlock, ...]
 ) -> LatestData:
+    """What may be looked at of a monitor that goes on."""
     latest = health.latest
     return LatestData(
         window=None if window is None else window(),
         filled=health.filled,
+        sensors=() if latest is None else latest.sensors,
         parameters=() if latest is None else latest.parameters,
         why_not="" if latest is None else latest.reason,
         blocks=blocks,

@@ -23,6 +23,17 @@ def completed(block: SampleBlock) -> SampleBlock:
     return block if there.all() else replace(block, samples=np.where(there, block.samples, block.samples.dtype.type(0)))
 
 
+def no_data(names: Sequence[str]) -> str:
+    """What is said of channels that have no numbers; empty without any.
+
+    Examples
+    --------
+    >>> no_data(["y1", "z1"])
+    'no data of y1, z1: sent as NaN, not connected'
+    """
+    return f"no data of {', '.join(names)}: sent as NaN, not connected" if names else ""
+
+
 class MissingNumbers:
     """Remembers when channels had no numbers.
 

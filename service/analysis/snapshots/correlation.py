@@ -10,7 +10,7 @@ from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot, U
 from service.analysis.correlation import MeasuredCorrelations, measured_correlations
 from service.analysis.prediction import Prediction
 from service.analysis.snapshots.channels import check_held, chosen_pairs, figures, product_unit, seen_by
-from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
+from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory, unsent
 
 
 def correlation_snapshot(
@@ -55,6 +55,8 @@ def correlation_snapshot(
     columns = [window.states.index(state) for state in states]
     places = [(states.index(state_name(one)), states.index(state_name(other))) for one, other in pairs]
     measured = measured_correlations(machine, window, [(columns[i], columns[j]) for i, j in places])
+    gone = [number for number, (i, j) in enumerate(places) if data.missing & {states[i], states[j]}]
+    measured.values[:, gone] = measured.errors[:, gone] = measured.outside_band[gone] = np.nan
     nominal, estimated = _predicted(prediction, used, places, measured)
     return CorrelationSnapshot(
         **heading(subject, data),
@@ -63,7 +65,7 @@ def correlation_snapshot(
         band_hz=measured.band_hz,
         pairs=tuple(_pair(pair, number, measured, nominal, estimated, units) for number, pair in enumerate(pairs)),
         theory=stated,
-        reason="",
+        reason=unsent(machine, data),
     )
 
 

@@ -6,11 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from models.diagnosis.sensors.missing import no_data
+from models.diagnosis.sensors.reference import implicated
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine, MachineFile
 from models.signals.block import SampleBlock
+from models.signals.channels import state_name
+from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.snapshots import PredictedChange, Theory
-from rotorwatch.records.windows import Parameter
+from rotorwatch.records.windows import Parameter, SensorFault
 from service.monitor.reports import Identity
 
 
@@ -34,6 +38,12 @@ class LatestData:
     why_not: str = ""  # why it was not evaluated
     blocks: tuple[SampleBlock, ...] = ()  # the newest blocks, without a gap
     lacking: str = ""  # why there is no window, where it is not that one is still filling
+    sensors: tuple[SensorFault, ...] = ()  # found in the window
+
+    @property
+    def missing(self) -> frozenset[str]:
+        """States that lacked numbers in the window: what stands in for them is not to be shown."""
+        return frozenset(implicated(one for one in self.sensors if one.kind is FaultKind.MISSING))
 
     def mark(self) -> tuple[object, ...]:
         """What an answer about the window depends on; short, so that it may be kept."""
@@ -43,7 +53,7 @@ class LatestData:
 def heading(subject: Subject, data: LatestData) -> dict[str, Any]:
     """Whose snapshot this is, and of which window: first fields of every snapshot."""
     window = data.window
-    speed = np.nan if window is None else window.speed_rad_s
+    speed = np.nan if window is None or "theta" in data.missing else window.speed_rad_s
     return {
         **subject.identity,
         "start_ns": None if window is None else window.start_ns,
@@ -51,6 +61,11 @@ def heading(subject: Subject, data: LatestData) -> dict[str, Any]:
         "filled": data.filled,
         "speed_rad_s": float(speed) if np.isfinite(speed) else None,
     }
+
+
+def unsent(machine: MachineFile, data: LatestData) -> str:
+    """What is said of channels that lacked numbers in the window; empty if all had them."""
+    return no_data([one.name for one in machine.sensors if state_name(one) in data.missing])
 
 
 def no_window(machine: MachineFile, data: LatestData) -> str:

@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 from models.commissioning.commissioned import Installed
 from models.diagnosis.window.statistics import WindowStatistics
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
-from service.analysis.snapshots.heading import LatestData, Subject
+from service.analysis.snapshots.heading import LatestData, Subject, unsent
 from service.monitor.reports import Identity
 
 if TYPE_CHECKING:
@@ -63,9 +63,9 @@ class MachineSnapshots:
     def _theory(self, data: LatestData) -> "Prediction":
         from service.analysis.prediction import NO_PARAMETERS, Prediction, predict  # noqa: PLC0415
 
-        if data.window is None:
+        if data.window is None or data.missing:
             known = self._subject.known
-            reason = NO_PARAMETERS if known is None else _NO_WINDOW
+            reason = NO_PARAMETERS if known is None else unsent(self._subject.machine, data) or _NO_WINDOW
             return Prediction(known, None, {}, reason, reason)
         with self._lock:
             found = self._predictions.get(data.window)

@@ -12,13 +12,13 @@ from models.machine import Machine, MachineFile
 from models.physics.response import synchronous_response
 from models.physics.rotor import STATES, RotorParameters, changed
 from models.signals.block import SampleBlock
-from models.signals.channels import Channel
+from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector, Units
 from service.analysis.orbit import MODELLED, Ellipse, no_pair, orbit_pairs, phase_lag_deg, planes_of
 from service.analysis.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
 from service.analysis.revolutions import Excerpt, Revolutions, newest_revolutions
 from service.analysis.snapshots.channels import SnapshotError, figures, known_figures
-from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
+from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory, unsent
 
 MOST_REVOLUTIONS = 64
 _MOST_SAMPLES = 20_000
@@ -45,15 +45,18 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
         If `revolutions` is negative or too large.
     """
     machine, known, window = subject.machine, subject.known, data.window
-    pairs = orbit_pairs(machine.sensors)
+    there = orbit_pairs(machine.sensors)
+    pairs = [pair for pair in there if not data.missing & {state_name(one) for one in pair}]
     places = [pair for pair in pairs if pair[0].location in MODELLED]
     path = _newest_path(machine, data.blocks, revolutions, None if window is None else window.speed_rad_s)
     changes = read_changes(data.parameters)
     lacking = NO_PARAMETERS if known is None else ""
     estimated_reason = lacking or ("" if changes else data.why_not or NOTHING_READ)
-    vectors = None if window is None else _vectors(window)
-    if not pairs:
+    vectors = None if window is None or "theta" in data.missing else _vectors(window)
+    if not there:
         reason = f"{machine.title}: {no_pair(machine.sensors)}"
+    elif pairs != there or "theta" in data.missing:
+        reason = unsent(machine, data)
     elif not places:
         reason = ""  # the window holds none of these places; `path_reason` says what there is of them
     elif window is None:
@@ -189,8 +192,9 @@ def _path(machine: MachineFile, path: Revolutions, pair: tuple[Channel, Channel]
     factor = 1.0 if units == "SI" else 1 / pair[0].to_si
     samples = path.excerpt.samples
     y, z = planes_of(pair).turned(np.stack([samples[:, names.index(one.name)] * one.to_si * factor for one in pair]))
+    if not np.isfinite(y + z).all():
+        return None  # a sensor is not connected
     times_s = np.arange(y.size) / machine.rate_hz
-    # What is not finite was refused when it came in.
     return PathSamples(times_s=known_figures(times_s), y=known_figures(y - y.mean()), z=known_figures(z - z.mean()))
 
 

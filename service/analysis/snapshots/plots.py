@@ -4,6 +4,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from models.diagnosis.sensors.missing import no_data
 from models.errors import RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
@@ -42,7 +43,10 @@ def waveform_snapshot(
     data: Sampled, channels: tuple[Channel, ...], revolutions: int, speed_rad_s: float | None
 ) -> WaveformSnapshot:
     """The newest whole revolutions of some channels, and pulses of the phase reference; without it, of a mean speed."""
-    excerpt = data.latest(channels, _SOON_S)[-1]
+    sent = data.sent(channels)
+    if not sent:
+        raise RotorwatchError(data.lacking)
+    excerpt = data.latest(sent, _SOON_S)[-1]
     found = newest_revolutions(excerpt, revolutions, speed_rad_s, _MOST_SAMPLES)
     shown = found.excerpt or _newest(excerpt)
     speed = figures([shown.speed_rad_s if np.isfinite(shown.speed_rad_s) else speed_rad_s or np.nan])[0]
@@ -61,9 +65,9 @@ def waveform_snapshot(
                 mean=figures([unit_shown(channel)[1] * column.mean()])[0],
                 values=figures(unit_shown(channel)[1] * (column - column.mean())),
             )
-            for channel, column in zip(channels, shown.samples.T, strict=True)
+            for channel, column in zip(sent, shown.samples.T, strict=True)
         ),
-        reason=found.reason,
+        reason="; ".join(filter(None, (found.reason, no_data([one.name for one in channels if one not in sent])))),
     )
 
 
@@ -98,6 +102,7 @@ def full_spectrum_snapshot(data: Sampled) -> FullSpectrumSnapshot:
             )
             for pair, row in zip(found.pairs, values, strict=True)
         ),
+        reason=data.lacking,
     )
 
 
@@ -113,6 +118,8 @@ def waterfall_snapshot(data: Sampled, channel: Channel, over: Literal["time", "s
     if over == "speed" and not data.has_angle:
         raise RotorwatchError("spectra over speed need the shaft angle (keyphasor), which is not measured")
     row_s = max(_ROW_S, (data.to_ns - data.from_ns) / 1e9 / _MOST_ROWS, 16 / rate_hz)
+    if not data.sent([channel]):
+        raise RotorwatchError(no_data([channel.name]))
     found = read_waterfall(data, channel, row_s, max(1 / row_s, 1.0 if row_s > 1 else 0.0), "amplitude")
     if over == "speed":
         if text := steady(found.speed_rad_s):

@@ -23,7 +23,7 @@ from service.analysis.snapshots.channels import (
     product_unit,
     seen_by,
 )
-from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
+from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory, unsent
 
 MOST_LINES = 1000
 """Lines in a snapshot; where the band has more, neighbours are averaged."""
@@ -98,7 +98,10 @@ def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
         one if one is None else _grouped(one if parts is None else np.asarray(parts @ one @ parts.T), group)
         for one in prediction.spectra(of_theory, frequencies_hz)
     )
-    spectra = _grouped(window.spectrum[lines][:, columns][:, :, columns], group), nominal, estimated
+    measured = _grouped(window.spectrum[lines][:, columns][:, :, columns], group)
+    gone = np.isin(states, list(data.missing))
+    measured[:, gone[:, None] | gone] = np.nan
+    spectra = measured, nominal, estimated
     averages = _averages(window.n_segments, group)
     freedom = 2 * averages
     speed = head["speed_rad_s"]
@@ -124,7 +127,7 @@ def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
             for pair in pairs
         ),
         theory=stated,
-        reason="",
+        reason=unsent(machine, data),
     )
 
 

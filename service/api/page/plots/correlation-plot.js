@@ -46,7 +46,7 @@ class CorrelationPlot extends MachineElement {
     if (this.#choice.options.length !== found.pairs.length) offered(this.#choice, found.pairs.map((one, at) => [String(at), pairName(one)]));
     const pair = found.pairs[Number(this.#choice.value)];
     this.#chart.parentElement.hidden = this.#choice.hidden = !pair;
-    const theory = [found.theory.nominal_reason || found.theory.estimated_reason, found.reason].filter(Boolean);
+    const theory = [...new Set([found.theory.nominal_reason || found.theory.estimated_reason, found.reason])].filter(Boolean);
     if (!pair || !found.start_ns || !found.end_ns) {
       this.#said.textContent = [this.windowText(found), ...theory].filter(Boolean).join("; ");
       return;

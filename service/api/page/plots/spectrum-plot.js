@@ -84,7 +84,7 @@ class SpectrumPlot extends MachineElement {
     const theory = found.theory;
     // Whoever looks for 1× has to be told where it is.
     const once = shown && found.left_out_hz ? "1× is taken out (shaded: where some of it may be left); it is among the vibration levels" : "";
-    this.#message.textContent = [this.windowText(found), once, found.reason, theory.nominal_reason || theory.estimated_reason].filter(Boolean).join("; ");
+    this.#message.textContent = [...new Set([this.windowText(found), once, found.reason, theory.nominal_reason || theory.estimated_reason])].filter(Boolean).join("; ");
     if (!shown) return;
     this.#chart.setAttribute("aria-label", `spectrum of ${shown.channel}, rms ${figure(shown.rms)}`);
     this.#chart.draw(spectrumDrawing(found, shown));

@@ -1,0 +1,95 @@
+"""What is shown of a sensor that is not connected is nothing, and not a line at 0; the others are shown as always."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.commissioning.commissioned import Installed, install
+from models.errors import RotorwatchError
+from models.signals.block import SampleBlock
+from service.analysis.past import Past
+from service.analysis.recorded import Held, Sampled
+from service.analysis.recorded_window import recorded_window
+from service.analysis.snapshots.heading import LatestData
+from service.analysis.snapshots.plots import (
+    centreline_series,
+    full_spectrum_snapshot,
+    vector_series,
+    waterfall_snapshot,
+    waveform_snapshot,
+)
+from service.monitor.evaluators import evaluator_for
+from service.monitor.monitor import MachineMonitor
+from service.stream.worker import held_now
+from tests.service.analysis.snapshotting import snapshots_of
+from tests.service.monitor.test_monitor_missing import KIT
+from tests.service.rig.live import scenario_blocks
+from tests.service.rig.replaying import recorded, recording
+
+NAMES = [one.name for one in KIT.sensors]
+SECONDS = 30.0
+
+
+@cache
+def dead(*names: str) -> tuple[SampleBlock, ...]:
+    lacking = np.isin(NAMES, names)
+    return tuple(replace(one, samples=np.where(lacking, np.nan, one.samples)) for one in scenario_blocks(SECONDS))
+
+
+def shown(way: str, folder: Path, *names: str) -> tuple[LatestData, Sampled]:
+    """What a monitor holds, or what its recording gives."""
+    if way == "live":
+        monitor = MachineMonitor(install(KIT, None))
+        for block in dead(*names):
+            monitor.step(block)
+        return held_now(monitor.window, monitor.health(), monitor.blocks), Held(KIT, monitor.blocks)
+    data = recorded(recording(folder / "made.mcap", dead(*names), KIT))
+    lagged = evaluator_for(Installed(KIT)).needs_lags
+    return recorded_window(data.source, KIT, "demo/lab", None, None, lagged=lagged), data
+
+
+@pytest.mark.parametrize("way", ["live", "recorded"])
+def test_a_dead_channel_is_shown_as_no_data(way: str, tmp_path: Path) -> None:
+    data, samples = shown(way, tmp_path, "z1")
+    said = "no data of z1: sent as NaN, not connected"
+    made = snapshots_of(KIT)
+    spectra, correlations, orbits = made.spectra(data), made.correlations(data), made.orbits(data, 4)
+    assert (spectra.reason, correlations.reason, orbits.reason) == (said, said, said)
+    assert {spectra.theory.nominal_reason, correlations.theory.nominal_reason} == {said}
+    density = {one.channel: one for one in spectra.densities}
+    assert set(density["z1"].measured) == {None}
+    assert density["z1"].rms is None
+    assert None not in density["y1"].measured
+    for pair in correlations.pairs:
+        assert (None in pair.measured) == ("z1" in (pair.first, pair.second))
+    assert [(one.location, one.path is not None) for one in orbits.orbits] == [("disc", True)]
+    places = {one.location for one in full_spectrum_snapshot(samples).places}
+    assert places == {"disc"}
+    wave = waveform_snapshot(samples, samples.channels(["y1", "z1"]), 4, None)
+    assert [one.channel for one in wave.waveforms] == ["y1"]
+    assert said in wave.reason
+    assert [one.name for one in samples.chosen(())] == ["y1", "y2", "z2"]
+    with pytest.raises(RotorwatchError, match=said):
+        waterfall_snapshot(samples, samples.channels(["z1"])[0], "time")
+
+
+def test_what_the_history_has_of_the_others_is_shown() -> None:
+    monitor = MachineMonitor(install(KIT, None))
+    reports = tuple(report for block in dead("z1") for report in monitor.step(block).windows)
+    past = Past(KIT, KIT.title, "the history", reports, ())
+    assert [one.location for one in centreline_series(past).places] == ["disc"]
+    vectors = vector_series(past, past.channels(["y1"]), 1, 8, None)
+    assert vectors.speeds_rad_s[-1] == pytest.approx(138.2, rel=0.01)
+
+
+@pytest.mark.parametrize("way", ["live", "recorded"])
+def test_without_its_angle_a_machine_has_no_speed_of_0(way: str, tmp_path: Path) -> None:
+    data, samples = shown(way, tmp_path, "theta")
+    orbits = snapshots_of(KIT).orbits(data, 4)
+    assert orbits.speed_rad_s is None
+    assert [one.ellipse for one in orbits.orbits] == [None, None]
+    assert "no data of theta" in orbits.reason
+    assert waveform_snapshot(samples, samples.channels(["y1"]), 4, None).speed_rad_s is None
