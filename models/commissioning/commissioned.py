@@ -25,7 +25,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.misfit import HealthyMisfit
-from models.diagnosis.networks.bundle import Bundle, load_bundle
+from models.diagnosis.networks.bundle import MANIFEST, Bundle, load_bundle
 from models.diagnosis.sensors.reference import Naming, SensorReference
 from models.diagnosis.shape import HealthyShape
 from models.diagnosis.window.excluded import KnownLine
@@ -320,9 +320,6 @@ def load_commissioned(directory: Path, machine: MachineFile, *, same_description
     return found
 
 
-_MANIFEST = "manifest.json"
-
-
 @dataclass(frozen=True, slots=True)
 class Installed:
     """One machine and all that its monitor knows of it."""
@@ -385,7 +382,7 @@ def install(machine: MachineFile, bundle: str | Path | None) -> Installed:
     if directory is not None and (directory / FILE).is_file():
         commissioned = load_commissioned(directory, machine)
         known = commissioned.completed(machine)
-        networks = load_bundle(directory, known) if known is not None and (directory / _MANIFEST).is_file() else None
+        networks = load_bundle(directory, known) if known is not None and (directory / MANIFEST).is_file() else None
         return Installed(machine, networks, commissioned)
     if bundle is None:
         return Installed(machine)

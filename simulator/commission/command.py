@@ -14,8 +14,9 @@ from rich.text import Text
 from models.commissioning.commission import Commissioning, CommissioningReport, ParameterSummary, commission
 from models.commissioning.commissioned import FILE, Commissioned, HealthyEntry, load_commissioned
 from models.commissioning.healthy import HealthyRecording, read_healthy
+from models.diagnosis.networks.bundle import MANIFEST, load_bundle
 from models.errors import BundleError, MachineFileError
-from models.machine import MachineFile, load_machine_file
+from models.machine import Machine, MachineFile, load_machine_file
 from simulator.commands import labelled_bars
 from simulator.commission.page import write_report
 from simulator.commission.verdict import (
@@ -167,6 +168,21 @@ def _before(out: Path, machine: MachineFile, why: str) -> Commissioned | None:
     return before
 
 
+def _remove_networks(out: Path, machine: Machine) -> bool:
+    """Remove networks that are not the machine's: beside its commissioning no monitor would start until it has its own.
+
+    Says whether there were any.
+    """
+    if not (out / MANIFEST).exists():
+        return False
+    try:
+        load_bundle(out, machine)
+    except BundleError:
+        (out / MANIFEST).unlink()
+        return True
+    return False
+
+
 def _entry(path: Path, recording: HealthyRecording) -> HealthyEntry:
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
@@ -188,6 +204,8 @@ def _write(out: Path, made: Commissioning, replaces: Commissioned | None) -> Non
             return
         if replaces is not None:
             shutil.copyfile(out / FILE, out / _KEPT.format(version=replaces.version))
+        if made.machine is not None and _remove_networks(out, made.machine):
+            typer.echo(f"{out}: the networks that were there are of another rotor and were removed")
         draft = out / (FILE + ".new")  # what is replaced stays whole until the new one is
         draft.write_text(made.commissioned.model_dump_json(indent=1) + "\n", encoding="utf-8")
         draft.replace(out / FILE)

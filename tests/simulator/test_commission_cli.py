@@ -5,6 +5,7 @@ import json
 import os
 import re
 import resource
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from models.commissioning.commissioned import load_commissioned
+from models.commissioning.commissioned import install, load_commissioned
 from models.diagnosis.networks.bundle import load_bundle
 from models.machine import load_machine, load_machine_file
 from simulator.recorder import record
@@ -76,6 +77,19 @@ def test_a_machine_is_commissioned_and_again_only_with_a_reason(folder: Path, mo
     second = load_commissioned(folder / "kit", machine)
     assert (second.version, second.replaces, second.why) == (2, first.identity, "bearing exchanged")
     assert json.loads((folder / "kit" / "commissioned-1.json").read_text(encoding="utf-8"))["version"] == 1
+
+
+@pytest.mark.parametrize(("of", "stays"), [("heavy", False), ("lab", True)])
+def test_networks_of_another_rotor_do_not_stay_beside_a_new_commissioning(
+    folder: Path, of: str, stays: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("simulator.commission.page.pictures_of", lambda *_: ())
+    out = f"with-{of}"
+    shutil.copytree(ROOT / "models" / "bundles" / of, folder / out)
+    found = run(folder, "--machine", "lab", "--healthy", "monday.mcap", "--out", out, "--no-networks")
+    assert found.exit_code == 0, found.stderr
+    assert ("networks that were there are of another rotor" in found.stdout) is not stays
+    assert (install(LAB, folder / out).bundle is not None) is stays  # a monitor starts, whatever was there
 
 
 def test_an_unfit_recording_is_refused_with_what_to_record(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,6 +39,7 @@ from models.errors import BundleError
 from models.machine import Machine
 from models.mistakes import did_you_mean, mistakes
 
+MANIFEST = "manifest.json"
 _SHIPPED = Path(__file__).parents[2] / "bundles"
 _Array = np.ndarray[Any, np.dtype[Any]]
 _Arrays = dict[str, _Array]
@@ -183,7 +184,7 @@ def save_bundle(
     try:
         directory.mkdir(parents=True, exist_ok=True)
         (directory / "weights.safetensors").write_bytes(weights)
-        (directory / "manifest.json").write_bytes(_canonical(manifest) + b"\n")
+        (directory / MANIFEST).write_bytes(_canonical(manifest) + b"\n")
     except OSError as error:
         raise BundleError(f"{directory}: cannot be written ({error.strerror})") from error
     return Bundle(manifest, networks, amortised)
@@ -208,7 +209,7 @@ def load_bundle(name_or_path: str | Path, machine: Machine) -> Bundle:
     if not directory.is_dir() and (_SHIPPED / str(name_or_path)).is_dir():
         directory = _SHIPPED / str(name_or_path)
     try:
-        manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
+        manifest = Manifest.model_validate_json((directory / MANIFEST).read_bytes())
         weights = (directory / "weights.safetensors").read_bytes()
     except OSError as error:
         shipped = sorted(entry.name for entry in _SHIPPED.iterdir() if entry.is_dir())
