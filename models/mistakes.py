@@ -9,6 +9,7 @@ import os
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import is_dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any, TypeVar, cast, get_args
@@ -32,6 +33,7 @@ _TYPES = {
     "list": "a list in brackets, [...]",
     "dict": "a table",
     "model": "a table",
+    "dataclass": "a table",
     "path": "the name of a file in quotes",
     "datetime": "a date and time such as 2026-01-31T12:00:00Z",
 }
@@ -225,7 +227,9 @@ def mistakes(error: ValidationError, model: type[BaseModel], fields: object = No
         within = any(other["loc"][: len(place)] == place and len(other["loc"]) > len(place) for other in found)
         if one["type"] == "extra_forbidden" or place in meant or (one["type"] in {"too_short", "too_long"} and within):
             continue
-        if one["type"] == "missing":
+        if one["type"] == "unexpected_keyword_argument":
+            texts.setdefault(place, []).append("unknown")
+        elif one["type"] == "missing":
             texts.setdefault(place, []).append(_missing(place, one["loc"], info))
         elif one["type"] in {"value_error", "assertion_error"}:
             texts.setdefault(place, []).append(one["msg"].removeprefix("Value error, "))
@@ -393,6 +397,10 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
     return [found for part in get_args(annotation) for found in _models(part)]
 
 
+def _has_dataclass(annotation: Any) -> bool:
+    return is_dataclass(annotation) or any(map(_has_dataclass, get_args(annotation)))
+
+
 def _owner(place: _Place, model: type[BaseModel]) -> type[BaseModel] | None:
     """The table at a place."""
     owner: type[BaseModel] | None = model
@@ -409,7 +417,8 @@ def _field(place: _Place, model: type[BaseModel]) -> tuple[_Place, FieldInfo | N
         owner = _owner(place[: end - 1], model)
         info = None if owner is None else owner.model_fields.get(str(place[end - 1]))
         if info is not None:
-            return (place, None) if end < len(place) and _models(info.annotation) else (place[:end], info)
+            into = _models(info.annotation) or _has_dataclass(info.annotation)
+            return (place, None) if end < len(place) and into else (place[:end], info)
     return place, None
 
 

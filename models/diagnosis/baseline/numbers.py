@@ -1,5 +1,6 @@
 """Numbers and arrays as a stored baseline has them: finite, and of possible sign and shape."""
 
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import numpy as np
@@ -25,12 +26,19 @@ def _square(rows: _Rows) -> _Rows:
     return rows
 
 
-def _stored(kind: object) -> GetPydanticSchema:
+def _cube(bands: tuple[_Rows, ...]) -> FloatArray:
+    first = len(bands[0]) if bands else 0
+    if other := next((len(rows) for rows in bands if len(rows) != first), 0):
+        raise ValueError(f"a band is {other} by {other}, the first {first} by {first}")
+    return np.array(bands, dtype=np.float64).reshape(len(bands), first, first)
+
+
+def _stored(kind: object, made: Callable[[Any], FloatArray] = _array) -> GetPydanticSchema:
     """Say that an array is stored as nested numbers."""
-    as_numbers = Annotated[kind, AfterValidator(_array), PlainSerializer(np.ndarray.tolist)]  # type: ignore[valid-type]
+    as_numbers = Annotated[kind, AfterValidator(made), PlainSerializer(np.ndarray.tolist)]  # type: ignore[valid-type]
     return GetPydanticSchema(lambda _, handler: handler(as_numbers))
 
 
 Vector = Annotated[FloatArray, _stored(tuple[Number, ...])]
 Covariance = Annotated[FloatArray, _stored(Annotated[_Rows, AfterValidator(_square)])]
-Spectra = Annotated[FloatArray, _stored(tuple[Annotated[_Rows, AfterValidator(_square)], ...])]
+Spectra = Annotated[FloatArray, _stored(tuple[Annotated[_Rows, AfterValidator(_square)], ...], _cube)]

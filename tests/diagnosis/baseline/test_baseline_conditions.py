@@ -16,6 +16,7 @@ from models.diagnosis.baseline.rows import ROWS
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.readings import Diagnosis, parameter_reading
 from models.errors import EstimationError
+from models.mistakes import mistakes
 from tests.diagnosis.baseline.fe_rotor import OTHER, ROTOR, Excitation, recorded
 from tests.sure import sure
 
@@ -87,8 +88,19 @@ def test_a_restored_baseline_reads_the_same_to_the_last_bit() -> None:
         assert np.array_equal(sure(a), sure(b))
 
 
-@pytest.mark.parametrize("damage", ["nan", "shape", "reason", "unknown", "text"])
-def test_a_damaged_baseline_is_refused(damage: str) -> None:
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        ("nan", "relations.0.coefficients.0: expected a finite number (found nan)"),
+        ("shape", "relations.0.covariance: not 4 by 4"),
+        ("reason", "a relation is there, or a reason why not; never both or neither"),
+        ("unknown", "relations.0.code: unknown"),
+        ("missing", "relations.0.misfit: missing"),
+        ("text", "relations.0.coefficients.0: expected a number (found '1.0')"),
+        ("bands", "force: a band is 1 by 1, the first 2 by 2"),
+    ],
+)
+def test_a_damaged_baseline_is_refused(damage: str, told: str) -> None:
     record = json.loads(BaselineRecord.of(baseline()).model_dump_json())
     relation = record["relations"][0]
     if damage == "nan":
@@ -99,10 +111,15 @@ def test_a_damaged_baseline_is_refused(damage: str) -> None:
         record["reasons"][0] = "not measured"
     elif damage == "unknown":
         relation["code"] = "import os"
+    elif damage == "missing":
+        del relation["misfit"]
+    elif damage == "bands":
+        record["force"] = [[[1.0, 0.0], [0.0, 1.0]], [[1.0]]]
     else:
         relation["coefficients"][0] = "1.0"
-    with pytest.raises(ValidationError):
+    with pytest.raises(ValidationError) as refused:
         BaselineRecord.model_validate_json(json.dumps(record))
+    assert [text for _, text in mistakes(refused.value, BaselineRecord)] == [told]
 
 
 def suspected(k: float, c: float, states: tuple[str, ...] = ("y1", "y2")) -> str:

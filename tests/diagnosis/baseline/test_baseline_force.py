@@ -1,5 +1,6 @@
 """Errors that belong to other conditions, and the lag from which a relation holds."""
 
+import json
 from dataclasses import replace
 from functools import cache
 
@@ -80,6 +81,7 @@ def test_several_conditions_are_not_one_force_and_without_one_a_record_is_as_it_
     assert learn_baseline(both, ["one", "one", "two", "two"]).force.size == 0
     record = BaselineRecord.of(baseline(3).without_force).model_dump(mode="json")
     assert "force" not in record
+    assert BaselineRecord.model_validate_json(json.dumps(record | {"force": []})).force.shape == (0, 0, 0)
     assert all("lag_from_s" not in relation for relation in record["relations"])
     assert BaselineRecord.of(baseline(3)).model_dump(mode="json")["force"]
 
