@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -92,6 +92,13 @@ class Report(OfMachine):
         description="true where the window was not evaluated because the monitor could not keep up, and only its "
         "levels and sensors were judged; left out otherwise",
         examples=[False],
+    )
+    gyroscopic: Literal["", "opposite"] = Field(
+        default="",
+        exclude_if=lambda value: not value,
+        description="opposite where the window was compared with theory whose gyroscopic moments have the opposite "
+        "sense to Eq. (27), because they explain the machine and those do not; left out otherwise",
+        examples=[""],
     )
     reason: Reason = ""
     bundle: BundleIdentity

@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 
@@ -39,6 +40,7 @@ class Evaluation:
     opinions: tuple[Opinion, ...]  # what the others say
     speed_rad_s: float | None
     shapes: tuple[Shape, ...] = ()  # where no equation can be evaluated: whether each channel's vibration is as it was
+    gyroscopic: Literal["", "opposite"] = ""  # where it is not that of Eq. (27): sense of the moments in theory
     alone: bool = False  # whether only later windows can say that this one is astride a change
 
     def calm(self, *, outside: bool) -> HealthState:
@@ -51,6 +53,17 @@ class Evaluation:
         if "not changed" in states and "changed" not in states:
             return HealthState.UNCHANGED
         return HealthState.NOT_EVALUABLE
+
+    @property
+    def read(self) -> dict[str, Any]:
+        """What a report has of it as it is."""
+        return {
+            "speed_rad_s": self.speed_rad_s,
+            "parameters": self.readings,
+            "equations": self.equations,
+            "opinions": self.opinions,
+            "gyroscopic": self.gyroscopic,
+        }
 
     @property
     def readings(self) -> tuple[Parameter, ...]:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from typing import Literal
 
 import numpy as np
 
@@ -109,7 +110,8 @@ class KnownMachineEvaluator(WindowEvaluator):
                 continue
             equations = diagnosis.equations or equations
             opinions.append(opinion_of(deciding, beside(deciding, diagnosis)))
-        return Evaluation(deciding, short, equations, tuple(opinions), speed)
+        sense: Literal["", "opposite"] = "opposite" if self._machine.rotor.I2p_kg_m2 < 0 else ""
+        return Evaluation(deciding, short, equations, tuple(opinions), speed, gyroscopic=sense)
 
     def _elsewhere(self, deciding: Diagnosis) -> bool:
         """Whether the first window that shows the heavy spot shows it where it was only supposed not to be.

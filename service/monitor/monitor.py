@@ -468,10 +468,7 @@ class MachineMonitor:
             calm, reason = HealthState.UNCHANGED, ""
         return Report(
             **self._window_now(start_ns, end_ns, self._state(calm)),
-            speed_rad_s=evaluation.speed_rad_s,
-            parameters=evaluation.readings,
-            equations=evaluation.equations,
-            opinions=evaluation.opinions,
+            **evaluation.read,
             misfit_z=evaluation.deciding.misfit_z,
             suspect=suspect if verdict.outside_model or foreign.hides else "",
             verdict=verdict,

@@ -48,6 +48,8 @@ def test_the_healthy_machine_is_healthy_in_its_own_sense() -> None:
     full = [window for window in windows if window.filled == 1.0]
     assert {window.state for window in full} == {HealthState.HEALTHY}
     assert max(abs(one.relative_change or 0.0) for one in full[-1].parameters) < 0.05
+    assert {window.gyroscopic for window in full} == {"opposite"}
+    assert '"gyroscopic":"opposite"' in full[-1].model_dump_json()
     rest = stream(75.0, SEED)[700:]
     assert feed(resumed(going, Installed(LAB)), rest) == feed(going, rest)
 
@@ -72,6 +74,8 @@ def test_a_commissioning_finds_the_sense(machine: MachineFile) -> None:
     known = Installed(machine, None, made.commissioned).known
     assert known is not None
     assert known.rotor.I2p_kg_m2 == -LAB.rotor.I2p_kg_m2
+    windows, _ = feed(MachineMonitor(Installed(machine, None, made.commissioned)), seen)
+    assert windows[-1].gyroscopic == "opposite"
 
 
 def test_a_commissioning_keeps_the_sense_that_explains_its_recordings() -> None:

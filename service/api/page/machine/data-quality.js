@@ -24,6 +24,7 @@ class DataQuality extends MachineElement {
       ["window", `${(100 * health.filled).toFixed(0)} % full, until ${clock(report?.end_ns)}`],
       ["speed", speed !== null && `${figure((speed * 30) / Math.PI)} rpm (${figure(speed)} rad/s)`],
       ["misfit", typeof report?.misfit_z === "number" && `${figure(report.misfit_z)} standard deviations`],
+      ["gyroscopic moments", report?.gyroscopic === "opposite" && "the opposite sense to Eq. (27): it explains this machine"],
       ["blocks", `${quality.accepted_blocks} accepted, ${refused.reduce((sum, [, count]) => sum + count, 0)} refused`],
       ["refused", refused.length > 0 && refused.map(([reason, count]) => `${reason} ${count}`).join(", ")],
       ["last refusal", quality.last_refusal],
