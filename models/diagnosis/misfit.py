@@ -25,9 +25,11 @@ _LEAST_SUSPECT = 5e-3  # no sensor and no machine file is truer than that, and w
 _SCATTER = 1e-4  # probability that a score scatters so much among healthy windows by chance
 _LINEAR = 0.5  # largest one-step estimate that is worth telling: farther out it only says that the thing is not small
 _LEAST_DELAY_S, _LONGEST_DELAY_S = 2e-6, 1e-3  # the same of delays
-# Part of the excess that a thing accounts for by itself, from which it is told although the window is unexplained. The
-# right one of delays and gains mostly accounts for more; where another rotor or force is at work a delay never did.
-_ACCOUNTS = 1 / 3
+# Part of the excess that a thing accounts for by itself, from which it is told: of a window that is unexplained, and of
+# any other. The right one of delays, gains and masses accounted for a third at least mostly, and for a sixth always
+# where the window was not unexplained; where another rotor or force was at work, such as a whirl, nothing for a
+# twentieth.
+_ACCOUNTS, _ACCOUNTS_LITTLE = 1 / 3, 1 / 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +95,9 @@ class Goodness:
         return best.told if abs(best.z) > _LEAST_SUSPECT_Z else ""
 
     def suspected(self, *, unexplained: bool) -> str:
-        """`suspect`; of a window so far from theory that it is unexplained, only what alone accounts for much of it."""
+        """`suspect`, if it alone accounts for some of the excess; of a window that is unexplained, for much of it."""
         accounted = max([one.z**2 for one in self.alternatives], default=0.0)
-        return "" if unexplained and accounted < _ACCOUNTS * self.excess else self.suspect
+        return "" if accounted < (_ACCOUNTS if unexplained else _ACCOUNTS_LITTLE) * self.excess else self.suspect
 
 
 def _two_sided(z: float) -> float:
