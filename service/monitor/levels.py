@@ -21,6 +21,7 @@ from models.levels.bands import NEIGHBOURHOOD
 from models.levels.contact import LatestContact
 from models.levels.judgement import Foreign, LevelJudge, channel_state, fallen
 from models.levels.measures import STANDS_RAD_S, WindowLevels
+from models.levels.orders import ORDERS
 from models.levels.reference import FirstWindows, LevelReference, expected_levels
 from models.machine import Machine, MachineFile
 from models.signals.channels import state_name, with_channel_names
@@ -38,6 +39,7 @@ _WINDOWS_OF_CONTACT = 4
 _STILL_RAD = 0.1
 """Less than this in a hop is no turning: an encoder may waver. The slowest kilns turn further."""
 _NEARLY_ALL = 0.9
+_OF_ORDERS = {*ORDERS, "not_x1"}
 """Part of a channel's random vibration from which on a new line hides what the machine does by itself."""
 
 
@@ -201,7 +203,8 @@ class LevelWatch:
         ----------
         faulty : collection of str
             States whose sensors are at fault: what they show may be no vibration, so only what is dangerously loud
-            counts.
+            counts. Of a faulty shaft angle (``theta``) that is what turns with the shaft, in every channel: a hop in
+            which the angle was lost has it at no multiple of its speed.
         standing : bool
             Whether the machine stood in the window. The same counts then, unless the reference holds a machine that
             stands; without a shaft angle that says so what has fallen counts too, for its sensors may have no supply.
@@ -213,11 +216,16 @@ class LevelWatch:
         evidence = Evidence(start_ns=end_ns - self._hop_ns, end_ns=end_ns)
         known = () if self.reference is None else self.reference.states
         unlike = standing and all(one.speed_rad_s is not None for one in known)
+        turning = "theta" not in faulty
         for state, levels in zip(self._states, self.latest, strict=False):
-            now, name = channel_state(levels), f"{LEVEL}{levels.channel}"
+            now, name = channel_state(levels if turning else _without_orders(levels)), f"{LEVEL}{levels.channel}"
             held = state in faulty or (explained and not alarms.present(name))
             held |= unlike and (self._by_angle or not fallen(levels))
             beyond = now.beyond and (now.absolute or now.danger or not held)
             # In the deadband, while a sensor is at fault, or growth cannot be told, an alarm stays as it is.
-            small = now.small and not self._moved
+            small = now.small and not self._moved and turning
             alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=small)
+
+
+def _without_orders(levels: ChannelLevels) -> ChannelLevels:
+    return levels.model_copy(update={"limits": tuple(one for one in levels.limits if one.measure not in _OF_ORDERS)})

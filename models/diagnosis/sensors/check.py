@@ -17,6 +17,8 @@ from models.signals.channels import Channel
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
+_ALL = 0.999  # of a window
+
 
 def sensor_findings(
     window: WindowStatistics,
@@ -30,8 +32,8 @@ def sensor_findings(
 
     Without a reference only what is impossible for any healthy sensor is found. A channel that is missing, stuck or
     clipped is not looked at further; where the shaft angle jumps, slips or jitters, channels are not compared: what
-    turns with the shaft stays among what they share. Nor are they where the machine stood in the window; no angle has
-    to turn then.
+    turns with the shaft stays among what they share. Nor are they where the angle is missing from a part of the window,
+    or where the machine stood in it; no angle has to turn then.
     """
     window, naming = window.as_mounted, Naming(channels)
     stood = np.full(len(window.waveforms), True) if standing else runs_down(window)
@@ -41,11 +43,13 @@ def sensor_findings(
     lost = implicated(findings)  # where a channel falls to the end of its range it is not cut off there
     findings += [found for found in clipped(window, naming) if not set(found.states) & lost]
     wrong_angle = [] if "theta" in bare else no_angle(window, naming)
-    if stood.any() or wrong_angle or "theta" in bare:
+    if stood.any() or wrong_angle:
         return (*findings, *wrong_angle)
     findings += [found for found in offset(window, naming, reference) if not set(found.states) & implicated(findings)]
     findings += [found for found in spiked(window, naming) if not set(found.states) & implicated(findings)]
     bad = implicated(findings)
+    if any("theta" in one.states and (one.value or 0.0) < _ALL * window.duration_s for one in missing):
+        return tuple(findings)  # where the angle comes or goes, what turns with the shaft is left in a hop
 
     def sound(*columns: int) -> bool:
         return not {window.states[column] for column in columns} & bad

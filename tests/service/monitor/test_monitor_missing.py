@@ -88,6 +88,29 @@ def test_without_an_angle_the_phase_reference_is_lost() -> None:
     assert raised(monitor) == {PHASE_REFERENCE}
 
 
+@pytest.mark.parametrize("lost", [np.nan, 1.0])
+def test_a_phase_reference_that_is_lost_is_all_that_is_wrong(lost: float) -> None:
+    """The hop in which it was lost turned half as far; nothing there is at a multiple of that speed."""
+    made = commissioned(KIT, recording(KIT, scenario_blocks(END_S)[:800])).commissioned
+    monitor, told = MachineMonitor(Installed(KIT, None, made)), set[str]()
+    for block in list(without(THETA, 114.4, END_S + 25, lost, end_s=END_S + 25))[800:]:
+        told |= {event.alarm.name for event in monitor.step(block).events}
+    assert told == {PHASE_REFERENCE}
+
+
+@pytest.mark.parametrize(("from_s", "faults"), [(0.0, {"theta", "z1", "z1_dot"}), (28.0, {"theta"})])
+def test_without_an_angle_other_sensors_are_watched_but_not_where_it_comes_or_goes(
+    from_s: float, faults: set[str]
+) -> None:
+    monitor, found = MachineMonitor(install(KIT, None)), set[str]()
+    for block in without(THETA, from_s, END_S, end_s=38.0):
+        samples = block.samples.copy()
+        samples[:, 1] *= 1.25 if from_s == 0 else 1.0
+        for report in monitor.step(replace(block, samples=samples)).windows:
+            found |= {state for one in report.sensors for state in one.states}
+    assert found == faults
+
+
 @pytest.mark.parametrize(
     ("rows", "columns"), [((7, 8), (3, 4)), ((7, None), (3, 4)), ((7, 8), (0, 9)), ((0, None), (0, 9))]
 )
