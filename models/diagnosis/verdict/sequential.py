@@ -202,7 +202,8 @@ class SequentialTest:
         detected = bool(verdicts) and not unexplained
         return Verdict(
             changed=findings,
-            text=_in_words(findings, isolation, detected=detected, read=bool(current)) + either * _EITHER,
+            text=_in_words(findings, isolation, detected=detected, read=[one.name for one in current])
+            + either * _EITHER,
             detected=detected,
             confidence=isolation.confidence,
             candidates=() if unexplained else _candidates(isolation),
@@ -406,7 +407,7 @@ def _candidates(isolation: Isolation) -> tuple[Candidate, ...]:
     )
 
 
-def _in_words(findings: Sequence[Finding], isolation: Isolation, *, detected: bool, read: bool) -> str:
+def _in_words(findings: Sequence[Finding], isolation: Isolation, *, detected: bool, read: Collection[str]) -> str:
     if findings:
         found = ", ".join(
             f"{one.text} ({one.name}) since {_clock(one.since_ns)}, found {_clock(one.found_ns)} in "
@@ -420,7 +421,8 @@ def _in_words(findings: Sequence[Finding], isolation: Isolation, *, detected: bo
     elif detected:
         text = "something has changed; too little data yet to say what"
     else:
-        text = "nothing has changed" if read else "no parameter could be read"
+        unread = ", ".join(name for name in PARAMETERS if name not in read)
+        text = f"nothing has changed{unread and f'; not read: {unread}'}" if read else "no parameter could be read"
     if isolation.outside:
         text += "; outside the model: something has changed that no parameter describes, or a sensor is at fault"
     return text

@@ -353,3 +353,19 @@ def test_a_converter_that_samples_one_channel_after_the_other_is_told_where_noth
     (event,) = events
     assert event.alarm.name == MODEL
     assert event.alarm.note.endswith(windows[-1].suspect)
+
+
+def test_healthy_is_said_of_what_is_read() -> None:
+    """Sensors in one plane: the bearing has lost stiffness in the other."""
+    kit = rotor_kit.LAB
+    seen = [number for number, one in enumerate(kit.sensors) if one.name[0] in "yt"]
+    file = kit.model_copy(update={"sensors": tuple(kit.sensors[number] for number in seen)})
+    softer = stream(70.0, Event(at_s=0.0, parameter="k_bz", relative_change=-0.3))
+    windows, events = feed(
+        MachineMonitor(install(file, None)), [replace(one, samples=one.samples[:, seen]) for one in softer]
+    )
+    assert not events
+    verdict = sure(windows[-1].verdict)
+    assert (windows[-1].state, verdict.text) == (HealthState.HEALTHY, "nothing has changed; not read: k_bz, c_bz")
+    (*_, whole), _ = feed(MachineMonitor(install(kit, None)), healthy(65.0))
+    assert sure(whole.verdict).text == "nothing has changed"
