@@ -19,7 +19,7 @@ def import_(
         Path,
         typer.Argument(
             metavar="SOURCE",
-            help="CSV, Parquet, NumPy .npz, MATLAB .mat, WAV, UFF 58, TDMS or MF4 file, or a folder of such files.",
+            help="CSV, Parquet, NumPy .npz, MATLAB .mat, HDF5, WAV, UFF 58, TDMS or MF4 file, or a folder of them.",
         ),
     ],
     mapping: Annotated[
@@ -45,6 +45,8 @@ def import_(
     from service.interchange.importing import import_file, summary_lines  # noqa: PLC0415
     from service.interchange.mapping import load_mapping  # noqa: PLC0415
 
+    if out.is_file() and not overwrite:
+        raise MachineFileError(f"{out}: already exists; --overwrite replaces it")
     described = load_machine_file(machine)
     done = import_file(source, load_mapping(mapping, described), described, out, overwrite=overwrite)
     for line in summary_lines(done):

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
-from models.errors import RecordingError
+from models.errors import MachineFileError, RecordingError
 from service.interchange.exported import Selection, Table, alarm_table, report_table, stream_table
 from service.interchange.source import Array
 
@@ -34,11 +34,13 @@ def export(
 
     Raises
     ------
+    MachineFileError
+        If there is such a file already.
     RecordingError
         If the recordings cannot be read, have nothing of what is wanted, or the file cannot be written.
     """
     if out.exists() and not overwrite:
-        raise RecordingError(f"{out}: already exists and is not overwritten")
+        raise MachineFileError(f"{out}: already exists; --overwrite replaces it")
     if any(path.exists() and out.exists() and path.samefile(out) for path in selection.recordings):
         raise RecordingError(f"{out}: is one of the recordings")
     table = _TABLES[what](selection)

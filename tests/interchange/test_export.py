@@ -189,7 +189,7 @@ def test_what_is_not_there_and_what_is_there_already_is_said(tmp_path: Path) -> 
     with pytest.raises(RecordingError, match="no stream in the time that is wanted"):
         export(selection, "stream", "parquet", tmp_path / "out.parquet")
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
-    with pytest.raises(RecordingError, match=r"run\.mcap: already exists"):
+    with pytest.raises(MachineFileError, match=r"run\.mcap: already exists; --overwrite replaces it"):
         export(Selection((tmp_path / "run.mcap",)), "stream", "parquet", tmp_path / "run.mcap")
     with pytest.raises(RecordingError, match=r"run\.mcap: is one of the recordings"):
         export(Selection((tmp_path / "run.mcap",)), "stream", "parquet", tmp_path / "run.mcap", overwrite=True)

@@ -333,6 +333,8 @@ def test_a_folder_without_its_bad_file_is_exit_code_1(tmp_path: Path) -> None:
     assert f"{recording}: 20000 samples in 100 blocks" in found.stdout
     assert found.stderr.startswith(f"left out: {folder}/20260101T000100.npz: damaged, or no NumPy .npz file")
     assert found.stderr.count("\n") == 1
+    again = run("import", folder, "--mapping", mapping, "--machine", machine, "--out", recording)
+    assert (again.returncode, again.stderr) == (2, f"{recording}: already exists; --overwrite replaces it\n")
 
 
 @pytest.mark.parametrize("command", ["import", "export"])
