@@ -4,6 +4,7 @@ import json
 import sys
 import time
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -105,8 +106,8 @@ def init(
     typer.echo(f"{machine_path}: {machine.title}, {channels}")
     typer.echo(f"{settings_path}: listens on {ENDPOINT}, records into {folder / 'recordings'}")
     typer.echo(f"samples are expected under {machine.keys.stream}; the wire format is in docs/wire.md")
-    typer.echo(f"see what arrives: rotorwatch doctor --machine {machine_path}")
-    typer.echo(f"monitor it:       rotorwatch run --config {settings_path}")
+    typer.echo(f"see what arrives: rotorwatch doctor --machine {quote(str(machine_path))}")
+    typer.echo(f"monitor it:       rotorwatch run --config {quote(str(settings_path))}")
 
 
 def _asked(option: str, text: str, kind: type[str] | type[float] = str, *, empty: bool = False) -> str:

@@ -63,9 +63,10 @@ def publishing(folder: Path, address: str, seconds: float, pace: float, rate_hz:
 
 
 def test_init_writes_files_that_the_other_commands_take(tmp_path: Path) -> None:
+    tmp_path /= "of a plant"
     done = run(*FAN, "--folder", str(tmp_path), "--speed-rpm", "1488")
     assert done.returncode == 0, done.stderr
-    assert "rotorwatch doctor --machine" in done.stdout
+    assert f"rotorwatch doctor --machine '{tmp_path}/fan.toml'" in done.stdout
     machine = load_machine_file(tmp_path / "fan.toml")
     assert [channel.name for channel in machine.sensors] == ["DE-H", "NDE-V"]
     assert sure(machine.operation).speed_rpm == 1488

@@ -47,7 +47,7 @@ class ServiceLoad extends LiveElement {
         cells: [
           html("a", { href: `#/machines/${place}` }, place),
           html("state-mark", { state: one.state }),
-          number(age !== null ? lasting(age) : monitor.machines.has(place) ? "never received" : "–"),
+          number(age !== null ? lasting(age) : monitor.machines.has(place) ? "none since the monitor started" : "–"),
           number(one.queue_blocks),
           number(one.worker_busy_s < 1 ? "idle" : `${one.worker_busy_s.toFixed(0)} s on one block`),
           number(quality?.queue_dropped_blocks),

@@ -19,7 +19,7 @@ class DataQuality extends MachineElement {
     const refused = Object.entries(quality.refused_blocks);
     /** @type {[string, string | false][]} */
     const facts = [
-      ["newest data", age === null ? "never received" : `${lasting(age)} old`],
+      ["newest data", age === null ? "none since the monitor started" : `${lasting(age)} old`],
       ["silent", stream.silent && `since ${clock(stream.silent_since_ns)}`],
       ["window", `${(100 * health.filled).toFixed(0)} % full, until ${clock(report?.end_ns)}`],
       ["speed", speed !== null && `${figure((speed * 30) / Math.PI)} rpm (${figure(speed)} rad/s)`],
