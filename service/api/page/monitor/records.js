@@ -21,7 +21,7 @@
  * @typedef {{starts_ns: number[], means: number[]}} Trend
  * @typedef {{equation: string, title: string, evaluable: boolean, msd: number | null, msd_healthy: number | null, parameters: Parameter[], reason: string}} Equation
  * @typedef {{first: string, second: string, unit: string, measured: (number | null)[], standard_error: (number | null)[], nominal: (number | null)[] | null, estimated: (number | null)[] | null, nominal_z: number | null, estimated_z: number | null}} CorrelationPair
- * @typedef {{start_ns: number | null, end_ns: number | null, lags_s: number[], pairs: CorrelationPair[], theory: {nominal_reason: string, estimated_reason: string}, reason: string}} CorrelationSnapshot
+ * @typedef {{start_ns: number | null, end_ns: number | null, speed_rad_s: number | null, lags_s: number[], pairs: CorrelationPair[], theory: {nominal_reason: string, estimated_reason: string}, reason: string}} CorrelationSnapshot
  * @typedef {{source: string, start_ns: number | null, end_ns: number | null, revolutions: number, times_s: number[], pulses_s: number[], waveforms: {channel: string, unit: string, mean: number | null, values: (number | null)[]}[], reason: string}} WaveformSnapshot
  * @typedef {{source: string, start_ns: number | null, end_ns: number | null, speed_rad_s: number | null, frequencies_hz: number[], averages: number, places: {location: string, channels: string[], unit: string, values: (number | null)[]}[], reason: string}} FullSpectrumSnapshot
  * @typedef {{source: string, start_ns: number | null, end_ns: number | null, channel: string, unit: string, over: string, frequencies_hz: number[], rows: {start_ns: number | null, speed_rad_s: number | null, values: (number | null)[]}[], reason: string}} WaterfallSnapshot

@@ -52,7 +52,7 @@ class CorrelationPlot extends MachineElement {
       return;
     }
     const apart = [pair.nominal_z !== null && `nominal ${figure(pair.nominal_z)}`, pair.estimated_z !== null && `estimated ${figure(pair.estimated_z)}`].filter(Boolean);
-    this.#said.textContent = [`${this.windowText(found) || `Window ${stretch(found.start_ns, found.end_ns)}`}, without mean and 1×`, apart.length && `distance from theory in standard errors (rms): ${apart.join(", ")}`, ...theory].filter(Boolean).join("; ");
+    this.#said.textContent = [`${this.windowText(found) || `Window ${stretch(found.start_ns, found.end_ns)}`}, without mean${found.speed_rad_s === null ? "" : " and 1×"}`, apart.length && `distance from theory in standard errors (rms): ${apart.join(", ")}`, ...theory].filter(Boolean).join("; ");
     const lines = measuredLines(pair, { label: "measured", values: pair.measured, width: 2 });
     if (pair.nominal) lines.push({ label: "as nominal", values: pair.nominal, colour: "nominal", dash: [6, 4] });
     if (pair.estimated) lines.push({ label: "as estimated", values: pair.estimated, colour: "estimated" });
