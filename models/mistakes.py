@@ -144,29 +144,21 @@ def checked(model: type[_Model], fields: object, place: object) -> _Model:
     MachineFileError
         With one line for each mistake.
     """
+    told, found, cause = truths_told(fields, model), None, None
     try:
-        refuse_truths(fields, model, place)
-        return model.model_validate(fields)
+        found = model.model_validate(fields)
     except ValidationError as error:
-        told = [text for _, text in mistakes(error, model, fields)]
+        told += [text for _, text in mistakes(error, model, fields)]
         more = error.error_count() - _MOST_TOLD
         told += [f"and {more} more mistakes"] if more > 0 else []
-        raise MachineFileError("\n".join(f"{place}: {text}" for text in told)) from error
+        cause = error
+    if found is None or told:
+        raise MachineFileError("\n".join(f"{place}: {text}" for text in told)) from cause
+    return found
 
 
-def refuse_truths(fields: object, model: type[BaseModel], place: object) -> None:
-    """Refuse true and false in the place of a number, for which pydantic takes them: 1 and 0.
-
-    Parameters
-    ----------
-    place : object
-        What the messages begin with.
-
-    Raises
-    ------
-    MachineFileError
-        With one line for each of them.
-    """
+def truths_told(fields: object, model: type[BaseModel]) -> list[str]:
+    """Mistakes that pydantic does not see: true and false in the place of a number, which it takes for 1 and 0."""
     told = []
     for at, value in _truths(fields):
         info = _field(at, model)[1]
@@ -174,9 +166,8 @@ def refuse_truths(fields: object, model: type[BaseModel], place: object) -> None
         kind = next((one for one in ("int", "float") if one in kinds and "bool" not in kinds), None)
         if kind is not None:
             fault = ErrorDetails(type=f"{kind}_type", loc=at, msg="", input=value)
-            told.append(f"{place}: {_named(at, fields)}{expectation(fault, info)}")
-    if told:
-        raise MachineFileError("\n".join(told))
+            told.append(f"{_named(at, fields)}{expectation(fault, info)}")
+    return told
 
 
 def _truths(fields: object, at: _Place = ()) -> Iterator[tuple[_Place, bool]]:

@@ -14,7 +14,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 
 from models.errors import MachineFileError
 from models.machine import MachineFile, load_machine_file
-from models.mistakes import in_folder, mistakes, read_toml, refuse_truths
+from models.mistakes import in_folder, mistakes, read_toml, truths_told
 from models.signals.link import LinkSettings, TlsSettings, endpoint_fault
 from service.history.records import Retention, StoreError
 from service.settings.access import AccessSettings, check_access
@@ -281,18 +281,20 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
     if path is not None and not fields:  # of an editor that found the disk full, for example
         raise MachineFileError(f"{path}: is empty, expected settings (TOML)")
     place = Path("default settings") if path is None else path
-    refuse_truths(fields, ServiceSettings, place)
+    told = [f"{place}: {text}" for text in truths_told(fields, ServiceSettings)]
     try:
         settings = ServiceSettings(**fields)  # type: ignore[arg-type]  # checked by pydantic, that is the point
     except ValidationError as error:
-        found = mistakes(error, ServiceSettings, fields)
-        raise MachineFileError("\n".join(f"{_culprit(at, place)}: {text}" for at, text in found)) from error
+        told += [f"{_culprit(at, place)}: {text}" for at, text in mistakes(error, ServiceSettings, fields)]
+        raise MachineFileError("\n".join(told)) from error
     except SettingsError as error:
         name = str(error).partition('"')[2].partition('"')[0]
         raise MachineFileError(
             f"environment variable {_ENV_PREFIX}{name.upper()}: expected JSON, "
             f"found {os.environ.get(_ENV_PREFIX + name.upper(), '')!r}"
         ) from error
+    if told:
+        raise MachineFileError("\n".join(told))
     folder = Path() if path is None else path.parent
     entries = tuple(_resolved(entry, folder) for entry in settings.machines)
     history = settings.history
