@@ -83,16 +83,14 @@ class Described(ABC):
         MachineFileError
             If there is no such channel, or none but the shaft angle.
         RecordingError
-            If one that is named has no numbers.
+            If one that is named has no numbers, or none has.
         """
-        if names:
-            asked = self.channels(names)
-            if self.sent(asked) != asked:
-                raise RecordingError(f"{self.place}: {self.lacking}")
-            return asked
-        there = self.sent(self.descriptor.channels)
-        first = min((one.quantity for one in there), key=list(Quantity).index)  # the shaft angle is the last
-        return self.channels([one.name for one in there if one.quantity is first])
+        asked = self.channels(names)
+        there = self.sent(asked or self.descriptor.channels)
+        first = min((one.quantity for one in there), key=list(Quantity).index, default=None)  # the shaft angle is last
+        if self.lacking and (first in {None, Quantity.SHAFT_ANGLE} or (asked and there != asked)):
+            raise RecordingError(f"{self.place}: {self.lacking}")
+        return asked or self.channels([one.name for one in there if one.quantity is first])
 
 
 class Sampled(Described):

@@ -73,6 +73,8 @@ def test_a_dead_channel_is_shown_as_no_data(way: str, tmp_path: Path) -> None:
     assert said in wave.reason
     assert [one.name for one in samples.chosen(())] == ["y1", "y2", "z2"]
     with pytest.raises(RotorwatchError, match=said):
+        samples.chosen(["y1", "z1"])
+    with pytest.raises(RotorwatchError, match=said):
         waterfall_snapshot(samples, samples.channels(["z1"])[0], "time")
 
 
@@ -93,3 +95,11 @@ def test_without_its_angle_a_machine_has_no_speed_of_0(way: str, tmp_path: Path)
     assert [one.ellipse for one in orbits.orbits] == [None, None]
     assert "no data of theta" in orbits.reason
     assert waveform_snapshot(samples, samples.channels(["y1"]), 4, None).speed_rad_s is None
+
+
+def test_of_an_angle_alone_there_is_nothing_to_plot(tmp_path: Path) -> None:
+    _, samples = shown("recorded", tmp_path, *NAMES[:-1])
+    with pytest.raises(RotorwatchError, match=r"no data of y1, z1, .*: sent as NaN"):
+        samples.chosen(())
+    with pytest.raises(RotorwatchError, match="no data of y1, z1"):
+        full_spectrum_snapshot(samples)
