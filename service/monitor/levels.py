@@ -204,7 +204,8 @@ class LevelWatch:
         faulty : collection of str
             States whose sensors are at fault: what they show may be no vibration, so only what is dangerously loud
             counts. Of a faulty shaft angle (``theta``) that is what turns with the shaft, in every channel: a hop in
-            which the angle was lost has it at no multiple of its speed.
+            which the angle was lost has it at no multiple of its speed; and all that is compared with the machine as it
+            was at several speeds.
         standing : bool
             Whether the machine stood in the window. The same counts then, unless the reference holds a machine that
             stands; without a shaft angle that says so what has fallen counts too, for its sensors may have no supply.
@@ -218,7 +219,7 @@ class LevelWatch:
         unlike = standing and all(one.speed_rad_s is not None for one in known)
         turning = "theta" not in faulty
         for state, levels in zip(self._states, self.latest, strict=False):
-            now, name = channel_state(levels if turning else _without_orders(levels)), f"{LEVEL}{levels.channel}"
+            now, name = channel_state(levels if turning else self._without_angle(levels)), f"{LEVEL}{levels.channel}"
             held = state in faulty or (explained and not alarms.present(name))
             held |= unlike and (self._by_angle or not fallen(levels))
             beyond = now.beyond and (now.absolute or now.danger or not held)
@@ -226,6 +227,8 @@ class LevelWatch:
             small = now.small and not self._moved and turning
             alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=small)
 
-
-def _without_orders(levels: ChannelLevels) -> ChannelLevels:
-    return levels.model_copy(update={"limits": tuple(one for one in levels.limits if one.measure not in _OF_ORDERS)})
+    def _without_angle(self, levels: ChannelLevels) -> ChannelLevels:
+        """The same with the limits that hold whatever the speed is."""
+        usual = not self._several_speeds  # else the reference may be that of another speed
+        kept = (one for one in levels.limits if one.measure not in _OF_ORDERS and (usual or one.absolute))
+        return levels.model_copy(update={"limits": tuple(kept)})

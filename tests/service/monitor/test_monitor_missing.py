@@ -15,7 +15,8 @@ from models.signals.sensor import Sensor
 from models.signals.wire import encode_block
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
-from tests.commissioning.rotor_kit import commissioned, elsewhere, recording
+from simulator.scenario import Event
+from tests.commissioning.rotor_kit import commissioned, elsewhere, recording, stream
 from tests.service.rig.live import LAB, scenario_blocks
 from tests.service.rig.watching import feed, named, raised, resumed
 from tests.sure import sure
@@ -95,6 +96,21 @@ def test_a_phase_reference_that_is_lost_is_all_that_is_wrong(lost: float) -> Non
     monitor, told = MachineMonitor(Installed(KIT, None, made)), set[str]()
     for block in list(without(THETA, 114.4, END_S + 25, lost, end_s=END_S + 25))[800:]:
         told |= {event.alarm.name for event in monitor.step(block).events}
+    assert told == {PHASE_REFERENCE}
+
+
+def at_speed(rpm: float, end_s: float) -> Sequence[SampleBlock]:
+    return stream(end_s, 20263313 + round(rpm), Event(at_s=0.0, speed_rpm=rpm))
+
+
+def test_without_an_angle_a_machine_is_not_compared_with_itself_at_another_speed() -> None:
+    rig = elsewhere(KIT)
+    healthy = [recording(rig, at_speed(rpm, end_s), f"{rpm}.mcap") for rpm, end_s in ((1320.0, 85.0), (2600.0, 45.0))]
+    monitor, told = MachineMonitor(Installed(rig, None, commissioned(rig, *healthy).commissioned)), set[str]()
+    for number, block in enumerate(at_speed(2600.0, 75.0)):
+        samples = block.samples.copy()
+        samples[:, THETA] = np.nan if number >= 300 else samples[:, THETA]
+        told |= {event.alarm.name for event in monitor.step(replace(block, samples=samples)).events}
     assert told == {PHASE_REFERENCE}
 
 
