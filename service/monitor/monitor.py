@@ -424,8 +424,10 @@ class MachineMonitor:
         there = statistics or self._window.statistics(len(self._window.hops))  # while it fills
         stood = "" if there is None else self._standstill.found(there)
         if statistics is None:
+            if missing and there is not None:  # it ends no other fault: those are looked for in whole windows
+                self._data_path.sensors(missing, there, standing=True)
             self._levels.tell(self._alarms, end_ns, faulty=implicated(missing), standing=bool(stood))
-            return Report(**self._window_now(end_ns, end_ns, self._state(HealthState.WARMING)))
+            return Report(**self._window_now(end_ns, end_ns, self._state(HealthState.WARMING)), sensors=missing)
         speed = float(statistics.speed_rad_s) if np.isfinite(statistics.speed_rad_s) else None
         self._alarms.suppress(None if speed is None else speed * _RPM, end_ns)
         findings = sensor_findings(statistics, self._sensors, self.machine.sensors, missing, standing=bool(stood))

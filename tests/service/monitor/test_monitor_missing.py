@@ -82,11 +82,18 @@ def test_a_channel_that_is_not_connected_leaves_the_rotor_diagnosed_as_it_is_wit
     assert (told.state, told.verdict, told.parameters) == (plain.state, plain.verdict, plain.parameters)
 
 
-def test_without_an_angle_the_phase_reference_is_lost() -> None:
-    monitor = MachineMonitor(install(KIT, None))
-    reports = feed(monitor, list(without(THETA, 0.0, END_S)))[0]
-    assert [fault.states for fault in reports[-1].sensors] == [("theta",)]
-    assert raised(monitor) == {PHASE_REFERENCE}
+@pytest.mark.parametrize(("column", "state", "alarm"), [(THETA, "theta", PHASE_REFERENCE), (2, "y1_dot", "data-missing")])
+def test_a_sensor_that_was_never_connected_is_told_before_the_first_window_is_full(
+    column: int, state: str, alarm: str
+) -> None:
+    monitor, stream = MachineMonitor(install(KIT, None)), list(without(column, 0.0, END_S))
+    reports = feed(monitor, stream[:190])[0]
+    assert [[fault.states for fault in one.sensors] for one in reports] == [[(state,)]] * len(reports)
+    assert {one.state for one in reports} == {HealthState.WARMING}
+    assert raised(monitor) == {alarm}
+    reports = feed(monitor, stream[190:])[0]
+    assert [fault.states for fault in reports[-1].sensors] == [(state,)]
+    assert raised(monitor) == {alarm}
 
 
 @pytest.mark.parametrize("lost", [np.nan, 1.0])
