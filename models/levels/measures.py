@@ -357,12 +357,24 @@ class WindowLevels:
 
     @property
     def hidden_twice(self) -> npt.NDArray[np.bool_] | None:
-        """Whether random vibration as loud as it is now explains the 2x, shape (n,); None where that cannot be told."""
-        if self.moments is None or self.vectors is None or self.hops < _LEAST_HOPS:
+        """Whether random vibration as loud as it is now explains the 2x, shape (n,); None where that cannot be told.
+
+        With a phase reference its steps from hop to hop say how loud that is, otherwise the bands around it.
+        """
+        if self.moments is None or self.speed_rad_s is None or self.bands is None or self.hops < _LEAST_HOPS:
             return None
-        steps = np.abs(np.diff(self.moments[2][:, 1], axis=0)) ** 2  # where a line begins, one of them is its own
-        error = np.sqrt(np.median(steps, axis=0) / (2 * math.log(2) * self.hops))
-        return np.asarray(np.abs(self.vectors[2]) < ERRORS * error)
+        if self.vectors is not None:
+            steps = np.abs(np.diff(self.moments[2][:, 1], axis=0)) ** 2  # where a line begins, one of them is its own
+            error = np.sqrt(np.median(steps, axis=0) / (2 * math.log(2) * self.hops))
+            return np.asarray(np.abs(self.vectors[2]) < ERRORS * error)
+        known = self.moments[2][~np.isnan(self.moments[2][:, 1]).any(axis=1), 1]
+        at = int(np.searchsorted(self.bands.edges_hz, abs(self.speed_rad_s) / np.pi)) - 1
+        if not 0 <= at < len(self.bands.rms) or not len(known):
+            return None
+        twice, around = _mean(np.abs(known) ** 2) / 2, slice(max(0, at - 1), at + 2)
+        rest = np.maximum((self.bands.rms[around] ** 2).sum(axis=0) - twice, 0.0)
+        cells = self.bands.freedom[around].sum() / (2 * self.hops)
+        return np.asarray(twice < rest / cells * (1 + ERRORS / np.sqrt(len(known))))
 
 
 def window_levels(
