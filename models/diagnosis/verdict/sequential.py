@@ -295,10 +295,19 @@ class SequentialTest:
     def _decide(
         self, every: Mapping[int, Stretch], clean: Mapping[int, Stretch], verdicts: Mapping[int, Isolation]
     ) -> tuple[Stretch, Isolation]:
-        """The stretch that says which parameters changed: the longest clean one that says any."""
-        for hops in sorted(clean, reverse=True):
-            if hops in verdicts:
-                return clean[hops], verdicts[hops]
+        """The stretch that says which parameters changed: the longest clean one that says any.
+
+        But not one that names others than a shorter one does: it holds older data, and what has changed little by
+        little passes there for a change of another parameter, whose errors go with its own.
+        """
+        names: list[set[str]] = []
+        decided = None
+        for hops in sorted(clean):
+            if hops in verdicts and all(before & set(verdicts[hops].changed) for before in names):
+                decided = clean[hops], verdicts[hops]
+                names.append(set(verdicts[hops].changed))
+        if decided is not None:
+            return decided
         for hops, look in every.items():
             if hops not in clean and hops in verdicts:
                 leader = self._leader(look, verdicts[hops], clean)
