@@ -115,7 +115,7 @@ class BaselineEvaluator(WindowEvaluator):
         self._rotation.power = float(checked(arrays, _ROTATION, np.float64, ()))
 
     def _read(self, window: WindowStatistics) -> Diagnosis:
-        clear = window.without_lines if self._lines else window
+        clear = (window.without_lines if self._lines else window).with_steady_rotation
         return determined(self._baseline_for(window).diagnose(clear), window, self._length_s)
 
     def _newest(

@@ -32,6 +32,7 @@ from models.signals.waveform import Waveform, stacked_waveform
 
 _DRIFT = 0.1  # rms of a channel by which its mean may drift before that of every hop is taken out of it
 _VARIED = 0.06  # relative range of a speed found in the vibration up to which levels at its multiples are taken
+_LOBE = 2  # bins to either side over which a Hann window spreads a line
 _BESIDE = 3  # bins beside a line whose mean is where the spectra go over it
 _SMOOTH = 0.5  # squares of a drift's steps from hop to hop over those about its mean, at most; of chance 2
 
@@ -145,6 +146,33 @@ class WindowStatistics:
         spectrum = replace(self, lines=tuple(lines)).spectrum_without_lines
         correlation, hop_correlation = self.correlation - gone, self.hop_correlation - gone
         return replace(self, correlation=correlation, hop_correlation=hop_correlation, spectrum=spectrum, lines=())
+
+    @property
+    def with_steady_rotation(self) -> "WindowStatistics":
+        """The same window without what a 1x that drifts leaves beside its mean in correlations and spectra.
+
+        That is as strong at all lags, like a line, and no relation between motions holds for it. Vectors that scatter
+        from hop to hop are noise, and left as they are.
+        """
+        vectors = self.hop_synchronous
+        if vectors is None or self.removed_by_hop or (vectors == 0).all(axis=1).any():
+            return self
+        rest = vectors - vectors.mean(axis=0)
+        squares, steps = np.abs(rest) ** 2, np.abs(np.diff(rest, axis=0)) ** 2
+        smooth = steps.sum(axis=0) < _SMOOTH * squares.sum(axis=0)
+        if not np.any(smooth & (squares.max(axis=0) > _DRIFT**2 * np.abs(np.diag(self.correlation[0])))):
+            return self
+        turns = np.exp(-1j * self.speed_rad_s * self.lags_s)[:, np.newaxis, np.newaxis]
+        power = (rest[:, :, np.newaxis] * rest[:, np.newaxis].conj() / 2)[:, np.newaxis]
+        gone = np.asarray((turns * power).real, dtype=np.float64)
+        step_hz = float(self.frequencies_hz[1] - self.frequencies_hz[0])
+        line = ExcludedLine(abs(self.speed_rad_s) / (2 * np.pi), _LOBE * step_hz)
+        return replace(
+            self,
+            correlation=self.correlation - gone.mean(axis=0),
+            hop_correlation=self.hop_correlation - gone,
+            spectrum=replace(self, lines=(line,)).spectrum_without_lines,
+        )
 
     @cached_property
     def hop_waveform(self) -> Waveform:

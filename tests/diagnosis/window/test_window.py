@@ -184,6 +184,21 @@ def test_a_drift_of_the_mean_is_no_vibration(drift: FloatArray, most: float) -> 
     assert np.abs((drifting.hop_correlation.mean(axis=0) - still.correlation) / power).max() < most
 
 
+def test_a_drift_of_the_rotation_is_no_vibration_either() -> None:
+    plan, samples = replace(small_plan(hops=20), hop=400, stride=400), signal(8_200, 18)
+    (still,) = feed(SlidingWindow(plan), samples)[-1:]
+    assert still.with_steady_rotation is still
+    theta, size = samples[:, 2], samples[:, :2].std(axis=0)
+    samples[:, :2] += np.outer(np.linspace(-1, 1, len(samples)) * np.cos(theta), size)
+    samples[:, :2] += np.outer(np.linspace(1, -1, len(samples)) * np.sin(theta), size * [1.0, -0.5])
+    (drifting,) = feed(SlidingWindow(plan), samples)[-1:]
+    power = np.sqrt(np.outer(*[np.diag(still.correlation[0])] * 2))
+    steady = drifting.with_steady_rotation
+    assert np.abs((drifting.correlation - still.correlation) / power).max() > 0.2
+    for found in (steady.correlation, steady.hop_correlation.mean(axis=0)):
+        assert np.abs((found - still.correlation) / power).max() < 0.04
+
+
 def test_spectrum_is_the_two_sided_density() -> None:
     """White noise of unit variance has density 1/rate; 400 averages make the standard error of the mean 0.1 %."""
     plan = small_plan(angle=False, hops=200)
