@@ -210,9 +210,8 @@ class LevelWatch:
             Whether the machine stood in the window. The same counts then, unless the reference holds a machine that
             stands; without a shaft angle that says so what has fallen counts too, for its sensors may have no supply.
         explained : bool
-            Whether parameters have been found to have changed, without reserve: their alarms say what has become
-            louder, and why, so an alert is not raised beside them. What is raised already stays, and a danger is
-            always told.
+            Whether alarms on parameters, without reserve, say what has become louder, and why: an alert is not raised
+            beside them. What is raised already stays, and a danger is always told.
         """
         evidence = Evidence(start_ns=end_ns - self._hop_ns, end_ns=end_ns)
         known = () if self.reference is None else self.reference.states

@@ -43,6 +43,11 @@ class Alarm:
         return self.present and self.state.annunciated
 
     @property
+    def due(self) -> bool:
+        """Whether the condition is there, or will be after the on-delay."""
+        return self.present or self.beyond_ns is not None
+
+    @property
     def open(self) -> bool:
         """Whether there is anything to see: any state but normal, or a delay that runs."""
         return self.state is not AlarmState.NORMAL or self.beyond_ns is not None

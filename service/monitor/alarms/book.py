@@ -103,7 +103,7 @@ class AlarmBook:
     ) -> bool:
         """Judge what the sequential test has found at the end of a hop; without clean data alarms stay where they are.
 
-        Returns whether a change of a parameter explains the data without reserve.
+        Returns whether a change of a parameter that operators hear of explains the data without reserve.
 
         Parameters
         ----------
@@ -181,7 +181,8 @@ class AlarmBook:
             note = "; ".join(filter(None, (unexplained, suspect and f"best explained by: {suspect}", at_once, just)))
             outside = verdict.outside_model
             self.update_state(MODEL, outside, end_ns, note, evidence=evidence)
-        return bool(unreserved) and not (verdict.outside_model or hidden)
+        heard = any(self._alarms[one].due for one in (*probability, CHANGED) if one in self._alarms)
+        return bool(unreserved) and heard and not (verdict.outside_model or hidden)
 
     def update(  # noqa: PLR0913  # what one reading says
         self,

@@ -216,10 +216,15 @@ def test_where_a_wrong_gain_would_explain_it_as_well_both_are_told(change: float
     assert judged([SURE] * 3, outside=True, hidden=True) == ["raised model"]
 
 
-def test_a_shaft_that_reads_stiffer_explains_no_levels_and_one_that_is_repaired_has_no_reserve() -> None:
+def test_what_reads_stiffer_or_has_no_alarm_explains_no_levels_and_a_repaired_shaft_has_no_reserve() -> None:
     book = AlarmBook(SETTINGS)
     changes = ({"EI": 0.99}, 0.2), ({"EI": 0.99}, -0.2), ({"EI": 0.99, "e": 0.99}, 0.2)
     assert [book.found(verdict(of, change=change), "", "", 0) for of, change in changes] == [False, True, True]
+    # Nobody hears of a change below its limit: it must not keep levels from being told.
+    assert [AlarmBook(SETTINGS).found(verdict({"e": 0.99}, change=size), "", "", 0) for size in (0.01, 0.2)] == [
+        False,
+        True,
+    ]
     crack = AlarmBook(SETTINGS)
     for number in range(15):
         crack.found(

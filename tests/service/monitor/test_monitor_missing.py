@@ -82,7 +82,9 @@ def test_a_channel_that_is_not_connected_leaves_the_rotor_diagnosed_as_it_is_wit
     assert (told.state, told.verdict, told.parameters) == (plain.state, plain.verdict, plain.parameters)
 
 
-@pytest.mark.parametrize(("column", "state", "alarm"), [(THETA, "theta", PHASE_REFERENCE), (2, "y1_dot", "data-missing")])
+@pytest.mark.parametrize(
+    ("column", "state", "alarm"), [(THETA, "theta", PHASE_REFERENCE), (2, "y1_dot", "data-missing")]
+)
 def test_a_sensor_that_was_never_connected_is_told_before_the_first_window_is_full(
     column: int, state: str, alarm: str
 ) -> None:
