@@ -8,7 +8,8 @@ from models.diagnosis.verdict.sequential import SequentialTest
 from models.diagnosis.verdict.stretch import Stretch
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
-from tests.diagnosis.verdict.test_sequential import SETTINGS, true
+from tests.diagnosis.verdict.gaussian_hops import true
+from tests.diagnosis.verdict.test_sequential import SETTINGS
 
 WINDOW_NS = 60_000_000_000
 
