@@ -148,7 +148,8 @@ def _elsewhere(
     if len(usual) < min(2, len(columns)):
         return None
     there, amplitude = list(usual), np.array(list(usual.values()))
-    if np.median(np.abs(vectors[:, there].mean(axis=0)) / amplitude) > _GONE:
+    # Hop by hop: vectors that pass through zero, as where a bow grows, have a small mean and are not gone.
+    if np.median(np.abs(vectors[:, there]).mean(axis=0) / amplitude) > _GONE:
         return None
     power = np.einsum("fii->fi", window.spectrum).real[:, there]
     count = power.shape[0] // _AROUND_BINS

@@ -425,6 +425,15 @@ def test_an_angle_of_another_speed_is_named_with_what_the_pulses_do(factor: floa
     assert told in finding.text
 
 
+def test_a_1x_that_passes_through_zero_is_no_fault_of_the_angle() -> None:
+    """As where a bow grows opposite to the unbalance: over the window nothing of it is left on average."""
+    samples = recorded("lab", 1).copy()
+    turns, moving = np.exp(1j * samples[:, -1]), samples[:, :-1]
+    grown = np.interp(np.arange(len(samples)) / plan_of("lab").rate_hz, [20.0, 45.0], [0.0, 2.0])
+    moving -= np.real(np.outer(grown * turns, 2 * (turns.conj() @ moving) / len(samples)))
+    assert "theta" not in implicated(found_in(samples, reference_of("lab")))
+
+
 def test_what_a_sensor_shows_of_the_other_plane_is_no_delay() -> None:
     """One force moves both planes, so that it is in the transfer; two sensors were told as 0.13 ms late."""
     samples, states = recorded("heavy", 1, one_source=True).copy(), plan_of("heavy").states
