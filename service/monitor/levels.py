@@ -39,8 +39,8 @@ _WINDOWS_OF_CONTACT = 4
 _STILL_RAD = 0.1
 """Less than this in a hop is no turning: an encoder may waver. The slowest kilns turn further."""
 _NEARLY_ALL = 0.9
-_OF_ORDERS = {*ORDERS, "not_x1"}
 """Part of a channel's random vibration from which on a new line hides what the machine does by itself."""
+_OF_ORDERS = {*ORDERS, "not_x1"}
 
 
 class LevelWatch:

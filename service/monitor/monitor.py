@@ -428,18 +428,19 @@ class MachineMonitor:
                 self._data_path.sensors(missing, there, standing=True)
             self._levels.tell(self._alarms, end_ns, faulty=implicated(missing), standing=bool(stood))
             return Report(**self._window_now(end_ns, end_ns, self._state(HealthState.WARMING)), sensors=missing)
-        speed = float(statistics.speed_rad_s) if np.isfinite(statistics.speed_rad_s) else None
-        self._alarms.suppress(None if speed is None else speed * _RPM, end_ns)
         findings = sensor_findings(statistics, self._sensors, self.machine.sensors, missing, standing=bool(stood))
+        start_ns, faulty = statistics.start_ns, implicated(findings)
+        known = np.isfinite(statistics.speed_rad_s) and "theta" not in faulty
+        speed = float(statistics.speed_rad_s) if known else None
+        self._alarms.suppress(None if speed is None else speed * _RPM, end_ns)
         self._data_path.sensors(findings, statistics, standing=bool(stood))
         self._evaluator.heard(findings)
-        start_ns, faulty = statistics.start_ns, implicated(findings)
 
         def unread(state: HealthState, reason: str) -> Report:
             """Of the levels and the sensors alone."""
             self._levels.tell(self._alarms, end_ns, faulty=faulty, standing=bool(stood))
             now = self._window_now(start_ns, end_ns, self._state(state))
-            return Report(**now, speed_rad_s=None if "theta" in faulty else speed, sensors=findings, reason=reason)
+            return Report(**now, speed_rad_s=speed, sensors=findings, reason=reason)
 
         # A fault of a channel elsewhere says nothing of the equations, but it is all there is where they are none.
         if findings and (not self._plan.states or faulty - set(self._plan.others)):

@@ -371,6 +371,7 @@ class AlarmBook:
             return self.present(rule.while_alarm)
         if speed_rpm is None:
             return rule.identity in alarm.rules
+        speed_rpm = abs(speed_rpm)  # either way round
         if rule.below_rpm is not None:
             return speed_rpm < rule.below_rpm
         return rule.above_rpm is not None and speed_rpm > rule.above_rpm

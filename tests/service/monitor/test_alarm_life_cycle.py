@@ -165,8 +165,9 @@ def test_rules_suppress_and_give_back() -> None:
     told = book.suppress(None, (now_s + 5) * S)  # an unknown speed changes nothing of what depends on it
     assert [(event.kind, event.alarm.name) for event in told] == [("unsuppressed", "k_by")]
     assert (state_of(book), state_of(book, "model")) == (AlarmState.UNACKNOWLEDGED, AlarmState.SUPPRESSED)
-    book.suppress(1320.0, (now_s + 10) * S)
+    book.suppress(-1320.0, (now_s + 10) * S)  # the other way round
     assert state_of(book, "model") is AlarmState.NORMAL
+    assert [event.alarm.name for event in book.suppress(-500.0, (now_s + 15) * S)] == ["model"]
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from models.alarm_names import PHASE_REFERENCE
 from models.commissioning.commissioned import Installed, install
 from models.diagnosis.sensors.missing import MissingNumbers
 from models.ingest import Reason
+from models.machine import AlarmSettings
 from models.signals.block import SampleBlock
 from models.signals.sensor import Sensor
 from models.signals.wire import encode_block
@@ -121,6 +122,15 @@ def test_without_an_angle_a_machine_is_not_compared_with_itself_at_another_speed
         samples[:, THETA] = np.nan if number >= 300 else samples[:, THETA]
         told |= {event.alarm.name for event in monitor.step(replace(block, samples=samples)).events}
     assert told == {PHASE_REFERENCE}
+
+
+@pytest.mark.parametrize("lost", [np.nan, 1.0])
+def test_a_phase_reference_that_is_lost_is_no_machine_that_has_slowed_down(lost: float) -> None:
+    rule = {"alarms": ["model"], "below_rpm": 600, "because": "coasting down"}
+    alarms = AlarmSettings.model_validate({"suppress": [rule]})
+    monitor = MachineMonitor(install(KIT.model_copy(update={"alarms": alarms}), None))
+    events = feed(monitor, without(THETA, 31.0, 50.0, lost, end_s=50.0))[1]
+    assert named(events) == [("raised", PHASE_REFERENCE)]
 
 
 @pytest.mark.parametrize(("from_s", "faults"), [(0.0, {"theta", "z1", "z1_dot"}), (28.0, {"theta"})])
