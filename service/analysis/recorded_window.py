@@ -65,7 +65,8 @@ def recorded_window(
     window = SlidingWindow(plan)
     newest: Excerpt | None = None
     channels = data.descriptor.channels
-    sent = data.sent(channels)
+    lost = LatestData(sensors=() if report is None else report.sensors).missing
+    sent = [one for one in data.sent(channels) if state_name(one) not in lost]
     for stretch in data.stretches(sent):
         part = _between(stretch, first_ns, end_ns)
         if not part.samples.size:

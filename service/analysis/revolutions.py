@@ -48,13 +48,15 @@ class Excerpt:
 
     @classmethod
     def of_blocks(cls, blocks: Sequence[SampleBlock], described: ChannelDescriptor) -> "Excerpt":
-        """All columns of blocks that follow each other."""
+        """All columns of blocks that follow each other, since the latest sample whose angle is not a number."""
         samples, states = np.concatenate([block.samples for block in blocks]).astype(np.float64), described.states
         start_ns = blocks[-1].end_ns - round(samples.shape[0] / described.rate_hz * 1e9)
         angle_rad = samples[:, states.index("theta")] if "theta" in states else None
-        if angle_rad is not None and not np.isfinite(angle_rad).all():
-            angle_rad = None  # its sensor is not connected, or was not
-        return cls(start_ns, described.rate_hz, samples, angle_rad)
+        if angle_rad is None or not np.isfinite(angle_rad[-1]):  # its sensor is not connected
+            return cls(start_ns, described.rate_hz, samples, None)
+        lost = np.flatnonzero(~np.isfinite(angle_rad))
+        whole = cls(start_ns, described.rate_hz, samples, angle_rad)
+        return whole.part(int(lost[-1]) + 1, len(samples)) if lost.size else whole
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from service.monitor.monitor import MachineMonitor
 from service.stream.worker import held_now
 from tests.service.analysis.snapshotting import snapshots_of
 from tests.service.monitor.test_monitor_missing import KIT
-from tests.service.rig.live import scenario_blocks
+from tests.service.rig.live import START_NS, scenario_blocks
 from tests.service.rig.replaying import recorded, recording
 
 NAMES = [one.name for one in KIT.sensors]
@@ -34,9 +34,13 @@ SECONDS = 30.0
 
 
 @cache
-def dead(*names: str) -> tuple[SampleBlock, ...]:
+def dead(*names: str, between_s: tuple[float, float] = (0.0, SECONDS)) -> tuple[SampleBlock, ...]:
     lacking = np.isin(NAMES, names)
-    return tuple(replace(one, samples=np.where(lacking, np.nan, one.samples)) for one in scenario_blocks(SECONDS))
+    from_ns, to_ns = (START_NS + round(one * 1e9) for one in between_s)
+    return tuple(
+        replace(one, samples=np.where(lacking & (from_ns <= one.start_ns < to_ns), np.nan, one.samples))
+        for one in scenario_blocks(SECONDS)
+    )
 
 
 def shown(way: str, folder: Path, *names: str) -> tuple[LatestData, Sampled]:
@@ -95,6 +99,33 @@ def test_without_its_angle_a_machine_has_no_speed_of_0(way: str, tmp_path: Path)
     assert [one.ellipse for one in orbits.orbits] == [None, None]
     assert "no data of theta" in orbits.reason
     assert waveform_snapshot(samples, samples.channels(["y1"]), 4, None).speed_rad_s is None
+
+
+def test_an_angle_that_is_back_is_shown_from_then_on() -> None:
+    monitor = MachineMonitor(install(KIT, None))
+    for block in dead("theta", between_s=(22.0, 23.0)):
+        monitor.step(block)
+    samples = Held(KIT, monitor.blocks)
+    assert samples.from_ns == START_NS + 23 * 10**9
+    wave = waveform_snapshot(samples, samples.channels(["y1"]), 4, None)
+    assert wave.revolutions == 4
+    assert wave.speed_rad_s == pytest.approx(138.2, rel=0.01)
+    assert vector_series(samples, samples.channels(["y1"]), 1, 8, None).speeds_rad_s[-1] == wave.speed_rad_s
+
+
+def test_a_recorded_window_that_lacked_a_channel_for_a_time_is_shown_as_it_was_live(tmp_path: Path) -> None:
+    blocks, monitor = dead("z1", between_s=(12.0, 13.0)), MachineMonitor(install(KIT, None))
+    for block in blocks:
+        monitor.step(block)
+    live = held_now(monitor.window, monitor.health(), monitor.blocks)
+    source = recorded(recording(tmp_path / "made.mcap", blocks, KIT)).source
+    lagged = evaluator_for(Installed(KIT)).needs_lags
+    data = recorded_window(source, KIT, "demo/lab", None, monitor.health().latest, lagged=lagged)
+    now, then = (snapshots_of(KIT).spectra(one) for one in (live, data))
+    assert now.reason == then.reason == "no data of z1: sent as NaN, not connected"
+    for one, other in zip(now.densities, then.densities, strict=True):
+        assert (one.rms is None) == (other.rms is None) == (one.channel == "z1")
+        assert one.rms is None or one.rms == pytest.approx(other.rms, rel=1e-4)
 
 
 def test_of_an_angle_alone_there_is_nothing_to_plot(tmp_path: Path) -> None:

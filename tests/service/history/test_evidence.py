@@ -25,7 +25,10 @@ HOP = 50
 """Blocks of a hop."""
 
 
-def test_an_alarm_can_be_understood_long_after_its_window_is_gone(tmp_path: Path) -> None:
+def test_an_alarm_can_be_understood_long_after_its_window_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.runtime.machines._TICK_S", 0.1)
     plan = settings(endpoint(), machine_file(tmp_path, *SHORT), when_full="wait", history=kept_in(tmp_path))
     blocks = scenario_blocks(100.0, parse_fault(f"k_by={CHANGED}@{FAULT_S:g}"))
     with feeding(plan) as (runtime, feed), client(runtime) as http:
@@ -40,7 +43,7 @@ def test_an_alarm_can_be_understood_long_after_its_window_is_gone(tmp_path: Path
             feed.put(*blocks[sent : sent + count])
             sent += count
             until(lambda: worker.health().quality.accepted_blocks == sent, f"{sent} blocks")
-            time.sleep(0.3)  # windows are looked at four times a second
+            time.sleep(0.3)  # windows are looked at every 0.1 s here
 
         def until_settled() -> bool:
             feed_on(HOP)

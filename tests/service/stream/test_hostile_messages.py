@@ -211,6 +211,9 @@ def test_what_cannot_be_a_block_costs_no_place_and_a_queue_is_bounded_in_bytes_t
         inbox.put(raw(1, size=100_000))
     assert len(inbox) <= 10
     assert inbox.dropped == 50 - len(inbox)
+    first = inbox.get()
+    assert isinstance(first, RawBlock)
+    assert first.dropped_before == inbox.dropped  # all that was dropped, of every time that it was full
 
 
 @pytest.mark.parametrize("same_run", [False, True])
