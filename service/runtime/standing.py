@@ -13,12 +13,13 @@ from models.signals.block import SampleBlock
 from models.signals.waveform import Waveform
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import Health
-from rotorwatch.records.windows import Parameter
+from rotorwatch.records.windows import Parameter, SensorFault
 from service.analysis.snapshots.heading import LatestData
 from service.monitor.alarms.operation import OperatorAction
 from service.stream.monitored import MachineStatus
 
 _PARTS: dict[str, Any] = {kind.__name__: kind for kind in (LatestData, WindowStatistics, Waveform, SampleBlock)}
+_RECORDS: dict[str, type[BaseModel]] = {kind.__name__: kind for kind in (Parameter, SensorFault)}
 
 EVENTS = TypeAdapter(tuple[AlarmCloudEvent, ...])
 
@@ -75,8 +76,8 @@ def _form(value: object, arrays: list[np.ndarray]) -> Any:
         return value.item()
     if isinstance(value, tuple):
         return ["tuple", [_form(one, arrays) for one in value]]
-    if isinstance(value, Parameter):
-        return ["parameter", value.model_dump_json()]
+    if isinstance(value, BaseModel):
+        return [type(value).__name__, value.model_dump_json()]
     if dataclasses.is_dataclass(value):
         fields = {one.name: _form(getattr(value, one.name), arrays) for one in dataclasses.fields(value)}
         return [type(value).__name__, fields]
@@ -91,6 +92,6 @@ def _value(form: Any, arrays: dict[str, np.ndarray]) -> Any:
         return arrays[content]
     if kind == "tuple":
         return tuple(_value(one, arrays) for one in content)
-    if kind == "parameter":
-        return Parameter.model_validate_json(content)
+    if kind in _RECORDS:
+        return _RECORDS[kind].model_validate_json(content)
     return _PARTS[kind](**{name: _value(one, arrays) for name, one in content.items()})

@@ -23,6 +23,7 @@ from service.analysis.snapshots.plots import (
 )
 from service.monitor.evaluators import evaluator_for
 from service.monitor.monitor import MachineMonitor
+from service.runtime.standing import latest_from_bytes, latest_to_bytes
 from service.stream.worker import held_now
 from tests.service.analysis.snapshotting import snapshots_of
 from tests.service.monitor.test_monitor_missing import KIT
@@ -45,17 +46,19 @@ def dead(*names: str, between_s: tuple[float, float] = (0.0, SECONDS)) -> tuple[
 
 def shown(way: str, folder: Path, *names: str) -> tuple[LatestData, Sampled]:
     """What a monitor holds, or what its recording gives."""
-    if way == "live":
+    if way != "recorded":
         monitor = MachineMonitor(install(KIT, None))
         for block in dead(*names):
             monitor.step(block)
-        return held_now(monitor.window, monitor.health(), monitor.blocks), Held(KIT, monitor.blocks)
+        held = held_now(monitor.window, monitor.health(), monitor.blocks)
+        held = latest_from_bytes(latest_to_bytes(held)) if way == "of another process" else held
+        return held, Held(KIT, held.blocks)
     data = recorded(recording(folder / "made.mcap", dead(*names), KIT))
     lagged = evaluator_for(Installed(KIT)).needs_lags
     return recorded_window(data.source, KIT, "demo/lab", None, None, lagged=lagged), data
 
 
-@pytest.mark.parametrize("way", ["live", "recorded"])
+@pytest.mark.parametrize("way", ["live", "of another process", "recorded"])
 def test_a_dead_channel_is_shown_as_no_data(way: str, tmp_path: Path) -> None:
     data, samples = shown(way, tmp_path, "z1")
     said = "no data of z1: sent as NaN, not connected"
