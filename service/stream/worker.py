@@ -52,8 +52,8 @@ _LONGEST_ERROR = 500
 class MachineWorker:
     """Monitors one machine in a thread of its own.
 
-    The monitor belongs to the thread. What others may see is an immutable snapshot that the thread replaces after every
-    block, and the history, which has its own lock.
+    The monitor belongs to the thread. What others may see is an immutable snapshot that the thread replaces with every
+    piece of news and after the last block that waits, and the history, which has its own lock.
 
     Parameters
     ----------

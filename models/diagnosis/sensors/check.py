@@ -33,7 +33,7 @@ def sensor_findings(
     Without a reference only what is impossible for any healthy sensor is found. A channel that is missing, stuck or
     clipped is not looked at further; where the shaft angle jumps, slips or jitters, channels are not compared: what
     turns with the shaft stays among what they share. Nor are they where the angle is missing from a part of the window,
-    or where the machine stood in it; no angle has to turn then.
+    or where the machine stood in it; no angle has to turn then. Without any angle none is found incoherent or noisy.
     """
     window, naming = window.as_mounted, Naming(channels)
     stood = np.full(len(window.waveforms), True) if standing else runs_down(window)
@@ -73,6 +73,8 @@ def sensor_findings(
         if reading.shared >= BROKEN * (1.0 if known is None else known.shared):
             readings.append(reading)
             continue
+        if "theta" in bad:
+            continue  # run-out, which turns with the shaft, is in the displacement alone
         text = (
             f"{naming.name(second)} and {naming.name(first)} measure the same motion but share only "
             f"{reading.shared:.2f} of it, expected nearly 1: noise, a loose sensor, or a wrong channel"

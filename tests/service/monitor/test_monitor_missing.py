@@ -125,6 +125,18 @@ def test_without_an_angle_a_machine_is_not_compared_with_itself_at_another_speed
 
 
 @pytest.mark.parametrize("lost", [np.nan, 1.0])
+def test_run_out_is_no_fault_of_sensors_while_the_angle_that_it_turns_with_is_lost(lost: float) -> None:
+    monitor, found = MachineMonitor(install(KIT, None)), set[str]()
+    for block in scenario_blocks(38.0):
+        samples = block.samples.copy()
+        samples[:, 0] += 50.0 * np.cos(samples[:, THETA])  # µm; of the motion it has 24 (rms)
+        samples[:, THETA] = lost
+        for report in monitor.step(replace(block, samples=samples)).windows:
+            found |= {state for one in report.sensors for state in one.states}
+    assert found == {"theta"}
+
+
+@pytest.mark.parametrize("lost", [np.nan, 1.0])
 def test_a_phase_reference_that_is_lost_is_no_machine_that_has_slowed_down(lost: float) -> None:
     rule = {"alarms": ["model"], "below_rpm": 600, "because": "coasting down"}
     alarms = AlarmSettings.model_validate({"suppress": [rule]})
