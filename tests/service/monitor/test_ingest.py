@@ -81,6 +81,10 @@ def test_wild_times_cost_their_blocks_and_never_move_the_clock() -> None:
     assert verdicts[3].continuous
     scattered = [block(n, run=2, shift_ns=n * 9000 * 10**9) for n in range(1, 40)]
     assert all(verdict.reason is Reason.FUTURE for verdict in judge(block(0), *scattered)[1:])
+    uncounted = [block(n, sequence=2 * n, run=2, shift_ns=9000 * 10**9) for n in range(1, 40)]
+    assert all(verdict.reason is Reason.FUTURE for verdict in judge(block(0), *uncounted)[1:])
+    again = judge(block(0), wild, block(2), wild)[3]
+    assert (again.reason, "was refused before" in again.text) == (Reason.OVERLAP, True)
 
 
 def test_what_was_there_before_a_restart_is_no_news_once() -> None:
