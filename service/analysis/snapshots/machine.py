@@ -63,7 +63,7 @@ class MachineSnapshots:
     def _theory(self, data: LatestData) -> "Prediction":
         from service.analysis.prediction import NO_PARAMETERS, Prediction, predict  # noqa: PLC0415
 
-        if data.window is None or data.missing:
+        if data.window is None or data.missing & {*data.window.states, "theta"}:
             known = self._subject.known
             reason = NO_PARAMETERS if known is None else unsent(self._subject.machine, data) or _NO_WINDOW
             return Prediction(known, None, {}, reason, reason)

@@ -26,7 +26,7 @@ from service.monitor.monitor import MachineMonitor
 from service.runtime.standing import latest_from_bytes, latest_to_bytes
 from service.stream.worker import held_now
 from tests.service.analysis.snapshotting import snapshots_of
-from tests.service.monitor.test_monitor_missing import KIT
+from tests.service.monitor.test_monitor_missing import KIT, RIG
 from tests.service.rig.live import START_NS, scenario_blocks
 from tests.service.rig.replaying import recorded, recording
 
@@ -83,6 +83,17 @@ def test_a_dead_channel_is_shown_as_no_data(way: str, tmp_path: Path) -> None:
         samples.chosen(["y1", "z1"])
     with pytest.raises(RotorwatchError, match=said):
         waterfall_snapshot(samples, samples.channels(["z1"])[0], "time")
+
+
+def test_a_casing_sensor_that_is_dead_hides_no_theory() -> None:
+    monitor = MachineMonitor(install(RIG, None))
+    for block in scenario_blocks(SECONDS):
+        gap = np.full((len(block.samples), 1), np.nan, np.float32)
+        monitor.step(replace(block, samples=np.hstack([block.samples.astype(np.float32), gap])))
+    spectra = snapshots_of(RIG).spectra(held_now(monitor.window, monitor.health(), monitor.blocks))
+    assert spectra.reason == "no data of DE-H: sent as NaN, not connected"
+    assert (spectra.theory.nominal_reason, spectra.theory.estimated_reason) == ("", "")
+    assert {one.nominal is not None for one in spectra.densities} == {True}
 
 
 def test_what_the_history_has_of_the_others_is_shown() -> None:
