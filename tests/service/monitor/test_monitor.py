@@ -108,7 +108,7 @@ def test_a_gap_is_reported_and_is_neither_a_fault_nor_healthy() -> None:
     target = watching()
     after, events = feed(target, everything[1050:])  # 40 s are lost: too much for the window's span
     quality = target.health().quality
-    assert quality.gaps == 1
+    assert (quality.gaps, quality.accepted_blocks) == (1, 650 + len(everything[1050:]))
     assert quality.missing_s == pytest.approx(40.0)
     assert "40 s of data are missing" in quality.last_gap
     begin_ns = everything[0].start_ns

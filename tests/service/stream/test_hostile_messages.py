@@ -216,6 +216,20 @@ def test_what_cannot_be_a_block_costs_no_place_and_a_queue_is_bounded_in_bytes_t
     assert first.dropped_before == inbox.dropped  # all that was dropped, of every time that it was full
 
 
+def test_only_a_session_that_is_followed_is_known_and_a_run_alone_is_anybodys() -> None:
+    told: list[bool] = []
+
+    def may_be_block(_: RawBlock, known: bool) -> bool:
+        told.append(known)
+        return True
+
+    inbox = Inbox(10, "drop", may_be_block=may_be_block)
+    for followed, source in (("a", "a"), ("a", "b"), ("", "")):
+        inbox.follow(raw(1, source=followed))
+        inbox.put(raw(1, source=source))
+    assert told == [True, False, False]
+
+
 @pytest.mark.parametrize("same_run", [False, True])
 def test_another_publisher_costs_the_one_that_is_followed_no_block(same_run: bool) -> None:
     inbox = Inbox(20, "drop")
