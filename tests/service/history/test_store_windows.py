@@ -12,7 +12,7 @@ from service.history.machine import MachineStore
 from service.history.records import Retention, Step, StoredReading
 from service.history.store import Store
 from service.history.tables import buckets, machines
-from service.history.windows import READING, packed, unpacked
+from service.history.windows import READING, add_up, packed, singles, unpacked
 from tests.service.history.test_store import T0
 from tests.service.rig.postgres import executed, opened
 
@@ -49,6 +49,16 @@ def test_readings_come_out_of_their_value_as_they_went_in(windows: list[list[tup
     places, found = unpacked([packed(each) for each in arrays], READING)
     assert found.tobytes() == b"".join(each.tobytes() for each in arrays)
     assert places.tolist() == [place for place, each in enumerate(windows) for _ in each]
+
+
+@pytest.mark.parametrize("first", [-3, 0])
+def test_readings_are_added_up_by_place_and_series_wherever_that_is(first: int) -> None:
+    readings = np.zeros(6, READING)
+    readings["series_id"], readings["value"] = 1_000_000 * np.array([0, 1, 0, 1, 0, 1]), range(1, 7)
+    places, made = add_up(singles(readings), first + np.array([0, 0, 0, 1, 1, 1]))
+    assert places.tolist() == [first, first, first + 1, first + 1]
+    assert made["series_id"].tolist() == [0, 1_000_000] * 2
+    assert (made["count"].tolist(), made["total"].tolist()) == ([2, 1, 1, 2], [4.0, 2.0, 5.0, 10.0])
 
 
 def test_windows_go_into_their_bucket_when_one_of_another_comes(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:

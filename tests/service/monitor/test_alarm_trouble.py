@@ -388,6 +388,21 @@ def test_a_stream_has_time_to_be_heard_again_after_a_restart(tmp_path: Path) -> 
         assert not at.worker.health().stream.silent
 
 
+def test_others_see_blocks_that_wait_every_half_second_and_the_last_one_at_once(tmp_path: Path) -> None:
+    now_s, seen = [0.0], list[int]()
+    with opened(f"sqlite:///{tmp_path / 'history.sqlite'}") as store:
+        clocks = Clocks(monotonic_s=lambda: now_s[0])
+        worker = MachineWorker(install(machine(), None), QueueSettings(), store.machine("demo", "lab"), clocks)
+        for number in range(5):
+            worker.inbox.put(RawBlock(*encode_block(block(number), "")))
+        for now_s[0] in (0.0, 0.1, 0.4, 0.6, 0.7):
+            one = worker.inbox.get()
+            assert isinstance(one, RawBlock)
+            worker._take(one)
+            seen.append(worker.health().quality.accepted_blocks)
+    assert seen == [1, 1, 1, 4, 5]
+
+
 def test_a_silence_is_longer_than_a_block() -> None:
     with pytest.raises(ValueError, match="no_data_after_s is 5, expected more than block_to_s, 30"):
         IngestSettings(block_to_s=30.0)
