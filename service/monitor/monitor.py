@@ -38,6 +38,7 @@ from models.levels.judgement import growth_seen
 from models.signals.block import NewestBlocks, SampleBlock
 from models.signals.wire import decode_block
 from rotorwatch.records.alarms import Evidence
+from rotorwatch.records.fields import finite
 from rotorwatch.records.health import HealthState, Quality, Report
 from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import AlarmBook
@@ -361,9 +362,8 @@ class MachineMonitor:
 
     def health(self) -> MachineHealth:
         """Where the machine stands now."""
-        # What operators did since the latest window counts at once.
         return MachineHealth(
-            self._state(HealthState.NOT_EVALUABLE if self._fault else self._calm),
+            self._state(HealthState.NOT_EVALUABLE if self._fault else self._calm),  # what operators did counts at once
             self._window.filled,
             self._latest,
             self._alarms.alarms,
@@ -430,8 +430,7 @@ class MachineMonitor:
             return Report(**self._window_now(end_ns, end_ns, self._state(HealthState.WARMING)), sensors=missing)
         findings = sensor_findings(statistics, self._sensors, self.machine.sensors, missing, standing=bool(stood))
         start_ns, faulty = statistics.start_ns, implicated(findings)
-        known = np.isfinite(statistics.speed_rad_s) and "theta" not in faulty
-        speed = float(statistics.speed_rad_s) if known else None
+        speed = None if "theta" in faulty else finite(statistics.speed_rad_s)
         self._alarms.suppress(None if speed is None else speed * _RPM, end_ns)
         self._data_path.sensors(findings, statistics, standing=bool(stood))
         self._evaluator.heard(findings)
