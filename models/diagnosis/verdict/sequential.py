@@ -202,8 +202,7 @@ class SequentialTest:
         detected = bool(verdicts) and not unexplained
         return Verdict(
             changed=findings,
-            text=_in_words(findings, isolation, detected=detected, read=[one.name for one in current])
-            + either * _EITHER,
+            text=_in_words(findings, isolation, detected=detected, read=current) + either * _EITHER,
             detected=detected,
             confidence=isolation.confidence,
             candidates=() if unexplained else _candidates(isolation),
@@ -416,7 +415,7 @@ def _candidates(isolation: Isolation) -> tuple[Candidate, ...]:
     )
 
 
-def _in_words(findings: Sequence[Finding], isolation: Isolation, *, detected: bool, read: Collection[str]) -> str:
+def _in_words(findings: Sequence[Finding], isolation: Isolation, *, detected: bool, read: Sequence[Parameter]) -> str:
     if findings:
         found = ", ".join(
             f"{one.text} ({one.name}) since {_clock(one.since_ns)}, found {_clock(one.found_ns)} in "
@@ -430,7 +429,8 @@ def _in_words(findings: Sequence[Finding], isolation: Isolation, *, detected: bo
     elif detected:
         text = "something has changed; too little data yet to say what"
     else:
-        unread = ", ".join(name for name in PARAMETERS if name not in read)
+        known = {one.name for one in read} | ({"EI"} if any(one.by == "baseline" for one in read) else set())
+        unread = ", ".join(name for name in PARAMETERS if name not in known)  # without parameters no shaft is read
         text = f"nothing has changed{unread and f'; not read: {unread}'}" if read else "no parameter could be read"
     if isolation.outside:
         text += "; outside the model: something has changed that no parameter describes, or a sensor is at fault"
