@@ -281,6 +281,9 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
             "scouting/gossip/enabled": "false",
             "timestamping/enabled": "true",
             "transport/shared_memory/enabled": json.dumps(self.shared_memory),
+            # Zenoh sends heartbeats from the thread that serves its sockets. One that waits for its turn behind others
+            # of its priority, which wait for room in the socket, stops both until the link breaks: so none has theirs.
+            "qos/publication": json.dumps([{"key_exprs": ["**/@adv/**"], "config": {"priority": "background"}}]),
             # Up to 256 messages wait in each of Zenoh's queues, and by itself it takes a gigabyte each.
             "transport/link/rx/max_message_size": str(round(self.max_message_mb * 1e6)),
         }

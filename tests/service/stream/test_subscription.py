@@ -5,13 +5,14 @@ import threading
 import time
 from functools import partial
 from itertools import count
+from typing import Any
 
 import pytest
 import zenoh
 
 from models.signals.link import LinkSettings
 from service.stream.inbox import RawBlock
-from service.stream.transport import MachineCallbacks, MachineLink
+from service.stream.transport import Link, MachineCallbacks, MachineLink
 from tests.loopback import session_of
 from tests.service.rig.live import (
     LAB,
@@ -240,3 +241,25 @@ def _numbered(seen: list[int], block: RawBlock) -> None:
 
 def _more_than(seen: list[int], count: int) -> bool:
     return len(seen) > count
+
+
+def test_a_heartbeat_does_not_hold_up_what_is_asked_for_again() -> None:
+    """The publisher connects, as most do: Zenoh then serves its socket from the thread that sends its heartbeats."""
+    with Link(LinkSettings(listen=(address := endpoint(),))).session as session:
+        stream = LAB.keys.stream
+        with session_of(LinkSettings(connect=(address,))) as publishing:
+            publisher = advanced_publisher(publishing, stream, KEPT, heartbeat_s=0.01)
+            for number in range(KEPT):
+                publisher.put(_payload(number) * (SIZE // 4))
+            caches = f"{stream}/@adv/pub/**"
+            heartbeats: Any = zenoh.handlers.RingChannel(1)
+            subscriber = session.declare_subscriber(caches, heartbeats)
+            until(lambda: subscriber.try_recv() is not None, "heartbeat")
+            few: Any = zenoh.handlers.FifoChannel(1)
+            answers = session.get(
+                f"{caches}?_max={KEPT}", few, consolidation=zenoh.ConsolidationMode.NONE,
+                accept_replies=zenoh.ReplyKeyExpr.ANY, timeout=60.0,
+            )  # fmt: skip
+            until(lambda: answers.try_recv() is not None, "first answer")
+            time.sleep(0.5)  # several heartbeats, while nothing more is taken
+            assert sum(answer.ok is not None for answer in answers) == KEPT - 1
