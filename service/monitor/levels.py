@@ -41,6 +41,7 @@ _STILL_RAD = 0.1
 _NEARLY_ALL = 0.9
 """Part of a channel's random vibration from which on a new line hides what the machine does by itself."""
 _OF_ORDERS = {*ORDERS, "not_x1"}
+_NO_ORDERS = dict.fromkeys((*_OF_ORDERS, "x1_phase_lag_deg", "x2_phase_lag_deg"))
 
 
 class LevelWatch:
@@ -204,8 +205,8 @@ class LevelWatch:
         faulty : collection of str
             States whose sensors are at fault: what they show may be no vibration, so only what is dangerously loud
             counts. Of a faulty shaft angle (``theta``) that is what turns with the shaft, in every channel: a hop in
-            which the angle was lost has it at no multiple of its speed; and all that is compared with the machine as it
-            was at several speeds.
+            which the angle was lost has it at no multiple of its speed. It is not stated then, and nothing is compared
+            with the machine as it was at several speeds.
         standing : bool
             Whether the machine stood in the window. The same counts then, unless the reference holds a machine that
             stands; without a shaft angle that says so what has fallen counts too, for its sensors may have no supply.
@@ -217,8 +218,10 @@ class LevelWatch:
         known = () if self.reference is None else self.reference.states
         unlike = standing and all(one.speed_rad_s is not None for one in known)
         turning = "theta" not in faulty
+        if not turning:
+            self.latest = tuple(map(self._without_angle, self.latest))
         for state, levels in zip(self._states, self.latest, strict=False):
-            now, name = channel_state(levels if turning else self._without_angle(levels)), f"{LEVEL}{levels.channel}"
+            now, name = channel_state(levels), f"{LEVEL}{levels.channel}"
             held = state in faulty or (explained and not alarms.present(name))
             held |= unlike and (self._by_angle or not fallen(levels))
             beyond = now.beyond and (now.absolute or now.danger or not held)
@@ -227,7 +230,7 @@ class LevelWatch:
             alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=small)
 
     def _without_angle(self, levels: ChannelLevels) -> ChannelLevels:
-        """The same with the limits that hold whatever the speed is."""
+        """The same without what turns with the shaft, and with the limits that hold whatever the speed is."""
         usual = not self._several_speeds  # else the reference may be that of another speed
         kept = (one for one in levels.limits if one.measure not in _OF_ORDERS and (usual or one.absolute))
-        return levels.model_copy(update={"limits": tuple(kept)})
+        return levels.model_copy(update=_NO_ORDERS | {"limits": tuple(kept)})

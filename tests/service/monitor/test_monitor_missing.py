@@ -15,6 +15,7 @@ from models.signals.block import SampleBlock
 from models.signals.sensor import Sensor
 from models.signals.wire import encode_block
 from rotorwatch.records.health import HealthState, Report
+from rotorwatch.records.levels import ChannelLevels
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import commissioned, elsewhere, recording, stream
@@ -104,9 +105,15 @@ def test_a_phase_reference_that_is_lost_is_all_that_is_wrong(lost: float) -> Non
     """The hop in which it was lost turned half as far; nothing there is at a multiple of that speed."""
     made = commissioned(KIT, recording(KIT, scenario_blocks(END_S)[:800])).commissioned
     monitor, told = MachineMonitor(Installed(KIT, None, made)), set[str]()
+    levels: dict[bool, list[ChannelLevels]] = {True: [], False: []}
     for block in list(without(THETA, 114.4, END_S + 25, lost, end_s=END_S + 25))[800:]:
-        told |= {event.alarm.name for event in monitor.step(block).events}
+        done = monitor.step(block)
+        told |= {event.alarm.name for event in done.events}
+        for report in done.windows:
+            levels[bool(report.sensors)] += report.levels
     assert told == {PHASE_REFERENCE}
+    assert {(one.x1, one.x1_phase_lag_deg, one.not_x1) for one in levels[True]} == {(None, None, None)}
+    assert None not in {one.overall for one in levels[True]} | {one.x1 for one in levels[False]}
 
 
 def at_speed(rpm: float, end_s: float) -> Sequence[SampleBlock]:
