@@ -74,6 +74,17 @@ def test_missing_samples_are_told_of_their_channel_until_the_window_has_left_the
     assert [one.name for one in last.parameters] == [one.name for one in other.parameters]
 
 
+@pytest.mark.parametrize("column", [0, 1])
+def test_the_distance_of_a_shaft_is_not_told_where_one_of_its_two_probes_lacks_numbers(column: int) -> None:
+    monitor = MachineMonitor(install(KIT, None))
+    reports, _ = feed(monitor, without(column, 31.0, 45.0, end_s=50.0))
+    told = {level.channel: level for level in reports[-1].levels}
+    lacking, other = ("y1", "z1") if column == 0 else ("z1", "y1")
+    assert (told[lacking].overall, told[lacking].s_max, told[other].s_max) == (None, None, None)
+    assert told[other].overall is not None
+    assert told["y2"].s_max is not None
+
+
 def test_a_channel_that_is_not_connected_leaves_the_rotor_diagnosed_as_it_is_without_it() -> None:
     monitor, alone = MachineMonitor(install(RIG, None)), MachineMonitor(install(KIT, None))
     stream = scenario_blocks(40.0)
