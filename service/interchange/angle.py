@@ -67,13 +67,14 @@ def read_pulses(path: Path, runs: Sequence[FloatArray], keyphasor: Keyphasor) ->
 class AngleColumn:
     """Puts the shaft angle where the machine file has it, and brings angles into [0, 2π).
 
-    Rows whose angle is not known are left out; they make a gap.
+    Rows whose angle is not known are left out, and make a gap; where channels may be missing, they only lack it.
     """
 
     machine: MachineFile
     pulses: PulseTrain | None
     reverse: bool  # whether the shaft turns from z to y
-    unknown: int = 0  # rows left out
+    partial: bool = False  # whether channels may be missing
+    unknown: int = 0  # rows
     # How far a column of angles turned, rad, and in which time, ns.
     turned: float = 0.0
     passed_ns: float = 0.0
@@ -95,14 +96,18 @@ class AngleColumn:
             if self.pulses is None:
                 samples = piece.samples.copy()
                 samples[:, column] = np.mod(samples[:, column], _TURN)
-                self.turned += float((np.mod(np.diff(samples[:, column]) + np.pi, _TURN) - np.pi).sum())
-                self.passed_ns += float(piece.time_ns[-1] - piece.time_ns[0])
+                steps = np.mod(np.diff(samples[:, column]) + np.pi, _TURN) - np.pi
+                self.turned += float(np.nansum(steps))
+                self.passed_ns += float(np.diff(piece.time_ns)[np.isfinite(steps)].sum())
                 yield Piece(piece.begins, piece.time_ns, samples)
                 continue
             angle = shaft_angle(self.pulses, piece.time_ns, reverse=self.reverse)
             samples = np.insert(piece.samples, column, angle, axis=1)
             known = np.isfinite(angle)
             self.unknown += int(np.count_nonzero(~known))
+            if self.partial:
+                yield Piece(piece.begins, piece.time_ns, samples)
+                continue
             edges = np.flatnonzero(np.diff(known)) + 1
             for rows in np.split(np.arange(angle.size), edges):
                 if known[rows[0]]:

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
@@ -14,6 +15,7 @@ from service.interchange.samples import Piece
 
 _BLOCK_S = 0.1
 _TURN = 2 * np.pi
+_SAME_NS = 1_000_000  # between blocks that follow each other, whose times are means
 
 
 @dataclass(slots=True)
@@ -24,6 +26,8 @@ class Written:
     samples: int = 0
     lengths: list[int] = field(default_factory=list)  # samples of each contiguous stretch
     too_short: int = 0  # samples in stretches too short for a block, left out
+    missing: dict[str, list[tuple[int, int]]] = field(default_factory=dict)  # of each channel, from when to when, ns
+    none_whole: int = 0  # samples in blocks in which every channel misses some, left out
     # Time of the first sample, and of the one after the last.
     start_ns: int = 0
     end_ns: int = 0
@@ -33,7 +37,8 @@ class BlockMaker:
     """Cuts pieces into blocks of 0.1 s, as a publisher would have sent them.
 
     A block's time is the mean of its rows' times, each less its place in the block: jitter of single rows averages out
-    and a clock that runs a little fast or slow is followed. The first row of the file is at `origin_ns`.
+    and a clock that runs a little fast or slow is followed. The first row of the file is at `origin_ns`. A channel that
+    misses numbers in a block is missing in all of it, as a monitor takes no others.
     """
 
     def __init__(self, machine: MachineFile, origin_ns: int) -> None:
@@ -87,6 +92,11 @@ class BlockMaker:
         return max(1, round(silence_s * self._machine.rate_hz / self._length))
 
     def _block(self, time_ns: FloatArray, samples: FloatArray) -> Iterator[RecordedMessage]:
+        lost = np.asarray(np.isnan(samples).any(axis=0))
+        if lost.all():
+            self.written.none_whole += time_ns.size
+            self._new = True
+            return
         keys, rate_hz = self._machine.keys, self._machine.rate_hz
         since_ns = float(np.mean(time_ns - np.arange(time_ns.size) * (1e9 / rate_hz)))
         block_ns = self._origin_ns + round(since_ns)
@@ -99,10 +109,11 @@ class BlockMaker:
         if self._new:
             self.written.lengths.append(0)
         self._expected_ns = since_ns + time_ns.size * 1e9 / rate_hz
-        columns = samples.astype(np.dtype(self._machine.dtype))
+        columns = np.where(lost, np.nan, samples).astype(np.dtype(self._machine.dtype))
         for number in self._angles:  # rounding may reach 2π, which is 0
             columns[:, number] = np.where(columns[:, number] >= _TURN, 0.0, columns[:, number])
         block = SampleBlock(block_ns, self._sequence, 1, rate_hz, columns)
+        self._note(lost, block)
         payload, attachment, encoding = encode_block(block, self._hash)
         yield RecordedMessage(keys.stream, payload, attachment, encoding, block.end_ns, block.end_ns)
         self._sequence, self._new = self._sequence + 1, False
@@ -110,3 +121,11 @@ class BlockMaker:
         self.written.samples += time_ns.size
         self.written.lengths[-1] += time_ns.size
         self.written.end_ns = block.end_ns
+
+    def _note(self, lost: npt.NDArray[np.bool_], block: SampleBlock) -> None:
+        """Take note of the channels that a block lacks, stretch by stretch."""
+        for number in np.flatnonzero(lost):
+            times = self.written.missing.setdefault(self._machine.sensors[number].name, [])
+            continues = bool(times) and block.start_ns - times[-1][1] < _SAME_NS
+            from_ns = times.pop()[0] if continues else block.start_ns
+            times.append((from_ns, block.end_ns))

@@ -124,7 +124,8 @@ def _imported(
             overlaps.append(Overlap(Resampling(clock.ratio, angles)))
         for overlap in overlaps:
             parts = overlap.feed(parts)
-        angle = AngleColumn(machine, pulses, keyphasor is not None and keyphasor.direction == "reverse")
+        reverse = keyphasor is not None and keyphasor.direction == "reverse"
+        angle = AngleColumn(machine, pulses, reverse, partial=mapping.time.not_finite == "missing")
         maker = BlockMaker(machine, clock.origin_ns)
         writer = RecordingWriter(recording, overwrite=overwrite)
         try:
@@ -185,7 +186,19 @@ def summary_lines(done: Imported) -> list[str]:
         *_angle_lines(done),
     ]
     if read.left_out:
-        lines.append(f"rows left out for an empty cell, NaN, infinity or a number beyond the dtype: {read.left_out}")
+        every = " in every channel" if done.mapping.time.not_finite == "missing" else ""
+        lines.append(
+            f"rows left out for an empty cell, NaN, infinity or a number beyond the dtype{every}: {read.left_out}"
+        )
+    for name, times in written.missing.items():
+        lost_s = sum(end_ns - from_ns for from_ns, end_ns in times) / 1e9
+        stretches = f" in {len(times)} stretches" if len(times) > 1 else ""
+        lines.append(
+            f"missing, in whole blocks: {name}, {lasting(lost_s)}{stretches} from {rfc3339(times[0][0])} to "
+            f"{rfc3339(times[-1][1])}"
+        )
+    if written.none_whole:
+        lines.append(f"samples left out in blocks in which every channel lacks numbers: {written.none_whole}")
     if written.too_short:
         lines.append(f"samples left out in stretches shorter than a block: {written.too_short}")
     lines += _snapshot_lines(machine, written)
@@ -310,7 +323,8 @@ def _pulse_lines(done: Imported, train: PulseTrain) -> tuple[list[str], float]:
         f"bridged, {train.extra} extra ones left out, {train.interruptions} interruptions"
     ]
     if done.angle.unknown:
-        lines.append(f"rows left out because the shaft angle is not known: {done.angle.unknown}")
+        without = "without it" if done.angle.partial else "left out"
+        lines.append(f"rows {without} because the shaft angle is not known: {done.angle.unknown}")
         share = done.angle.unknown / max(1, done.read.rows)
         if share > _NOTED:
             lines.append(

@@ -74,8 +74,11 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
     fill_gaps_up_to_s: float = Field(
         default=0.0, ge=0, le=1, description="gaps up to this length are filled with straight lines"
     )
-    not_finite: Literal["refuse", "gap"] = Field(
-        default="refuse", description="what to make of empty cells, NaN and infinities"
+    # Refused unless asked for: in a file, empty cells are more often those of columns of several rates, or of a wrong
+    # mapping, than a dead probe's, and here, other than live, that can still be put right.
+    not_finite: Literal["refuse", "gap", "missing"] = Field(
+        default="refuse",
+        description="what to make of empty cells, NaN and infinities: missing keeps the other channels of such rows",
     )
 
     @model_validator(mode="after")

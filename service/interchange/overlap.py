@@ -3,15 +3,18 @@
 Each window has context before and after the rows whose result is kept. The beginning and the end of a stretch have
 none; there the result is not valid and is left out.
 
-A filter says at multiples of how many rows of a stretch windows begin (`multiple`), and how many rows of context there
-are before and after (`context`). It takes times and samples of a window with its contexts, and the first row of the
-stretch, and returns times and samples of the rows between the contexts.
+A filter says at multiples of how many rows of a stretch windows begin (`multiple`), how many rows of context there are
+before and after (`context`), and which columns it changes (`columns`). It takes times and samples of a window with its
+contexts, and the first row of the stretch, and returns times and samples of the rows between the contexts.
+
+Where a channel is missing, a filter is given straight lines, and what they reach of its result is missing too.
 """
 
 from collections.abc import Iterator
 from fractions import Fraction
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 from scipy.signal import resample_poly
 
 from models.signals.block import FloatArray, integrated, settling_s
@@ -39,7 +42,7 @@ class Overlap:
         for piece in pieces:
             if piece.begins:
                 yield from self._finish()
-                self._begins, self._level = True, piece.samples[0].copy()
+                self._begins, self._level = True, np.nan_to_num(piece.samples[0])
             self._time_ns.append(piece.time_ns)
             self._samples.append(piece.samples)
             self._rows += piece.time_ns.size
@@ -58,12 +61,28 @@ class Overlap:
 
     def _window(self, length: int, advance: int) -> Iterator[Piece]:
         time_ns, samples = np.concatenate(self._time_ns), np.concatenate(self._samples)
-        result = self._filter(time_ns[:length], samples[:length], self._level)
+        result = self._filtered(time_ns[:length], samples[:length])
         if result[0].size:
             yield Piece(self._begins, *result)
             self._begins = False
         self._time_ns, self._samples = [time_ns[advance:]], [samples[advance:]]
         self._rows -= advance
+
+    def _filtered(self, time_ns: FloatArray, samples: FloatArray) -> tuple[FloatArray, FloatArray]:
+        lost = np.isnan(samples)
+        if not lost.any():
+            return self._filter(time_ns, samples, self._level)
+        bridged, rows = samples.copy(), np.arange(time_ns.size)
+        for number in np.flatnonzero(lost.any(axis=0)):
+            there = np.flatnonzero(~lost[:, number])
+            bridged[:, number] = np.interp(rows, there, samples[there, number]) if there.size else 0.0
+        new_ns, result = self._filter(time_ns, bridged, self._level)
+        reached, columns = lost.copy(), self._filter.columns
+        reached[:, columns] = maximum_filter1d(lost[:, columns], 2 * self._context + 1, axis=0)
+        # The rate may be another one now.
+        at = self._context + np.arange(new_ns.size) * (time_ns.size - 2 * self._context) // max(1, new_ns.size)
+        result[reached[at]] = np.nan
+        return new_ns, result
 
 
 class Integration:
@@ -73,6 +92,7 @@ class Integration:
 
     def __init__(self, signals: list[Signal], rate_hz: float, high_pass_hz: float) -> None:
         self._signals, self._rate_hz, self._high_pass_hz = signals, rate_hz, high_pass_hz
+        self.columns: slice | list[int] = [number for number, signal in enumerate(signals) if signal.integrations]
         self.context = int(np.ceil(settling_s(high_pass_hz) * rate_hz))
 
     def __call__(self, time_ns: FloatArray, samples: FloatArray, level: FloatArray) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002
@@ -94,6 +114,7 @@ class Resampling:
 
     def __init__(self, ratio: Fraction, angles: list[int]) -> None:
         self._up, self._down, self._angles = ratio.numerator, ratio.denominator, angles
+        self.columns: slice | list[int] = slice(None)
         self.multiple = self._down
         widest = max(self._up, self._down)
         # resample_poly's filter reaches ten samples of the lower rate to either side.

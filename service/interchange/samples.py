@@ -33,7 +33,7 @@ class Piece:
 
     begins: bool  # whether there is a gap before it, or nothing; otherwise it continues the last piece
     time_ns: FloatArray  # (n,), nanoseconds since the first row of the file
-    samples: FloatArray  # (n, n_channels), in the units of the channels
+    samples: FloatArray  # (n, n_channels), in the units of the channels; NaN where a channel is missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,8 @@ class Read:
     longest: int = 0
     gaps: list[Gap] = field(default_factory=list)
     filled: int = 0  # rows that were put into short gaps
-    left_out: int = 0  # rows left out for an empty cell, NaN, infinity or a number beyond the dtype
+    # Rows left out for an empty cell, NaN, infinity or a number beyond the dtype; of every channel, if those may miss.
+    left_out: int = 0
 
 
 def signals_of(source: Source, mapping: Mapping, machine: MachineFile) -> list[Signal]:
@@ -128,10 +129,12 @@ class _Splitter:
         self._read.rows += samples.shape[0]
         rows = np.arange(first_row, self._read.rows)
         self._check_times(time_ns, entries, first_row)
-        finite = (np.abs(samples) <= self._largest).all(axis=1)
-        if not finite.all():
+        there = np.abs(samples) <= self._largest
+        if not there.all():
             if self._base.not_finite == "refuse":
                 self._refuse_missing(samples, first_row)
+            samples = np.where(there, samples, np.nan)
+            finite = there.any(axis=1) if self._base.not_finite == "missing" else there.all(axis=1)
             self._read.left_out += int(np.count_nonzero(~finite))
             time_ns, samples, rows = time_ns[finite], samples[finite], rows[finite]
         if not time_ns.size:
@@ -161,7 +164,8 @@ class _Splitter:
         most = f" up to {self._largest[number]:.3g}" if np.isfinite(samples[row, number]) else ""
         raise SourceError(
             f"{self._clock.path}: row {first_row + row + 1}, column {self._signals[number].reference}: found "
-            f'{samples[row, number]}, expected a finite number{most} (time.not_finite = "gap" leaves such rows out)'
+            f'{samples[row, number]}, expected a finite number{most} (time.not_finite = "missing" keeps the other '
+            'channels, "gap" leaves such rows out)'
         )
 
     def _steps(self, time_ns: FloatArray, rows: npt.NDArray[np.intp]) -> npt.NDArray[np.int64]:

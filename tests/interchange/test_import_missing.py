@@ -1,0 +1,177 @@
+"""Where a file lacks numbers of single channels, these are told as missing, and the others imported and evaluated."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+
+from models.commissioning.commissioned import install
+from models.machine import MachineFile
+from models.signals.block import FloatArray, SampleBlock
+from models.signals.recording import read_recording
+from models.signals.wire import decode_block
+from rotorwatch.records.health import Report
+from service.interchange.exported import Selection
+from service.interchange.exporting import export
+from service.interchange.importing import summary_lines
+from service.recordings.replay.offline import OfflineReplay
+from service.recordings.replay.source import RecordingSource
+from tests.interchange.material import (
+    PULSES,
+    SPEED_HZ,
+    START,
+    TEXT,
+    archive,
+    good_rows,
+    imported,
+    machine,
+    signals,
+    table,
+    with_cell,
+)
+from tests.service.rig.live import LAB, scenario_blocks
+
+KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 10.0, "max_span_s": 20.0})})
+MISSING = '[time]\nnot_finite = "missing"'
+
+
+def blocks_of(recording: Path, described: MachineFile) -> list[SampleBlock]:
+    messages = read_recording(recording, keys={described.keys.stream})
+    return [decode_block(one.payload, one.attachment, one.encoding)[0] for one in messages]
+
+
+def samples_of(recording: Path, described: MachineFile) -> FloatArray:
+    return np.concatenate([block.samples for block in blocks_of(recording, described)]).astype(np.float64)
+
+
+def reports_of(recording: Path) -> list[Report]:
+    lines: list[str] = []
+    source = RecordingSource([recording])
+    assert OfflineReplay(source, source.machine(), install(KIT, None), lines.append).run().refused_blocks == {}
+    messages = [json.loads(line) for line in lines]
+    return [Report.model_validate(one["message"]) for one in messages if one["topic"] == KIT.keys.report]
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_a_probe_that_was_dead_for_a_while_is_told_and_the_others_are_evaluated(tmp_path: Path, kind: str) -> None:
+    samples = np.concatenate([block.samples for block in scenario_blocks(40.0)]).astype(np.float64)
+    time_ns = 1_769_860_800 * 10**9 + np.arange(len(samples)) * 500_000
+    columns = {channel.name: samples[:, number] for number, channel in enumerate(KIT.sensors)}
+    mapping = '[time]\ncolumn = "t"\nunit = "ns"\nstart = "unix"\nnot_finite = "missing"\n[channels]\n'
+    mapping += "".join(f'{one.name} = {{ column = "{one.name}", unit = "{one.unit}" }}\n' for one in KIT.sensors)
+    told, reports = "", list[list[Report]]()
+    for dead in (False, True):
+        lost = dead & (time_ns >= time_ns[22_000]) & (time_ns < time_ns[30_050])
+        content = pa.table({"t": time_ns, **columns, "z1": pa.array(columns["z1"], mask=lost)})
+        source = tmp_path / f"run.{kind}"
+        (pa.csv.write_csv if kind == "csv" else pa.parquet.write_table)(content, source)
+        done, recording = imported(tmp_path, source, mapping, KIT)
+        assert (done.read.gaps, done.written.samples) == ([], len(samples))
+        told, reports = "\n".join(summary_lines(done)), [*reports, reports_of(recording)]
+    assert "missing, in whole blocks: z1, 4.1 s from 2026-01-31T12:00:11.000000Z to 2026-01-31T12:00:15.100000Z" in told
+    usual, lacking = reports
+    assert [one.end_ns for one in lacking] == [one.end_ns for one in usual]
+    found = [one for one in lacking if one.sensors]
+    assert {(fault.states, fault.kind) for one in found for fault in one.sensors} == {(("z1",), "missing")}
+    touched = [one.end_ns for one in usual if one.start_ns < time_ns[30_200] and one.end_ns > time_ns[22_000]]
+    assert [one.end_ns for one in found][: len(touched)] == touched
+    assert len(found) <= len(touched) + 1 < len(usual) - 2  # filters look a little further back
+    assert sum(len(one.levels) for one in found) > 0
+    for one, other in zip(lacking, usual, strict=True):
+        if one in found:
+            assert [level for level in one.levels if level.channel != "z1"] == [
+                level.model_copy(update={"s_max": None}) if level.channel == "y1" else level  # which needs both
+                for level in other.levels
+                if level.channel != "z1"
+            ]
+            assert {level.overall for level in one.levels if level.channel == "z1"} <= {None}
+
+
+@pytest.mark.parametrize("cell", ["", "NaN", "inf"])
+def test_an_empty_cell_takes_its_channel_out_of_one_block(tmp_path: Path, cell: str) -> None:
+    source = table(tmp_path / "run.csv", with_cell(cell))
+    done, recording = imported(tmp_path, source, TEXT.replace("[time]", MISSING))
+    assert (done.read.left_out, done.read.gaps, done.written.samples) == (0, [], 1000)
+    expected = np.column_stack(signals(1000)[1:])
+    expected[600:800, 1] = np.nan
+    np.testing.assert_array_equal(samples_of(recording, machine()), expected)
+    # What is exported of it is imported again as the same.
+    export(Selection((recording,)), "stream", "csv", tmp_path / "again.csv")
+    again = TEXT.replace("[time]", MISSING).replace(f'start = "{START}"', 'unit = "ns"\nstart = "unix"')
+    for name, column in {"t": "time_ns", "x": "y1 [um]", "v": "y1_dot [mm/s]", "a": "theta [rad]"}.items():
+        again = again.replace(f'column = "{name}"', f'column = "{column}"')
+    _, recording = imported(tmp_path, tmp_path / "again.csv", again)
+    np.testing.assert_array_equal(samples_of(recording, machine()), expected)
+
+
+def test_where_every_channel_is_missing_there_is_a_gap(tmp_path: Path) -> None:
+    rows = good_rows()
+    for row in range(250, 260):
+        rows[row] = rows[row].split(",")[0] + ",,,"
+    for row, lacking in {700: "{t},,{v},{a}", 701: "{t},{x},,{a}", 702: "{t},{x},{v},"}.items():
+        rows[row] = lacking.format(**dict(zip("txva", rows[row].split(","), strict=True)))
+    done, recording = imported(tmp_path, table(tmp_path / "run.csv", rows), TEXT.replace("[time]", MISSING))
+    told = "\n".join(summary_lines(done))
+    assert "gaps: 1, 0.005 s in all" in told
+    assert "beyond the dtype in every channel: 10" in told
+    assert "samples left out in blocks in which every channel lacks numbers: 200" in told
+    assert done.written.samples == 1000 - 10 - 200
+    assert np.isfinite(samples_of(recording, machine())).all()
+
+
+def test_a_channel_of_which_the_file_has_nothing_is_missing_throughout(tmp_path: Path) -> None:
+    rows = [",".join([t, x, "", a]) for t, x, _, a in (row.split(",") for row in good_rows())]
+    done, recording = imported(tmp_path, table(tmp_path / "run.csv", rows), TEXT.replace("[time]", MISSING))
+    assert "missing, in whole blocks: y1_dot, 0.5 s from" in "\n".join(summary_lines(done))
+    assert np.isnan(samples_of(recording, machine())).all(axis=0).tolist() == [False, True, False]
+
+
+def test_a_keyphasor_that_gives_no_pulses_takes_the_angle_alone(tmp_path: Path) -> None:
+    time, x, v, a = signals(8000)
+    pulse = np.where((a < 0.8) & ~((time > 1.5) & (time < 2.5)), 5.0, 0.0)
+    pulse[5000:5100] = np.nan
+    mapping = f'{PULSES}column = "k"\nthreshold = 2.5\n'.replace("[time]", MISSING)
+    done, recording = imported(tmp_path, archive(tmp_path, x=x, v=v, k=pulse), mapping)
+    assert done.read.gaps == []
+    assert f"rows without it because the shaft angle is not known: {done.angle.unknown}" in summary_lines(done)
+    samples = samples_of(recording, machine())
+    assert samples.shape == (8000, 3)
+    np.testing.assert_array_equal(samples[:, :2], np.column_stack([x, v]))
+    lost = np.isnan(samples[:, 2])
+    assert lost[3400:4800].all()
+    assert not lost[:3000].any()
+    assert not lost[5400:].any()
+    assert done.angle.unknown > 1600
+
+
+@pytest.mark.parametrize("rate_hz", [2000.0, 5000.0])
+def test_what_filters_make_of_missing_numbers_is_missing_and_the_rest_as_without(
+    tmp_path: Path, rate_hz: float
+) -> None:
+    count = int(120 * rate_hz)
+    time, x, _, a = signals(count, rate_hz)
+    omega = 2 * np.pi * SPEED_HZ
+    mapping = (
+        f'[time]\nrate_hz = {rate_hz}\nresample = true\nstart = "{START}"\n[channels]\n'
+        'y1 = { column = "x", unit = "um" }\ntheta = { column = "a", unit = "rad" }\n[acceleration]\n'
+        'high_pass_hz = 2.0\n[acceleration.channels]\ny1_dot = { column = "g", unit = "m/s^2" }\n'
+    ).replace("[time]", MISSING)
+    gravity = 40e-6 * omega**2 * np.cos(omega * time)
+    _, recording = imported(tmp_path, archive(tmp_path, x=x, a=a, g=gravity), mapping)
+    whole = samples_of(recording, machine())
+    dead = slice(int(50 * rate_hz), int(51 * rate_hz))  # seen by two of the filter's windows at the higher rate
+    gravity[dead], x[dead.start + 7] = np.nan, np.nan
+    gravity[: int(rate_hz)] = np.nan
+    _, recording = imported(tmp_path, archive(tmp_path, x=x, a=a, g=gravity), mapping)
+    samples = samples_of(recording, machine())
+    lost = np.isnan(samples)
+    assert lost.any(axis=0).tolist() == [True, True, False]
+    assert lost[:, 0].sum() <= 2 * 200
+    # The second in which it was dead, 2.5 s to either side in which the filter settles, and what is left of blocks.
+    settling = lost[:, 1] & (np.arange(len(lost)) > 20_000)
+    assert settling.sum() / 2000 == pytest.approx(6.0, abs=0.25)
+    np.testing.assert_allclose(samples[~lost], whole[~lost], atol=0.02)
