@@ -144,7 +144,7 @@ def checked(model: type[_Model], fields: object, place: object) -> _Model:
     MachineFileError
         With one line for each mistake.
     """
-    told, found, cause = truths_told(fields, model), None, None
+    told, found, cause = unseen_mistakes(fields, model), None, None
     try:
         found = model.model_validate(fields)
     except ValidationError as error:
@@ -157,10 +157,18 @@ def checked(model: type[_Model], fields: object, place: object) -> _Model:
     return found
 
 
-def truths_told(fields: object, model: type[BaseModel]) -> list[str]:
-    """Mistakes that pydantic does not see: true and false in the place of a number, which it takes for 1 and 0."""
+def unseen_mistakes(fields: object, model: type[BaseModel]) -> list[str]:
+    """Mistakes that pydantic does not see.
+
+    True and false in the place of a number, which it takes for 1 and 0, and characters 0 in text, which no name of a
+    file or host can have.
+    """
     told = []
-    for at, value in _truths(fields):
+    for at, value in _leaves(fields):
+        if isinstance(value, str) and "\0" in value:
+            told.append(f"{_named(at, fields)}expected text without the character 0 (\\u0000)")
+        if not isinstance(value, bool):
+            continue
         info = _field(at, model)[1]
         kinds = {"bool"} if info is None else set(re.findall(r"\w+", str(info.annotation)))
         kind = next((one for one in ("int", "float") if one in kinds and "bool" not in kinds), None)
@@ -170,12 +178,12 @@ def truths_told(fields: object, model: type[BaseModel]) -> list[str]:
     return told
 
 
-def _truths(fields: object, at: _Place = ()) -> Iterator[tuple[_Place, bool]]:
-    if isinstance(fields, bool):
-        yield at, fields
-    elif isinstance(fields, Mapping | list | tuple):
+def _leaves(fields: object, at: _Place = ()) -> Iterator[tuple[_Place, object]]:
+    if isinstance(fields, Mapping | list | tuple):
         for name, value in fields.items() if isinstance(fields, Mapping) else enumerate(fields):
-            yield from _truths(value, (*at, name))
+            yield from _leaves(value, (*at, name))
+    else:
+        yield at, fields
 
 
 def in_folder(model: _Model, folder: Path) -> _Model:

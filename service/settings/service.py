@@ -14,7 +14,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 
 from models.errors import MachineFileError
 from models.machine import MachineFile, load_machine_file
-from models.mistakes import in_folder, mistakes, read_toml, truths_told
+from models.mistakes import in_folder, mistakes, read_toml, unseen_mistakes
 from models.signals.link import LinkSettings, TlsSettings, endpoint_fault
 from service.history.records import Retention, StoreError
 from service.settings.access import AccessSettings, check_access
@@ -281,7 +281,7 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
     if path is not None and not fields:  # of an editor that found the disk full, for example
         raise MachineFileError(f"{path}: is empty, expected settings (TOML)")
     place = Path("default settings") if path is None else path
-    told = [f"{place}: {text}" for text in truths_told(fields, ServiceSettings)]
+    told = [f"{place}: {text}" for text in unseen_mistakes(fields, ServiceSettings)]
     try:
         settings = ServiceSettings(**fields)  # type: ignore[arg-type]  # checked by pydantic, that is the point
     except ValidationError as error:
