@@ -134,7 +134,7 @@ def _imported(
                     writer.write(message)
                 cut_rows = sum(overlap.cut_rows for overlap in overlaps)
                 if maker.written.blocks == 0:
-                    raise SourceError(_nothing(path, machine, read, cut_rows))
+                    raise SourceError(_nothing(path, machine, read, maker.written, cut_rows))
                 alone = [one.row for one, following in pairwise(read.gaps) if following.row == one.row + 1]
                 if len(alone) > _MOST_ALONE * read.rows:
                     raise SourceError(
@@ -160,10 +160,12 @@ def _left_out(path: Path, files: tuple[SnapshotFile, ...]) -> list[str]:
     return sorted(one.name for one in path.iterdir() if one.name not in names and not one.name.startswith("."))
 
 
-def _nothing(path: Path, machine: MachineFile, read: Read, cut_rows: int) -> str:
+def _nothing(path: Path, machine: MachineFile, read: Read, written: Written, cut_rows: int) -> str:
+    lost = read.left_out + written.none_whole
+    without = f", {lost} of them without numbers" if lost else ""
     ends = f", {cut_rows} of them at the ends where filters settle" if cut_rows else ""
     return (
-        f"{path}: {read.rows} rows, {len(read.gaps)} gaps: no stretch is long enough{ends}; expected at least "
+        f"{path}: {read.rows} rows{without}, {len(read.gaps)} gaps: no stretch is long enough{ends}; expected at least "
         f"{machine.ingest.block_from_s:g} s of the machine's samples"
     )
 

@@ -26,6 +26,7 @@ from tests.interchange.material import (
     START,
     TEXT,
     archive,
+    fault,
     good_rows,
     imported,
     machine,
@@ -121,6 +122,13 @@ def test_where_every_channel_is_missing_there_is_a_gap(tmp_path: Path) -> None:
     assert "samples left out in blocks in which every channel lacks numbers: 200" in told
     assert done.written.samples == 1000 - 10 - 200
     assert np.isfinite(samples_of(recording, machine())).all()
+
+
+@pytest.mark.parametrize("handling", ["missing", "gap"])
+def test_a_file_without_any_numbers_is_refused_for_that(tmp_path: Path, handling: str) -> None:
+    mapping = TEXT.replace("[time]", MISSING.replace("missing", handling))
+    told = fault(tmp_path, [f"{row.split(',')[0]},,," for row in good_rows()], mapping)
+    assert "1000 rows, 1000 of them without numbers, 0 gaps: no stretch is long enough" in told
 
 
 def test_a_channel_of_which_the_file_has_nothing_is_missing_throughout(tmp_path: Path) -> None:
