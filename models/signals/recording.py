@@ -77,12 +77,14 @@ class RecordingWriter:
     Raises
     ------
     RecordingError
-        If one of them exists, or cannot be written, or `path` is a folder; the message names it.
+        If one of them exists, or cannot be written, or `path` is a folder or device; the message names it.
     """
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
         if path.is_dir():
             raise RecordingError(f"{path}: is a folder, expected the name of a recording (.mcap)")
+        if path.exists() and not path.is_file():  # which the finished file would take the place of
+            raise RecordingError(f"{path}: is a device or pipe, expected the name of a recording (.mcap)")
         self.path = path
         self._overwrite = overwrite
         self.part = path.with_name(path.name + ".part")

@@ -66,6 +66,8 @@ def _completed(out: Path) -> Iterator[Path]:
     """Give a file its name when it is complete."""
     if out.is_dir():
         raise RecordingError(f"{out}: is a folder, expected the name of a file")
+    if out.exists() and not out.is_file():
+        raise RecordingError(f"{out}: is a device or pipe, expected the name of a file")
     part = out.with_name(out.name + ".part")
     try:
         part.touch()  # what a library says of a folder that is not there is not for users

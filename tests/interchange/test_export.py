@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -201,3 +202,7 @@ def test_what_is_not_there_and_what_is_there_already_is_said(tmp_path: Path) -> 
         export(Selection((tmp_path / "nothing.mcap",)), "stream", "csv", tmp_path / "a.csv")
     with pytest.raises(RecordingError, match="is a folder, expected the name of a file"):
         export(Selection((tmp_path / "run.mcap",)), "stream", "csv", Path(), overwrite=True)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(RecordingError, match="pipe: is a device or pipe, expected the name of a file"):
+        export(Selection((tmp_path / "run.mcap",)), "stream", "csv", tmp_path / "pipe", overwrite=True)
+    assert (tmp_path / "pipe").is_fifo()

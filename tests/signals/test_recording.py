@@ -1,6 +1,7 @@
 """Recordings: messages come back byte by byte, and damage is named."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -266,6 +267,13 @@ def test_a_flushed_message_is_safe_and_an_abandoned_file_keeps_it(tmp_path: Path
     writer.abandon()
     assert not writer.path.exists()
     assert _salvage(writer.part, writer.path) == content[:2]
+
+
+def test_a_device_or_pipe_is_not_replaced_by_a_recording(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(RecordingError, match="pipe: is a device or pipe, expected the name of a recording"):
+        RecordingWriter(tmp_path / "pipe", overwrite=True)
+    assert [(one.name, one.is_fifo()) for one in tmp_path.iterdir()] == [("pipe", True)]
 
 
 def test_a_name_that_was_taken_meanwhile_is_not_overwritten(tmp_path: Path) -> None:
