@@ -168,19 +168,19 @@ def _before(out: Path, machine: MachineFile, why: str) -> Commissioned | None:
     return before
 
 
-def _remove_networks(out: Path, machine: Machine) -> bool:
-    """Remove networks that are not the machine's: beside its commissioning no monitor would start until it has its own.
+def _remove_networks(out: Path, machine: Machine) -> str:
+    """Remove networks that are not the machine's, or damaged: beside its commissioning no monitor would start.
 
-    Says whether there were any.
+    Says what is wrong with them; empty if they stay, or there are none.
     """
     if not (out / MANIFEST).exists():
-        return False
+        return ""
     try:
         load_bundle(out, machine)
-    except BundleError:
+    except BundleError as error:
         (out / MANIFEST).unlink()
-        return True
-    return False
+        return str(error)
+    return ""
 
 
 def _entry(path: Path, recording: HealthyRecording) -> HealthyEntry:
@@ -204,8 +204,8 @@ def _write(out: Path, made: Commissioning, replaces: Commissioned | None) -> Non
             return
         if replaces is not None:
             shutil.copyfile(out / FILE, out / _KEPT.format(version=replaces.version))
-        if made.machine is not None and _remove_networks(out, made.machine):
-            typer.echo(f"{out}: the networks that were there are of another rotor and were removed")
+        if made.machine is not None and (why := _remove_networks(out, made.machine)):
+            typer.echo(f"the networks that were there cannot be used and were removed: {why}")
         draft = out / (FILE + ".new")  # what is replaced stays whole until the new one is
         draft.write_text(made.commissioned.model_dump_json(indent=1) + "\n", encoding="utf-8")
         draft.replace(out / FILE)

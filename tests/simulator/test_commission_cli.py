@@ -79,16 +79,24 @@ def test_a_machine_is_commissioned_and_again_only_with_a_reason(folder: Path, mo
     assert json.loads((folder / "kit" / "commissioned-1.json").read_text(encoding="utf-8"))["version"] == 1
 
 
-@pytest.mark.parametrize(("of", "stays"), [("heavy", False), ("lab", True)])
-def test_networks_of_another_rotor_do_not_stay_beside_a_new_commissioning(
-    folder: Path, of: str, stays: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("of", "damaged", "why"),
+    [("heavy", False, "trained for another machine"), ("lab", True, "weights.safetensors"), ("lab", False, "")],
+)
+def test_networks_that_cannot_be_used_do_not_stay_beside_a_new_commissioning(
+    folder: Path, of: str, damaged: bool, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("simulator.commission.page.pictures_of", lambda *_: ())
-    out = f"with-{of}"
+    out, stays = f"with-{of}-{damaged}", not why
     shutil.copytree(ROOT / "models" / "bundles" / of, folder / out)
+    if damaged:
+        (folder / out / "weights.safetensors").write_bytes(b"")
     found = run(folder, "--machine", "lab", "--healthy", "monday.mcap", "--out", out, "--no-networks")
     assert found.exit_code == 0, found.stderr
-    assert ("networks that were there are of another rotor" in found.stdout) is not stays
+    told = " ".join(found.stdout.split())
+    assert ("the networks that were there cannot be used and were removed" in told) is not stays
+    assert why in told
+    assert ("another machine" in told) is (of == "heavy")
     assert (install(LAB, folder / out).bundle is not None) is stays  # a monitor starts, whatever was there
 
 
