@@ -92,17 +92,17 @@ def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistic
             line = Line(states[column], float(frequencies_hz[at]), share, certain, likely=likely)
             # A channel that is sure of it goes before one that it is louder in.
             found[at] = max(found.get(at, line), line, key=lambda one: (one.certain, one.likely, one.share))
-    lines = [*found.values(), *_beside_multiples(plan, window, every, floor, total)]
+    lines = [*found.values(), *_beside_multiples(plan, window, every, mean, total)]
     return tuple(sorted(lines, key=lambda line: -line.share))
 
 
 def _beside_multiples(
-    plan: Plan, window: WindowStatistics, every: ComplexArray, floor: FloatArray, total: FloatArray
+    plan: Plan, window: WindowStatistics, every: ComplexArray, mean: FloatArray, total: FloatArray
 ) -> Iterator[Line]:
     """The strongest line that is certain beside each multiple of the speed, where this is steady.
 
-    `every` is of shape (n_segments, n_bins, n_states + n_regressors), the power of what surrounds a bin, `floor`, of
-    shape (n_bins, n_states).
+    `every` is of shape (n_segments, n_bins, n_states + n_regressors), the power of a bin, `mean`, of shape (n_bins,
+    n_states). What surrounds a multiple are bins that neither it reaches nor, most of them, a line beside it.
     """
     if window.speed_source != "phase reference" or window.removed_by_hop:
         return
@@ -113,11 +113,15 @@ def _beside_multiples(
     turning = every[:, np.abs(frequencies_hz - speed_hz).argmin(), len(states) + 1]
     turning = turning / np.maximum(np.abs(turning), np.finfo(float).tiny)
     for order in range(1, _HARMONICS + 1):
-        near = np.abs(frequencies_hz - order * speed_hz) <= (_LOBE + 1) * step_hz
+        away_hz = np.abs(frequencies_hz - order * speed_hz)
+        near = away_hz <= (_LOBE + 1) * step_hz
+        around = ~near & (away_hz <= (_LOBE + 1) * step_hz + _NEIGHBOURHOOD_HZ)
+        if not (near.any() and around.any()):
+            continue
         left = every[:, near, : len(states)] * (turning.conj() ** order)[:, None, None]
         left -= left.mean(axis=0)
         own = (left.real**2 + left.imag**2).mean(axis=0)
-        stands_out = (own > _STANDS_OUT * floor[near]).any(axis=0)
+        stands_out = (own > _STANDS_OUT * np.median(mean[around], axis=0)).any(axis=0)
         shares = np.where(stands_out, 2 * step_hz * own.sum(axis=0) / total, 0.0)
         if not shares.any():
             continue

@@ -163,6 +163,16 @@ def test_a_line_that_beats_with_a_multiple_of_the_speed_is_found_beside_it(hz: f
     assert new_line([found], [found.known(speed_rad_s)], speed_rad_s) is None
 
 
+@pytest.mark.parametrize("off_hz", [-0.85, 0.85])
+def test_what_a_multiple_reaches_is_no_measure_of_a_line_beside_it(off_hz: float) -> None:
+    """In segments of 2 s the two of them fill most of the bins that noise is seen in."""
+    speed_hz = 22.2
+    made = recording(line(speed_hz + off_hz), machine=with_segments(2.0), speed_hz=speed_hz)
+    (found,) = lines_of(made)
+    assert found.certain
+    assert found.frequency_hz == pytest.approx(speed_hz + off_hz, abs=0.02)
+
+
 def test_a_beat_of_the_healthy_machine_is_not_new_and_a_1x_that_drifted_then_hides_none() -> None:
     beats, drifts = line(22.08), line(SPEED_HZ, 6.0) * T / T[-1]
     found, speed_rad_s = lines(beats), 2 * np.pi * SPEED_HZ
