@@ -291,7 +291,8 @@ def gain_course(window: WindowStatistics, reading: PairReading, bands: Banded) -
     """Relative deviation of the pair's gain from its mean, hop by hop, and the standard error of each hop.
 
     The noise of the sensors stays as it is while the motion comes and goes: where a machine runs down it is more and
-    more of what they show, and makes the ratio of a hop smaller, and less certain.
+    more of what they show, and where a line of its own begins it is less. The ratio of a hop follows, and is less
+    certain. A band in which the usual hop shows nothing but noise does not say what has become of the gain.
     """
     number = motion_pairs(window.states).index(reading.pair)
     z, v = bands.total[:, 0, 0].real, bands.total[:, 1, 1].real
@@ -303,9 +304,10 @@ def gain_course(window: WindowStatistics, reading: PairReading, bands: Banded) -
     # Each band about its own mean: what noise takes from the ratio is the same in all hops that are as loud.
     course = ratio / np.median(ratio, axis=0) - 1
     noise = np.minimum(incoherent * own.mean(axis=0) / own, 1.0)
-    variance = noise / np.maximum(1 - noise, 1e-6) / (bands.averages / len(powers))
-    weight = 1 / variance
+    kept = np.maximum(1 - noise, 1e-6)
+    variance = noise / kept / (bands.averages / len(powers))
+    weight = 1 / np.maximum(variance, np.median(variance, axis=0))
     total = weight.sum(axis=1)
-    taken = np.sum(weight * noise, axis=1) / total
-    error = np.sqrt(1 / (2 * total) + np.maximum(taken - np.median(taken), 0.0) ** 2)
+    by_noise = np.sum(weight * (kept / np.median(kept, axis=0) - 1), axis=1) / total
+    error = np.sqrt(1 / (2 * total) + by_noise**2)
     return np.asarray(np.sum(course * weight, axis=1) / total, dtype=np.float64), np.asarray(error, dtype=np.float64)

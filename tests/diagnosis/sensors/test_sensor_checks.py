@@ -410,6 +410,18 @@ def test_a_machine_that_sinks_into_the_noise_of_its_sensors_has_no_gain_that_dri
     assert found_in(samples) == found_in(samples, reference_of("lab")) == ()
 
 
+def test_a_line_of_the_machine_that_begins_where_sensors_showed_noise_is_no_gain_that_drifts() -> None:
+    """As of a gear that begins to whine: a displacement hardly shows it, and shows it alone from then on."""
+    plan, samples = plan_of("lab"), recorded("lab", 31).copy()
+    at_s, omega = np.arange(len(samples)) / plan.rate_hz, 2 * np.pi * 120.0
+    for place in ("y1", "z1", "y2", "z2"):
+        motion, rate = (plan.states.index(f"{place}{of}") for of in ("", "_dot"))
+        size = samples[:, rate].std()
+        samples[:, rate] += size * np.cos(omega * at_s) * (at_s > 40.0)
+        samples[:, motion] += size / omega * np.sin(omega * at_s) * (at_s > 40.0)
+    assert found_in(samples) == found_in(samples, reference_of("lab")) == ()
+
+
 def test_a_machine_that_moves_more_is_no_sensors_fault() -> None:
     samples = of_displacements(recorded("lab", 23))
     samples[70_000:, :4] *= 1.5
