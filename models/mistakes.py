@@ -314,11 +314,11 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     --------
     >>> did_you_mean("k_by", ("k_by_N_per_m", "k_bz_N_per_m"))
     '; did you mean k_by_N_per_m?'
-    >>> did_you_mean("window", ("height",))
-    ''
+    >>> did_you_mean("window", ("height",)), did_you_mean("y", ("y", "z"))
+    ('', '')
     """
     name = _nearest(word, known)
-    return "" if name is None else f"; did you mean {name}?"
+    return "" if name in (None, word) else f"; did you mean {name}?"
 
 
 def argument_text(error: Exception) -> str | None:
