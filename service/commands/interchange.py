@@ -31,12 +31,13 @@ def import_(
 ) -> None:
     """Turn measurements from another program into a recording.
 
-    Units, rate and time are checked; what is wrong is named with row and column. Gaps stay gaps. Empty cells and NaN
-    are refused, unless the mapping says time.not_finite = "missing", which keeps the other channels where a probe was
-    dead, or "gap", which leaves such rows out. The files of a folder,
+    Units, rate and time are checked; what is wrong is named with row and column. Gaps stay gaps. The files of a folder,
     such as snapshots, are joined in the order of their times, which are in their names (20260131T120000), in the files,
     or follow from the mapping's start and the machine's schedule. Files of a folder that cannot be read are left out
     and named, with exit code 1.
+
+    Empty cells and NaN are refused, unless the mapping says time.not_finite = "missing", which keeps the other channels
+    where a probe was dead, or "gap", which leaves such rows out.
 
     [bold]Example[/bold]
 
