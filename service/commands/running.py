@@ -24,6 +24,8 @@ _RAGGED = re.compile(r"(?<!\n)(?<!\[/cyan\])\n(?!\n|\[cyan\])")
 _FILES = 65_536
 _UNUSABLE = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.EROFS}
 """What the system says of a file that somebody has named, and that this program cannot use."""
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+"""What it says of a file that has no room; of no name, it is the one to which the output goes."""
 _NO_THREAD = "can't start new thread"
 _MB = 1_000_000
 _ADDRESS_SPACE_MB = 2_000
@@ -155,6 +157,10 @@ def exit_codes() -> Iterator[None]:
         typer.echo(str(error), err=True)
         raise typer.Exit(exit_code(error)) from error
     except OSError as error:
+        if error.errno in _FULL and error.filename is None:
+            typer.echo(f"the output cannot be written ({error.strerror})", err=True)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # where what is still to be written goes
+            raise typer.Exit(1) from error
         if error.errno not in _UNUSABLE or error.filename is None:
             raise
         typer.echo(f"{error.filename}: {error.strerror}", err=True)

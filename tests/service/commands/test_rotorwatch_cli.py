@@ -80,6 +80,14 @@ def test_a_file_of_somebody_else_is_told_in_a_line(capsys: pytest.CaptureFixture
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
 
+@pytest.mark.parametrize("command", [("size", "--machines", "3"), ("check-config", "models/machines/lab.toml")])
+def test_an_output_that_has_no_room_is_told_in_a_line(command: tuple[str, ...]) -> None:
+    with Path("/dev/full").open("w", encoding="utf-8") as full:
+        argv = [sys.executable, "-m", "service", *command]
+        found = subprocess.run(argv, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False)
+    assert (found.returncode, found.stderr) == (1, "the output cannot be written (No space left on device)\n")
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_run_says_where_it_is_needs_no_torch_and_stops_cleanly(tmp_path: Path, number: signal.Signals) -> None:
     address = endpoint()
