@@ -40,8 +40,7 @@ _STILL_RAD = 0.1
 """Less than this in a hop is no turning: an encoder may waver. The slowest kilns turn further."""
 _NEARLY_ALL = 0.9
 """Part of a channel's random vibration from which on a new line hides what the machine does by itself."""
-_OF_ORDERS = {*ORDERS, "not_x1"}
-_NO_ORDERS = dict.fromkeys((*_OF_ORDERS, "x1_phase_lag_deg", "x2_phase_lag_deg"))
+_OF_THE_ANGLE = {*ORDERS, "not_x1", "x1_phase_lag_deg", "x2_phase_lag_deg"}
 
 
 class LevelWatch:
@@ -218,8 +217,12 @@ class LevelWatch:
         known = () if self.reference is None else self.reference.states
         unlike = standing and all(one.speed_rad_s is not None for one in known)
         turning = "theta" not in faulty
-        if not turning:
-            self.latest = tuple(map(self._without_angle, self.latest))
+        pairs = ((self._states[first], self._states[second]) for first, second in self._pairs)
+        halved = {pair[0] for pair in pairs if not set(pair).isdisjoint(faulty)}
+        self.latest = tuple(
+            self._known(levels, turning=turning, halved=state in halved)
+            for state, levels in zip(self._states, self.latest, strict=False)
+        )
         for state, levels in zip(self._states, self.latest, strict=False):
             now, name = channel_state(levels), f"{LEVEL}{levels.channel}"
             held = state in faulty or (explained and not alarms.present(name))
@@ -229,8 +232,9 @@ class LevelWatch:
             small = now.small and not self._moved and turning
             alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=small)
 
-    def _without_angle(self, levels: ChannelLevels) -> ChannelLevels:
-        """The same without what turns with the shaft, and with the limits that hold whatever the speed is."""
-        usual = not self._several_speeds  # else the reference may be that of another speed
-        kept = (one for one in levels.limits if one.measure not in _OF_ORDERS and (usual or one.absolute))
-        return levels.model_copy(update=_NO_ORDERS | {"limits": tuple(kept)})
+    def _known(self, levels: ChannelLevels, *, turning: bool, halved: bool) -> ChannelLevels:
+        """The same without what takes the shaft angle, where it is at fault, or both probes of a place, where one is."""
+        gone = (set() if turning else _OF_THE_ANGLE) | ({"s_max"} if halved else set())
+        usual = turning or not self._several_speeds  # else the reference may be that of another speed
+        kept = (one for one in levels.limits if one.measure not in gone and (usual or one.absolute))
+        return levels.model_copy(update=dict.fromkeys(gone) | {"limits": tuple(kept)}) if gone else levels

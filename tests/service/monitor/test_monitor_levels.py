@@ -313,6 +313,25 @@ def test_a_dead_sensor_at_whatever_place_is_a_fault_of_that_sensor_and_no_quiet_
     assert monitor.health().state is HealthState.DATA_HEALTH
 
 
+def test_a_probe_at_fault_makes_no_large_orbit_of_the_other_probe_of_its_place() -> None:
+    probe = {"quantity": "displacement", "location": "bearing", "unit": "um"}
+    sensors = [{**probe, "name": f"DE-{one}", "direction": one, "angle_deg": at} for one, at in (("X", 45), ("Y", 135))]
+    pump = MachineFile.model_validate(FAN.model_dump(include={"site", "name", "rate_hz"}) | {"sensors": sensors})
+    jumping = []
+    for block in blocks(5, 400):
+        samples = 10 * block.samples
+        if block.start_ns >= START_NS + 333_000_000_000:
+            samples[:, 1] = -1270 + 0.01 * samples[:, 1]
+        jumping.append(replace(block, samples=samples))
+    monitor = MachineMonitor(install(pump, None))
+    _, events = run(monitor, iter(jumping[:720]))
+    assert "data-offset" in {name for _, name, _ in events}
+    assert [one.s_max for one in latest(monitor).levels] == [None, None]
+    _, later = run(monitor, iter(jumping[720:]))
+    assert {name for _, name, _ in events + later} == {"data-offset", "level:DE-Y"}
+    assert sure(latest(monitor).levels[0].s_max) < 100
+
+
 def test_a_dead_sensor_elsewhere_is_told_and_the_rotor_is_diagnosed_as_before() -> None:
     casing = Sensor(name="DE-H", quantity="acceleration", location="DE", direction="horizontal", unit="m/s2")
     rig = LAB.model_copy(update={"sensors": (*LAB.sensors, casing)})
