@@ -39,7 +39,10 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
     troubles: list[str] = []
     announced = [one.payload for one in messages if one.key == keys.descriptor]
     if not announced:
-        troubles.append("no channel descriptor was announced: names and units of the channels cannot be compared")
+        troubles.append(
+            "no channel descriptor was announced in this time, and no publisher answers a query for it (docs/wire.md): "
+            "names and units of the channels cannot be compared"
+        )
     troubles += descriptor_mismatch(announced[-1], machine) if announced else ()
     stream = [one for one in messages if one.key == keys.stream]
     if not stream:

@@ -245,6 +245,8 @@ def _fetch_healths(
                 "certificate of your own, --url the name in it"
             ) from error
         why = re.sub(r"\[Errno -?\d+\] ", "", why)
-        raise RotorwatchError(f"{url}: the monitor's HTTP API does not answer: {why}") from error
+        raise RotorwatchError(
+            f"{url}: the monitor's HTTP API does not answer: {why}; --url says where it is"
+        ) from error
     except ClientError as error:
         raise RotorwatchError(f"{url}: this is not the HTTP API of a monitor: {error}") from error

@@ -27,7 +27,7 @@ def report_line(report: Report) -> str:
     '00:03:25  demo/lab  alert          k_by −24.7±1.4 %  |  changed: k_by  |  relation agrees'
     """
     verdict = report.verdict
-    if report.parameters:
+    if report.parameters and not report.shapes:
         parts = [
             "  ".join(_change(one.name, one.relative_change, one.standard_error) for one in _shown(report))
             or _TOO_LITTLE
@@ -37,6 +37,8 @@ def report_line(report: Report) -> str:
         tail = "  |  ".join(parts)
     else:
         told = [one.text for one in report.levels if report.state == "watching" or one.beyond]
+        if report.shapes:  # no parameter will ever be read here: what has changed, or would have been seen
+            told.append(report.level_growth.text if report.level_growth else report.reason)
         tail = "  |  ".join(told) or report.reason or f"window {report.filled:.0%} full"
     # No alarm yet, or none at all if the change stays below its limit; but healthy is what nothing is found on.
     state = "no alarm" if report.state == "healthy" and _found(verdict) else report.state

@@ -131,6 +131,7 @@ def test_the_doctor_says_what_is_wrong(tmp_path: Path) -> None:
     silent = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", endpoint(), "--seconds", "1")
     assert silent.returncode == 1
     assert "nothing arrived under rotorwatch/plant/fan/stream" in silent.stdout
+    assert "no publisher answers a query for it (docs/wire.md)" in silent.stdout
 
 
 def test_the_doctor_sums_up_gaps_and_says_for_how_long_a_sensor_was_not_connected(tmp_path: Path) -> None:

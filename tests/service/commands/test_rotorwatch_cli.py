@@ -16,6 +16,8 @@ import typer
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, Report
+from rotorwatch.records.levels import LevelGrowth
+from rotorwatch.records.windows import Shape
 from service.commands.running import exit_codes
 from service.terminal.lines import alarm_event_line, alarm_state_lines, health_line, report_line
 from simulator.scenario import parse_fault
@@ -123,6 +125,7 @@ def test_status_without_a_monitor_says_so_as_json_too() -> None:
     said = json.loads(found.stdout)
     assert (found.returncode, said["summary"], said["machines"]) == (4, "no-answer", [])
     assert f"{url}: the monitor's HTTP API does not answer" in said["reason"]
+    assert said["reason"].endswith("--url says where it is")
 
 
 def test_status_tells_data_that_have_stopped_from_an_alarm(tmp_path: Path) -> None:
@@ -207,6 +210,7 @@ def test_watch_ends_when_nobody_reads_any_more(form: tuple[str, ...]) -> None:
 
 def test_lines_for_terminals() -> None:
     report = Report.model_validate(example(Report))
+    shape = Shape.model_validate(example(Shape))
     start, tail = "00:03:25  demo/lab  alert          ", "  |  changed: k_by  |  relation agrees"
     assert report_line(report) == f"{start}k_by −24.7±1.4 %{tail}"
     assert report.verdict is not None
@@ -217,6 +221,12 @@ def test_lines_for_terminals() -> None:
     assert report_line(settled.model_copy(update={"parameters": (sharp,)})) == f"{start}k_by +0.500±0.039 %{tail}"
     blind = report.parameters[0].model_copy(update={"relative_change": None})
     assert report_line(settled.model_copy(update={"parameters": (blind,)})) == f"{start}k_by n/a{tail}"
+    unread = {"level_growth": None, "reason": "y1: changed", "levels": ()}
+    assert report_line(report.model_copy(update={**unread, "shapes": (shape,)})) == f"{start}y1: changed"
+    seen = LevelGrowth.model_validate(example(LevelGrowth))
+    assert report_line(report.model_copy(update={**unread, "shapes": (shape,), "level_growth": seen})).endswith(
+        seen.text
+    )
     just = report.model_copy(update={"verdict": report.verdict.model_copy(update={"current": (), "changed": ()})})
     assert "too little data since the change  |  changed: ?" in report_line(just)
     calm = report.verdict.model_copy(update={"changed": (), "detected": False, "outside_model": True})
