@@ -80,7 +80,9 @@ def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> 
     if share > _TOO_MUCH_REFUSED:
         advice = f"find out why {share:.0%} of the data are missing, and {advice}"
         return told(verdict="refused", text=f"too many gaps: {found}", advice=advice)
-    if used_s < wanted_s or share > _MUCH_REFUSED or refused:
+    # Before its first hop, each recording fills the lags, which costs a hop: six windows are not too few for that.
+    lead_s = sum(one.plan.fresh / one.plan.rate_hz for one in recordings)
+    if used_s + lead_s < wanted_s or share > _MUCH_REFUSED or refused:
         return told(verdict="limited", text=found, advice=advice)
     return told(verdict="passed", text=found)
 
@@ -308,12 +310,13 @@ def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows
             text=text,
             advice="set limits for the levels yourself: the healthy signal of these channels is noise-like",
         )
-    return told(
-        verdict="limited" if seen else "refused",
-        text=text,
-        advice=f"record about {wanted} windows, {wanted * machine.window.length_s:g} s: with fewer, a window "
-        "must differ more from them to be beyond chance",
+    advice = (
+        f"record about {wanted} windows, {wanted * machine.window.length_s:g} s: with fewer, a window must differ more "
+        "from them to be beyond chance"
     )
+    if not seen:
+        advice += "; or give these sensors a location of another name, such as DE: then levels alone are learned"
+    return told(verdict="limited" if seen else "refused", text=text, advice=advice)
 
 
 def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: str | None = None) -> Check:

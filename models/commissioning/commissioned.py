@@ -23,6 +23,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
+from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.misfit import HealthyMisfit
 from models.diagnosis.networks.bundle import MANIFEST, Bundle, load_bundle
@@ -74,9 +75,13 @@ def knowledge_of(machine: MachineFile) -> Knowledge:
     if isinstance(machine, Machine):
         return Knowledge(KnowledgeLevel.FULL, "the machine file gives all parameters of the rotor")
     if rotor is None:
-        return Knowledge(
-            KnowledgeLevel.NONE, "the machine file has no [rotor]: everything is learned from the recordings"
-        )
+        learned = ": everything is learned from the recordings"
+        if all(reason for _, reason in evaluable_rows(states_of(machine), has_phase_reference=True)):
+            learned = (
+                ", and these sensors allow no equation: no part is diagnosed, each channel is only compared with its "
+                "own healthy form"
+            )
+        return Knowledge(KnowledgeLevel.NONE, f"the machine file has no [rotor]{learned}")
     lacking = [name for name in _GEOMETRY if name in rotor.unknown]
     if lacking:
         return Knowledge(

@@ -390,6 +390,8 @@ def unit_factor(quantity: str, unit: str) -> float:
     others = [name for name, units in _UNITS.items() if spelled in units]
     if others:
         raise ValueError(f"unit {unit!r} is a unit of {' or '.join(others)}, not of {quantity}; {accepted}")
+    if quantity == Quantity.SHAFT_ANGLE and spelled in ("rpm", "1/min", "Hz"):
+        accepted += "; a speed is no angle: leave the channel out, and give speed_rpm in [operation] of the machine"
     raise ValueError(f"unit {unit!r} is not known for {quantity}; {accepted}")
 
 

@@ -228,7 +228,8 @@ def _unit(source: Source, column: Column, name: str, quantity: str) -> tuple[str
         try:
             unit_factor(quantity, stated)
         except ValueError as error:
-            raise SourceError(f"{source.path}: column {reference}, channel {name}: {error}") from error
+            volts = "; of a sensor's voltage, give unit and scale in the mapping" if stated in {"V", "mV"} else ""
+            raise SourceError(f"{source.path}: column {reference}, channel {name}: {error}{volts}") from error
         return stated, ""
     if not stated or column.scale != 1 or column.scale_from is not None:
         return column.unit, ""

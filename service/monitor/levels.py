@@ -233,7 +233,7 @@ class LevelWatch:
             alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=small)
 
     def _known(self, levels: ChannelLevels, *, turning: bool, halved: bool) -> ChannelLevels:
-        """The same without what takes the shaft angle, where it is at fault, or both probes of a place, where one is."""
+        """The same without what takes the angle, where it is at fault, or both probes of a place, where one of them is."""
         gone = (set() if turning else _OF_THE_ANGLE) | ({"s_max"} if halved else set())
         usual = turning or not self._several_speeds  # else the reference may be that of another speed
         kept = (one for one in levels.limits if one.measure not in gone and (usual or one.absolute))

@@ -78,6 +78,8 @@ def test_a_machine_file_says_how_much_is_known() -> None:
     without_inertia = PARTIAL.model_copy(update={"rotor": rotor})
     assert knowledge_of(without_inertia).level is KnowledgeLevel.NONE
     assert "lacks I2_kg_m2" in knowledge_of(without_inertia).text
+    at_bearing = [one for one in NOTHING.sensors if one.location != "disc"]
+    assert "allow no equation" in knowledge_of(NOTHING.model_copy(update={"sensors": tuple(at_bearing)})).text
 
 
 @pytest.mark.parametrize("known", [LAB, NOTHING])

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.commissioning.checks import check_agreement, check_lines, check_shapes, check_speed_given
+from models.commissioning.checks import check_agreement, check_data, check_lines, check_shapes, check_speed_given
 from models.commissioning.commission import Commissioning
 from models.diagnosis.misfit import AlternativeTest, Goodness
 from models.diagnosis.readings import Diagnosis, UnbalanceVector, parameter_reading
@@ -142,6 +142,14 @@ def test_what_is_not_fit_is_refused_with_what_to_do(make: Callable[[], Commissio
         assert re.search(words, said[check] if check else made.report.summary)
 
 
+@pytest.mark.parametrize(("hops", "verdict"), [(71, "passed"), (70, "limited")])
+def test_a_file_as_long_as_six_windows_is_enough_although_its_first_hop_fills_the_lags(hops: int, verdict: str) -> None:
+    one = recording(NOTHING, stream(60.0, 51))
+    assert len(one.hops) == 11
+    check = check_data(NOTHING, [replace(one, stretches=((one.hops * 7)[:hops],))])
+    assert check.verdict == verdict
+
+
 def test_one_sensor_for_each_motion_is_enough() -> None:
     assert told_of(of_displacements(("y1", "z1", "y2", "z2", "theta")), "sensors")[0] == "passed"
 
@@ -262,6 +270,7 @@ def test_shapes_without_power_are_no_commissioning(count: int, varies: float, ve
     if verdict == "refused":
         (wanted,) = re.findall(r"record about (\d+) windows", check.advice)
         assert int(wanted) > count
+        assert check.advice.endswith("such as DE: then levels alone are learned")
         then = _shaped(int(wanted), varies).powers(3e-6)
         assert all(then[name].growth <= 8 for name, one in powers.items() if one.windows is not None)
     if verdict == "limited" and varies > 1:

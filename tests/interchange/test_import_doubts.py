@@ -119,6 +119,11 @@ def test_a_unit_in_round_brackets_may_be_left_out_of_the_mapping(tmp_path: Path)
     np.testing.assert_allclose(stretches(recording)[0].samples[:, 0], signals(1000)[1] * 25.4, rtol=1e-9)
 
 
+def test_a_column_of_volts_without_a_unit_in_the_mapping_is_refused_with_what_to_give(tmp_path: Path) -> None:
+    mapping = TEXT.replace('{ column = "x", unit = "um" }', '{ column = "x (V)" }')
+    assert "give unit and scale in the mapping" in fault(tmp_path, GOOD, mapping, "t,x (V),v,a")
+
+
 @pytest.mark.parametrize(
     ("header", "wish", "noted"),
     [("Volts", "", True), ("um pp", "", True), ("Volts", ", scale = 5", False), ("um", "", False)],

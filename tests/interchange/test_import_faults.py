@@ -162,6 +162,12 @@ def test_a_wav_file_that_was_cut_is_refused_with_what_is_there(tmp_path: Path, n
         imported(tmp_path, tmp_path / "run.wav", mapping)
 
 
+def test_a_speed_is_no_shaft_angle(tmp_path: Path) -> None:
+    mapping = TEXT.replace('"a", unit = "rad"', '"a", unit = "rpm"')
+    with pytest.raises(MachineFileError, match=r"'rpm' is not known for shaft_angle.*give speed_rpm in \[operation\]"):
+        imported(tmp_path, table(tmp_path / "run.csv", GOOD), mapping)
+
+
 def test_a_unit_that_contradicts_the_file_is_refused(tmp_path: Path) -> None:
     content = pa.table(dict(zip("txva", signals(1000), strict=True)))
     in_mil = content.schema.set(1, pa.field("x", pa.float64(), metadata={"unit": "mil"}))
