@@ -214,7 +214,8 @@ class ParquetSource(_Table):
         wanted = self._checked(columns)
         for name in wanted:
             kind = self._schema.field(name).type
-            if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_timestamp(kind)):
+            numbers = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_null(kind)
+            if not (numbers or pa.types.is_timestamp(kind)):
                 raise SourceError(f"{self.path}: column {name!r} holds {kind}, expected numbers")
         # With pre_buffer Arrow would keep all that it has read of the file.
         with readable(self.path, self.kind), pa.parquet.ParquetFile(self.path, pre_buffer=False) as file:
@@ -242,4 +243,5 @@ def _array(column: Any) -> Array:
     """An Arrow column as numpy's: nan where a number is missing, NaT where a time is."""
     if pa.types.is_timestamp(column.type):
         return np.asarray(column.cast(pa.timestamp("ns")).to_numpy(zero_copy_only=False))
-    return np.asarray(column.to_numpy(zero_copy_only=False))
+    numbers = column.cast(pa.float64()) if pa.types.is_null(column.type) else column  # of a column without any
+    return np.asarray(numbers.to_numpy(zero_copy_only=False))

@@ -131,9 +131,14 @@ def test_a_file_without_any_numbers_is_refused_for_that(tmp_path: Path, handling
     assert "1000 rows, 1000 of them without numbers, 0 gaps: no stretch is long enough" in told
 
 
-def test_a_channel_of_which_the_file_has_nothing_is_missing_throughout(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_a_channel_of_which_the_file_has_nothing_is_missing_throughout(tmp_path: Path, kind: str) -> None:
     rows = [",".join([t, x, "", a]) for t, x, _, a in (row.split(",") for row in good_rows())]
-    done, recording = imported(tmp_path, table(tmp_path / "run.csv", rows), TEXT.replace("[time]", MISSING))
+    source = table(tmp_path / "run.csv", rows)
+    if kind == "parquet":  # in which such a column has no type
+        content, source = pa.csv.read_csv(source), tmp_path / "run.parquet"
+        pa.parquet.write_table(content, source)
+    done, recording = imported(tmp_path, source, TEXT.replace("[time]", MISSING))
     assert "missing, in whole blocks: y1_dot, 0.5 s from" in "\n".join(summary_lines(done))
     assert np.isnan(samples_of(recording, machine())).all(axis=0).tolist() == [False, True, False]
 
