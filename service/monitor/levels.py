@@ -228,8 +228,9 @@ class LevelWatch:
             held = state in faulty or (explained and not alarms.present(name))
             held |= unlike and (self._by_angle or not fallen(levels))
             beyond = now.beyond and (now.absolute or now.danger or not held)
-            # In the deadband, while a sensor is at fault, or growth cannot be told, an alarm stays as it is.
-            small = now.small and not self._moved and turning
+            # In the deadband, while a sensor is at fault, or growth or s_max cannot be told, an alarm stays as it is.
+            small = now.small and not self._moved and turning and state not in faulty
+            small &= levels.s_max is not None or levels.limit("s_max") is None
             alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=small)
 
     def _known(self, levels: ChannelLevels, *, turning: bool, halved: bool) -> ChannelLevels:

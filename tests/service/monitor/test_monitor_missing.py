@@ -10,6 +10,7 @@ from models.alarm_names import PHASE_REFERENCE
 from models.commissioning.commissioned import Installed, install
 from models.diagnosis.sensors.missing import MissingNumbers
 from models.ingest import Reason
+from models.levels.settings import LevelLimit
 from models.machine import AlarmSettings
 from models.signals.block import SampleBlock
 from models.signals.sensor import Sensor
@@ -83,6 +84,15 @@ def test_the_distance_of_a_shaft_is_not_told_where_one_of_its_two_probes_lacks_n
     assert (told[lacking].overall, told[lacking].s_max, told[other].s_max) == (None, None, None)
     assert told[other].overall is not None
     assert told["y2"].s_max is not None
+
+
+@pytest.mark.parametrize(("measure", "column"), [("overall", 0), ("x1", 0), ("s_max", 1)])
+def test_a_level_alarm_stays_while_numbers_are_missing_of_which_its_level_is_made(measure: str, column: int) -> None:
+    own = LAB.levels.model_copy(update={"limits": (LevelLimit(channel="y1", measure=measure, alert=0.1),)})
+    soon = AlarmSettings(on_delay_s=1.0, off_delay_s=1.0)
+    monitor = MachineMonitor(install(KIT.model_copy(update={"levels": own, "alarms": soon}), None))
+    _, events = feed(monitor, without(column, FROM_S, END_S, end_s=60.0))
+    assert named(events) == [("raised", "level:y1"), ("raised", "data-missing")]
 
 
 def test_a_channel_that_is_not_connected_leaves_the_rotor_diagnosed_as_it_is_without_it() -> None:
