@@ -229,12 +229,11 @@ class LevelWatch:
             held |= unlike and (self._by_angle or not fallen(levels))
             beyond = now.beyond and (now.absolute or now.danger or not held)
             # In the deadband, while a sensor is at fault, or growth or s_max cannot be told, an alarm stays as it is.
-            small = now.small and not self._moved and turning and state not in faulty
-            small &= levels.s_max is not None or levels.limit("s_max") is None
+            small = now.small and not self._moved and turning and state not in halved.union(faulty)
             alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=small)
 
     def _known(self, levels: ChannelLevels, *, turning: bool, halved: bool) -> ChannelLevels:
-        """The same without what takes the angle, where it is at fault, or both probes of a place, where one of them is."""
+        """The same without what takes the angle, where it is at fault, or both probes of a place, where one is."""
         gone = (set() if turning else _OF_THE_ANGLE) | ({"s_max"} if halved else set())
         usual = turning or not self._several_speeds  # else the reference may be that of another speed
         kept = (one for one in levels.limits if one.measure not in gone and (usual or one.absolute))
