@@ -74,6 +74,8 @@ def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> 
     wanted_s = _FEW_WINDOWS * machine.window_data_s
     advice = f"record at least {_FEW_WINDOWS * window.length_s:g} s without interruption, in one or several files"
     if hops < _FEWEST_HOPS:
+        if refused:
+            advice = f"import again if the channels of the machine file have changed since, or {advice}"
         return told(verdict="refused", text=f"too short: {found}", advice=advice)
     span_s = sum((one.hops[-1].end_ns - one.hops[0].start_ns) / 1e9 for one in recordings if one.hops)
     share = missing_s / span_s
@@ -315,7 +317,10 @@ def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows
         "from them to be beyond chance"
     )
     if not seen:
-        advice += "; or give these sensors a location of another name, such as DE: then levels alone are learned"
+        advice += (
+            "; or give these sensors a location of another name, such as DE, and import or record again: then levels "
+        )
+        advice += "alone are learned"
     return told(verdict="limited" if seen else "refused", text=text, advice=advice)
 
 

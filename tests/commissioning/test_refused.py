@@ -10,9 +10,11 @@ import pytest
 
 from models.commissioning.checks import check_agreement, check_data, check_lines, check_shapes, check_speed_given
 from models.commissioning.commission import Commissioning
+from models.commissioning.healthy import HealthyRecording
 from models.diagnosis.misfit import AlternativeTest, Goodness
 from models.diagnosis.readings import Diagnosis, UnbalanceVector, parameter_reading
 from models.diagnosis.shape import HealthyShape
+from models.diagnosis.window.moments import plan_for
 from models.machine import MachineFile, Operation
 from models.signals.block import FloatArray, SampleBlock
 from simulator.scenario import Event
@@ -150,6 +152,13 @@ def test_a_file_as_long_as_six_windows_is_enough_although_its_first_hop_fills_th
     assert check.verdict == verdict
 
 
+def test_blocks_of_other_channels_are_imported_again() -> None:
+    check = check_data(
+        NOTHING, [HealthyRecording("monday.mcap", plan_for(NOTHING), (), 0, 0.0, (("schema", 9),), "hash")]
+    )
+    assert check.advice.startswith("import again if the channels of the machine file have changed since, or record")
+
+
 def test_one_sensor_for_each_motion_is_enough() -> None:
     assert told_of(of_displacements(("y1", "z1", "y2", "z2", "theta")), "sensors")[0] == "passed"
 
@@ -270,7 +279,7 @@ def test_shapes_without_power_are_no_commissioning(count: int, varies: float, ve
     if verdict == "refused":
         (wanted,) = re.findall(r"record about (\d+) windows", check.advice)
         assert int(wanted) > count
-        assert check.advice.endswith("such as DE: then levels alone are learned")
+        assert check.advice.endswith("such as DE, and import or record again: then levels alone are learned")
         then = _shaped(int(wanted), varies).powers(3e-6)
         assert all(then[name].growth <= 8 for name, one in powers.items() if one.windows is not None)
     if verdict == "limited" and varies > 1:
