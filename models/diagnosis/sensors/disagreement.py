@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from models.diagnosis.sensors.kinematics import Banded, PairReading, banded, gain_course, same
+from models.diagnosis.sensors.kinematics import Banded, PairReading, banded, gain_courses, same
 from models.diagnosis.sensors.reference import Naming, SensorReference
 from models.diagnosis.window.motion import MotionPair, motion_pairs
 from models.diagnosis.window.statistics import WindowStatistics
@@ -82,10 +82,13 @@ def _departure(
         gain, delay, polarity = gain - known.log_gain, delay - known.delay_s, known.polarity
         gain_error = float(np.hypot(gain_error, known.log_gain_spread))
         delay_error = float(np.hypot(delay_error, known.delay_spread_s))
-    course, error = gain_course(window, reading, bands)
-    step, z = _largest_part(course, error)
+    courses = gain_courses(window, reading, bands)
+    parts = [_largest_part(*one) for one in courses]
+    step, z = min(parts, key=lambda part: part[1])
+    if len({part[0] > 0 for part in parts}) > 1:
+        step, z = 0.0, 0.0  # the noise of one of the two has changed
     return _Departure(
-        reading, gain, abs(gain) / gain_error, delay, abs(delay) / delay_error, course, step, z,
+        reading, gain, abs(gain) / gain_error, delay, abs(delay) / delay_error, courses[0][0], step, z,
         known is not None, reading.polarity != polarity,
     )  # fmt: skip
 

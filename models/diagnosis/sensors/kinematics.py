@@ -287,25 +287,41 @@ def _transfer(bands: Banded, incoherent: FloatArray) -> tuple[ComplexArray, Floa
     return h, variance / explained, left
 
 
-def gain_course(window: WindowStatistics, reading: PairReading, bands: Banded) -> tuple[FloatArray, FloatArray]:
-    """Relative deviation of the pair's gain from its mean, hop by hop, and the standard error of each hop.
+def gain_courses(
+    window: WindowStatistics, reading: PairReading, bands: Banded
+) -> tuple[tuple[FloatArray, FloatArray], ...]:
+    """Relative deviation of the pair's gain from its mean, hop by hop, and each hop's standard error, in two ways.
 
     The noise of the sensors stays as it is while the motion comes and goes: where a machine runs down it is more and
     more of what they show, and where a line of its own begins it is less. The ratio of a hop follows, and is less
     certain. A band in which the usual hop shows nothing but noise does not say what has become of the gain.
+
+    The first way takes what the sensors share over the power of the first, which more noise of the first makes smaller,
+    the second over that of the second: a change of the gain is in both, and one of a sensor's noise in one of them.
     """
     number = motion_pairs(window.states).index(reading.pair)
     z, v = bands.total[:, 0, 0].real, bands.total[:, 1, 1].real
     incoherent = np.maximum(1 - np.abs(bands.total[:, 1, 0]) ** 2 / (z * v), _FLOOR)
     aligned = reading.transfer(bands.w).conj() / np.exp(reading.log_gain)
     powers = np.stack([hop[number] for hop in window.pair_powers])
-    own = np.maximum(powers[:, :, 0].real, np.finfo(float).tiny)
-    ratio = np.real(aligned * powers[:, :, 1]) / own
+    common = np.real(aligned * powers[:, :, 1])
+    averages = bands.averages / len(powers)
+    over_first = _course(common, powers[:, :, 0].real, incoherent, averages)
+    falls, error = _course(common, powers[:, :, 2].real, incoherent, averages)
+    return over_first, (-falls, error)
+
+
+def _course(
+    common: FloatArray, power: FloatArray, incoherent: FloatArray, averages: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Relative deviation of a ratio of powers, shape (n_hops, n_bands), over all bands; standard error of each hop."""
+    own = np.maximum(power, np.finfo(float).tiny)
+    ratio = common / own
     # Each band about its own mean: what noise takes from the ratio is the same in all hops that are as loud.
     course = ratio / np.median(ratio, axis=0) - 1
     noise = np.minimum(incoherent * own.mean(axis=0) / own, 1.0)
     kept = np.maximum(1 - noise, 1e-6)
-    variance = noise / kept / (bands.averages / len(powers))
+    variance = noise / kept / averages
     weight = 1 / np.maximum(variance, np.median(variance, axis=0))
     total = weight.sum(axis=1)
     by_noise = np.sum(weight * (kept / np.median(kept, axis=0) - 1), axis=1) / total

@@ -422,6 +422,16 @@ def test_a_line_of_the_machine_that_begins_where_sensors_showed_noise_is_no_gain
     assert found_in(samples) == found_in(samples, reference_of("lab")) == ()
 
 
+@pytest.mark.parametrize("state", ["y1", "y1_dot"])
+@pytest.mark.parametrize(("from_s", "part"), [(50.0, 0.5), (25.0, 0.5), (25.0, 1.0)])
+def test_noise_that_begins_in_one_channel_is_no_gain_that_drifts(state: str, from_s: float, part: float) -> None:
+    plan, samples = plan_of("lab"), recorded("lab", 31).copy()
+    noisy = samples[round(from_s * plan.rate_hz) :, plan.states.index(state)]
+    noisy += part * noisy.std() * np.random.default_rng([31, 9]).standard_normal(noisy.size)
+    kinds = {finding.kind for finding in found_in(samples, reference_of("lab"))}
+    assert kinds <= {"noise", "incoherent"}
+
+
 def test_a_machine_that_moves_more_is_no_sensors_fault() -> None:
     samples = of_displacements(recorded("lab", 23))
     samples[70_000:, :4] *= 1.5
