@@ -161,8 +161,9 @@ def _left_out(path: Path, files: tuple[SnapshotFile, ...]) -> list[str]:
 
 
 def _nothing(path: Path, machine: MachineFile, read: Read, written: Written, cut_rows: int) -> str:
-    lost = read.left_out + written.none_whole
-    without = f", {lost} of them without numbers" if lost else ""
+    without = f", {read.left_out} of them without numbers" if read.left_out else ""
+    if written.none_whole:  # counted at the machine's rate
+        without += f", {written.none_whole} samples in blocks in which every channel lacks numbers"
     ends = f", {cut_rows} of them at the ends where filters settle" if cut_rows else ""
     return (
         f"{path}: {read.rows} rows{without}, {len(read.gaps)} gaps: no stretch is long enough{ends}; expected at least "

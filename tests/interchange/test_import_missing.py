@@ -1,6 +1,7 @@
 """Where a file lacks numbers of single channels, these are told as missing, and the others imported and evaluated."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -120,7 +121,9 @@ def test_where_every_channel_is_missing_there_is_a_gap(tmp_path: Path) -> None:
     assert "gaps: 1, 0.005 s in all" in told
     assert "beyond the dtype in every channel: 10" in told
     assert "samples left out in blocks in which every channel lacks numbers: 200" in told
-    assert done.written.samples == 1000 - 10 - 200
+    assert "shaft angle: 1320 rpm on average" in told
+    assert done.written.lengths == [250, 400, 140]
+    assert np.diff([block.sequence for block in blocks_of(recording, machine())]).tolist() == [1, 2, 1, 2]
     assert np.isfinite(samples_of(recording, machine())).all()
 
 
@@ -129,6 +132,14 @@ def test_a_file_without_any_numbers_is_refused_for_that(tmp_path: Path, handling
     mapping = TEXT.replace("[time]", MISSING.replace("missing", handling))
     told = fault(tmp_path, [f"{row.split(',')[0]},,," for row in good_rows()], mapping)
     assert "1000 rows, 1000 of them without numbers, 0 gaps: no stretch is long enough" in told
+
+
+def test_a_file_in_which_every_channel_lacks_numbers_in_every_block_is_refused_for_that(tmp_path: Path) -> None:
+    rows = [row.split(",") for row in good_rows()]
+    for number, row in enumerate(rows):
+        row[1 + number % 3] = ""
+    told = fault(tmp_path, [",".join(row) for row in rows], TEXT.replace("[time]", MISSING))
+    assert "1000 rows, 1000 samples in blocks in which every channel lacks numbers, 0 gaps: no stretch" in told
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
@@ -179,7 +190,8 @@ def test_what_filters_make_of_missing_numbers_is_missing_and_the_rest_as_without
     dead = slice(int(50 * rate_hz), int(51 * rate_hz))  # seen by two of the filter's windows at the higher rate
     gravity[dead], x[dead.start + 7] = np.nan, np.nan
     gravity[: int(rate_hz)] = np.nan
-    _, recording = imported(tmp_path, archive(tmp_path, x=x, a=a, g=gravity), mapping)
+    done, recording = imported(tmp_path, archive(tmp_path, x=x, a=a, g=gravity), mapping)
+    assert re.search("missing, in whole blocks: y1_dot, .* s in 2 stretches from", "\n".join(summary_lines(done)))
     samples = samples_of(recording, machine())
     lost = np.isnan(samples)
     assert lost.any(axis=0).tolist() == [True, True, False]
