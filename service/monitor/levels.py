@@ -70,6 +70,7 @@ class LevelWatch:
         self._moved, self._moved_ns = False, 0  # from when on all has been at about the newest speed
         self.latest: tuple[ChannelLevels, ...] = ()  # of the latest window; empty before the first hop
         self._found: WindowLevels | None = None
+        self._to_learn: tuple[int, int, WindowLevels] | None = None  # if the shaft angle is in order
         self._states = [state_name(channel) for channel in channels]
         self._machine = machine
         self._hop_ns = round(machine.window.hop_s * 1e9)
@@ -92,6 +93,7 @@ class LevelWatch:
 
     def take(self, window: SlidingWindow, missing: Collection[str] = ()) -> None:
         """Take the levels of the window as it is after a hop, in which some channels lacked numbers."""
+        self._to_learn = None
         found = window.levels(errors=self._takes_first and self._first.learning)
         if found is None:
             return
@@ -100,7 +102,8 @@ class LevelWatch:
         self._found = found
         stood = any(abs(hop.turned_rad) < _STILL_RAD for hop in window.hops)  # not where there is no angle: nan
         if self._takes_first and window.filled == 1 and not stood:
-            self._first.take(window.hops[0].start_ns, window.hops[-1].end_ns, found.without(columns, self._pairs))
+            learned = found.without(columns, self._pairs)
+            self._to_learn = window.hops[0].start_ns, window.hops[-1].end_ns, learned
 
     def _at(self, states: Collection[str]) -> list[int]:
         """Columns of some channels."""
@@ -214,9 +217,11 @@ class LevelWatch:
             beside them. What is raised already stays, and a danger is always told.
         """
         evidence = Evidence(start_ns=end_ns - self._hop_ns, end_ns=end_ns)
+        turning = "theta" not in faulty
+        if turning and self._to_learn is not None:
+            self._first.take(*self._to_learn)
         known = () if self.reference is None else self.reference.states
         unlike = standing and all(one.speed_rad_s is not None for one in known)
-        turning = "theta" not in faulty
         pairs = ((self._states[first], self._states[second]) for first, second in self._pairs)
         halved = {pair[0] for pair in pairs if not set(pair).isdisjoint(faulty)}
         self.latest = tuple(

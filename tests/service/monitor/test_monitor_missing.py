@@ -133,8 +133,22 @@ def test_a_phase_reference_that_is_lost_is_all_that_is_wrong(lost: float) -> Non
         for report in done.windows:
             levels[bool(report.sensors)] += report.levels
     assert told == {PHASE_REFERENCE}
-    assert {(one.x1, one.x1_phase_lag_deg, one.not_x1) for one in levels[True]} == {(None, None, None)}
+    turning = [(one.x1, one.x1_phase_lag_deg, one.x2, one.x2_phase_lag_deg, one.not_x1) for one in levels[True]]
+    assert set(turning) == {(None,) * 5}
     assert None not in {one.overall for one in levels[True]} | {one.x1 for one in levels[False]}
+
+
+@pytest.mark.parametrize("lost", [np.nan, 1.0])
+def test_first_windows_in_which_the_angle_was_lost_are_no_reference(lost: float) -> None:
+    """The speed seems another one in them."""
+    first = LAB.levels.model_copy(update={"reference": "first windows", "reference_windows": 2})
+    monitor = MachineMonitor(install(KIT.model_copy(update={"levels": first}), None))
+    feed(monitor, without(THETA, 25.0, 26.0, lost, end_s=80.0))
+    reference = monitor._levels.reference
+    assert reference is not None
+    (state,) = reference.states
+    assert state.windows == 2
+    assert state.speed_rad_s == pytest.approx((LAB.operation.speed_rad_s,) * 2)
 
 
 def at_speed(rpm: float, end_s: float) -> Sequence[SampleBlock]:
