@@ -121,8 +121,6 @@ class LevelJudge:
             turned = 1.0 if levels.speed_rad_s >= 0 else -1.0
             values[-2:] = np.degrees(-turned * np.angle(vectors[1:3])) % 360
         values[:, [*missing]] = np.nan
-        halved = [first for first, second in self._plan.pairs if second in missing]  # seen in one direction alone
-        values[_ROW["s_max"], halved] = np.nan
         shown = all_rounded(values.T)
         return tuple(
             self._channel(column, own, dict(zip(_SHOWN, shown[column], strict=True)), levels, alike, grown[column])
