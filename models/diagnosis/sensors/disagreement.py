@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from models.diagnosis.sensors.kinematics import Banded, PairReading, banded, gain_courses, same
+from models.diagnosis.sensors.kinematics import Banded, PairReading, banded, delay_course, gain_courses, same
 from models.diagnosis.sensors.reference import Naming, SensorReference
 from models.diagnosis.window.motion import MotionPair, motion_pairs
 from models.diagnosis.window.statistics import WindowStatistics
@@ -61,12 +61,16 @@ def gain_and_delay(
         least_gain = LEAST_GAIN_CHANGE if departure.known else LEAST_GAIN
         least_delay = LEAST_DELAY_CHANGE_S if departure.known else LEAST_DELAY_S
         steady = departure.gain_z > MOST_ERRORS and abs(np.expm1(departure.log_gain)) > least_gain
+        late = departure.delay_z > MOST_ERRORS and abs(departure.delay_s) > least_delay
+        if late:  # of two delays in turn, the mean is smaller than either, and passes for a gain
+            step_s, z = _largest_part(*delay_course(window, departure.reading, bands[departure.reading.pair]))
+            steady &= not (z > MOST_ERRORS and abs(step_s) > least_delay)
         moving = departure.course_z > MOST_ERRORS and abs(departure.course_step) > LEAST_COURSE
         if steady or moving or departure.reversed:
             findings.append(_gain(window, departure, departures, naming, reference, moving=moving and not steady))
         if not departure.known and abs(departure.reading.lead_rad_s) > MOST_LEAD_RAD_S:
             findings.append(_ahead(window, departure.reading, bands[departure.reading.pair], naming))
-        elif departure.delay_z > MOST_ERRORS and abs(departure.delay_s) > least_delay:
+        elif late:
             findings.append(_delay(window, departure, departures, naming, rate_hz))
     return _once(findings)
 

@@ -327,3 +327,15 @@ def _course(
     by_noise = np.sum(weight * (kept / np.median(kept, axis=0) - 1), axis=1) / total
     error = np.sqrt(1 / (2 * total) + by_noise**2)
     return np.asarray(np.sum(course * weight, axis=1) / total, dtype=np.float64), np.asarray(error, dtype=np.float64)
+
+
+def delay_course(window: WindowStatistics, reading: PairReading, bands: Banded) -> tuple[FloatArray, FloatArray]:
+    """By how much the second comes later than the reading says, hop by hop, and the standard error of each hop, s."""
+    number = motion_pairs(window.states).index(reading.pair)
+    powers = np.stack([hop[number] for hop in window.pair_powers])
+    common = powers[:, :, 1] * reading.transfer(bands.w).conj()
+    coherent = np.abs(common) ** 2 / np.maximum(powers[:, :, 0].real * powers[:, :, 2].real, np.finfo(float).tiny)
+    weight = coherent / np.maximum(1 - coherent, _FLOOR) * bands.w**2 * bands.averages / len(powers)
+    total = weight.sum(axis=1)
+    course = -np.sum(weight * np.angle(common) / bands.w, axis=1) / total
+    return np.asarray(course, dtype=np.float64), np.asarray(np.sqrt(1 / (2 * total)), dtype=np.float64)

@@ -422,6 +422,16 @@ def test_a_line_of_the_machine_that_begins_where_sensors_showed_noise_is_no_gain
     assert found_in(samples) == found_in(samples, reference_of("lab")) == ()
 
 
+@pytest.mark.parametrize(("seed", "one_source"), [(5, True), (24, False)])
+def test_a_channel_that_begins_to_come_late_has_no_wrong_gain_besides(seed: int, *, one_source: bool) -> None:
+    """Of two delays in turn, the mean of the transfer is smaller than either."""
+    plan, samples = plan_of("lab"), recorded("lab", seed, one_source=one_source).copy()
+    column, late, start = plan.states.index("y2_dot"), round(4e-3 * plan.rate_hz), round(15 * plan.rate_hz)
+    samples[start:, column] = samples[start - late : -late, column]
+    (finding,) = found_in(samples, reference_of("lab"))
+    assert (finding.states, finding.kind) == (("y2_dot",), "delay")
+
+
 @pytest.mark.parametrize("state", ["y1", "y1_dot"])
 @pytest.mark.parametrize(("from_s", "part"), [(50.0, 0.5), (25.0, 0.5), (25.0, 1.0)])
 def test_noise_that_begins_in_one_channel_is_no_gain_that_drifts(state: str, from_s: float, part: float) -> None:
