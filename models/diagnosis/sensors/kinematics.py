@@ -336,6 +336,6 @@ def delay_course(window: WindowStatistics, reading: PairReading, bands: Banded) 
     common = powers[:, :, 1] * reading.transfer(bands.w).conj()
     coherent = np.abs(common) ** 2 / np.maximum(powers[:, :, 0].real * powers[:, :, 2].real, np.finfo(float).tiny)
     weight = coherent / np.maximum(1 - coherent, _FLOOR) * bands.w**2 * bands.averages / len(powers)
-    total = weight.sum(axis=1)
+    total = np.maximum(weight.sum(axis=1), np.finfo(float).tiny)  # a hop in which one of them is dead says nothing
     course = -np.sum(weight * np.angle(common) / bands.w, axis=1) / total
     return np.asarray(course, dtype=np.float64), np.asarray(np.sqrt(1 / (2 * total)), dtype=np.float64)

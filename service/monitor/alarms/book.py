@@ -129,7 +129,7 @@ class AlarmBook:
         # While the window holds the moment at which a bearing changed, their means are not those of one machine: near a
         # resonance an unbalance would fit them.
         bearings = set(named) - {"e", "EI"}
-        moves = {"k_by", "k_bz"} <= bearings or (bearings != set() and not verdict.settled)
+        unlike = {"k_by", "k_bz"} <= bearings or (bearings != set() and not verdict.settled)
         start_ns = end_ns - round(verdict.decided_s * 1e9)
         evidence = Evidence(start_ns=start_ns, end_ns=end_ns, confidence=verdict.confidence)
         for reading in verdict.current:
@@ -149,7 +149,7 @@ class AlarmBook:
                     low_confidence=verdict.outside_model
                     or hidden
                     or held_stiff
-                    or (moves and (reading.name, reading.by) == ("e", BaselineDiagnostician.by)),
+                    or (unlike and (reading.name, reading.by) == ("e", BaselineDiagnostician.by)),
                     growth=larger if reading.name == "e" else None,
                     evidence=evidence,
                     note=_HELD if held_stiff else "" if reading.vector is None else reading.vector.text,
