@@ -129,7 +129,13 @@ class AlarmBook:
         # While the window holds the moment at which a bearing changed, their means are not those of one machine: near a
         # resonance an unbalance would fit them.
         bearings = set(named) - {"e", "EI"}
-        unlike = {"k_by", "k_bz"} <= bearings or (bearings != set() and not verdict.settled)
+        # It moves as well where only one of them, or the unbalance in their place, is named, and both read softer.
+        softer = {
+            one.name
+            for one in verdict.current
+            if one.relative_change is not None and one.relative_change < -Z95 * (one.standard_error or math.inf)
+        }
+        unlike = {"k_by", "k_bz"} <= bearings | softer or (bearings != set() and not verdict.settled)
         start_ns = end_ns - round(verdict.decided_s * 1e9)
         evidence = Evidence(start_ns=start_ns, end_ns=end_ns, confidence=verdict.confidence)
         for reading in verdict.current:

@@ -261,6 +261,22 @@ def test_an_unbalance_beside_bearings_without_parameters_is_named_with_reserve(
     assert named == dict.fromkeys(others, False) | {"e": reserve}
 
 
+@pytest.mark.parametrize(
+    ("vertical", "by", "reserve"),
+    [(-0.14, "baseline", True), (-0.03, "baseline", False), (0.2, "baseline", False), (-0.14, "likelihood", False)],
+)
+def test_an_unbalance_is_named_with_reserve_while_both_bearing_stiffnesses_read_softer(
+    vertical: float, by: str, *, reserve: bool
+) -> None:
+    """As of a foundation that has gone soft, where the unbalance happened to explain the window better."""
+    book, found = AlarmBook(SETTINGS), verdict({"e": 1.0, "k_by": 0.1, "k_bz": 0.1})
+    changes = {"e": 0.17, "k_by": -0.3, "k_bz": vertical}
+    current = tuple(one.model_copy(update={"by": by, "relative_change": changes[one.name]}) for one in found.current)
+    for number in range(3):
+        book.found(found.model_copy(update={"current": current}), "", "", number * 5_000_000_000)
+    assert {event.alarm.name: event.alarm.low_confidence for event in book.take()} == {"e": reserve}
+
+
 def test_a_name_is_held_with_reserve_once_nothing_explains_the_machine() -> None:
     book, named = AlarmBook(SETTINGS), verdict({"c_bz": 0.97})
     unexplained = named.model_copy(update={"current": (), "candidates": (), "outside_model": True})
