@@ -125,16 +125,16 @@ class AlarmBook:
         sure = {one for one in named if not nameless and probability.get(one, 0.0) >= self._settings.name_confidence}
         held = {*named, *(one for one, likely in probability.items() if likely >= _TAKEN_BACK)}
         # Without parameters the unbalance is read through the stiffness to ground at running speed. Where that has
-        # changed in both planes, what the bearings stand on may move, and it is another one than at other frequencies.
-        # While the window holds the moment at which a bearing changed, their means are not those of one machine: near a
-        # resonance an unbalance would fit them.
-        bearings = set(named) - {"e", "EI"}
-        # It moves as well where only one of them, or the unbalance in their place, is named, and both read softer.
+        # changed in both planes, what the bearings stand on may move, and it is another one than at other frequencies;
+        # so too where only one of them, or the unbalance in their place, is named, and both read softer.
         softer = {
             one.name
             for one in verdict.current
             if one.relative_change is not None and one.relative_change < -Z95 * (one.standard_error or math.inf)
         }
+        # While the window holds the moment at which a bearing changed, their means are not those of one machine: near a
+        # resonance an unbalance would fit them.
+        bearings = set(named) - {"e", "EI"}
         unlike = {"k_by", "k_bz"} <= bearings | softer or (bearings != set() and not verdict.settled)
         start_ns = end_ns - round(verdict.decided_s * 1e9)
         evidence = Evidence(start_ns=start_ns, end_ns=end_ns, confidence=verdict.confidence)
