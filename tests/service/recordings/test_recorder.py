@@ -54,7 +54,7 @@ def into(directory: Path, **fields: float) -> RecordingSettings:
 
 @contextmanager
 def recording(directory: Path, **fields: float) -> Iterator[MachineRecorder]:
-    recorder = MachineRecorder(LAB, into(directory, **fields), lambda _: ())
+    recorder = MachineRecorder(LAB, into(directory, **fields), lambda _: (), now_ns=lambda: NOW_NS)
     recorder.start()
     try:
         yield recorder
@@ -175,7 +175,7 @@ def test_files_are_closed_by_age_also_when_nothing_more_comes(tmp_path: Path) ->
         time_s[0] += 0.1  # or a message written after the last second would never be confirmed
         return time_s[0]
 
-    recorder = MachineRecorder(LAB, into(tmp_path, rotate_s=300), lambda _: (), clock=clock)
+    recorder = MachineRecorder(LAB, into(tmp_path, rotate_s=300), lambda _: (), clock, lambda: NOW_NS)
     recorder.start()
     put(recorder, blocks(3))
     until(lambda: recorder.status().synced == 3, "confirmed messages")
