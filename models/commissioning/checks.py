@@ -319,8 +319,8 @@ def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows
     if not seen:
         advice += (
             "; or give these sensors a location of another name, such as DE, and import or record again: then levels "
+            "alone are learned"
         )
-        advice += "alone are learned"
     return told(verdict="limited" if seen else "refused", text=text, advice=advice)
 
 

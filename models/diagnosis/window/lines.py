@@ -102,7 +102,7 @@ def _beside_multiples(
     """The strongest line that is certain beside each multiple of the speed, where this is steady.
 
     `every` is of shape (n_segments, n_bins, n_states + n_regressors), the power of a bin, `mean`, of shape (n_bins,
-    n_states). The noise is that of bins around a multiple that it does not reach, and a line beside it only few of.
+    n_states). The noise is the median of bins around a multiple: it reaches none of them, and a line beside it few.
     """
     if window.speed_source != "phase reference" or window.removed_by_hop:
         return
