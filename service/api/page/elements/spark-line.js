@@ -38,7 +38,10 @@ const seen = new IntersectionObserver((entries) => {
   for (const { target, isIntersecting } of entries) /** @type {SparkLine} */ (target).seen(isIntersecting);
 });
 
-/** The last 24 h of one reading, without numbers: `<spark-line place quantity series>`. */
+/**
+ * The last 24 h of one reading, without numbers: `<spark-line place quantity series range>`. What lies within `range`,
+ * two numbers, is shown in any case: scatter far from a limit looks like scatter.
+ */
 class SparkLine extends MachineElement {
   #drawn = -Infinity;
   #visible = false;
@@ -79,8 +82,9 @@ class SparkLine extends MachineElement {
   draw({ starts_ns: starts, means }) {
     if (starts.length < 2) return this.replaceChildren();
     this.#drawn = performance.now();
+    const within = (this.getAttribute("range") ?? "").split(" ").filter(Boolean).map(Number);
     const [first, last] = [starts[0], starts[starts.length - 1]];
-    const [low, high] = [Math.min(...means), Math.max(...means)];
+    const [low, high] = [Math.min(...means, ...within), Math.max(...means, ...within)];
     const x = (/** @type {number} */ ns) => 2 + ((WIDTH - 4) * (ns - first)) / (last - first);
     const y = (/** @type {number} */ value) => HEIGHT - 3 - ((HEIGHT - 6) * (value - low)) / (high - low || 1);
     const longest = GAP * shortest(starts);

@@ -5,7 +5,7 @@ import { figure, percent, printed, quantity, shownIn, within, Z95 } from "./figu
 /** @typedef {import("./records.js").Alarm} Alarm */
 /** @typedef {import("./records.js").ChannelLevels} ChannelLevels */
 /** @typedef {import("./records.js").LevelLimits} LevelLimits */
-/** @typedef {{title: string, value: string, limit: string, quantity: string, series: string}} Worst */
+/** @typedef {{title: string, value: string, limit: string, quantity: string, series: string, range: number[]}} Worst */
 
 /** Every state of a machine in words, the most urgent first. @type {Record<string, string>} */
 export const STATES = {
@@ -81,6 +81,7 @@ function levels(health) {
         limit: limitText(/** @type {LevelLimits} */ (limit), one) || "no limit",
         quantity: "level",
         series: `${one.channel}:${limit.measure}`,
+        range: limit.alert === null ? [] : [0, limit.alert],
         nearness: beyond + (limit.alert ? value / limit.alert : 0),
       };
     });
@@ -98,7 +99,7 @@ function parameters(health) {
     if (change === null || error === null || !name) return [];
     const seen = report.detectable.find((one) => one.name === name);
     const least = seen && (change < 0 ? seen.loss : seen.gain);
-    return [{ title: text ?? name, value: within(change, Z95 * error), limit: least ? `detectable from ${percent(least)}` : "", quantity: "parameter", series: name, nearness: least ? change / least : 0 }];
+    return [{ title: text ?? name, value: within(change, Z95 * error), limit: least ? `detectable from ${percent(least)}` : "", quantity: "parameter", series: name, range: seen ? [seen.loss, seen.gain] : [], nearness: least ? change / least : 0 }];
   });
 }
 
@@ -115,5 +116,5 @@ export function worst(health) {
   if (!alarm) return health.state === "not-evaluable" ? null : (found[0] ?? null); // why it is not comes before a level of a machine that stands
   const same = found.find((one) => one.series === alarm.name || `level:${one.series}`.startsWith(`${alarm.name}:`));
   const value = alarm.relative_change !== null && alarm.standard_error !== null ? within(alarm.relative_change, Z95 * alarm.standard_error) : "";
-  return { title: alarm.text, value: same?.value ?? value, limit: same?.limit ?? "", quantity: same?.quantity ?? "", series: same?.series ?? "" };
+  return { title: alarm.text, value: same?.value ?? value, limit: same?.limit ?? "", quantity: same?.quantity ?? "", series: same?.series ?? "", range: same?.range ?? [] };
 }

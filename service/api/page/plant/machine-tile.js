@@ -57,6 +57,7 @@ class MachineTile extends MachineElement {
     this.#count.textContent = unseen ? `${unseen} unacknowledged` : standing ? `${standing} acknowledged` : "no alarm";
     const line = this.#line.firstElementChild;
     if ((line?.getAttribute("series") ?? "") !== (found?.series ?? "")) lay(this.#line, found?.series && html("spark-line", { place: this.place, quantity: found.quantity, series: found.series }));
+    this.#line.firstElementChild?.setAttribute("range", (found?.range ?? []).join(" "));
     this.age();
   }
 

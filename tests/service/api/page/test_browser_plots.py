@@ -125,17 +125,22 @@ def test_the_drawing_turns_the_unbalance_and_names_the_sensor_at_fault(browser: 
         expect(drawing.locator("g.part", has_text="c_by")).to_contain_text("too little data yet")
 
 
-def test_the_line_of_a_tile_breaks_where_data_lack(browser: Browser, runtime: Runtime) -> None:
+@pytest.mark.parametrize(("part", "least", "most"), [(1.0, 20.0, 22.0), (1e-4, 0.0, 0.5)])
+def test_the_line_of_a_tile_breaks_where_data_lack_and_is_flat_where_nothing_could_be_detected(
+    browser: Browser, runtime: Runtime, part: float, least: float, most: float
+) -> None:
     trend = {"site": "demo", "machine": "lab", "quantity": "parameter", "name": "k_by", "length_ns": 10**9}
     starts = [at * 10**9 for at in (0, 1, 2, 4, 30, 60, 61)]  # 4: one bucket without a reading is no gap
-    told = trend | {"starts_ns": starts, "means": [0.0, 0.1, 0.2, 0.2, 0.3, 0.4, 0.5]}
+    told = trend | {"starts_ns": starts, "means": [part * mean for mean in (0.0, 0.1, 0.2, 0.2, 0.3, 0.4, 0.5)]}
     with looking(browser, runtime.http_url) as page:
         page.route("**/api/v1/trends?*", lambda route: route.fulfill(json={"trends": [told]}))
         page.goto(f"{runtime.http_url}/#/")
         lines = page.locator("spark-line polyline")
         expect(lines).to_have_count(3)
-        points = [len((line.get_attribute("points") or "").split()) for line in lines.all()]
-        assert points == [4, 2, 2]  # the one alone is a dot
+        points = [(line.get_attribute("points") or "").split() for line in lines.all()]
+        assert [len(one) for one in points] == [4, 2, 2]  # the one alone is a dot
+        rise = float(points[0][0].partition(",")[2]) - float(points[2][1].partition(",")[2])
+        assert least <= rise <= most  # of 22: all of it that lies beyond what could be detected
 
 
 def test_a_plant_is_measured(
