@@ -9,9 +9,10 @@ import numpy as np
 
 from models.diagnosis.readings import Diagnosis, no_reading
 from models.diagnosis.sensors.level import at_range_end
-from models.diagnosis.sensors.reference import Naming
+from models.diagnosis.sensors.reference import Naming, implicated
 from models.diagnosis.verdict.calibration import agreements
 from models.diagnosis.verdict.sequential import SequentialTest
+from models.diagnosis.window.moments import Plan
 from models.diagnosis.window.rotation import LEAST_SETTLED, STRONG
 from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
@@ -43,12 +44,15 @@ class Evaluation:
     gyroscopic: Literal["", "opposite"] = ""  # where it is not that of Eq. (27): sense of the moments in theory
     alone: bool = False  # whether only later windows can say that this one is astride a change
 
-    def calm(self, *, outside: bool) -> HealthState:
-        """State without raised alarms: healthy only if something was read that could have said otherwise."""
+    def calm(self, *, outside: bool, without: bool = False) -> HealthState:
+        """State without raised alarms: healthy only if something was read that could have said otherwise.
+
+        Not if it was read `without` some of the sensors: those that are at fault come first.
+        """
         if outside:
             return HealthState.OUTSIDE_MODEL
         if self.deciding.evaluable:
-            return HealthState.HEALTHY
+            return HealthState.DATA_HEALTH if without else HealthState.HEALTHY
         states = {shape.verdict for shape in self.shapes}
         if "not changed" in states and "changed" not in states:
             return HealthState.UNCHANGED
@@ -158,6 +162,13 @@ class WindowEvaluator(ABC):
             If the window cannot be evaluated: outside the speed range, speed not steady, no fluctuation in a channel.
         """
 
+    def usable(self, window: WindowStatistics, plan: Plan, findings: Sequence[SensorFault]) -> WindowStatistics | None:
+        """The part of a window that can be evaluated although these sensors are at fault; None if there is none.
+
+        A fault of a channel elsewhere says nothing of the equations, but it is all there is where they are none.
+        """
+        return window if not findings or (plan.states and implicated(findings).issubset(plan.others)) else None
+
     def heard(self, findings: Sequence[SensorFault]) -> None:
         """Take note of what is wrong with the sensors: what an angle that jumped costs stays lost."""
         self.directed &= ("theta", FaultKind.OFFSET) not in {(*one.states, one.kind) for one in findings}
@@ -178,6 +189,11 @@ class WindowEvaluator(ABC):
             raise CheckpointError(f"{', '.join(sorted(arrays))} is of another diagnostician")
 
 
+def left_out(finding: SensorFault) -> SensorFault:
+    """A fault of a sensor that the others are evaluated without."""
+    return finding.model_copy(update={"text": f"{finding.text}; the machine is diagnosed without it"})
+
+
 def settled(place: str, window: WindowStatistics, newest: Newest | None) -> tuple[WindowStatistics, int]:
     """The window without the hops in which a drive went from one set point to another, and how many came after them.
 
@@ -196,7 +212,7 @@ def settled(place: str, window: WindowStatistics, newest: Newest | None) -> tupl
             f"{place}: the speed was found and steady in {np.count_nonzero(window.settled)} of {window.settled.size} "
             f"hops, evaluation limit {LEAST_SETTLED:.0%}: without a shaft angle the rotation is taken out of no others"
         )
-    return newest[0].settled(), window.settled.size - 1 - int(passed[-1])
+    return newest[0].settled().of(window.states), window.settled.size - 1 - int(passed[-1])
 
 
 class LatestRotation:

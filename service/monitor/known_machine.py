@@ -1,6 +1,6 @@
 """Evaluation of a machine whose parameters are known, given or identified: its windows are compared with theory."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -15,16 +15,18 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading
+from models.diagnosis.sensors.reference import implicated
 from models.diagnosis.verdict.calibration import beside
 from models.diagnosis.verdict.sequential import SequentialTest
 from models.diagnosis.verdict.stretch import determined, with_shared_error
-from models.diagnosis.window.moments import STEADY
+from models.diagnosis.window.moments import STEADY, Plan
 from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError, UnexplainedError
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS
-from rotorwatch.records.windows import Equation, Opinion
+from rotorwatch.records.sensor_faults import FaultKind
+from rotorwatch.records.windows import Equation, Opinion, SensorFault
 from service.monitor.evaluation import Evaluation, LatestRotation, Newest, WindowEvaluator, opinion_of, settled
 
 _LIKELIHOOD, _EXPLAINED, _SENSE, _DIRECTED, _ROTATION = "likelihood", "explained_ns", "sense", "directed", "rotation"
@@ -39,6 +41,8 @@ than another, and of what is outside the model by something else than its spectr
 _HEAVIEST, _SURELY = 20.0, 3.0
 """Times the unbalance of the machine file, in standard errors: a lost blade makes ten of it, millimetres in place of
 micrometres a thousand."""
+_SILENT = {FaultKind.MISSING, FaultKind.STUCK}
+"""Faults of a sensor that shows nothing: all others can be believed, and it is sure which one it is."""
 _OUTSIDE = 4.0
 """Standard deviations of the misfit from which the short stretches of a window are tested for themselves."""
 
@@ -80,6 +84,19 @@ class KnownMachineEvaluator(WindowEvaluator):
             others.append(NetworkDiagnostician(machine, bundle.amortised))
         others.append(RelationDiagnostician(machine, () if bundle is None else bundle.networks))
         self._others = tuple(others)
+
+    def usable(self, window: WindowStatistics, plan: Plan, findings: Sequence[SensorFault]) -> WindowStatistics | None:
+        """Without sensors that show nothing, too, as long as most are left: the theory holds for any of them.
+
+        Where the speed is found in the vibration, how much of it there is depends on which sensors are left.
+        """
+        whole = super().usable(window, plan, findings)
+        own = [one for one in findings if not set(one.states).issubset(plan.others)]
+        if whole is not None or window.speed_source != "phase reference" or any(one.kind not in _SILENT for one in own):
+            return whole
+        lost = implicated(own)
+        left = () if "theta" in lost else plan.states_without(lost)
+        return window.of(left) if len(left) > len(plan.states) / 2 else None
 
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`."""
@@ -217,7 +234,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         for hops in wanted:
             with suppress(EstimationError):  # too little data for itself; the window has said what there is to say
                 if (statistics := sliding.statistics(hops)) is not None:
-                    statistics = replace(statistics, directed=self.directed, lines=window.lines)
+                    statistics = replace(statistics.of(window.states), directed=self.directed, lines=window.lines)
                     decided = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
                     evaluated[hops] = self._judged(statistics, self._within(decided))
         return evaluated

@@ -44,6 +44,7 @@ from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
 from service.monitor.alarms.operation import OperatorAction
+from service.monitor.evaluation import left_out
 from service.monitor.evaluators import evaluator_for
 from service.monitor.levels import LevelWatch
 from service.monitor.parts import divided, joined
@@ -429,6 +430,9 @@ class MachineMonitor:
             self._levels.tell(self._alarms, end_ns, faulty=implicated(missing), standing=bool(stood))
             return Report(**self._window_now(end_ns, end_ns, self._state(HealthState.WARMING)), sensors=missing)
         findings = sensor_findings(statistics, self._sensors, self.machine.sensors, missing, standing=bool(stood))
+        usable = self._evaluator.usable(statistics, self._plan, findings)
+        if usable is not None and usable is not statistics and not stood:
+            findings = tuple(map(left_out, findings))
         start_ns, faulty = statistics.start_ns, implicated(findings)
         speed = None if "theta" in faulty else finite(statistics.speed_rad_s)
         self._alarms.suppress(None if speed is None else speed * _RPM, end_ns)
@@ -441,13 +445,12 @@ class MachineMonitor:
             now = self._window_now(start_ns, end_ns, self._state(state))
             return Report(**now, speed_rad_s=speed, sensors=findings, reason=reason)
 
-        # A fault of a channel elsewhere says nothing of the equations, but it is all there is where they are none.
-        if findings and (not self._plan.states or faulty - set(self._plan.others)):
+        if usable is None:
             return unread(HealthState.DATA_HEALTH, "; ".join(each.text for each in findings))
         if stood or skipped:
             return unread(HealthState.NOT_EVALUABLE, stood or _SKIPPED)
         try:
-            evaluation = self._evaluator.evaluate(statistics, (self._window, self._test))
+            evaluation = self._evaluator.evaluate(usable, (self._window, self._test))
         except EstimationError as error:
             return unread(HealthState.WATCHING if self.watching else HealthState.NOT_EVALUABLE, str(error))
         foreign = self._levels.foreign(self._window, statistics, named=bool(self._test.state.findings), faulty=faulty)
@@ -465,7 +468,7 @@ class MachineMonitor:
             changed, evidence = evaluation.unlike_healthy, Evidence(start_ns=start_ns, end_ns=end_ns)
             self._alarms.update_state(SHAPE, changed != "", end_ns, changed, evidence=evidence)
         look, length_s = looks[whole].complete(), self.machine.window.length_s
-        calm = evaluation.calm(outside=verdict.outside_model)
+        calm = evaluation.calm(outside=verdict.outside_model, without=usable is not statistics)
         if not self._plan.states and self._levels.reference is not None:
             calm, reason = HealthState.UNCHANGED, ""
         return Report(

@@ -67,11 +67,13 @@ class LengthFits:
         """Whether the latest hops, of any of these lengths, may say more than that the machine is as the window says.
 
         The window is the latest of the sliding one. Its rotation is taken out of them, not their own: less work, and
-        hardly another spectrum away from it. Where no one rotation is that of all hops, or accelerations are measured,
-        they may.
+        hardly another spectrum away from it. Where no one rotation is that of all hops, accelerations are measured, or
+        the window is that of some of the sensors, they may.
         """
         rotation, by_hop, plan = window.as_mounted.synchronous, window.hop_synchronous, sliding.plan
-        if rotation is None or by_hop is None or window.removed_by_hop or integrated(window) is not window:
+        if window.states != plan.states or integrated(window) is not window:
+            return True
+        if rotation is None or by_hop is None or window.removed_by_hop:
             return True
         n, hops = len(plan.states), sliding.hops[-max(lengths, default=1) :]
         segments = np.concatenate([hop.segments.swapaxes(0, 1) for hop in hops], axis=1, dtype=np.complex128)

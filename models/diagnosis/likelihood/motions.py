@@ -294,16 +294,11 @@ def integrated(window: WindowStatistics) -> WindowStatistics:
     if not any(name in ACCELERATIONS for name in window.states):
         return window
     velocity = {name: name.replace("_ddot", "_dot") for name in window.states}
-    kept = [
-        column
-        for column, name in enumerate(window.states)
-        if velocity[name] == name or velocity[name] not in window.states
-    ]
-    states = tuple(velocity[window.states[column]] for column in kept)
-    made = np.array([window.states[column] in ACCELERATIONS for column in kept])
+    window = window.of(tuple(name for name, of in velocity.items() if of == name or of not in velocity))
+    made = np.isin(window.states, ACCELERATIONS)
     w = 2 * np.pi * window.frequencies_hz
     turn = np.where(made, 1 / (1j * w[:, None]), 1.0)
-    spectrum = window.spectrum[:, kept][:, :, kept] * turn[:, :, None] * turn[:, None, :].conj()
+    spectrum = window.spectrum * turn[:, :, None] * turn[:, None, :].conj()
     step_hz = float(window.frequencies_hz[1] - window.frequencies_hz[0])
     correlation = 2 * step_hz * spectrum.real.sum(axis=0)[np.newaxis]
     at_speed = (
@@ -313,12 +308,12 @@ def integrated(window: WindowStatistics) -> WindowStatistics:
     hops = window.hop_correlation.shape[0]
     return replace(
         window,
-        states=states,
+        states=tuple(velocity[name] for name in window.states),
         lags_s=window.lags_s[:1],
         correlation=correlation,
         hop_correlation=np.repeat(correlation[np.newaxis], hops, axis=0),
         spectrum=spectrum,
-        synchronous=None if synchronous is None else synchronous[kept] * at_speed,
-        hop_synchronous=None if by_hop is None else by_hop[:, kept] * at_speed,
-        relative_synchronous=None if relative is None else relative[:, kept] * at_speed,
+        synchronous=None if synchronous is None else synchronous * at_speed,
+        hop_synchronous=None if by_hop is None else by_hop * at_speed,
+        relative_synchronous=None if relative is None else relative * at_speed,
     )

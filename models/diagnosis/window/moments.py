@@ -15,7 +15,7 @@ Without a phase reference the angle begins anew in every hop, and each of its se
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal, TypeVar
@@ -115,6 +115,12 @@ class Plan:
     def mounted(self) -> tuple[str, ...]:
         """What each column of `states` is as mounted."""
         return self.states if self.turn is None else self.angled
+
+    def states_without(self, lost: Collection[str]) -> tuple[str, ...]:
+        """States that are measured without some of the mounted sensors: at an angle it takes both of a place."""
+        turn = np.eye(len(self.states)) if self.turn is None else self.turn
+        part = np.abs(turn[:, np.isin(self.mounted, list(lost))]).sum(axis=1)
+        return tuple(state for state, gone in zip(self.states, part.tolist(), strict=True) if not gone)
 
     @property
     def pairs(self) -> tuple[MotionPair, ...]:

@@ -96,6 +96,29 @@ class WindowStatistics:
         """Statistics of the sensors as mounted, high-pass and delay divided out: for whatever judges a sensor."""
         return self if self.mounted is None else self.mounted
 
+    def of(self, states: tuple[str, ...]) -> "WindowStatistics":
+        """The same window of some of its states alone, and of what says nothing of single sensors."""
+        if states == self.states:
+            return self
+        kept = [self.states.index(state) for state in states]
+        synchronous, by_hop, relative = self.synchronous, self.hop_synchronous, self.relative_synchronous
+        return replace(
+            self,
+            states=states,
+            correlation=self.correlation[..., kept, :][..., kept],
+            hop_correlation=self.hop_correlation[..., kept, :][..., kept],
+            spectrum=self.spectrum[:, kept][:, :, kept],
+            synchronous=None if synchronous is None else synchronous[kept],
+            hop_synchronous=None if by_hop is None else by_hop[:, kept],
+            relative_synchronous=None if relative is None else relative[:, kept],
+            phase_kept=None if self.phase_kept is None else self.phase_kept[:, kept],
+            waveforms=(),
+            sensors=(),
+            pair_powers=(),
+            mounted=None,
+            lines=tuple(line.turned(np.eye(len(self.states))[kept]) for line in self.lines),
+        )
+
     @property
     def rotation_vectors(self) -> ComplexArray | None:
         """Rotation-synchronous vectors of each hop, from an angle that may be another one in each; None if unknown."""
