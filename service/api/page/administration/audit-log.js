@@ -5,7 +5,7 @@ import { API, monitor } from "../monitor/monitor.js";
 
 const [PAGE, REFRESH_S] = [50, 15];
 
-/** @typedef {import("../monitor/records.js").AuditRecord} AuditRecord */
+/** @typedef {import("../monitor/records.d.ts").AuditRecord} AuditRecord */
 
 /** What came of a request, in words. @param {AuditRecord} one */
 function outcome(one) {

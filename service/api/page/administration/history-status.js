@@ -5,7 +5,7 @@ import { API, monitor } from "../monitor/monitor.js";
 
 const REFRESH_S = 60;
 
-/** @typedef {import("../monitor/records.js").HistoryStatus} HistoryStatus */
+/** @typedef {import("../monitor/records.d.ts").HistoryStatus} HistoryStatus */
 
 /** How large the history is, how far back it goes, and for how long things are kept. */
 class HistoryStatusTable extends LiveElement {

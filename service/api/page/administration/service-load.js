@@ -6,7 +6,7 @@ import "../elements/state-mark.js";
 
 const REFRESH_S = 10;
 
-/** @typedef {import("../monitor/records.js").Readiness} Readiness */
+/** @typedef {import("../monitor/records.d.ts").Readiness} Readiness */
 
 /** Whether the service can do its work, and how each machine's monitor keeps up. */
 class ServiceLoad extends LiveElement {

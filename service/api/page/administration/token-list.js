@@ -7,7 +7,7 @@ const [REFRESH_S, DAYS] = [30, 90];
 const TOKENS = `${API}/tokens`;
 const SCOPES = /** @type {[string, string][]} */ ([["read", "look"], ["operate", "acknowledge, shelve and reset alarms, start replays"], ["configure", "take alarms out of service, administer"]]);
 
-/** @typedef {import("../monitor/records.js").TokenEntry} TokenEntry */
+/** @typedef {import("../monitor/records.d.ts").TokenEntry} TokenEntry */
 
 /** Who may use the service: tokens, a form for a new one, and the end of each. */
 class TokenTable extends LiveElement {

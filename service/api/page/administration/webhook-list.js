@@ -5,7 +5,7 @@ import { API, monitor } from "../monitor/monitor.js";
 
 const REFRESH_S = 15;
 
-/** @typedef {import("../monitor/records.js").WebhookStatus} WebhookStatus */
+/** @typedef {import("../monitor/records.d.ts").WebhookStatus} WebhookStatus */
 
 /** Programs that are told of alarms, when they last took an event, and what went wrong last. */
 class WebhookTable extends LiveElement {

@@ -8,7 +8,7 @@ import "../elements/state-mark.js";
 
 const PAGE = 50;
 
-/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
+/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
 
 /** What happened to the alarms of a machine, newest first. */
 class AlarmHistory extends MachineElement {

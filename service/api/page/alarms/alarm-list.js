@@ -6,7 +6,7 @@ import { ordered } from "./alarm-order.js";
 import { why } from "./why-link.js";
 import "../elements/state-mark.js";
 
-/** @typedef {import("../monitor/records.js").Alarm} Alarm */
+/** @typedef {import("../monitor/records.d.ts").Alarm} Alarm */
 /** @typedef {{place: string, alarm: Alarm}} Placed */
 
 /** Why it is silenced, or how large the change is, or what the note says. @param {Alarm} alarm */

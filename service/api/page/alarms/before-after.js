@@ -6,8 +6,8 @@ import { choiceOf, offered } from "../plots/sample-plot.js";
 import { spectrumDrawing } from "../plots/spectrum-plot.js";
 import "../elements/line-chart.js";
 
-/** @typedef {import("../monitor/records.js").Picture} Picture */
-/** @typedef {import("../monitor/records.js").CorrelationPair} Pair */
+/** @typedef {import("../monitor/records.d.ts").Picture} Picture */
+/** @typedef {import("../monitor/records.d.ts").CorrelationPair} Pair */
 /** @typedef {import("../elements/line-chart.js").Line} Line */
 
 const HEIGHT = 270;

@@ -1,7 +1,7 @@
 import { html } from "../elements/markup.js";
 import "../elements/line-chart.js";
 
-/** @typedef {import("../monitor/records.js").Parameter} Parameter */
+/** @typedef {import("../monitor/records.d.ts").Parameter} Parameter */
 
 const [REACH, POINTS] = [4.5, 60]; // standard errors to either side, points there
 

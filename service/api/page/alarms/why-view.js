@@ -8,10 +8,10 @@ import "./before-after.js";
 import "../elements/line-chart.js";
 import "../elements/state-mark.js";
 
-/** @typedef {import("../monitor/records.js").AlarmEvidence} AlarmEvidence */
-/** @typedef {import("../monitor/records.js").Report} Report */
-/** @typedef {import("../monitor/records.js").Parameter} Parameter */
-/** @typedef {import("../monitor/records.js").ChannelLevels} ChannelLevels */
+/** @typedef {import("../monitor/records.d.ts").AlarmEvidence} AlarmEvidence */
+/** @typedef {import("../monitor/records.d.ts").Report} Report */
+/** @typedef {import("../monitor/records.d.ts").Parameter} Parameter */
+/** @typedef {import("../monitor/records.d.ts").ChannelLevels} ChannelLevels */
 
 const MEASURES = /** @type {(keyof ChannelLevels)[]} */ (["overall", "velocity", "x1", "x2", "crest", "kurtosis"]);
 
@@ -47,7 +47,7 @@ class WhyView extends HTMLElement {
     }
   }
 
-  /** @param {string} place @param {AlarmEvidence} found @param {import("../monitor/records.js").AlarmEvent | undefined} event */
+  /** @param {string} place @param {AlarmEvidence} found @param {import("../monitor/records.d.ts").AlarmEventData | undefined} event */
   #lay(place, found, event) {
     const { name, before, raised } = found;
     const after = found.settled ?? raised;
@@ -74,7 +74,7 @@ class WhyView extends HTMLElement {
     );
   }
 
-  /** @param {AlarmEvidence} found @param {Parameter | undefined} read @param {import("../monitor/records.js").Finding | undefined} finding @param {import("../monitor/records.js").AlarmEvent | undefined} event */
+  /** @param {AlarmEvidence} found @param {Parameter | undefined} read @param {import("../monitor/records.d.ts").Finding | undefined} finding @param {import("../monitor/records.d.ts").AlarmEventData | undefined} event */
   #sentence(found, read, finding, event) {
     const confidence = event?.evidence?.confidence ?? null;
     if (!read || !finding) return `${event?.text ?? found.name}${event ? `, ${clock(event.time_ns)}` : ""}. ${found.raised.report.reason}`;
@@ -84,7 +84,7 @@ class WhyView extends HTMLElement {
     return `${read.text} changed by ${change} since ${clock(finding.since_ns)}${range}, found in ${lasting(finding.stretch_s)} of data.${sure}`;
   }
 
-  /** @param {import("../monitor/records.js").Picture | null} before @param {import("../monitor/records.js").Picture} after */
+  /** @param {import("../monitor/records.d.ts").Picture | null} before @param {import("../monitor/records.d.ts").Picture} after */
   #pictures(before, after) {
     const made = /** @type {any} */ (html("before-after"));
     made.show(before, after);
@@ -156,7 +156,7 @@ class WhyView extends HTMLElement {
     return table(["level", "before", "after", "ratio", "limits"], rows, `Levels of ${channel}`);
   }
 
-  /** @param {string} place @param {AlarmEvidence} found @param {import("../monitor/records.js").AlarmEvent | undefined} event */
+  /** @param {string} place @param {AlarmEvidence} found @param {import("../monitor/records.d.ts").AlarmEventData | undefined} event */
   #data(place, found, event) {
     const { start_ns: start, end_ns: end } = event?.evidence ?? found.raised.report;
     return html(

@@ -7,7 +7,7 @@ import { sensorState } from "../machine/machine-file.js";
 import { MARKS } from "./rotor-parts.js";
 
 /** @typedef {import("../machine/machine-file.js").Sensor} Sensor */
-/** @typedef {import("../monitor/records.js").Health} Health */
+/** @typedef {import("../monitor/records.d.ts").Health} Health */
 
 const [WIDTH, LINE, SHAFT] = [360, 19, 22];
 

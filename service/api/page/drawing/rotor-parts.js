@@ -7,7 +7,7 @@ import { angleOf, sensorState } from "../machine/machine-file.js";
 
 /** @typedef {import("../machine/parameter-readings.js").Reading} Reading */
 /** @typedef {import("../machine/machine-file.js").Sensor} Sensor */
-/** @typedef {import("../monitor/records.js").Health} Health */
+/** @typedef {import("../monitor/records.d.ts").Health} Health */
 
 export const LINE = 14;
 export const MARKS = /** @type {Record<string, string>} */ ({ danger: "◆", alert: "▲", "data-health": "⬢" });

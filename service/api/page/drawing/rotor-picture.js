@@ -6,7 +6,7 @@ import { arrow, damper, LINE, parameter, rotation, sensorsRound, spring } from "
 
 /** @typedef {import("../machine/parameter-readings.js").Reading} Reading */
 /** @typedef {import("../machine/machine-file.js").MachineFile} MachineFile */
-/** @typedef {import("../monitor/records.js").Health} Health */
+/** @typedef {import("../monitor/records.d.ts").Health} Health */
 
 const [WIDTH, HEIGHT] = [360, 496];
 const BEARING = { x: 196, y: 214 };

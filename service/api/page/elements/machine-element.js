@@ -9,7 +9,7 @@ import { LiveElement } from "./live-element.js";
  */
 export class MachineElement extends LiveElement {
   static observedAttributes = ["recorded"];
-  /** @type {import("../monitor/records.js").Health | undefined} */
+  /** @type {import("../monitor/records.d.ts").Health | undefined} */
   #instead;
   /** Whether `show` needs all that is known of the latest window. */
   needsWhole = true;
@@ -66,7 +66,7 @@ export class MachineElement extends LiveElement {
     return this.getAttribute("place") ?? "";
   }
 
-  /** Show this and nothing that is live: a window of a replay. @param {import("../monitor/records.js").Health} health */
+  /** Show this and nothing that is live: a window of a replay. @param {import("../monitor/records.d.ts").Health} health */
   feed(health) {
     this.#instead = health;
     this.show();

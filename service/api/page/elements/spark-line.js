@@ -78,7 +78,7 @@ class SparkLine extends MachineElement {
     this.#asked = now;
   }
 
-  /** @param {import("../monitor/records.js").Trend} trend */
+  /** @param {import("../monitor/records.d.ts").Trend} trend */
   draw({ starts_ns: starts, means }) {
     if (starts.length < 2) return this.replaceChildren();
     this.#drawn = performance.now();

@@ -6,7 +6,7 @@ import "../elements/state-mark.js";
 
 const MEASURES = ["overall", "velocity", "x1", "x2", "mean", "crest", "kurtosis"];
 
-/** @param {import("../monitor/records.js").ChannelLevels} one @param {string} measure */
+/** @param {import("../monitor/records.d.ts").ChannelLevels} one @param {string} measure */
 function leveled(one, measure) {
   const value = /** @type {any} */ (one)[measure];
   return value === null ? null : value * shownIn(levelUnit(one, measure))[0];

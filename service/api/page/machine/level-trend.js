@@ -2,7 +2,7 @@ import { figure, shownIn } from "../monitor/figures.js";
 import { levelUnit, limitText, measureText } from "../monitor/states.js";
 import { ReadingTrend } from "./reading-trend.js";
 
-/** @typedef {import("../monitor/records.js").LevelBound} LevelBound */
+/** @typedef {import("../monitor/records.d.ts").LevelBound} LevelBound */
 /** @typedef {import("../elements/line-chart.js").Zone} Zone */
 
 /** Zones of a standard, from the bottom to the top. @param {[number, number, number]} edges @returns {Zone[]} */
@@ -41,7 +41,7 @@ export class LevelTrend extends ReadingTrend {
       const [factor, shown] = shownIn(unit);
       const said = bounds.map((bound) => {
         const [first, second, third] = (bound.zones ?? []).map((edge) => figure(factor * edge));
-        const limits = bound.zones ? `A to ${first}, B to ${second}, C to ${third}` : limitText({ ...bound, measure, state: "", text: "" }, one);
+        const limits = bound.zones ? `A to ${first}, B to ${second}, C to ${third}` : limitText({ ...bound, measure }, one);
         return `${bound.source}: ${`${limits} ${shown}`.trim()}${bound.zones ? ", D beyond" : ""}`;
       });
       return {

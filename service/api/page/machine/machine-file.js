@@ -43,7 +43,7 @@ export function stateOf(sensor) {
   return plane ? `${plane}${number}${rate}` : `${location}@${angle}${rate}`;
 }
 
-/** Why a sensor is abnormal: at fault, or with a level alarm; empty if it is not. @param {Sensor} sensor @param {import("../monitor/records.js").Health} health */
+/** Why a sensor is abnormal: at fault, or with a level alarm; empty if it is not. @param {Sensor} sensor @param {import("../monitor/records.d.ts").Health} health */
 export function sensorState(sensor, health) {
   if (health.report?.sensors.some((one) => one.states.includes(stateOf(sensor)))) return "data-health";
   return health.alarms.find((one) => one.raised && one.name === `level:${sensor.name}`)?.severity ?? "";

@@ -1,9 +1,9 @@
-/** @typedef {import("../monitor/records.js").Parameter} Parameter */
-/** @typedef {{stated: Parameter, parameter: Parameter, read: boolean, why: string, seen: import("../monitor/records.js").Detectable | undefined, severity: string}} Reading */
+/** @typedef {import("../monitor/records.d.ts").Parameter} Parameter */
+/** @typedef {{stated: Parameter, parameter: Parameter, read: boolean, why: string, seen: import("../monitor/records.d.ts").Detectable | undefined, severity: string}} Reading */
 
 /**
  * What is read of each parameter now: while the window straddles a change, of the machine since then.
- * @param {import("../monitor/records.js").Health | undefined} health
+ * @param {import("../monitor/records.d.ts").Health | undefined} health
  * @returns {Reading[]}
  */
 export function parameterReadings(health) {

@@ -4,7 +4,7 @@ import { MachineElement } from "../elements/machine-element.js";
 import { parameterReadings } from "./parameter-readings.js";
 import "../elements/state-mark.js";
 
-/** @typedef {import("../monitor/records.js").Opinion} Opinion */
+/** @typedef {import("../monitor/records.d.ts").Opinion} Opinion */
 /** @typedef {import("./parameter-readings.js").Reading} Reading */
 
 /** What another diagnostician reads of a parameter, and whether that agrees. @param {Opinion} opinion @param {string} name */

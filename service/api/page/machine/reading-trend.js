@@ -6,8 +6,8 @@ import "../elements/line-chart.js";
 
 const [POINTS, REFRESH_S, EVENTS] = [240, 15, 200];
 
-/** @typedef {import("../monitor/records.js").Bucket} Bucket */
-/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
+/** @typedef {import("../monitor/records.d.ts").ReadingBucket} Bucket */
+/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
 /** @typedef {{at: number, kind: "alert" | "danger", text: string, below?: boolean}} Limit */
 /** What is shown over time; limits within `near` are always in the picture. @typedef {{name: string, alarm: string, title: string, unit: string, scale: number, limits: Limit[], near: number, zones?: import("../elements/line-chart.js").Zone[], said?: string[], zero: boolean, changed: {text: string, since_ns: number, between_ns?: [number, number] | null}[]}} Trended */
 

@@ -2,8 +2,8 @@
 
 import { EventStream, named } from "./event-stream.js";
 
-/** @typedef {import("./records.js").Health} Health */
-/** @typedef {import("./records.js").Alarm} Alarm */
+/** @typedef {import("./records.d.ts").Health} Health */
+/** @typedef {import("./records.d.ts").Alarm} Alarm */
 
 export const API = "/api/v1";
 const AGAIN_MS = 5_000;

@@ -1,10 +1,10 @@
 /** What states are called, how urgent they are, and what of a machine is worst. */
 import { figure, percent, printed, quantity, shownIn, within, Z95 } from "./figures.js";
 
-/** @typedef {import("./records.js").Health} Health */
-/** @typedef {import("./records.js").Alarm} Alarm */
-/** @typedef {import("./records.js").ChannelLevels} ChannelLevels */
-/** @typedef {import("./records.js").LevelLimits} LevelLimits */
+/** @typedef {import("./records.d.ts").Health} Health */
+/** @typedef {import("./records.d.ts").Alarm} Alarm */
+/** @typedef {import("./records.d.ts").ChannelLevels} ChannelLevels */
+/** @typedef {Pick<import("./records.d.ts").LevelLimits, "measure" | "alert" | "danger" | "fall">} LevelLimits */
 /** @typedef {{title: string, value: string, limit: string, quantity: string, series: string, range: number[]}} Worst */
 
 /** Every state of a machine in words, the most urgent first. @type {Record<string, string>} */
@@ -78,7 +78,7 @@ function levels(health) {
       return {
         title: `${one.channel} ${measureText(limit.measure)}`,
         value: quantity(value, levelUnit(one, limit.measure)),
-        limit: limitText(/** @type {LevelLimits} */ (limit), one) || "no limit",
+        limit: limitText(limit, one) || "no limit",
         quantity: "level",
         series: `${one.channel}:${limit.measure}`,
         range: limit.alert === null ? [] : [0, limit.alert],
@@ -95,7 +95,7 @@ function parameters(health) {
   if (!report || !verdict) return [];
   const current = new Map((verdict.settled ? report.parameters : verdict.current).map((one) => [one.name, one]));
   return report.parameters.flatMap((stated) => {
-    const { name, text, relative_change: change = null, standard_error: error = null } = current.get(stated.name) ?? /** @type {Partial<import("./records.js").Parameter>} */ ({});
+    const { name, text, relative_change: change = null, standard_error: error = null } = current.get(stated.name) ?? /** @type {Partial<import("./records.d.ts").Parameter>} */ ({});
     if (change === null || error === null || !name) return [];
     const seen = report.detectable.find((one) => one.name === name);
     const least = seen && (change < 0 ? seen.loss : seen.gain);

@@ -7,7 +7,7 @@ import "./site-section.js";
 const KEPT = "rotorwatch.order";
 const byName = new Intl.Collator(undefined, { numeric: true }).compare;
 
-/** @typedef {import("../monitor/records.js").Health} Health */
+/** @typedef {import("../monitor/records.d.ts").Health} Health */
 /** @typedef {import("./site-section.js").Machine} Machine */
 
 /** Minutes since the newest data: machines whose data come all the time stay where they are. @param {Machine} machine */

@@ -8,7 +8,7 @@ const KEPT = "rotorwatch.folded";
 /** Sites whose machines are folded away in this browser. @returns {string[]} */
 const folded = () => JSON.parse(localStorage.getItem(KEPT) ?? "[]");
 
-/** @typedef {{place: string, health: import("../monitor/records.js").Health}} Machine */
+/** @typedef {{place: string, health: import("../monitor/records.d.ts").Health}} Machine */
 
 /** Machines of one site under a heading that folds them away: `<site-section site="demo">`; what is folded still tells its worst state. */
 export class SiteSection extends HTMLElement {

@@ -3,7 +3,7 @@ import { html, svg } from "../elements/markup.js";
 import { plane, REACH, roundUp } from "./plane.js";
 import { SamplePlot } from "./sample-plot.js";
 
-/** @typedef {import("../monitor/records.js").CentrelineSeries} Centrelines */
+/** @typedef {import("../monitor/records.d.ts").CentrelineSeries} Centrelines */
 
 /** Where the shaft was on average, at each place with two displacements. @extends {SamplePlot<Centrelines>} */
 class CentrelinePlot extends SamplePlot {

@@ -6,9 +6,9 @@ import "../elements/line-chart.js";
 
 const REFRESH_S = 15;
 
-/** @typedef {import("../monitor/records.js").CorrelationSnapshot} Correlations */
+/** @typedef {import("../monitor/records.d.ts").CorrelationSnapshot} Correlations */
 
-/** @typedef {import("../monitor/records.js").CorrelationPair} Pair */
+/** @typedef {import("../monitor/records.d.ts").CorrelationPair} Pair */
 
 /** @param {Pair} pair */
 export const pairName = ({ first, second }) => (first === second ? `${first} with itself` : `${first} and ${second}`);

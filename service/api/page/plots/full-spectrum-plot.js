@@ -4,7 +4,7 @@ import "../elements/line-chart.js";
 
 const ORDERS = 5;
 
-/** @typedef {import("../monitor/records.js").FullSpectrumSnapshot} FullSpectra */
+/** @typedef {import("../monitor/records.d.ts").FullSpectrumSnapshot} FullSpectra */
 
 /** What goes round with the rotation, and what against it, at each place with two displacements. @extends {SamplePlot<FullSpectra>} */
 class FullSpectrumPlot extends SamplePlot {

@@ -5,9 +5,9 @@ import { plane, REACH, roundUp } from "./plane.js";
 
 const [REFRESH_S, REVOLUTIONS] = [15, 8];
 
-/** @typedef {import("../monitor/records.js").Ellipse} Ellipse */
-/** @typedef {import("../monitor/records.js").PlaceOrbit} PlaceOrbit */
-/** @typedef {import("../monitor/records.js").Orbits} Orbits */
+/** @typedef {import("../monitor/records.d.ts").OrbitEllipse} Ellipse */
+/** @typedef {import("../monitor/records.d.ts").PlaceOrbit} PlaceOrbit */
+/** @typedef {import("../monitor/records.d.ts").OrbitSnapshot} Orbits */
 
 /** Where the shaft was when its mark passed the sensor. @param {PlaceOrbit} orbit @param {number[]} pulses_s */
 function marked({ path }, pulses_s) {

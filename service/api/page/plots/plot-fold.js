@@ -8,7 +8,7 @@ import { monitor } from "../monitor/monitor.js";
 class PlotFold extends HTMLElement {
   static observedAttributes = ["recorded"];
   #inside = html("div");
-  /** @type {import("../monitor/records.js").Health | null} */
+  /** @type {import("../monitor/records.d.ts").Health | null} */
   #fed = null;
 
   connectedCallback() {
@@ -30,7 +30,7 @@ class PlotFold extends HTMLElement {
     if (recorded !== null) this.#inside.firstElementChild?.setAttribute("recorded", recorded);
   }
 
-  /** Show this and nothing that is live, see `MachineElement`. @param {import("../monitor/records.js").Health} health */
+  /** Show this and nothing that is live, see `MachineElement`. @param {import("../monitor/records.d.ts").Health} health */
   feed(health) {
     this.#fed = health;
     /** @type {any} */ (this.#inside.firstElementChild)?.feed?.(health);

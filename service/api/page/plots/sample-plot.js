@@ -104,7 +104,7 @@ export class SamplePlot extends MachineElement {
     const [site, machine] = this.place.split("/");
     try {
       const found = (await monitor.ask(`/api/v1/recordings?${new URLSearchParams({ site, machine, latest: String(RECORDINGS), data_times: "true" })}`)).recordings;
-      const whole = /** @type {import("../monitor/records.js").RecordingEntry[]} */ (found).filter((one) => one.data_start_ns !== null).reverse();
+      const whole = /** @type {import("../monitor/records.d.ts").RecordingEntry[]} */ (found).filter((one) => one.data_start_ns !== null).reverse();
       this.#source.append(...whole.map((one) => html("option", { value: one.id.split("/")[2] }, `recorded ${stretch(Number(one.data_start_ns), Number(one.data_end_ns))}${one.kept_because ? ", kept for an alarm" : ""}`)));
       this.#source.hidden = !whole.length;
     } catch {

@@ -5,8 +5,8 @@ import "../elements/line-chart.js";
 
 const [REFRESH_S, ORDERS] = [15, 5];
 
-/** @typedef {import("../monitor/records.js").Spectra} Spectra */
-/** @typedef {import("../monitor/records.js").WaterfallSnapshot} Waterfall */
+/** @typedef {import("../monitor/records.d.ts").SpectrumSnapshot} Spectra */
+/** @typedef {import("../monitor/records.d.ts").WaterfallSnapshot} Waterfall */
 
 /** What spectra have around them: axes and the orders. @param {number[]} lines @param {number | null} turning Hz @param {string} unit */
 function frame(lines, turning, unit) {
@@ -22,7 +22,7 @@ function frame(lines, turning, unit) {
   };
 }
 
-/** One channel's spectrum beside its theory, with the orders. @param {Spectra} found @param {import("../monitor/records.js").Density} shown @returns {import("../elements/line-chart.js").Drawing} */
+/** One channel's spectrum beside its theory, with the orders. @param {Spectra} found @param {import("../monitor/records.d.ts").ChannelDensity} shown @returns {import("../elements/line-chart.js").Drawing} */
 export function spectrumDrawing(found, shown) {
   /** @type {import("../elements/line-chart.js").Line[]} */
   const lines = [{ label: "measured", values: shown.measured }];

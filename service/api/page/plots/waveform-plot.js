@@ -2,7 +2,7 @@ import { quantity, stretch } from "../monitor/figures.js";
 import { choiceOf, offered, SamplePlot } from "./sample-plot.js";
 import "../elements/line-chart.js";
 
-/** @typedef {import("../monitor/records.js").WaveformSnapshot} Waveforms */
+/** @typedef {import("../monitor/records.d.ts").WaveformSnapshot} Waveforms */
 
 /** The newest revolutions at one place, channel by channel, with the moments at which the keyphasor's mark passed. @extends {SamplePlot<Waveforms>} */
 class WaveformPlot extends SamplePlot {

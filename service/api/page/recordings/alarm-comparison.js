@@ -8,8 +8,8 @@ const EVENTS = 1000;
 /** Events of one kind that are no farther apart than this are the same one, earlier or later: windows of a replay need not end when those that were live did. */
 const SAME_NS = 120e9;
 
-/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
-/** @typedef {import("../monitor/records.js").ReplayJob} ReplayJob */
+/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
+/** @typedef {import("../monitor/records.d.ts").ReplayJob} ReplayJob */
 
 /**
  * Events of both lists, in the order of time, those that are the same together.

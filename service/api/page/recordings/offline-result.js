@@ -12,10 +12,10 @@ import "./window-plots.js";
 const [WINDOWS, EVENTS, WAIT_MS] = [600, 1000, 120];
 const RAISED = new Set(["raised", "escalated"]);
 
-/** @typedef {import("../monitor/records.js").Report} Report */
-/** @typedef {import("../monitor/records.js").Health} Health */
-/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
-/** @typedef {import("../monitor/records.js").ReplayJob} ReplayJob */
+/** @typedef {import("../monitor/records.d.ts").Report} Report */
+/** @typedef {import("../monitor/records.d.ts").Health} Health */
+/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
+/** @typedef {import("../monitor/records.d.ts").ReplayJob} ReplayJob */
 
 /** What an offline replay found: state, parameters and levels over time, alarms, and the report of any window. */
 class OfflineResult extends HTMLElement {

@@ -6,7 +6,7 @@ import "./window-plots.js";
 
 const FOLLOW_MS = 15_000;
 
-/** @typedef {import("../monitor/records.js").ReplayJob} ReplayJob */
+/** @typedef {import("../monitor/records.d.ts").ReplayJob} ReplayJob */
 
 /** Pause, resume and seek of a replay that goes onto the network at a pace. */
 class PacedControl extends HTMLElement {

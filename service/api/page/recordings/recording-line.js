@@ -6,8 +6,8 @@ import "../elements/state-mark.js";
 const [WIDTH, HEIGHT, LEAST, SHOWN, AROUND_S] = [1000, 26, 2, 10, 600];
 const RANGES = /** @type {[string, string][]} */ ([["", "everything shown below"], ["720", "last 30 days"], ["24", "last 24 h"], ["1", "last hour"]]);
 
-/** @typedef {import("../monitor/records.js").RecordingEntry} RecordingEntry */
-/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
+/** @typedef {import("../monitor/records.d.ts").RecordingEntry} RecordingEntry */
+/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
 /** @typedef {import("./recordings-view.js").Chosen} Chosen */
 
 /** Recordings on a line of time, the alarms of their machine above; an alarm chooses what was recorded around it. */

@@ -4,8 +4,8 @@ import { API } from "../monitor/monitor.js";
 
 const PAGE = 25;
 
-/** @typedef {import("../monitor/records.js").RecordingEntry} RecordingEntry */
-/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
+/** @typedef {import("../monitor/records.d.ts").RecordingEntry} RecordingEntry */
+/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
 /** @typedef {import("./recordings-view.js").Chosen} Chosen */
 
 /** Recordings, the latest first, to choose from and to download. */

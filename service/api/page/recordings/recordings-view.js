@@ -8,8 +8,8 @@ import "./replay-order.js";
 
 const [LATEST, EVENTS, REFRESH_S] = [200, 200, 30];
 
-/** @typedef {import("../monitor/records.js").RecordingEntry} RecordingEntry */
-/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
+/** @typedef {import("../monitor/records.d.ts").RecordingEntry} RecordingEntry */
+/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
 /** What is to be replayed: recordings by id, and a stretch of them if it is not all. @typedef {{ids: Set<string>, stretch: [number, number] | null}} Chosen */
 
 /** Recordings of one machine with its alarms, and replays of them. */

@@ -5,8 +5,8 @@ import { counted } from "./replay-list.js";
 
 const LARGEST = 100_000;
 
-/** @typedef {import("../monitor/records.js").RecordingEntry} RecordingEntry */
-/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
+/** @typedef {import("../monitor/records.d.ts").RecordingEntry} RecordingEntry */
+/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
 /** @typedef {import("./recordings-view.js").Chosen} Chosen */
 
 /** A form that starts a replay of what is chosen: as it was, or with another machine file, also one of this computer, or another limit. */

@@ -1,9 +1,9 @@
 import { LevelTrend } from "../machine/level-trend.js";
 import { ParameterTrend } from "../machine/parameter-trend.js";
 
-/** @typedef {import("../monitor/records.js").Report} Report */
-/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
-/** @typedef {import("../monitor/records.js").Bucket} Bucket */
+/** @typedef {import("../monitor/records.d.ts").Report} Report */
+/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
+/** @typedef {import("../monitor/records.d.ts").ReadingBucket} Bucket */
 /** @typedef {import("../machine/reading-trend.js").Trended} Trended */
 /** What a replay found. @typedef {{reports: Report[], events: AlarmEvent[], limits: Record<string, {raise_above: number, danger_above: number}>}} Found */
 

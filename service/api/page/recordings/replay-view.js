@@ -8,7 +8,7 @@ import "./paced-control.js";
 
 const ENDED = new Set(["finished", "stopped", "failed"]);
 
-/** @typedef {import("../monitor/records.js").ReplayJob} ReplayJob */
+/** @typedef {import("../monitor/records.d.ts").ReplayJob} ReplayJob */
 
 /** One replay, framed and under a banner, so that nobody takes it for what is live. */
 class ReplayView extends LiveElement {

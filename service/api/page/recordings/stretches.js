@@ -1,5 +1,5 @@
-/** @typedef {import("../monitor/records.js").RecordingEntry} RecordingEntry */
-/** @typedef {import("../monitor/records.js").Report} Report */
+/** @typedef {import("../monitor/records.d.ts").RecordingEntry} RecordingEntry */
+/** @typedef {import("../monitor/records.d.ts").Report} Report */
 /** @typedef {{state: string, from: number, to: number, at: number}} Run */
 
 /** Ids of the recordings that can be replayed and hold data of a stretch. @param {RecordingEntry[]} recordings @param {number} from @param {number} to @returns {Set<string>} */

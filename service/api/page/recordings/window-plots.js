@@ -28,7 +28,7 @@ class WindowPlots extends HTMLElement {
   /**
    * Show the window that ends at a time, once nobody goes on to another one.
    * @param {number} end_ns
-   * @param {import("../monitor/records.js").Health} [health] as it was told then
+   * @param {import("../monitor/records.d.ts").Health} [health] as it was told then
    */
   stand(end_ns, health) {
     const recorded = new URLSearchParams({ replay: this.getAttribute("replay") ?? "", until_ns: String(Math.round(end_ns)) }).toString();
