@@ -13,45 +13,27 @@ into another one, which goes on as if nothing had happened.
 from collections import deque
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from models.alarm_names import SHAPE
 from models.arrivals import Arrivals, Arrived, Senders
 from models.checkpoint import checked, prefixed, texts, unprefixed
 from models.commissioning.commissioned import Installed
-from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.missing import MissingNumbers, completed
-from models.diagnosis.sensors.reference import implicated
-from models.diagnosis.sensors.standstill import Standstill
-from models.diagnosis.verdict.calibration import detectable_changes
-from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.sequential_state import SequentialState
-from models.diagnosis.verdict.stretch import stretch_of
-from models.diagnosis.window.moments import plan_for
-from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
-from models.errors import CheckpointError, EstimationError, WireError
+from models.errors import CheckpointError, WireError
 from models.ingest import Admission, Gate, Reason, lasting
-from models.levels.judgement import growth_seen
 from models.signals.block import NewestBlocks, SampleBlock
 from models.signals.wire import decode_block
-from rotorwatch.records.alarms import Evidence
-from rotorwatch.records.fields import finite
 from rotorwatch.records.health import HealthState, Quality, Report
 from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
 from service.monitor.alarms.operation import OperatorAction
-from service.monitor.evaluation import left_out
-from service.monitor.evaluators import evaluator_for
-from service.monitor.levels import LevelWatch
 from service.monitor.parts import divided, joined
-from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, counted, identity_of
-
-_RPM = 30 / np.pi
-_SKIPPED = "not evaluated: this computer cannot keep up; levels and sensors were judged"
+from service.monitor.reporting import WindowReporter
+from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, counted
 
 
 class MachineMonitor:
@@ -77,30 +59,22 @@ class MachineMonitor:
         self, installed: Installed, skips: Callable[[int], bool] = lambda _: False, *, remembered: bool = True
     ) -> None:
         self.machine = machine = installed.machine
-        self.identity = identity_of(installed)
         self._skips = skips
-        self._evaluator = judge = evaluator_for(installed)
-        self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
-        self._standstill = Standstill(self._sensors)
-        self._plan = plan = plan_for(machine, lagged=judge.needs_lags, levels=True, thorough=installed.thorough)
-        self.watching = installed.watching or not plan.states
-        self._levels = LevelWatch(plan, machine, installed)
+        self._alarms = AlarmBook(machine.alarms)
+        self._data_path = DataPathAlarms(self._alarms, machine)
+        self._reporter = reporter = WindowReporter(installed, self._alarms, self._data_path, remembered=remembered)
+        self.identity, self.watching = reporter.identity, reporter.watching
+        self._window, self._levels, self._test = reporter.samples, reporter.levels, reporter.test
         self._senders, self._arrivals = Senders(), Arrivals(machine.ingest.reorder_blocks)
         self._due: deque[Arrived] = deque()
         self._done: list[MonitorReport] = []
         self._gate, self._missing = Gate(machine, partial=True), MissingNumbers(machine.sensors)
-        channels = len(machine.sensors)
-        self._window = SlidingWindow(plan, remembered=remembered, lines=installed.lines, channels=channels)
-        self._test = SequentialTest(SequentialSettings.for_machine(machine, short=judge.takes_short), by=judge.by)
-        self._alarms = AlarmBook(machine.alarms)
-        self._data_path = DataPathAlarms(self._alarms, machine)
         self._parts = (
-            ("gate", self._gate), ("evaluator", judge), ("standstill", self._standstill),
+            ("gate", self._gate), ("evaluator", reporter.evaluator), ("standstill", reporter.standstill),
             ("data_path", self._data_path), ("missing", self._missing),
         )  # fmt: skip
         self._quality, self._accepted = Quality(), 0
         self._latest: Report | None = None
-        self._calm = HealthState.WARMING
         self.end_ns: int | None = None
         self._reached_ns: int | None = None
         self._kept_is_valid = True
@@ -109,7 +83,6 @@ class MachineMonitor:
         self._drops: dict[tuple[int, int], int] = {}
         self._fault = ""
         self._defect: Exception | None = None
-        self.window: Callable[[], WindowStatistics] | None = None  # makes that of the latest report, if it was full
         self._newest = NewestBlocks(20_000)
         self._used: SampleBlock | None = None
         self.used, self.could_use, self.begin = False, self._gate.could_use, self._gate.begin
@@ -285,6 +258,11 @@ class MachineMonitor:
         return self._alarms.take()
 
     @property
+    def window(self) -> Callable[[], WindowStatistics] | None:
+        """What makes the statistics of the window of the latest report, if it was full."""
+        return self._reporter.window
+
+    @property
     def blocks_to_hop(self) -> int:
         """How many more blocks like the latest one complete a hop, at least one: little is news before."""
         return 1 if self._used is None else max(1, -(-self._window.lacking // self._used.samples.shape[0]))
@@ -316,7 +294,7 @@ class MachineMonitor:
             **prefixed("test", self._test.state.checkpoint()),
             **prefixed("levels", self._levels.checkpoint()),
             **{key: one for name, part in self._parts for key, one in prefixed(name, part.checkpoint()).items()},
-            "calm": np.array([self._calm.value]),
+            "calm": np.array([self._reporter.calm.value]),
             "end_ns": np.array([] if self.end_ns is None else [self.end_ns], dtype=np.int64),
         }
         state, new, names = divided(arrays, self._test.state.hops(), kept if self._kept_is_valid else ())
@@ -346,7 +324,7 @@ class MachineMonitor:
         for name, part in self._parts:
             part.restore(unprefixed(name, arrays))
         self._test.state = test
-        self.end_ns, self._calm = end_ns, HealthState(*calm)
+        self.end_ns, self._reporter.calm = end_ns, HealthState(*calm)
         self._arrivals.resume(self._gate.courses)
 
     def restore_alarms(self, alarms: str, next_sequence: int | None = None, end_ns: int | None = None) -> None:
@@ -364,7 +342,9 @@ class MachineMonitor:
     def health(self) -> MachineHealth:
         """Where the machine stands now."""
         return MachineHealth(
-            self._state(HealthState.NOT_EVALUABLE if self._fault else self._calm),  # what operators did counts at once
+            self._reporter.state(
+                HealthState.NOT_EVALUABLE if self._fault else self._reporter.calm
+            ),  # what operators did counts at once
             self._window.filled,
             self._latest,
             self._alarms.alarms,
@@ -404,100 +384,16 @@ class MachineMonitor:
         self._fault = ""
         skipped = self._skips(end_ns) and self._window.filled == 1
         try:
-            report = self._evaluated(end_ns, skipped=skipped)
+            self._data_path.hop(end_ns, skipped=skipped)
+            self._data_path.conflict(self._senders.conflict, end_ns)
+            missing = self._missing.found(self._window.first_ns, end_ns)
+            report = self._reporter.report(end_ns, missing, skipped=skipped)
         except Exception as error:
             self._failed(error, end_ns)
-            state = self._state(HealthState.NOT_EVALUABLE)
-            report = Report(**self._window_now(end_ns, end_ns, state), reason=self._fault)
+            report = self._reporter.unread(end_ns, end_ns, HealthState.NOT_EVALUABLE, reason=self._fault)
         if skipped:
             report, count = report.model_copy(update={"skipped": True}), self._quality.skipped_windows + 1
             self._quality = self._quality.model_copy(update={"skipped_windows": count})
         self._latest = report
         self._alarms.suppress(None, end_ns)
         return report
-
-    def _evaluated(self, end_ns: int, *, skipped: bool) -> Report:
-        self._data_path.hop(end_ns, skipped=skipped)
-        self._data_path.conflict(self._senders.conflict, end_ns)
-        missing = self._missing.found(self._window.first_ns, end_ns)
-        self._levels.take(self._window, implicated(missing))
-        statistics, self.window = self._window.statistics(), self._window.again()
-        there = statistics or self._window.statistics(len(self._window.hops))  # while it fills
-        stood = "" if there is None else self._standstill.found(there)
-        if statistics is None:
-            if missing and there is not None:  # it ends no other fault: those are looked for in whole windows
-                self._data_path.sensors(missing, there, standing=True)
-            self._levels.tell(self._alarms, end_ns, faulty=implicated(missing), standing=bool(stood))
-            return Report(**self._window_now(end_ns, end_ns, self._state(HealthState.WARMING)), sensors=missing)
-        findings = sensor_findings(statistics, self._sensors, self.machine.sensors, missing, standing=bool(stood))
-        usable = self._evaluator.usable(statistics, self._plan, findings)
-        if usable is not None and usable is not statistics and not stood:
-            findings = tuple(map(left_out, findings))
-        start_ns, faulty = statistics.start_ns, implicated(findings)
-        speed = None if "theta" in faulty else finite(statistics.speed_rad_s)
-        self._alarms.suppress(None if speed is None else speed * _RPM, end_ns)
-        self._data_path.sensors(findings, statistics, standing=bool(stood))
-        self._evaluator.heard(findings)
-
-        def unread(state: HealthState, reason: str) -> Report:
-            """Of the levels and the sensors alone."""
-            self._levels.tell(self._alarms, end_ns, faulty=faulty, standing=bool(stood))
-            now = self._window_now(start_ns, end_ns, self._state(state))
-            return Report(**now, speed_rad_s=speed, sensors=findings, reason=reason)
-
-        if usable is None:
-            return unread(HealthState.DATA_HEALTH, "; ".join(each.text for each in findings))
-        if stood or skipped:
-            return unread(HealthState.NOT_EVALUABLE, stood or _SKIPPED)
-        try:
-            evaluation = self._evaluator.evaluate(usable, (self._window, self._test))
-        except EstimationError as error:
-            return unread(HealthState.WATCHING if self.watching else HealthState.NOT_EVALUABLE, str(error))
-        foreign = self._levels.foreign(self._window, statistics, named=bool(self._test.state.findings), faulty=faulty)
-        evaluation = evaluation.named(self.machine.sensors, statistics, foreign.text)
-        looks = {n: stretch_of(one, self._window.hops[-n].start_ns, end_ns) for n, one in evaluation.short.items()}
-        whole = self._test.settings.window_hops
-        looks[whole] = stretch_of(evaluation.deciding, start_ns, end_ns)
-        verdict = self._test.update(looks, foreign=foreign.text != "", rivals=evaluation.rivals(foreign))
-        unexplained, suspect = evaluation.deciding.unexplained, evaluation.deciding.suspect
-        astride_s = self._test.astride_s if evaluation.alone and not foreign.text else 0.0
-        explains = self._alarms.found(verdict, self._test.unexplained, suspect, end_ns, astride_s, hidden=foreign.hides)
-        self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=explains)
-        reason = evaluation.reason(told=bool(verdict.current))
-        if evaluation.shapes:
-            changed, evidence = evaluation.unlike_healthy, Evidence(start_ns=start_ns, end_ns=end_ns)
-            self._alarms.update_state(SHAPE, changed != "", end_ns, changed, evidence=evidence)
-        look, length_s = looks[whole].complete(), self.machine.window.length_s
-        calm = evaluation.calm(outside=verdict.outside_model, without=usable is not statistics)
-        if not self._plan.states and self._levels.reference is not None:
-            calm, reason = HealthState.UNCHANGED, ""
-        return Report(
-            **self._window_now(start_ns, end_ns, self._state(calm)),
-            **evaluation.read,
-            misfit_z=evaluation.deciding.misfit_z,
-            suspect=suspect if verdict.outside_model or foreign.hides else "",
-            verdict=verdict,
-            sensors=findings,
-            detectable=() if unexplained else detectable_changes(look, self._test.thresholds(whole), length_s),
-            reason=reason,
-            shapes=evaluation.shapes,
-        )
-
-    def _window_now(self, start_ns: int, end_ns: int, state: HealthState) -> dict[str, Any]:
-        """What every report on a window begins with."""
-        little = state in {HealthState.UNCHANGED, HealthState.WATCHING}  # is claimed: what would be seen has to be said
-        return {
-            **self.identity,
-            "start_ns": start_ns,
-            "end_ns": end_ns,
-            "state": state,
-            "filled": self._window.filled,
-            "levels": self._levels.latest,
-            "level_growth": growth_seen(self._levels.latest) if little else None,
-        }
-
-    def _state(self, otherwise: HealthState) -> HealthState:
-        """A raised alarm outranks warming and not-evaluable: missing data clears nothing."""
-        self._calm = otherwise
-        severity = self._alarms.severity
-        return otherwise if severity is None else HealthState[severity.name]

@@ -1,0 +1,159 @@
+"""What is reported of the window after each hop: sensors first, then levels, then what the diagnosticians say."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from models.alarm_names import SHAPE
+from models.commissioning.commissioned import Installed
+from models.diagnosis.sensors.check import sensor_findings
+from models.diagnosis.sensors.reference import implicated
+from models.diagnosis.sensors.standstill import Standstill
+from models.diagnosis.verdict.calibration import detectable_changes
+from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
+from models.diagnosis.verdict.stretch import stretch_of
+from models.diagnosis.window.moments import plan_for
+from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.statistics import WindowStatistics
+from models.errors import EstimationError
+from models.levels.judgement import growth_seen
+from rotorwatch.records.alarms import Evidence
+from rotorwatch.records.fields import finite
+from rotorwatch.records.health import HealthState, Report
+from rotorwatch.records.windows import SensorFault
+from service.monitor.alarms.book import AlarmBook
+from service.monitor.alarms.data_path import DataPathAlarms
+from service.monitor.evaluation import left_out
+from service.monitor.evaluators import evaluator_for
+from service.monitor.levels import LevelWatch
+from service.monitor.reports import identity_of
+
+_RPM = 30 / np.pi
+_SKIPPED = "not evaluated: this computer cannot keep up; levels and sensors were judged"
+
+
+class WindowReporter:
+    """Reports on the windows of one machine, and lets its alarms know what they show.
+
+    Parameters
+    ----------
+    remembered : bool
+        See `MachineMonitor`.
+
+    Attributes
+    ----------
+    samples : SlidingWindow
+        What is reported on; whoever has the samples feeds it.
+    window : callable or None
+        Makes the statistics of the window of the latest report; None before it was full.
+    calm : HealthState
+        State of the latest report without raised alarms.
+    """
+
+    def __init__(self, installed: Installed, alarms: AlarmBook, data_path: DataPathAlarms, *, remembered: bool) -> None:
+        self._machine = machine = installed.machine
+        self.identity = identity_of(installed)
+        self.evaluator = judge = evaluator_for(installed)
+        self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
+        self.standstill = Standstill(self._sensors)
+        self._plan = plan = plan_for(machine, lagged=judge.needs_lags, levels=True, thorough=installed.thorough)
+        self.watching = installed.watching or not plan.states
+        self.levels = LevelWatch(plan, machine, installed)
+        channels = len(machine.sensors)
+        self.samples = SlidingWindow(plan, remembered=remembered, lines=installed.lines, channels=channels)
+        self.test = SequentialTest(SequentialSettings.for_machine(machine, short=judge.takes_short), by=judge.by)
+        self._alarms, self._data_path = alarms, data_path
+        self.window: Callable[[], WindowStatistics] | None = None
+        self.calm = HealthState.WARMING
+
+    def report(self, end_ns: int, missing: tuple[SensorFault, ...], *, skipped: bool) -> Report:
+        """Report on the window as it is after a completed hop, in which some channels lacked numbers.
+
+        It is skipped if it is not to be evaluated, because the monitor cannot keep up.
+        """
+        samples, levels, test = self.samples, self.levels, self.test
+        levels.take(samples, implicated(missing))
+        statistics, self.window = samples.statistics(), samples.again()
+        there = statistics or samples.statistics(len(samples.hops))  # while it fills
+        stood = "" if there is None else self.standstill.found(there)
+        if statistics is None:
+            if missing and there is not None:  # it ends no other fault: those are looked for in whole windows
+                self._data_path.sensors(missing, there, standing=True)
+            levels.tell(self._alarms, end_ns, faulty=implicated(missing), standing=bool(stood))
+            return self.unread(end_ns, end_ns, HealthState.WARMING, sensors=missing)
+        findings = sensor_findings(statistics, self._sensors, self._machine.sensors, missing, standing=bool(stood))
+        usable = self.evaluator.usable(statistics, self._plan, findings)
+        if usable is not None and usable is not statistics and not stood:
+            findings = tuple(map(left_out, findings))
+        start_ns, faulty = statistics.start_ns, implicated(findings)
+        speed = None if "theta" in faulty else finite(statistics.speed_rad_s)
+        self._alarms.suppress(None if speed is None else speed * _RPM, end_ns)
+        self._data_path.sensors(findings, statistics, standing=bool(stood))
+        self.evaluator.heard(findings)
+        seen: dict[str, Any] = {"speed_rad_s": speed, "sensors": findings}
+
+        def unread(state: HealthState, reason: str) -> Report:
+            levels.tell(self._alarms, end_ns, faulty=faulty, standing=bool(stood))
+            return self.unread(start_ns, end_ns, state, **seen, reason=reason)
+
+        if usable is None:
+            return unread(HealthState.DATA_HEALTH, "; ".join(each.text for each in findings))
+        if stood or skipped:
+            return unread(HealthState.NOT_EVALUABLE, stood or _SKIPPED)
+        try:
+            evaluation = self.evaluator.evaluate(usable, (samples, test))
+        except EstimationError as error:
+            return unread(HealthState.WATCHING if self.watching else HealthState.NOT_EVALUABLE, str(error))
+        foreign = levels.foreign(samples, statistics, named=bool(test.state.findings), faulty=faulty)
+        evaluation = evaluation.named(self._machine.sensors, statistics, foreign.text)
+        looks = {n: stretch_of(one, samples.hops[-n].start_ns, end_ns) for n, one in evaluation.short.items()}
+        whole = test.settings.window_hops
+        looks[whole] = stretch_of(evaluation.deciding, start_ns, end_ns)
+        verdict = test.update(looks, foreign=foreign.text != "", rivals=evaluation.rivals(foreign))
+        unexplained, suspect = evaluation.deciding.unexplained, evaluation.deciding.suspect
+        astride_s = test.astride_s if evaluation.alone and not foreign.text else 0.0
+        explains = self._alarms.found(verdict, test.unexplained, suspect, end_ns, astride_s, hidden=foreign.hides)
+        levels.tell(self._alarms, end_ns, faulty=faulty, explained=explains)
+        reason = evaluation.reason(told=bool(verdict.current))
+        if evaluation.shapes:
+            changed, evidence = evaluation.unlike_healthy, Evidence(start_ns=start_ns, end_ns=end_ns)
+            self._alarms.update_state(SHAPE, changed != "", end_ns, changed, evidence=evidence)
+        look, length_s = looks[whole].complete(), self._machine.window.length_s
+        calm = evaluation.calm(outside=verdict.outside_model, without=usable is not statistics)
+        if not self._plan.states and levels.reference is not None:
+            calm, reason = HealthState.UNCHANGED, ""
+        return Report(
+            **self._window_now(start_ns, end_ns, calm),
+            **seen | evaluation.read,
+            misfit_z=evaluation.deciding.misfit_z,
+            suspect=suspect if verdict.outside_model or foreign.hides else "",
+            verdict=verdict,
+            detectable=() if unexplained else detectable_changes(look, test.thresholds(whole), length_s),
+            reason=reason,
+            shapes=evaluation.shapes,
+        )
+
+    def unread(self, start_ns: int, end_ns: int, calm: HealthState, **seen: Any) -> Report:
+        """Report of the levels and the sensors alone."""
+        return Report(**self._window_now(start_ns, end_ns, calm), **seen)
+
+    def _window_now(self, start_ns: int, end_ns: int, calm: HealthState) -> dict[str, Any]:
+        """What every report on a window begins with."""
+        state = self.state(calm)
+        little = state in {HealthState.UNCHANGED, HealthState.WATCHING}  # is claimed: what would be seen has to be said
+        return {
+            **self.identity,
+            "start_ns": start_ns,
+            "end_ns": end_ns,
+            "state": state,
+            "filled": self.samples.filled,
+            "levels": self.levels.latest,
+            "level_growth": growth_seen(self.levels.latest) if little else None,
+        }
+
+    def state(self, otherwise: HealthState) -> HealthState:
+        """A raised alarm outranks warming and not-evaluable: missing data clears nothing."""
+        self.calm = otherwise
+        severity = self._alarms.severity
+        return otherwise if severity is None else HealthState[severity.name]
