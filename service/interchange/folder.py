@@ -18,7 +18,6 @@ from models.machine import MachineFile
 from models.signals.block import FloatArray
 from service.interchange.angle import pulse_times
 from service.interchange.clock import Clock, clock_for
-from service.interchange.formats import DATED, format_of, open_source
 from service.interchange.mapping import Keyphasor, Mapping
 from service.interchange.samples import Gap, Piece, Read, Signal, pieces, signals_of
 from service.interchange.source import Source, SourceError
@@ -81,13 +80,13 @@ def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tupl
         If there is none, or a start is given and no schedule.
     """
     paths = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
-    paths = sorted((path for path in paths if format_of(path, mapping) is not None), key=_natural)
+    paths = sorted((path for path in paths if mapping.format_of(path) is not None), key=_natural)
     if not paths:
         raise SourceError(f"{folder}: no file of a known format in it; say format = ... in the mapping")
     base, schedule = mapping.time, machine.schedule
     # The files' column may run on from one to the next.
     runs_on = base.start is not None and base.column is not None and schedule is None
-    dated = base.start is None and any(format_of(path, mapping) in DATED for path in paths)
+    dated = base.start is None and any(kind.dated for kind in map(mapping.format_of, paths) if kind)
     if base.is_absolute or runs_on or dated:
         return _by_their_own_times(paths, mapping, machine)
     if base.start_ns is not None:
@@ -126,7 +125,7 @@ def _by_their_own_times(paths: Sequence[Path], mapping: Mapping, machine: Machin
     begun, base = [], mapping.time
     for path, told_ns in zip(paths, _named(paths, mapping), strict=True):
         begin_ns, named_ns = -1, None
-        with suppress(SourceError), open_source(path, mapping) as source:
+        with suppress(SourceError), mapping.open(path) as source:
             columns = [one.reference for one in signals_of(source, mapping, machine)]
             if not base.is_datetime and base.start is None and source.timing(columns).start_ns is None:
                 named_ns = told_ns
@@ -235,7 +234,7 @@ def runs_of_pulses(
 def _opened(
     file: SnapshotFile, mapping: Mapping, machine: MachineFile, first: Clock | None = None
 ) -> Iterator[tuple[Source, list[Signal], Clock]]:
-    with open_source(file.path, mapping) as source:
+    with mapping.open(file.path) as source:
         signals = signals_of(source, mapping, machine)
         clock = clock_for(source, [one.reference for one in signals], mapping.time, machine, file.start_ns)
         yield source, signals, clock if first is None or file.start_ns is None else clock.after(first)

@@ -24,7 +24,6 @@ from service.interchange.angle import AngleColumn, pulse_times, read_pulses
 from service.interchange.blocks import BlockMaker, Written
 from service.interchange.clock import Clock, clock_for
 from service.interchange.folder import SnapshotFile, joined, runs_of_pulses, snapshot_files, unusable
-from service.interchange.formats import open_source
 from service.interchange.mapping import Mapping
 from service.interchange.overlap import Integration, Overlap, Resampling
 from service.interchange.samples import Piece, Read, pieces, signals_of
@@ -99,7 +98,7 @@ def _imported(
 ) -> Imported:
     if any(recording.exists() and file.path.exists() and recording.samefile(file.path) for file in files):
         raise SourceError(f"{recording}: is what is imported, expected another name for the recording")
-    with open_source(files[0].path, mapping) as source:
+    with mapping.open(files[0].path) as source:
         signals = signals_of(source, mapping, machine)
         columns = [signal.reference for signal in signals]
         keyphasor = mapping.keyphasor

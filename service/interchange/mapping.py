@@ -6,7 +6,7 @@ One TOML file; ``docs/interchange.md`` explains each field.
 import re
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, cast
 from zoneinfo import ZoneInfo
 
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
@@ -16,8 +16,9 @@ from models.machine import MachineFile
 from models.mistakes import checked, did_you_mean, read_toml
 from models.signals.channels import Channel, Quantity, time_unit_ns, unit_factor
 from models.signals.sensor import Sensor
+from service.interchange.formats import Format
+from service.interchange.source import Source, SourceError
 
-Format = Literal["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"]
 _DATETIME = "datetime"
 _ZEROS_NS = {"unix": 0, "datenum": -719_529 * 86_400 * 10**9}
 """Where counts of time begin, nanoseconds since 1970; MATLAB counts days from a year 0."""
@@ -188,6 +189,36 @@ class Mapping(BaseModel, extra="forbid", frozen=True):
     def accelerations(self) -> dict[str, Column]:
         """Channels to integrate."""
         return {} if self.acceleration is None else self.acceleration.channels
+
+    def format_of(self, path: Path) -> Format | None:
+        """Format that is said here, or by the end of a file's name; None if neither says one."""
+        return self.format or Format.of(path)
+
+    def open(self, path: Path) -> Source:
+        """Open a file.
+
+        Raises
+        ------
+        SourceError
+            If the format is not known, or the file is not of it.
+        """
+        if not path.is_file():
+            raise SourceError(f"{path}: no such file")
+        kind, base = self.format_of(path), self.time
+        zone = base.zone or "UTC"
+        if kind is None:
+            suffixes = ", ".join(suffix for known in Format for suffix in known.suffixes)
+            raise SourceError(
+                f"{path}: format {path.suffix or 'without a suffix'!r} is not known; say format = ... in the mapping, "
+                f"or name the file {suffixes}"
+            )
+        if kind is Format.CSV:
+            found = kind.reader(path, self.csv, base.column, datetimes=base.is_datetime, zone=zone)
+        elif kind is Format.PARQUET:
+            found = kind.reader(path, zone=zone)
+        else:
+            found = kind.reader(path)
+        return cast(Source, found)
 
     def check_against(self, machine: MachineFile) -> None:
         """Check that every channel of the machine is mapped, once, and in a unit of its quantity.

@@ -1,4 +1,4 @@
-"""What an importer asks of a file. A new format is one class, and a line in `service.interchange.formats`.
+"""What an importer asks of a file. A new format is one class, and a row of `service.interchange.formats`.
 
 A source hands out columns as the file has them, in pieces, and what the file itself says of time and units. It checks
 nothing: units, times and numbers are judged in one place for all formats.
