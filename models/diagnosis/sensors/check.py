@@ -6,7 +6,7 @@ import numpy as np
 
 from models.diagnosis.sensors.disagreement import BROKEN, gain_and_delay, suspect_pairs, swapped
 from models.diagnosis.sensors.kinematics import PairReading, banded, read_pair
-from models.diagnosis.sensors.level import clipped, dropped, gain_jump, offset, spiked, stuck
+from models.diagnosis.sensors.level import CHECKS, clipped, dropped, gain_jump, stuck
 from models.diagnosis.sensors.noise import noisy
 from models.diagnosis.sensors.phase import no_angle, phase_faults
 from models.diagnosis.sensors.reference import Naming, SensorReference, implicated
@@ -45,8 +45,9 @@ def sensor_findings(
     wrong_angle = [] if "theta" in bare else no_angle(window, naming)
     if stood.any() or wrong_angle:
         return (*findings, *wrong_angle)
-    findings += [found for found in offset(window, naming, reference) if not set(found.states) & implicated(findings)]
-    findings += [found for found in spiked(window, naming) if not set(found.states) & implicated(findings)]
+    for check in CHECKS:
+        bad = implicated(findings)
+        findings += [found for found in check(window, naming, reference) if not set(found.states) & bad]
     bad = implicated(findings)
     if any("theta" in one.states and (one.value or 0.0) < _ALL * window.duration_s for one in missing):
         return tuple(findings)  # where the angle comes or goes, what turns with the shaft is left in a hop

@@ -144,7 +144,7 @@ def at_range_end(windows: Sequence[WindowStatistics], naming: Naming) -> list[st
     return found
 
 
-def spiked(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
+def spiked(window: WindowStatistics, naming: Naming, _: SensorReference | None) -> list[SensorFault]:
     """Displacements with peaks that are no motion: velocity or acceleration of the same motion do not show them."""
     hops, found = window.hop_waveform, []
     reach = np.maximum(hops.maximum - hops.mean, hops.mean - hops.minimum)
@@ -208,6 +208,10 @@ def offset(window: WindowStatistics, naming: Naming, reference: SensorReference 
             continue
         findings.append(SensorFault(states=(state,), kind=FaultKind.OFFSET, text=text, value=value, z=z))
     return findings
+
+
+CHECKS = (offset, spiked)
+"""What is checked of channels that are neither missing, stuck nor clipped, one after the other."""
 
 
 def _scale(window: WindowStatistics) -> FloatArray:
