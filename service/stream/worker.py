@@ -34,6 +34,7 @@ from service.monitor.reports import MachineHealth, MonitorReport, Tally, identit
 from service.recordings.recorder import MachineRecorder
 from service.settings.service import QueueSettings
 from service.stream.checkpoints import StepWriter, recorded_after, recorded_since_ns, restored
+from service.stream.data_clock import DataClock
 from service.stream.inbox import Inbox, RawBlock
 from service.stream.liveness import COMPUTER, Clocks, Pulse
 from service.stream.monitored import MachineStatus
@@ -41,9 +42,6 @@ from service.stream.shedding import LoadShedding, in_turn
 from service.terminal.logs import Limiter, logger
 
 _OPERATION_S = 10.0
-_HELD_UP_S = 2.0
-"""Time passes in steps of a fraction of this; if not, the program itself stood still."""
-_AGAIN_S = 20.0  # to hear a stream again after a restart: of all machines, what publishers have kept comes first
 _SEEN_S = 0.5  # within which others see what a block changed, if more blocks wait
 _LATEST = 100
 _LONGEST_ERROR = 500
@@ -102,15 +100,13 @@ class MachineWorker:
         self._limiter = Limiter(clocks.monotonic_s)
         self.steps = StepWriter(history, self.identity)
         self._unpublished: tuple[StoredEvent, ...] = ()
-        self._asleep_s = self._unevaluated_s = 0.0
+        self._unevaluated_s = 0.0
+        self._time = DataClock(clocks, machine.ingest.no_data_after_s)
         self._shedding: LoadShedding | None = None
         self._monitor, self.restart = self._restored(installed)
         self._sheds = queue.when_full == "drop" and not self._monitor.watching
         self._snapshot: MachineHealth = self._monitor.health()
-        self._latest_data_s: float | None = None
-        self._operated_ns = 0
         self.told = self._monitor.next_sequence  # of the first alarm event that `health` does not show yet
-        self._begin_s = self._ticked_s = self._held_up_s = clocks.monotonic_s()
         self._seen_s = -math.inf  # when others were last shown where the monitor stands
         self._missed = self._dropped_logged = 0
         self._publisher_alive = self._replay_announced = False
@@ -132,7 +128,7 @@ class MachineWorker:
         monitor, text = restored(lambda: MachineMonitor(installed, self._skips), self.identity, checkpoint, last + 1)
         self.steps.keeps(tuple(name for name, _ in checkpoint.parts))
         self.history.go_on_from(monitor.next_sequence - 1)
-        self._asleep_s = max(0.0, (self._clocks.utc_ns() - checkpoint.head.recorded_ns) / 1e9)
+        self._time.slept(checkpoint.head.recorded_ns)
         # They were committed, but nobody knows whether they were published; whoever heard them leaves them out by id.
         latest = self.history.events(after=last - _LATEST, limit=_LATEST)
         self._unpublished = tuple(one for one in latest if one.recorded_ns >= checkpoint.head.recorded_ns)
@@ -147,7 +143,7 @@ class MachineWorker:
         reasons = [] if refused is None else [f"the history refuses what happens: {refused}"]
         if self.history.trouble:
             reasons.append(f"the history does not accept what happens: {self.history.trouble}")
-        if self._unevaluated_s > 2 * self.machine.hop_data_s and not self._silent:
+        if self._unevaluated_s > 2 * self.machine.hop_data_s and not self._time.silent:
             why = self._snapshot.reason
             reasons.append(f"{self._unevaluated_s:.0f} s of data have come in and no window was evaluated: {why}")
         return "; ".join(reasons)
@@ -155,7 +151,7 @@ class MachineWorker:
     def start(self, outlet: Callable[[Topic, str], None]) -> None:
         """Start the thread; it publishes to `outlet`."""
         self._outlet = outlet
-        self._begin_s = self._ticked_s = self._clocks.monotonic_s()
+        self._time.begin()
         self.tick()  # before any block: what time it is so far
         for event in self._unpublished:
             outlet("alarm_event", event.text)
@@ -195,13 +191,13 @@ class MachineWorker:
 
     def health(self) -> Health:
         """Where the machine stands now."""
-        latest_s, snapshot, silent = self._latest_data_s, self._snapshot, self._silent
+        snapshot, silent = self._snapshot, self._time.silent
         return conversion.health(
             self.identity,
             snapshot,
             StreamStatus(
                 publisher_alive=self._publisher_alive,
-                data_age_s=None if latest_s is None else round(max(0.0, self._clocks.monotonic_s() - latest_s), 3),
+                data_age_s=self._time.age_s,
                 silent=silent,
                 silent_since_ns=snapshot.end_ns if silent else None,
                 replay_announced=self._replay_announced,
@@ -267,8 +263,7 @@ class MachineWorker:
             if not done.set_running_or_notify_cancel():
                 return
             try:
-                time_ns = self._operated_ns = max(self._data_now_ns(), self._operated_ns + 1)
-                events = self._monitor.operate(operation, time_ns)
+                events = self._monitor.operate(operation, self._time.next_ns(self._monitor.end_ns))
                 self._conclude((), events)
                 done.set_result(tuple(alarm_cloud_event(self.identity, event) for event in events))
             except Exception as error:  # belongs to whoever asked; the thread goes on
@@ -289,41 +284,19 @@ class MachineWorker:
         """Let the machine's thread notice that time passes, with data or without; called every now and then."""
         self._pulse.beat()
 
-    @property
-    def _silent(self) -> bool:
-        """Whether no usable block has come for longer than a silence may last."""
-        before_s = self._asleep_s if self._latest_data_s is None else 0.0
-        return self._clocks.monotonic_s() - self._heard_s + before_s > self.machine.ingest.no_data_after_s
-
-    @property
-    def _heard_s(self) -> float:
-        """When the latest block came, or later, when this program went on after it had stood still."""
-        return max(self._held_up_s, self._begin_s if self._latest_data_s is None else self._latest_data_s)
-
     def _data_now_ns(self) -> int:
-        """Data time that has been reached: end of the newest data, and what has passed since."""
-        end_ns = self._monitor.end_ns
-        if end_ns is None:
-            return self._clocks.utc_ns()
-        now_s = self._clocks.monotonic_s()
-        if self._latest_data_s is None:
-            return end_ns + round((self._asleep_s + now_s - self._begin_s) * 1e9)
-        return end_ns + round((now_s - self._latest_data_s) * 1e9)
+        return self._time.now_ns(self._monitor.end_ns)
 
     def _tick(self) -> None:
-        now_s, least_s = self._clocks.monotonic_s(), _AGAIN_S if self._latest_data_s is None else 0.0
-        limit_s = max(self.machine.ingest.no_data_after_s, least_s)
-        if now_s - self._ticked_s > _HELD_UP_S and self._ticked_s - self._heard_s < limit_s:
-            self._held_up_s = now_s  # a silence that had begun before goes on
-        self._ticked_s = now_s
+        self._time.tick()
         if news := self.steps.begun_anew():
             self._conclude((), self._monitor.fault(news, self._data_now_ns()), always=True)
         if len(self.inbox):
             return  # time passes with the blocks that wait
         if self._monitor.end_ns is not None:
-            if now_s - self._heard_s >= limit_s:
+            if self._time.given_up:
                 self._conclude_reports(self._monitor.flush())
-            elif self._latest_data_s is None or now_s - self._latest_data_s >= limit_s:
+            elif self._time.stands:
                 return
         self._conclude((), self._monitor.passed(self._data_now_ns()))
 
@@ -335,9 +308,9 @@ class MachineWorker:
         """Take from the recording what the window lacks, and what came after the latest step that was committed."""
         for message in recorded_after(self._monitor, self._recorded(since_ns)):
             self._take(RawBlock(message.payload, message.attachment, message.encoding))
-            self._asleep_s = max(0.0, (self._clocks.utc_ns() - message.log_time_ns) / 1e9)
+            self._time.slept(message.log_time_ns)
         self._snapshot = self._monitor.health()
-        self._latest_data_s = None  # they are as old as they are
+        self._time.wake()
 
     def _run(self) -> None:
         try:
@@ -389,9 +362,7 @@ class MachineWorker:
         for report in reports:
             self._explain(report)
             if report.verdict.accepted:
-                if self._latest_data_s is None or not report.verdict.continuous:
-                    self._operated_ns = 0  # perhaps by another clock
-                self._latest_data_s = self._clocks.monotonic_s()
+                self._time.came(continuous=report.verdict.continuous)
                 self.tally.data_s += report.data_s
             if report.fault is not None:
                 self._failed(report.fault)
