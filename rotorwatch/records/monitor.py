@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from rotorwatch.records.fields import EXAMPLE_NS, REQUEST, OfMachine, Record
 from rotorwatch.records.health import State
@@ -149,6 +149,15 @@ class HistoryStatus(Record):
     readings_days: float = Field(description="how long the readings of single windows are kept", examples=[90.0])
     buckets_days: float = Field(description="how long what they are reduced to is kept", examples=[3650.0])
     machines: tuple[HistorySpan, ...] = Field(description="machine by machine, by name")
+
+
+class SettingList(Record):
+    """Settings of the monitor as they are in use, what the file leaves out filled in."""
+
+    settings: dict[str, dict[str, JsonValue]] = Field(
+        description="by table and name; tables that may hold a secret are left out",
+        examples=[{"http": {"host": "127.0.0.1", "port": 8080}, "log": {"level": "info", "format": "console"}}],
+    )
 
 
 class Problem(BaseModel):

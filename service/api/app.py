@@ -12,7 +12,7 @@ from rotorwatch import __version__
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health
 from rotorwatch.records.machines import DetectableChanges, MachineConfiguration, MachineDescription, MachineList
-from rotorwatch.records.monitor import Alive, Readiness, WebhookList
+from rotorwatch.records.monitor import Alive, Readiness, SettingList, WebhookList
 from service.access.guard import Guard
 from service.access.problems import add_problems, problem_answer, problem_responses, responses
 from service.api.description import DescribedApp, only_known_arguments
@@ -171,6 +171,11 @@ def _add_service_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
     def webhooks() -> WebhookList:
         """Programs that are told of alarm events, and whether they take them."""
         return service.webhooks.statuses()
+
+    @app.get("/api/v1/settings", tags=["service"], dependencies=[guard.configure], responses=responses(SettingList))
+    def settings() -> SettingList:
+        """Settings of the monitor as they are in use, without those that may hold a secret."""
+        return SettingList(settings=service.settings.shown)
 
 
 def _add_readiness_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:

@@ -12,6 +12,7 @@ from service.delivery.event_feed import EventFeed
 from service.delivery.metrics.collector import MeasuredService, Metrics
 from service.history.store import Store
 from service.recordings.catalogue import Catalogue
+from service.settings.service import ServiceSettings
 from service.stream.monitored import Monitored
 
 PLACE = "/api/v1/machines/{site}/{machine}"
@@ -48,6 +49,7 @@ AlarmName = Annotated[
 class ServiceView(MeasuredService, Protocol):
     """What the API needs to know about the service; `service.runtime.runtime.Runtime` is one."""
 
+    settings: ServiceSettings
     metrics: Metrics
     feed: EventFeed
     store: Store

@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, Field, JsonValue, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, SettingsError
 
 from models.errors import MachineFileError
@@ -23,6 +23,8 @@ from service.settings.webhooks import WebhookSettings
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 
 _ENV_PREFIX = "ROTORWATCH_"
+_SHOWN = {"http", "queue", "shards", "recording", "replay", "log"}
+"""Tables without a secret."""
 
 
 class HttpSettings(BaseModel, extra="forbid", frozen=True):
@@ -244,6 +246,11 @@ class ServiceSettings(BaseSettings):
         if repeated := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"webhooks: two are called {repeated[0]}, expected different names")
         return self
+
+    @property
+    def shown(self) -> dict[str, dict[str, JsonValue]]:
+        """What whoever may configure the monitor may see of them: everything in tables without a secret."""
+        return self.model_dump(mode="json", include=_SHOWN)
 
     @classmethod
     def settings_customise_sources(

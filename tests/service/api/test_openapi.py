@@ -96,7 +96,7 @@ def routes(app: FastAPI) -> set[tuple[str, str]]:
 
 
 def needed(method: str, path: str) -> Scope:
-    if path.startswith(("/api/v1/audit", "/api/v1/history", "/api/v1/tokens")) or path.endswith(
+    if path.startswith(("/api/v1/audit", "/api/v1/history", "/api/v1/settings", "/api/v1/tokens")) or path.endswith(
         ("/remove-from-service", "/return-to-service")
     ):
         return CONFIGURE

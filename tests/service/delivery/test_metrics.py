@@ -220,6 +220,19 @@ def test_webhooks_over_http(served: tuple[Runtime, str, Read]) -> None:
         assert http.get("/api/v1/webhooks").status_code == http.get("/metrics").status_code == 403
 
 
+def test_settings_over_http_are_those_in_use_without_what_may_be_secret(served: tuple[Runtime, str, Read]) -> None:
+    runtime, text, _ = served
+    with client(runtime, token(runtime, Scope.CONFIGURE, name="who sets it up")) as http:
+        answer = http.get("/api/v1/settings").raise_for_status()
+    found = answer.json()["settings"]
+    assert set(found) == {"http", "queue", "shards", "recording", "replay", "log"}
+    assert found["queue"] == runtime.settings.queue.model_dump()
+    assert "/hook" not in answer.text
+    assert runtime.settings.history.database not in answer.text
+    with client(runtime, text) as http:
+        assert http.get("/api/v1/settings").status_code == 403
+
+
 def test_after_a_restart(tmp_path: Path) -> None:
     plan = settings(endpoint(), machine_file(tmp_path, IN_ORDER), when_full="wait", history=kept_in(tmp_path))
     with feeding(plan) as (runtime, feed):

@@ -4,6 +4,7 @@ import { monitor } from "../monitor/monitor.js";
 import "./audit-log.js";
 import "./history-status.js";
 import "./service-load.js";
+import "./settings-list.js";
 import "./token-list.js";
 import "./webhook-list.js";
 
@@ -19,7 +20,7 @@ class AdministrationView extends LiveElement {
     const title = html("h1", {}, "Administration");
     if (!monitor.caller) return lay(this, title);
     if (!monitor.may("configure")) return lay(this, title, html("p", {}, `This needs the scope configure; ${monitor.caller.name} has ${monitor.caller.scopes.join(", ") || "none"}.`));
-    lay(this, title, html("service-load"), html("token-list"), html("webhook-list"), html("history-status"), html("audit-log"));
+    lay(this, title, html("service-load"), html("token-list"), html("webhook-list"), html("history-status"), html("settings-list"), html("audit-log"));
   }
 }
 

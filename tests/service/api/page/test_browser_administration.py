@@ -102,6 +102,7 @@ def test_a_token_is_created_used_to_sign_in_and_revoked(browser: Browser, runtim
         expect(page.locator("service-load tbody tr")).to_contain_text("demo/lab")
         expect(page.locator("history-status")).to_contain_text("kept for 14 days")
         expect(page.locator("webhook-list")).to_contain_text("The settings name no webhook")
+        expect(page.locator("settings-list tr", has_text="[queue] when_full")).to_be_visible()
         page.get_by_role("button", name="Older").click()
         expect(log.filter(has_text="long ago")).to_have_count(OLD)
         page.route("**/api/v1/webhooks", lambda route: route.fulfill(json=example(WebhookList)))

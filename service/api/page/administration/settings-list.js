@@ -1,0 +1,26 @@
+import { html, lay, table } from "../elements/markup.js";
+import { LiveElement } from "../elements/live-element.js";
+import { API, monitor } from "../monitor/monitor.js";
+
+/** @typedef {import("../monitor/records.d.ts").SettingList} SettingList */
+
+/** The settings of the monitor as they are in use. */
+class SettingTable extends LiveElement {
+  connectedCallback() {
+    super.connectedCallback();
+    this.load();
+  }
+
+  async ask() {
+    const { settings } = /** @type {SettingList} */ (await monitor.ask(`${API}/settings`));
+    const rows = Object.entries(settings).flatMap(([part, fields]) => Object.entries(fields).map(([name, value]) => ({ cells: [`[${part}] ${name}`, html("span", {}, value === null ? "none" : `${value}`)] })));
+    lay(this, html("h2", {}, "Settings"), table(["setting", "value"], rows, "Settings in use, but for access, webhooks, history and Zenoh"));
+  }
+
+  /** @param {string} why */
+  refused(why) {
+    lay(this, html("h2", {}, "Settings"), html("p", { class: "message", role: "status" }, why));
+  }
+}
+
+customElements.define("settings-list", SettingTable);
