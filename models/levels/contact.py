@@ -21,10 +21,14 @@ from models.signals.block import FloatArray
 
 _LAGS = (0, 2, 4, 8, 16, 64, 128)
 """Samples back that the next one is predicted from: the longest tell running speed from a line beside it."""
-_BEFORE = 2
-"""Samples back, one of these lags: far out is where the shaft was so then as well, and no single sample that is off."""
 _FAR_OUT = (0.02, 0.15)
 """Parts of the samples: a light contact is seen best in the first, one that is there in every turn in the second."""
+_BEFORE = 2
+"""Samples back, one of these lags: in the second, far out is where the shaft was so then as well. A stiff contact is
+over by then, and the shaft is back later than was predicted: in the first it is seen without."""
+_OFF = 8.0
+"""Times the average distance from what was predicted: a single sample that is off, by which nothing is far out unless
+the shaft was so before. Of a Gaussian's, none."""
 _LEAST = 1000
 """Samples: of less, hardly any are far out."""
 _FITTED = 4
@@ -82,22 +86,32 @@ def contact(
         now, then = place[:, first : kept - 1], place[:, first - _BEFORE : kept - 1 - _BEFORE]
         latest += [now, then]
     square, before = (y * y + z * z - 2 * skew * y * z for y, z in (now, then))
-    far = np.minimum(square, before)
-    at = [round((1 - part) * far.size) for part in _FAR_OUT]
-    limits = np.partition(far, at)[at]
-    # Towards the centre, in parts of the distance from it.
-    pushes = [(np.sqrt(limit / np.maximum(far, max(limit, _NOTHING**2))) - 1) * now for limit in limits]
     orders = np.stack([angle, angle * angle, angle * angle * angle])
-    known = np.concatenate([np.ones((1, far.size)), orders.real, orders.imag, *latest, square * now])
-    wanted = np.concatenate([x[:, first + 1 :], *pushes])
-    fitted, to = (np.ascontiguousarray(one[:, ::_FITTED]) for one in (known, wanted))
-    predicted, *_ = np.linalg.lstsq(fitted @ fitted.T, fitted @ to.T, rcond=1e-12)
-    left = wanted - predicted.T @ known  # the remainder, and what is left of the pushes
-    scale = np.sqrt(np.mean(left[:2] ** 2, axis=1))
-    together = left[0] / max(scale[0], _NOTHING) * left[2::2] + left[1] / max(scale[1], _NOTHING) * left[3::2]
+    known = np.concatenate([np.ones((1, square.size)), orders.real, orders.imag, *latest, square * now])
+    fitted = np.ascontiguousarray(known[:, ::_FITTED])
+    products = fitted @ fitted.T
+
+    def unpredicted(wanted: FloatArray) -> FloatArray:
+        by, *_ = np.linalg.lstsq(products, fitted @ np.ascontiguousarray(wanted[:, ::_FITTED]).T, rcond=1e-12)
+        return np.asarray(wanted - by.T @ known, dtype=np.float64)
+
+    remainder = unpredicted(x[:, first + 1 :])
+    both = np.minimum(square, before)
+    size = np.abs(remainder)
+    off = np.any(size > _OFF * size.mean(axis=1, keepdims=True), axis=0)[:-1]
+    square[1:][off] = both[1:][off]
+    limits, pushes = [], []
+    for part, far in zip(_FAR_OUT, (square, both), strict=True):
+        at = round((1 - part) * far.size)
+        limits.append(np.partition(far, at)[at])
+        # Towards the centre, in parts of the distance from it.
+        pushes.append((np.sqrt(limits[-1] / np.maximum(far, max(limits[-1], _NOTHING**2))) - 1) * now)
+    left = unpredicted(np.concatenate(pushes))
+    scale = np.sqrt(np.mean(remainder**2, axis=1))
+    together = remainder[0] / max(scale[0], _NOTHING) * left[::2] + remainder[1] / max(scale[1], _NOTHING) * left[1::2]
     # By their own squares: what shakes the machine may be louder while the shaft is far out.
     errors = np.sqrt(np.sum(together**2, axis=1))
-    if min(scale.min(), np.sqrt(limits.min())) < _NOTHING or errors.min() == 0:
+    if min(scale.min(), *np.sqrt(limits)) < _NOTHING or errors.min() == 0:
         return np.full(len(_FAR_OUT), np.nan)
     return np.asarray(together.sum(axis=1) / errors, dtype=np.float64)
 

@@ -21,10 +21,10 @@ COUNT = 24  # realisations of each, five seconds at 2 kHz
 def told(
     seed: int, *, clearance: float = np.inf, stiff: float = 0.5, cubic: float = 0.0, unbalance: float = 0.3,
     line: tuple[float, float] = (0.0, 1.0), spikes: float = 0.0, angle_deg: float = 90.0, rate_hz: float = 2000.0,
-    velocity: bool = False,
+    velocity: bool = False, mode_hz: float = MODE_HZ,
 ) -> FloatArray:  # fmt: skip
     """Of a disc on a shaft of stiffness one, shaken at random to an rms of about one, with noise of one per cent."""
-    rng, omega, dt = np.random.default_rng(seed), 2 * np.pi * MODE_HZ, 1 / rate_hz
+    rng, omega, dt = np.random.default_rng(seed), 2 * np.pi * mode_hz, 1 / rate_hz
     n = round(N * rate_hz / 2000.0)
     angle = 2 * np.pi * SPEED_HZ * dt * np.arange(n)
     circle = np.stack([np.cos(angle), np.sin(angle)])
@@ -81,6 +81,10 @@ def test_a_contact_is_seen_whatever_the_quantity_the_rate_and_the_angle(
     which: int, seed: int, how: dict[str, Any]
 ) -> None:
     assert z(told(seed, **how))[which] > 6
+
+
+def test_a_contact_that_is_over_after_a_few_samples_is_seen() -> None:
+    assert z(told(20261127, clearance=2.8, stiff=4.0, mode_hz=200.0))[0] > 6
 
 
 def test_velocities_are_looked_at_where_a_place_has_no_two_displacements() -> None:
