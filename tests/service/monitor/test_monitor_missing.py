@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from tests.sure import sure
 
 KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 20.0, "max_span_s": 40.0})})
 CASING = Sensor(name="DE-H", quantity="acceleration", location="DE", direction="horizontal", unit="m/s2")
+SOON = KIT.model_copy(update={"alarms": KIT.alarms.model_copy(update={"off_delay_s": 20.0})})
 RIG = KIT.model_copy(update={"sensors": (*KIT.sensors, CASING)})
 Z1_DOT, THETA = 3, 8
 FROM_S, TO_S, END_S = 31.0, 33.0, 125.0
@@ -47,14 +49,20 @@ def ends_s(reports: Sequence[Report], first_ns: int) -> list[float]:
     return [(one.end_ns - first_ns) / 1e9 for one in reports]
 
 
+@cache
+def usual(end_s: float, *, moved: bool = False) -> Sequence[Report]:
+    """Of a stream that lacks nothing, with the sensors where they are or on the casing."""
+    return feed(MachineMonitor(Installed(elsewhere(KIT) if moved else SOON)), scenario_blocks(end_s))[0]
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_missing_samples_are_told_of_their_channel_until_the_window_has_left_them(value: float) -> None:
-    monitor, sound = MachineMonitor(install(KIT, None)), MachineMonitor(install(KIT, None))
-    stream = list(without(Z1_DOT, FROM_S, TO_S, value))
-    (usual, _), (reports, events) = feed(sound, scenario_blocks(END_S)), feed(monitor, stream)
+    monitor, sound = MachineMonitor(install(SOON, None)), usual(85.0)
+    stream = list(without(Z1_DOT, FROM_S, TO_S, value, end_s=85.0))
+    reports, events = feed(monitor, stream)
     assert monitor.health().quality.refused_blocks == {}
     first_ns = stream[0].start_ns
-    assert ends_s(reports, first_ns) == ends_s(usual, first_ns)
+    assert ends_s(reports, first_ns) == ends_s(sound, first_ns)
     lacking = [one for one in reports if one.sensors]
     assert all(one.start_ns < first_ns + round(TO_S * 1e9) <= one.end_ns + 10**9 for one in lacking)
     assert {one.state for one in lacking} <= {HealthState.DATA_HEALTH, HealthState.ALERT}
@@ -67,10 +75,10 @@ def test_missing_samples_are_told_of_their_channel_until_the_window_has_left_the
     gone = [level for one in lacking for level in one.levels if level.channel == "z1_dot"]
     assert {(one.overall, one.x1, one.growth) for one in gone} == {(None, None, None)}  # not 0
     # Levels of the other channels are the same to the last bit, and the machine is diagnosed again.
-    for one, other in zip(reports, usual, strict=True):
+    for one, other in zip(reports, sound, strict=True):
         kept = [level for level in one.levels if level.channel != "z1_dot"]
         assert kept == [level for level in other.levels if level.channel != "z1_dot"]
-    last, other = reports[-1], usual[-1]
+    last, other = reports[-1], sound[-1]
     assert (last.state, last.sensors, last.levels) == (other.state, (), other.levels)
     assert [one.name for one in last.parameters] == [one.name for one in other.parameters]
 
@@ -262,13 +270,12 @@ def test_a_casing_sensor_that_is_unplugged_is_no_wrong_gain_of_its_place() -> No
 @pytest.mark.parametrize("missing_to_s", [30.0, 150.0])
 def test_the_first_windows_are_a_reference_of_the_channels_that_are_there(missing_to_s: float) -> None:
     rig = elsewhere(KIT)
-    monitor, sound = MachineMonitor(Installed(rig)), MachineMonitor(Installed(rig))
-    usual, reports = feed(sound, scenario_blocks(170.0))[0], list[Report]()
+    monitor, reports = MachineMonitor(Installed(rig)), list[Report]()
     for block in without(Z1_DOT, 0.0, missing_to_s, end_s=170.0):
         reports += feed(monitor, [block])[0]
         assert not any(name.startswith("level:") for name in raised(monitor))
     last, limited = reports[-1].levels, missing_to_s == 30.0
-    for level, other in zip(last, usual[-1].levels, strict=True):
+    for level, other in zip(last, usual(170.0, moved=True)[-1].levels, strict=True):
         assert (level == other) == (level.channel != "z1_dot")
         assert len(level.limits) == (len(other.limits) if limited or level == other else 0)
 

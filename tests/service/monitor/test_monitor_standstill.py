@@ -1,6 +1,6 @@
 """A machine that stops and starts raises nothing on its sensors; a phase reference that is lost while it runs does."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -13,7 +13,7 @@ from models.commissioning.healthy import healthy_from_blocks
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from models.signals.channels import Quantity
-from rotorwatch.records.health import HealthState
+from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
 from tests.commissioning.rotor_kit import commissioned, recording
 from tests.service.rig.live import LAB, scenario_blocks
@@ -61,8 +61,19 @@ def monitor_of(machine: MachineFile) -> MachineMonitor:
     return MachineMonitor(Installed(machine))
 
 
+@cache
+def stopped() -> Sequence[SampleBlock]:
+    """The rotor kit that stops and starts; not to be written to."""
+    return tuple(stopping(KIT, "machine"))
+
+
+@cache
+def usual() -> Sequence[Report]:
+    return feed(monitor_of(KIT), stopped())[0]
+
+
 def test_a_machine_that_stops_and_starts_raises_nothing_and_is_healthy_again_after_a_restart_too() -> None:
-    stream = list(stopping(KIT, "machine"))
+    stream = stopped()
     half = len(stream) // 2  # while it stands
     monitor = monitor_of(KIT)
     reports, events = feed(monitor, stream[:half])
@@ -86,13 +97,12 @@ def test_what_is_lost_while_the_machine_runs_is_told(what: str, alarm: str) -> N
 
 @pytest.mark.parametrize("dead", [0, 3])
 def test_beside_a_dead_channel_a_machine_that_stops_has_no_other_fault(dead: int) -> None:
-    name, stream = KIT.sensors[dead].name, list(stopping(KIT, "machine"))
+    name = KIT.sensors[dead].name
     silent = [
         replace(block, samples=np.where(np.arange(len(KIT.sensors)) == dead, np.float32(0), block.samples))
-        for block in stream
+        for block in stopped()
     ]
-    (usual, _), (reports, _) = feed(monitor_of(KIT), stream), feed(monitor_of(KIT), silent)
-    for one, other in zip(reports, usual, strict=True):
+    for one, other in zip(feed(monitor_of(KIT), silent)[0], usual(), strict=True):
         found, known = ({fault.states for fault in each.sensors} for each in (one, other))
         assert found - {(name,)} == {states for states in known if name not in states}
 
@@ -105,7 +115,7 @@ def test_without_a_shaft_angle_no_sensor_is_blamed_but_levels_have_fallen() -> N
 
 @cache
 def made_healthy() -> Installed:
-    made = commissioned(COMMISSIONED, recording(COMMISSIONED, scenario_blocks(END_S)))
+    made = commissioned(COMMISSIONED, recording(COMMISSIONED, scenario_blocks(125.0)))
     return Installed(COMMISSIONED, None, made.commissioned)
 
 
@@ -114,7 +124,7 @@ def test_a_level_has_fallen_while_the_first_window_fills_only_where_the_machine_
     quiet = [NOISE] * (len(KIT.sensors) - 1) + [1.0]
     first = [replace(block, samples=(block.samples * quiet).astype(np.float32)) for block in scenario_blocks(18.0)]
     if not turns:
-        first = list(stopping(KIT, "machine"))[round(10 * STANDS_S) :][:180]
+        first = list(stopped())[round(10 * STANDS_S) :][:180]
     reports, events = feed(MachineMonitor(made_healthy()), first)
     assert {one.state for one in reports} <= {HealthState.WARMING, HealthState.ALERT}
     assert {one.alarm.name for one in events} == {f"level:{one.name}" for one in KIT.sensors[:-1] if turns}
