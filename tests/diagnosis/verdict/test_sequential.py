@@ -308,6 +308,25 @@ def test_what_has_long_been_outside_the_model_is_taken_back_by_a_whole_window_al
     assert not outside
 
 
+def information(error: float, correlation: float) -> FloatArray:
+    """Of a window in which the unbalance has this error, correlated with that of damping."""
+    found = np.diag(np.array([0.03, 0.07, 0.03, 0.07, error, 0.01]) ** 2)
+    c, e = PARAMETERS.index("c_by"), PARAMETERS.index("e")
+    found[c, e] = found[e, c] = correlation * 0.07 * error
+    return np.asarray(np.linalg.inv(found), dtype=np.float64)
+
+
+def test_a_window_is_believed_where_a_sum_with_the_one_before_names_another_parameter() -> None:
+    """A change that grows little by little: windows of before and after it are added up."""
+    window_ns = 60_000_000_000
+    test = SequentialTest(replace(SETTINGS, short_hops=()))
+    healthy, now, grown = information(0.03, -0.6), information(0.06, 0.75), true(e=0.35)
+    for end_ns in range(window_ns, 2 * window_ns, 5_000_000_000):
+        test.update({12: Stretch(end_ns - window_ns, end_ns, 0 * grown, healthy)})
+    verdict = test.update({12: Stretch(window_ns, 2 * window_ns, now @ grown, now)})
+    assert [one.name for one in verdict.changed] == ["e"]
+
+
 def test_a_gap_is_no_part_of_a_sum() -> None:
     test, hops = SequentialTest(SETTINGS), gaussian(SEED + 8)
     play(test, hops, (24, true()))
