@@ -6,6 +6,9 @@
 
 The digest is looked at first, so that damaged bytes are refused before anything is read from them. Arrays of Python
 objects are refused: nothing in stored bytes is ever executed.
+
+What is remembered gives its arrays in `checkpoint` and takes them in `restore` or `restored`, which raise
+`CheckpointError` if one is missing or of another form.
 """
 
 import hashlib

@@ -180,13 +180,7 @@ class HopLevels:
 
     @classmethod
     def restored(cls, arrays: Mapping[str, np.ndarray]) -> "HopLevels":
-        """Levels from what `checkpoint` gave.
-
-        Raises
-        ------
-        CheckpointError
-            If an array is missing or of another form.
-        """
+        """Levels from what `checkpoint` gave, see `models.checkpoint`."""
         sums = checked(arrays, "sums", np.float64, (len(_SUMS), None))
         return cls(
             int(checked(arrays, "n_samples", np.int64, ())),

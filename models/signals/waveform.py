@@ -54,13 +54,7 @@ class Waveform:
 
     @classmethod
     def restored(cls, arrays: Mapping[str, np.ndarray]) -> "Waveform":
-        """Waveform of one hop from what `checkpoint` gave.
-
-        Raises
-        ------
-        CheckpointError
-            If an array is missing or of another form.
-        """
+        """Waveform of one hop from what `checkpoint` gave, see `models.checkpoint`."""
         mean, rms, minimum, maximum, step = checked(arrays, "levels", np.float64, (5, None))
         at_minimum, at_maximum, longest_run, dropped = checked(arrays, "counts", np.int64, (4, mean.size))
         n_samples = int(checked(arrays, "n_samples", np.int64, ()))

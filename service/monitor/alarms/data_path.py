@@ -44,13 +44,7 @@ class DataPathAlarms:
         }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called.
-
-        Raises
-        ------
-        CheckpointError
-            If an array is missing or of another form.
-        """
+        """Go on where `checkpoint` was called, see `models.checkpoint`."""
         windows, blocks, self._unseen_s = checked(arrays, "unseen", np.float64, (3,)).tolist()
         self._unseen_windows, self._unseen_blocks = int(windows), int(blocks)
         self._whole_ns = next(iter(checked(arrays, "whole_ns", np.int64, (None,)).tolist()), None)
