@@ -3,7 +3,8 @@
 What turns with the shaft stands still when seen from the shaft. If the rotation-synchronous vectors of all channels
 turn together and keep their lengths, it is the angle that moved, or the heavy spot: a machine that changes, changes
 them each in its own way, and an unbalance that grows keeps its place. Where the angle went on as before, it is the
-heavy spot, and no fault of the angle; an angle that jumps does so within a turn, faster than any shaft.
+heavy spot, and no fault of the angle; an angle that jumps does so within a turn, faster than any shaft. If only some
+sensors turn, evenly and in both planes, they are sampled by another clock.
 """
 
 from collections.abc import Sequence
@@ -36,8 +37,10 @@ _STEADY_TURNS, _WHOLE_TURNS = 0.02, 0.05
 # where the bounds are so many turns from whole ones.
 _BOUNDED, _LEAST_RANGE_RAD, _OFF_TURNS = 0.95, 0.5, 0.2
 _FEWEST_HOPS, _FEWEST_SIDE = 6, 3
+_CLOCK_HOPS = 8  # newest ones, in which a clock is told that has just begun to run at another rate
+LEAST_CLOCK_RAD = 0.1  # turn from hop to hop of the sensors on another clock than the others: 130 ppm at 24 Hz and 5 s
 _ALIKE = 0.25
-_STAY = 3.0
+_STAY, _SURE = 3.0, 4.0
 _LENGTH = 0.15  # relative change of the vectors' common length that still counts as none
 _LINE_BINS, _AROUND_BINS, _FEWEST_AROUND, _AROUND_HZ = 1, 12, 4, 6.0
 _LINE_STRENGTH = 15.0  # a line is one where the channels' mean power stands out by this factor
@@ -48,7 +51,7 @@ _GONE, _THERE = 1 / 3, 3.0
 def phase_faults(
     window: WindowStatistics, columns: Sequence[int], naming: Naming, reference: SensorReference | None
 ) -> list[SensorFault]:
-    """At most one finding on the shaft angle, from channels that nothing is wrong with.
+    """At most one finding on the shaft angle, or on the clocks of sensors, from channels that nothing is wrong with.
 
     Without a reference a speed that contradicts the vibration is not found.
     """
@@ -61,6 +64,7 @@ def phase_faults(
         if not window.removed_by_hop:
             scaled, course = _common(columns, vectors)
             found = _slip(window, course, name) or _jump(window, scaled, course, name)
+            found = found or _clock(window, columns, vectors, naming)
         found = found or _jitter(window, columns, vectors, name)
     return [found] if found else []
 
@@ -198,6 +202,46 @@ def _slip(window: WindowStatistics, course: ComplexArray, name: str) -> SensorFa
     )
     value = 1 + per_minute / (window.speed_rad_s * 30 / np.pi)
     return _theta(FaultKind.INCOHERENT, text, value, abs(mean) / max(error, 1e-9))
+
+
+def _clock(
+    window: WindowStatistics, columns: Sequence[int], vectors: ComplexArray, naming: Naming
+) -> SensorFault | None:
+    """Sensors of both planes turn evenly and keep their lengths, while others of either plane stand.
+
+    A machine turns what it changes in a plane, or everything with the heavy spot, and mostly by a bounded angle.
+    """
+    states = [window.states[column] for column in columns]
+    planes = np.array([state[0] for state in states])
+    for hops in sorted({_CLOCK_HOPS, len(vectors)}):
+        own = vectors[-hops:, list(columns)]
+        if len(own) < _CLOCK_HOPS:
+            return None
+        phases, at = np.unwrap(np.angle(own), axis=0), np.arange(len(own)) - (len(own) - 1) / 2
+        rates = at @ phases / (at @ at)
+        left = phases - phases.mean(axis=0) - np.outer(at, rates)
+        errors = np.maximum(np.sqrt((left**2).sum(axis=0) / (len(own) - 2) / (at @ at)), 1e-3)
+        surest = int((np.abs(rates) / errors).argmax())
+        rate, z = float(rates[surest]), float(np.abs(rates[surest]) / errors[surest])
+        turning = np.abs(rates - rate) < np.abs(rates)
+        apart = np.abs(np.where(turning, rates - rate, rates)) > np.maximum(_STAY * errors, _ALIKE * abs(rate))
+        lengths = np.abs(own[:, turning])
+        if abs(rate) < LEAST_CLOCK_RAD or z < MOST_ERRORS or np.any(apart) or np.any(_SURE * errors > abs(rate)):
+            continue
+        if np.any(lengths.std(axis=0) > _ALIKE * lengths.mean(axis=0)):
+            continue
+        if set(planes[turning]) != set("yz") or set(planes[~turning]) != set("yz"):
+            continue
+        found = tuple(state for state, one in zip(states, turning, strict=True) if one)
+        ahead_s = rate / window.speed_rad_s  # of the others, more in every hop
+        part = ahead_s * len(vectors) / window.duration_s
+        text = (
+            f"{naming.names(found)} turn by {np.degrees(rate):+.0f}° from hop to hop against the shaft angle and the "
+            f"other sensors, expected none: they are sampled by a clock of their own, about {abs(part) * 1e6:.0f} ppm "
+            f"{'slow' if part > 0 else 'fast'}"
+        )
+        return SensorFault(states=found, kind=FaultKind.DELAY, text=text, value=-ahead_s * len(vectors), z=z)
+    return None
 
 
 def _jump(window: WindowStatistics, vectors: ComplexArray, course: ComplexArray, name: str) -> SensorFault | None:

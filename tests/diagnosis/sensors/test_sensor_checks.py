@@ -473,3 +473,25 @@ def test_what_a_sensor_shows_of_the_other_plane_is_no_delay() -> None:
         samples[:, states.index(state)] += 0.02 * samples[:, states.index(other)]
     (window,) = windows_of(plan_of("heavy"), samples)
     assert sensor_findings(window, None, load_machine("heavy").sensors) == ()
+
+
+@pytest.mark.parametrize(("ppm", "speed"), [(400.0, "slow"), (-400.0, "fast")])
+def test_sensors_on_a_clock_of_their_own_are_told_once_it_runs_apart(ppm: float, speed: str) -> None:
+    samples = recorded("lab", 1).copy()
+    at = np.arange(len(samples), dtype=np.float64)
+    late = np.minimum(at + np.maximum(0, at - 40_000) * ppm * 1e-6, at[-1])
+    disc = ("y2", "z2", "y2_dot", "z2_dot")
+    for state in disc:
+        samples[:, column(state)] = np.interp(late, at, samples[:, column(state)])
+    finding = only(found_in(samples))
+    assert (finding.kind, set(finding.states)) == ("delay", set(disc))
+    assert finding.text.endswith(f" ppm {speed}")
+    assert float(finding.text.split()[-3]) == pytest.approx(abs(ppm), rel=0.15)
+
+
+def test_a_plane_that_turns_is_no_clock() -> None:
+    samples = recorded("lab", 1).copy()
+    at = np.arange(len(samples), dtype=np.float64)
+    for state in ("y1", "y1_dot", "y2", "y2_dot"):  # as where a resonance of one plane passes the speed
+        samples[:, column(state)] = np.interp(np.minimum(1.0004 * at, at[-1]), at, samples[:, column(state)])
+    assert not any("clock" in finding.text for finding in found_in(samples, reference_of("lab")))
