@@ -130,7 +130,7 @@ class LevelWatch:
     ) -> Foreign:
         """What the latest window shows that no change of a parameter makes: a new line, or see `LevelJudge.foreign`.
 
-        Nothing is made of what `faulty` channels show, none of which is one of the rotor's.
+        Nothing is made of what `faulty` channels show.
         """
         turned = self.reference is not None and any(state.speed_rad_s for state in self.reference.states)
         if self._found is None:
@@ -142,7 +142,7 @@ class LevelWatch:
             bare = replace(self._found, moments=None, lines=None)
             return judge(bare, self.latest, healthy, self._contact)
         if healthy is not None and healthy.lines is not None and math.isfinite(speed_rad_s) and speed_rad_s:
-            lines = steady_lines(window.plan, window.hops, statistics)
+            lines = steady_lines(window.plan, window.hops, statistics, faulty)
             if healthy.faint:
                 lines = self._lines.take(lines, statistics)
             line = new_line(lines, healthy.lines, speed_rad_s, beside=healthy.beside)

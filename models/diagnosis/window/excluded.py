@@ -58,6 +58,7 @@ def excluded_lines(
     speeds_rad_s: tuple[float, float],
     known: Sequence[KnownLine] | None = (),
     turning: ComplexArray | None = None,
+    alive: npt.NDArray[np.bool_] | None = None,
 ) -> tuple[ExcludedLine, ...]:
     """Lines that say nothing of the machine, in Fourier coefficients without mean and rotation.
 
@@ -72,7 +73,13 @@ def excluded_lines(
         Those of the healthy machine. None: all lines are taken for such, multiples of the speed too.
     turning : ndarray, shape (n_segments, n_bins), optional
         Fourier coefficients of the cosine of the shaft angle.
+    alive : ndarray, shape (n,), optional
+        Channels that show anything: what a dead one has is rounding, which is a line anywhere.
     """
+    if alive is not None and not alive.all():
+        place = np.eye(alive.size)[:, alive]
+        own = segments[:, :, alive], spectrum[:, alive][:, :, alive]
+        return tuple(one.turned(place) for one in excluded_lines(*own, frequencies_hz, speeds_rad_s, known, turning))
     slowest_hz, fastest_hz = sorted(abs(speed) / (2 * np.pi) for speed in speeds_rad_s)
     enough = segments.shape[1] >= _FEWEST_SEGMENTS and segments.shape[2] and frequencies_hz.size > 2 * _BESIDE.stop
     if not (slowest_hz > 0 and enough):

@@ -14,7 +14,7 @@ has to keep its phase besides.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,14 +58,20 @@ class Line:
         return round(self.frequency_hz, 4), round(self.frequency_hz * 2 * np.pi / abs(speed_rad_s), 4)
 
 
-def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistics) -> tuple[Line, ...]:
-    """Lines that are neither noise nor a multiple of the speed, strongest first, of the hops that make up a window."""
+def steady_lines(
+    plan: Plan, hops: Sequence[HopMoments], window: WindowStatistics, faulty: Collection[str] = ()
+) -> tuple[Line, ...]:
+    """Lines that are neither noise nor a multiple of the speed, strongest first, of the hops that make up a window.
+
+    Nothing that `faulty` sensors show is one.
+    """
     window = window.as_mounted
     states = plan.mounted
     every = np.concatenate([hop.segments for hop in hops], dtype=np.complex128)
     if plan.equaliser is not None:
         every[:, :, : len(states)] /= plan.equaliser.response(plan.frequencies_hz)
     segments = every[:, :, : len(states)]
+    segments[:, :, np.isin(states, list(faulty))] = 0
     if segments.shape[0] < _FEWEST_SEGMENTS:
         return ()
     power = segments.real**2 + segments.imag**2

@@ -297,7 +297,13 @@ def window_statistics(
         sensors=plan.sensors,
         pair_powers=tuple(hop.pair_powers for hop in hops),
         lines=excluded_lines(
-            by_bin, spectrum, plan.frequencies_hz, speed_range, lines, None if angle is None else angle.T
+            by_bin,
+            spectrum,
+            plan.frequencies_hz,
+            speed_range,
+            lines,
+            None if angle is None else angle.T,
+            np.any([hop.waveform.minimum[:n] < hop.waveform.maximum[:n] for hop in hops], axis=0),
         )
         if lagged
         else (),

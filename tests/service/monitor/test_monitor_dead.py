@@ -1,0 +1,84 @@
+"""A machine with known parameters is diagnosed without a sensor that shows nothing."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from models.commissioning.commissioned import Installed, install
+from models.diagnosis.window.moments import plan_for
+from models.physics.rotor import PARAMETERS
+from models.signals.block import SampleBlock
+from rotorwatch.records.health import HealthState
+from service.monitor.monitor import MachineMonitor
+from simulator.scenario import Event, parse_fault
+from tests.commissioning.rotor_kit import commissioned, recording
+from tests.service.rig.live import LAB, scenario_blocks
+from tests.service.rig.watching import feed, raised, resumed
+
+KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 30.0, "max_span_s": 60.0})})
+DEAD_S, CHANGE_S, END_S = 40.0, 70.0, 130.0
+
+
+def dying(columns: list[int], value: float, *changes: Event, end_s: float = END_S) -> Iterator[SampleBlock]:
+    stream = scenario_blocks(end_s, *changes)
+    for block in stream:
+        samples = block.samples.copy()
+        if block.start_ns - stream[0].start_ns >= DEAD_S * 1e9:
+            samples[:, columns] = value
+        yield replace(block, samples=samples)
+
+
+@pytest.mark.parametrize(("columns", "value"), [([0], 12e-6), ([2, 5], np.nan)])
+def test_a_change_is_named_without_sensors_that_are_dead(columns: list[int], value: float) -> None:
+    installed = install(KIT, None)
+    monitor = MachineMonitor(installed, remembered=True)
+    stream = list(dying(columns, value, parse_fault(f"k_by=-0.2@{CHANGE_S}")))
+    reports, _ = feed(monitor, stream[:695])
+    dead = [one for one in reports if one.filled == 1 and one.sensors]
+    assert len(dead) == 6
+    assert {one.state for one in dead[2:]} == {HealthState.DATA_HEALTH}
+    for report in dead:
+        assert report.verdict is not None
+        assert "nothing has changed" in report.verdict.text
+        assert None not in {one.relative_change for one in report.parameters}
+        assert all(one.text.endswith("; the machine is diagnosed without it") for one in report.sensors)
+    again = resumed(monitor, installed, remembered=True)
+    (reports, _), (same, _) = feed(monitor, stream[695:]), feed(again, stream[695:])
+    assert same == reports
+    window = monitor.window() if monitor.window else None
+    assert window is not None
+    assert window.lines == ()  # in the rounding of a dead channel there are lines anywhere
+    assert {name for name in raised(monitor) if not name.startswith("data-")} == {"k_by"}
+    change = {one.name: one for one in reports[-1].parameters}["k_by"]
+    assert abs((change.relative_change or 0.0) + 0.2) < 4 * (change.standard_error or 0.0) < 0.1
+
+
+@pytest.mark.parametrize("columns", [[0, 1, 2, 3], [0, 8]])
+def test_nothing_is_read_where_half_of_the_sensors_or_the_shaft_angle_is_dead(columns: list[int]) -> None:
+    reports, _ = feed(MachineMonitor(install(KIT, None)), dying(columns, np.nan, end_s=60.0))
+    dead = [one for one in reports if one.filled == 1 and one.sensors]
+    assert len(dead) == 4
+    assert not any(one.parameters for one in dead)
+    assert dead[-1].reason == "; ".join(one.text for one in dead[-1].sensors)
+
+
+def test_an_identified_machine_is_diagnosed_without_a_dead_sensor() -> None:
+    healthy = recording(KIT, scenario_blocks(END_S)[:700])
+    made = commissioned(KIT, healthy).commissioned
+    monitor = MachineMonitor(Installed(KIT, None, made))
+    reports, _ = feed(monitor, dying([1], np.nan))
+    assert {one.state for one in reports[-6:]} == {HealthState.DATA_HEALTH}
+    assert raised(monitor) == {"data-missing"}
+    assert [one.name for one in reports[-1].parameters if one.relative_change is not None] == list(PARAMETERS)
+
+
+def test_of_two_sensors_at_an_angle_either_is_needed() -> None:
+    plan = plan_for(LAB)
+    assert plan.states_without(["z1"]) == tuple(state for state in plan.states if state != "z1")
+    turn = np.eye(len(plan.states))
+    turn[np.ix_([0, 1], [0, 1])] = [[1, 1], [-1, 1]]
+    angled = replace(plan, turn=turn, angled=("bearing@45", "bearing@135", *plan.states[2:]))
+    assert angled.states_without(["bearing@135"]) == plan.states[2:]
+    assert angled.states_without([plan.states[3]]) == (*plan.states[:3], *plan.states[4:])
