@@ -162,12 +162,12 @@ class WindowEvaluator(ABC):
             If the window cannot be evaluated: outside the speed range, speed not steady, no fluctuation in a channel.
         """
 
-    def usable(self, window: WindowStatistics, plan: Plan, findings: Sequence[SensorFault]) -> WindowStatistics | None:
-        """The part of a window that can be evaluated although these sensors are at fault; None if there is none.
+    def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
+        """Sensors without which a window can be evaluated although these are at fault; None if it cannot be.
 
         A fault of a channel elsewhere says nothing of the equations, but it is all there is where they are none.
         """
-        return window if not findings or (plan.states and implicated(findings).issubset(plan.others)) else None
+        return () if not findings or (plan.states and implicated(findings).issubset(plan.others)) else None
 
     def heard(self, findings: Sequence[SensorFault]) -> None:
         """Take note of what is wrong with the sensors: what an angle that jumped costs stays lost."""
@@ -212,7 +212,7 @@ def settled(place: str, window: WindowStatistics, newest: Newest | None) -> tupl
             f"{place}: the speed was found and steady in {np.count_nonzero(window.settled)} of {window.settled.size} "
             f"hops, evaluation limit {LEAST_SETTLED:.0%}: without a shaft angle the rotation is taken out of no others"
         )
-    return newest[0].settled().of(window.states), window.settled.size - 1 - int(passed[-1])
+    return newest[0].settled(window.lost), window.settled.size - 1 - int(passed[-1])
 
 
 class LatestRotation:

@@ -85,18 +85,18 @@ class KnownMachineEvaluator(WindowEvaluator):
         others.append(RelationDiagnostician(machine, () if bundle is None else bundle.networks))
         self._others = tuple(others)
 
-    def usable(self, window: WindowStatistics, plan: Plan, findings: Sequence[SensorFault]) -> WindowStatistics | None:
-        """Without sensors that show nothing, too, as long as most are left: the theory holds for any of them.
+    def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
+        """Those that show nothing, too, as long as most are left: the theory holds for any of them.
 
         Where the speed is found in the vibration, how much of it there is depends on which sensors are left.
         """
-        whole = super().usable(window, plan, findings)
+        none = super().spared(plan, findings)
         own = [one for one in findings if not set(one.states).issubset(plan.others)]
-        if whole is not None or window.speed_source != "phase reference" or any(one.kind not in _SILENT for one in own):
-            return whole
+        if none is not None or plan.angle_column is None or any(one.kind not in _SILENT for one in own):
+            return none
         lost = implicated(own)
-        left = () if "theta" in lost else plan.states_without(lost)
-        return window.of(left) if len(left) > len(plan.states) / 2 else None
+        enough = "theta" not in lost and len(plan.states_without(lost)) > len(plan.states) / 2
+        return tuple(sorted(lost)) if enough else None
 
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`."""
@@ -233,8 +233,8 @@ class KnownMachineEvaluator(WindowEvaluator):
             return {}
         for hops in wanted:
             with suppress(EstimationError):  # too little data for itself; the window has said what there is to say
-                if (statistics := sliding.statistics(hops)) is not None:
-                    statistics = replace(statistics.of(window.states), directed=self.directed, lines=window.lines)
+                if (statistics := sliding.statistics(hops, lost=window.lost)) is not None:
+                    statistics = replace(statistics, directed=self.directed, lines=window.lines)
                     decided = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
                     evaluated[hops] = self._judged(statistics, self._within(decided))
         return evaluated

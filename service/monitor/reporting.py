@@ -83,8 +83,8 @@ class WindowReporter:
             levels.tell(self._alarms, end_ns, faulty=implicated(missing), standing=bool(stood))
             return self.unread(end_ns, end_ns, HealthState.WARMING, sensors=missing)
         findings = sensor_findings(statistics, self._sensors, self._machine.sensors, missing, standing=bool(stood))
-        usable = self.evaluator.usable(statistics, self._plan, findings)
-        if usable is not None and usable is not statistics and not stood:
+        lost = self.evaluator.spared(self._plan, findings)
+        if lost and not stood:
             findings = tuple(map(left_out, findings))
         start_ns, faulty = statistics.start_ns, implicated(findings)
         speed = None if "theta" in faulty else finite(statistics.speed_rad_s)
@@ -97,12 +97,13 @@ class WindowReporter:
             levels.tell(self._alarms, end_ns, faulty=faulty, standing=bool(stood))
             return self.unread(start_ns, end_ns, state, **seen, reason=reason)
 
-        if usable is None:
+        if lost is None:
             return unread(HealthState.DATA_HEALTH, "; ".join(each.text for each in findings))
         if stood or skipped:
             return unread(HealthState.NOT_EVALUABLE, stood or _SKIPPED)
         try:
-            evaluation = self.evaluator.evaluate(usable, (samples, test))
+            used = samples.statistics(lost=lost) if lost else None
+            evaluation = self.evaluator.evaluate(used or statistics, (samples, test))
         except EstimationError as error:
             return unread(HealthState.WATCHING if self.watching else HealthState.NOT_EVALUABLE, str(error))
         foreign = levels.foreign(samples, statistics, named=bool(test.state.findings), faulty=faulty)
@@ -120,7 +121,7 @@ class WindowReporter:
             changed, evidence = evaluation.unlike_healthy, Evidence(start_ns=start_ns, end_ns=end_ns)
             self._alarms.update_state(SHAPE, changed != "", end_ns, changed, evidence=evidence)
         look, length_s = looks[whole].complete(), self._machine.window.length_s
-        calm = evaluation.calm(outside=verdict.outside_model, without=usable is not statistics)
+        calm = evaluation.calm(outside=verdict.outside_model, without=bool(lost))
         if not self._plan.states and levels.reference is not None:
             calm, reason = HealthState.UNCHANGED, ""
         return Report(

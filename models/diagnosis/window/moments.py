@@ -122,6 +122,11 @@ class Plan:
         part = np.abs(turn[:, np.isin(self.mounted, list(lost))]).sum(axis=1)
         return tuple(state for state, gone in zip(self.states, part.tolist(), strict=True) if not gone)
 
+    def motions(self, alive: npt.NDArray[np.bool_]) -> list[int]:
+        """Columns of sensors that are alive, one of each motion."""
+        twice = {pair.second for pair in self.pairs if alive[pair.first]}
+        return [column for column in np.flatnonzero(alive).tolist() if column not in twice]
+
     @property
     def pairs(self) -> tuple[MotionPair, ...]:
         """Columns that measure the same motion."""

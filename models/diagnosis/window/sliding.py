@@ -260,20 +260,23 @@ class SlidingWindow:
         """Levels of the hops that are there, however few; None without any."""
         return levels_of(self.plan, tuple(self._hops), errors=errors) if self._hops else None
 
-    def statistics(self, hops: int | None = None, *, lagged: bool = False) -> WindowStatistics | None:
+    def statistics(
+        self, hops: int | None = None, *, lagged: bool = False, lost: tuple[str, ...] = ()
+    ) -> WindowStatistics | None:
         """Statistics of a full window, or of so many of its latest hops; None while there are not so many.
 
         The latest hops have correlations at all lags, as a full window has, only if `lagged`; otherwise at lag zero.
+        Without `lost` sensors, see `window_statistics`.
         """
         count = self.plan.hops if hops is None else hops
         if not 0 < count <= len(self._hops):
             return None
         lagged = lagged or hops is None
-        return window_statistics(self.plan, tuple(self._hops)[-count:], lagged=lagged, lines=self._lines)
+        return window_statistics(self.plan, tuple(self._hops)[-count:], lagged=lagged, lines=self._lines, lost=lost)
 
-    def settled(self) -> WindowStatistics:
+    def settled(self, lost: tuple[str, ...] = ()) -> WindowStatistics:
         """Statistics of the hops in which the shaft had one speed, see `WindowStatistics.settled`; there are some."""
-        return window_statistics(self.plan, tuple(self._hops), lines=self._lines, settled=True)
+        return window_statistics(self.plan, tuple(self._hops), lines=self._lines, settled=True, lost=lost)
 
     def again(self) -> Callable[[], WindowStatistics] | None:
         """What makes the statistics of the window as it is judged now when they are asked for; None before it is full.

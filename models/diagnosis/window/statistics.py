@@ -89,6 +89,7 @@ class WindowStatistics:
     mounted: "WindowStatistics | None" = None
     lines: tuple[ExcludedLine, ...] = ()  # that say nothing of the machine
     time_scale: float = 1.0  # how much slower the machine moves than usual (`models.stream_settings.time_scale`)
+    lost: tuple[str, ...] = ()  # sensors, as mounted, that it was made without
     directed: bool = True  # whether vectors keep their directions: the shaft angle has not jumped since it was set up
 
     @property
@@ -210,11 +211,13 @@ def window_statistics(
     lagged: bool = True,
     lines: Sequence[KnownLine] | None = (),
     settled: bool = False,
+    lost: tuple[str, ...] = (),
 ) -> WindowStatistics:
     """Add hops up to a window and take out its mean and its rotation-synchronous part.
 
     Without `lagged`, correlations are at lag zero alone, and no lines are looked for: the spectra are all that is asked
-    for. For `lines` see `excluded_lines`. With `settled`, hops that are not (see `settled_hops`) are left out.
+    for. For `lines` see `excluded_lines`. With `settled`, hops that are not (see `settled_hops`) are left out. Mounted
+    sensors that are `lost` say nothing of the states, of the level of forces or of lines.
 
     With a = (x, n) and β the least-squares coefficients of x on n over the window, the sum of
     (x - βn)(t-τ) (x - βn)ᵀ(t) is the product sum seen through the matrix (I, -β) from both sides.
@@ -256,15 +259,15 @@ def window_statistics(
         if plan.angle_column is not None:
             synchronous = _synchronous(beta)
     if plan.angle_column is not None:
-        turned = np.array([turns(hop) for hop in hops])[:, np.newaxis]
-        hop_synchronous = np.where(turned, _synchronous(regression(products[:, 0], n)), 0)
+        hop_synchronous = np.where([[turns(hop)] for hop in hops], _synchronous(regression(products[:, 0], n)), 0)
         angle = segments[:, :, n + 1].copy()
     del segments, products  # megabytes that nothing below needs
     spectrum = summed(by_bin)
     if angle is not None and phase_kept is None:
         powers = np.einsum("fii->fi", spectrum).real * (np.abs(angle) ** 2).sum(axis=1, keepdims=True)
         phase_kept = _coherence((by_bin.transpose(0, 2, 1) @ angle[:, :, np.newaxis].conj())[:, :, 0], powers)
-    levels = segment_levels(by_bin, spectrum, sorted({*range(n)} - {pair.second for pair in plan.pairs}))
+    alive = ~np.isin(plan.mounted, lost)
+    levels = segment_levels(by_bin, spectrum, plan.motions(alive))
     if levels is not None:
         spectrum = summed(by_bin / np.sqrt(levels)[:, np.newaxis])
     speed_rad_s, speed_range = _speeds(rotation, hops, plan)
@@ -303,12 +306,12 @@ def window_statistics(
             speed_range,
             lines,
             None if angle is None else angle.T,
-            np.any([hop.waveform.minimum[:n] < hop.waveform.maximum[:n] for hop in hops], axis=0),
+            alive & np.any([hop.waveform.minimum[:n] < hop.waveform.maximum[:n] for hop in hops], axis=0),
         )
         if lagged
         else (),
     )
-    return _of_the_shaft(found, plan, by_bin)
+    return _of_the_shaft(found, plan, by_bin, lost)
 
 
 def _settled(hops: tuple[HopMoments, ...], rotation: Rotation) -> tuple[tuple[HopMoments, ...], Rotation]:
@@ -318,11 +321,14 @@ def _settled(hops: tuple[HopMoments, ...], rotation: Rotation) -> tuple[tuple[Ho
     return tuple(hop for hop, there in zip(hops, kept, strict=True) if there), found
 
 
-def _of_the_shaft(window: WindowStatistics, plan: Plan, by_bin: ComplexArray) -> WindowStatistics:
+def _of_the_shaft(
+    window: WindowStatistics, plan: Plan, by_bin: ComplexArray, lost: tuple[str, ...]
+) -> WindowStatistics:
     """The window of the motion itself, from that of the samples; `by_bin` has shape (n_bins, n_segments, n)."""
     mounted = window if plan.equaliser is None else _equalised(window, plan.equaliser, by_bin)
     shaft = mounted if plan.runout is None else _without(mounted, plan.runout)
-    return shaft if plan.turn is None else _turned(shaft, plan.states, plan.turn)
+    shaft = shaft if plan.turn is None else _turned(shaft, plan.states, plan.turn)
+    return replace(shaft.of(plan.states_without(lost)), lost=lost) if lost else shaft
 
 
 def _equalised(window: WindowStatistics, equaliser: Equaliser, by_bin: ComplexArray) -> WindowStatistics:
