@@ -74,7 +74,7 @@ class Report(OfMachine):
     detectable: tuple[Detectable, ...] = Field(default=(), description="what would have been found in this window")
     sensors: tuple[SensorFault, ...] = Field(
         default=(),
-        description="faults of sensors in the window; with any of them nothing is said of the machine",
+        description="faults of sensors in the window; nothing is said of the machine unless diagnosed without them",
         examples=[()],
     )
     shapes: tuple[Shape, ...] = Field(

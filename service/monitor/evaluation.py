@@ -47,12 +47,14 @@ class Evaluation:
     def calm(self, *, outside: bool, without: bool = False) -> HealthState:
         """State without raised alarms: healthy only if something was read that could have said otherwise.
 
-        Not if it was read `without` some of the sensors: those that are at fault come first.
+        Not if it was evaluated `without` some of the sensors: those that are at fault come first.
         """
         if outside:
             return HealthState.OUTSIDE_MODEL
+        if without:
+            return HealthState.DATA_HEALTH
         if self.deciding.evaluable:
-            return HealthState.DATA_HEALTH if without else HealthState.HEALTHY
+            return HealthState.HEALTHY
         states = {shape.verdict for shape in self.shapes}
         if "not changed" in states and "changed" not in states:
             return HealthState.UNCHANGED

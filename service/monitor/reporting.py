@@ -84,7 +84,7 @@ class WindowReporter:
             return self.unread(end_ns, end_ns, HealthState.WARMING, sensors=missing)
         findings = sensor_findings(statistics, self._sensors, self._machine.sensors, missing, standing=bool(stood))
         lost = self.evaluator.spared(self._plan, findings)
-        if lost and not stood:
+        if lost and not (stood or skipped):
             findings = tuple(map(left_out, findings))
         start_ns, faulty = statistics.start_ns, implicated(findings)
         speed = None if "theta" in faulty else finite(statistics.speed_rad_s)
@@ -95,7 +95,8 @@ class WindowReporter:
 
         def unread(state: HealthState, reason: str) -> Report:
             levels.tell(self._alarms, end_ns, faulty=faulty, standing=bool(stood))
-            return self.unread(start_ns, end_ns, state, **seen, reason=reason)
+            calm = state if lost == () else HealthState.DATA_HEALTH  # a sensor at fault comes first
+            return self.unread(start_ns, end_ns, calm, **seen, reason=reason)
 
         if lost is None:
             return unread(HealthState.DATA_HEALTH, "; ".join(each.text for each in findings))

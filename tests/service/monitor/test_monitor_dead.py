@@ -64,6 +64,19 @@ def test_nothing_is_read_where_half_of_the_sensors_or_the_shaft_angle_is_dead(co
     assert dead[-1].reason == "; ".join(one.text for one in dead[-1].sensors)
 
 
+@pytest.mark.parametrize("why", ["this computer cannot keep up", "off 1980 rpm"])
+def test_a_dead_sensor_comes_before_what_else_keeps_a_window_from_being_evaluated(why: str) -> None:
+    skips, speed = "keep up" in why, LAB.operation.speed_rpm
+    fast = LAB.operation.model_copy(update={"speed_rpm": speed if skips else 1.5 * speed})
+    installed = install(KIT.model_copy(update={"operation": fast}), None)
+    reports, _ = feed(MachineMonitor(installed, lambda _: skips), dying([0], np.nan, end_s=60.0))
+    dead = [one for one in reports if one.filled == 1 and one.sensors]
+    assert len(dead) == 4
+    assert {one.state for one in dead} == {HealthState.DATA_HEALTH}
+    assert all(why in one.reason for one in dead)
+    assert not (skips and any("is diagnosed" in fault.text for one in dead for fault in one.sensors))
+
+
 def test_an_identified_machine_is_diagnosed_without_a_dead_sensor() -> None:
     healthy = recording(KIT, scenario_blocks(END_S)[:700])
     made = commissioned(KIT, healthy).commissioned
