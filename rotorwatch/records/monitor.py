@@ -152,7 +152,7 @@ class HistoryStatus(Record):
 
 
 class SettingList(Record):
-    """Settings of the monitor as they are in use, what the file leaves out filled in."""
+    """Settings of the monitor as they are in use; null is what the file leaves out and has no default."""
 
     settings: dict[str, dict[str, JsonValue]] = Field(
         description="by table and name; tables that may hold a secret are left out",
