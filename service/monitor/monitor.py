@@ -341,10 +341,9 @@ class MachineMonitor:
 
     def health(self) -> MachineHealth:
         """Where the machine stands now."""
+        calm = HealthState.NOT_EVALUABLE if self._fault else self._reporter.calm
         return MachineHealth(
-            self._reporter.state(
-                HealthState.NOT_EVALUABLE if self._fault else self._reporter.calm
-            ),  # what operators did counts at once
+            self._reporter.state(calm),  # what operators did counts at once
             self._window.filled,
             self._latest,
             self._alarms.alarms,
