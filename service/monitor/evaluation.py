@@ -1,7 +1,7 @@
 """Evaluation of one window: several diagnosticians side by side, and whether they agree."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -116,13 +116,17 @@ class Evaluation:
         reasons = (one.reason for one in self.deciding.parameters if one.reason)
         return "; ".join(dict.fromkeys([*self._changed, *reasons]))
 
-    def named(self, channels: Sequence[Channel], window: WindowStatistics, foreign: str) -> "Evaluation":
+    def named(
+        self, channels: Sequence[Channel], window: WindowStatistics, foreign: str, faulty: Collection[str] = ()
+    ) -> "Evaluation":
         """The same with sentences in the names of a machine's channels.
 
         What was seen that no change of a parameter makes (`foreign`, empty if nothing) is the first suspect. Channels
-        of the window that reach the end of their range explain what does not fit, too.
+        of the window that reach the end of their range explain what does not fit, too; not `faulty` ones, which it was
+        evaluated without.
         """
-        limited = [] if foreign or self.shapes or not self._doubtful else at_range_end([window], Naming(channels))
+        told = foreign or self.shapes or not self._doubtful
+        limited = [] if told else at_range_end([window], Naming(channels), faulty)
         ends = f"{'; '.join(limited)}, the end of its range" if limited else ""
         suspect = foreign or ends or with_channel_names(self.deciding.suspect, channels)
         return replace(

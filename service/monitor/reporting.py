@@ -108,7 +108,7 @@ class WindowReporter:
         except EstimationError as error:
             return unread(HealthState.WATCHING if self.watching else HealthState.NOT_EVALUABLE, str(error))
         foreign = levels.foreign(samples, statistics, named=bool(test.state.findings), faulty=faulty)
-        evaluation = evaluation.named(self._machine.sensors, statistics, foreign.text)
+        evaluation = evaluation.named(self._machine.sensors, statistics, foreign.text, faulty)
         looks = {n: stretch_of(one, samples.hops[-n].start_ns, end_ns) for n, one in evaluation.short.items()}
         whole = test.settings.window_hops
         looks[whole] = stretch_of(evaluation.deciding, start_ns, end_ns)

@@ -7,7 +7,7 @@ or with the other channels moving too, cannot be told from the machine and is le
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -126,13 +126,16 @@ def clipped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
     return findings
 
 
-def at_range_end(windows: Sequence[WindowStatistics], naming: Naming) -> list[str]:
-    """Say which channels reach the end of their range again and again, but for too few samples for `clipped`."""
+def at_range_end(windows: Sequence[WindowStatistics], naming: Naming, faulty: Collection[str] = ()) -> list[str]:
+    """Say which channels reach the end of their range again and again, but for too few samples for `clipped`.
+
+    Of those at fault that is said already: one that is stuck is at a value in every hop.
+    """
     hops, found = stacked_waveform([each for window in windows for each in window.waveforms]), []
     least = max(_FEWEST_LIMITED, _LIMITED_PART * len(hops.rms))
     for column, state in enumerate(windows[0].sensors):
         mean, rms, steps = hops.mean[:, column].mean(), hops.rms[:, column].mean(), hops.step[:, column]
-        if state == "theta" or np.any(steps > _FINE * rms):
+        if state == "theta" or state in faulty or np.any(steps > _FINE * rms):
             continue
         for values, flat in ((hops.maximum, hops.at_maximum), (hops.minimum, hops.at_minimum)):
             furthest = values[np.argmax(np.abs(values[:, column] - mean)), column]

@@ -21,11 +21,13 @@ KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s":
 DEAD_S, CHANGE_S, END_S = 40.0, 70.0, 130.0
 
 
-def dying(columns: list[int], value: float, *changes: Event, end_s: float = END_S) -> Iterator[SampleBlock]:
+def dying(
+    columns: list[int], value: float, *changes: Event, dead_s: float = DEAD_S, end_s: float = END_S
+) -> Iterator[SampleBlock]:
     stream = scenario_blocks(end_s, *changes)
     for block in stream:
         samples = block.samples.copy()
-        if block.start_ns - stream[0].start_ns >= DEAD_S * 1e9:
+        if block.start_ns - stream[0].start_ns >= dead_s * 1e9:
             samples[:, columns] = value
         yield replace(block, samples=samples)
 
@@ -75,6 +77,14 @@ def test_a_dead_sensor_comes_before_what_else_keeps_a_window_from_being_evaluate
     assert {one.state for one in dead} == {HealthState.DATA_HEALTH}
     assert all(why in one.reason for one in dead)
     assert not (skips and any("is diagnosed" in fault.text for one in dead for fault in one.sensors))
+
+
+def test_a_dead_sensor_is_no_suspect_for_what_does_not_fit() -> None:
+    heavier = Event(at_s=0.0, anomaly="added_mass", size=0.25)
+    reports, _ = feed(MachineMonitor(install(KIT, None)), dying([0], 500.0, heavier, dead_s=42.0, end_s=58.0))
+    suspects = {one.suspect for one in reports if one.filled == 1 and one.sensors}
+    assert suspects - {""}
+    assert not any(suspect.startswith("y1 ") for suspect in suspects)
 
 
 def test_an_identified_machine_is_diagnosed_without_a_dead_sensor() -> None:
