@@ -98,7 +98,7 @@ class WindowStatistics:
         return self if self.mounted is None else self.mounted
 
     def of(self, states: tuple[str, ...]) -> "WindowStatistics":
-        """The same window of some of its states alone, and of what says nothing of single sensors."""
+        """The same window of some of its states alone; waveforms, pairs and mounted sensors are left out."""
         if states == self.states:
             return self
         kept = [self.states.index(state) for state in states]
