@@ -31,27 +31,27 @@ from models.signals.block import FloatArray
 
 _COLD_STEPS, _WARM_STEPS = 100, 15
 _NEAR, _GAIN = 0.15, 3.0  # converged: no diagnosed parameter would move by more than this many standard errors
-# A cold search finds its region on groups three times as wide.
+# A cold search first finds the region of the maximum on groups three times as wide.
 _COARSE, _COARSE_STEPS, _COARSE_NEAR, _COARSE_GAIN = 3.0, 25, 1.0, 30.0
-_GROUPS = 150  # the band over the widest group
-# Steps after which a cold search is given up where it is still so many times further off than is evaluated. In windows
-# that the theory explains most searches have ended by then.
+_GROUPS = 150  # width of the band over that of the widest group
+# Steps after which a cold search is given up if it still exceeds the limits of evaluation by this factor. In windows
+# that the theory explains, most searches have ended by then.
 _PATIENCE, _HOPELESS = 30, 2.0
 _OUTSIDE = "a sensor is at fault, or something outside the model has changed"
-_STIFFEST, _SURELY = 0.5, 3.0  # no shaft becomes stiffer by half; in standard errors
+_STIFFEST, _SURELY = 0.5, 3.0  # no shaft becomes stiffer by half; standard errors by which it must read stiffer
 _SYNCHRONOUS_BINS, _FEWEST_BINS = 3, 20
-# Standard errors by which latest hops may differ from the window in the unbalance, and in all together from nominal.
+# Standard errors by which the newest hops may differ from the window in e, and from nominal in all parameters together.
 _DIFFERS, _STANDS_OUT = 3.0, 4.0  # a change is named from five on
-_LINE_ERROR = 0.01  # least relative error of an unbalance whose angle is that of a line found in noise
-_FOLLOWED = 12  # windows in a row that may start from one window's units and slopes before a search takes its own
+_LINE_ERROR = 0.01  # least relative error of e if the angle is that of a line found in the vibration
+_FOLLOWED = 12  # windows in a row that may reuse one window's units and slopes before a search makes new ones
 
 
 class LikelihoodFit:
     """Fits window after window, each from where the last one ended.
 
-    The state kept between windows is the starting point, how alike the forces' colours were, and the slopes of the last
-    search, with which windows that differ little from it are followed. They may be followed if windows that come one
-    after the other overlap (`follow`). If `sized`, the size of the unbalance is read without a phase reference, too.
+    The state kept between windows is the starting point, the strength of the pull on the forces' colours, and, if
+    `follow`, the slopes of the last search, with which windows that differ little are followed without a new search.
+    Consecutive windows must overlap for that. If `sized`, the size of e is read without a phase reference, too.
     """
 
     by = "likelihood"
@@ -101,12 +101,12 @@ class LikelihoodFit:
         return found
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called: the next readings are the same to the last bit.
+        """Continue where `checkpoint` was called: the next readings are the same to the last bit.
 
         Raises
         ------
         CheckpointError
-            If they are not those of a fit of this machine; nothing is changed then.
+            If the arrays are not of a fit of this machine; nothing is changed then.
         """
         last, strength = (checked(arrays, name, np.float64, (None,)) for name in ("last", "strength"))
         segments, followed = checked(arrays, "followed", np.int64, (2,)).tolist()
@@ -161,7 +161,7 @@ class LikelihoodFit:
         states = self._grouped(window.frequencies_hz, excluded).average(window.spectrum)
         no_maximum = f"{self._machine.name}: the likelihood has no maximum for this window: {_OUTSIDE}"
         try:
-            # Trial points may lie far out; what comes of them is checked, not warned of.
+            # Trial points may lie far out; their results are checked, so no warnings are needed.
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
                 model, weights, found = self._followed_or_searched(window, excluded, np.sqrt(power), speed, states)
             known = np.linalg.inv(found.information) if found.covariance is None else found.covariance
@@ -200,7 +200,7 @@ class LikelihoodFit:
     def balanced(self, machine: Machine, window: WindowStatistics, diagnosis: Diagnosis) -> Diagnosis:
         """Read the window that was diagnosed last relative to a machine that differs in its unbalance alone.
 
-        What is random does not depend on the unbalance: nothing is searched again.
+        The stochastic part does not depend on the unbalance, so no new search is needed.
         """
         if self._latest is None:
             raise EstimationError(f"{machine.name}: no window has been diagnosed")
@@ -209,10 +209,10 @@ class LikelihoodFit:
         return replace(diagnosis, parameters=read.parameters, covariance=read.covariance, unbalance=read.unbalance)
 
     def glance(self, stretch: WindowStatistics) -> Diagnosis | None:
-        """Read a short stretch, latest hops of the window diagnosed last, by one step from the window's maximum.
+        """Read the newest hops of the window diagnosed last by one step from the window's maximum.
 
-        None if there is no such window, or the stretch says anything that the window does not: diagnose it then.
-        Whether the stretch is outside the model is not tested closely, so there is no misfit.
+        None if there is no such window or the stretch differs from it: `diagnose` the stretch then. Whether it is
+        outside the model is not tested closely, so there is no misfit.
         """
         stretch = integrated(stretch)
         line, speed = self._line, self._speed(stretch)
@@ -230,10 +230,10 @@ class LikelihoodFit:
             return None
 
     def may_be_news(self, segments: ComplexArray, synchronous: ComplexArray) -> bool:
-        """Whether the latest hops may say more than that the machine is as nominal, or as the latest window says.
+        """Whether the newest hops may differ from the latest window or from the nominal machine.
 
-        What is known of them are Fourier coefficients without the rotation, (n_bins, n_segments, n_states), and the
-        vector of the rotation, (n_states,).
+        They are given by Fourier coefficients without the rotation, shape (n_bins, n_segments, n_states), and by their
+        synchronous vector, shape (n_states,).
         """
         line = self._line
         if line is None or self._said is None:
@@ -280,7 +280,7 @@ class LikelihoodFit:
     def _unbalance(
         self, window: WindowStatistics, model: SpectralModel, point: Expected, structural: FloatArray, speed: float
     ) -> Unbalance:
-        """Change of e; hop by hop where the speed varies, or is found in the vibration: that has no angle."""
+        """Change of e; hop by hop where the speed varies or is found in the vibration, without an angle reference."""
         known = (self._machine, model, point, structural)
         if window.relative_synchronous is not None:
             hop_s, found = window.duration_s / window.hop_speed_rad_s.size, np.isfinite(window.hop_speed_rad_s)
@@ -321,7 +321,7 @@ class LikelihoodFit:
                 self._line = line
                 return line.model, line.weights, found
             search = self._search(line.model, window, speed, self._strength)
-            # The same units, and the first step's derivatives are those at which the last search ended.
+            # The units stay the same, and the first step uses the derivatives where the last search ended.
             model = line.model
             with suppress(np.linalg.LinAlgError):  # unless that makes no valid spectrum for this window
                 found = search.maximise(line.theta, _WARM_STEPS, _NEAR, _GAIN, line.derivatives)
@@ -400,11 +400,11 @@ class LikelihoodFit:
         """Why a window is unexplained, as a sentence; empty if it is explained."""
         if not why:
             return ""
-        self.reset()  # perhaps the search has followed another maximum: the next window is searched anew
+        self.reset()  # perhaps the search has followed another maximum: start the next window cold
         return f"{self._machine.name}: the theory does not explain this window: {why}; {_OUTSIDE}"
 
     def _too_stiff(self, read: Diagnosis) -> str:
-        """Why a shaft that reads much stiffer means another machine than that of the file; empty if it does not."""
+        """Why a shaft that reads far too stiff shows that the file does not fit the machine; empty for any other."""
         at = STRUCTURAL.index("EI")
         change, error = read.parameters[at].relative_change, read.parameters[at].standard_error
         if change is None or error is None or change - _SURELY * error < _STIFFEST:
@@ -422,7 +422,7 @@ def _observed(model: SpectralModel, window: WindowStatistics) -> ComplexArray:
 
 
 def _near_lines(window: WindowStatistics, speed_rad_s: float) -> npt.NDArray[np.bool_]:
-    """Bins around the rotation, wherever it went, and other lines: what is left of these there is not stochastic."""
+    """Bins around the rotation, over its range of speeds, and other lines: their residue is not stochastic."""
     f = window.frequencies_hz
     slowest, fastest = window.speed_range if window.removed_by_hop else (speed_rad_s, speed_rad_s)
     passed = np.clip(f, slowest / (2 * np.pi), fastest / (2 * np.pi))
@@ -441,7 +441,7 @@ def _twins(states: tuple[str, ...], observed: ComplexArray) -> tuple[str, ...]:
 
 
 def _dead(states: tuple[str, ...], power: FloatArray) -> list[str]:
-    """States without fluctuation: a thousand times less than another one of their kind."""
+    """States without fluctuation: less than a thousandth of the amplitude of another one of their kind."""
     rates = np.array([name.endswith("_dot") for name in states])
     largest = np.where(rates, power[rates].max(initial=0.0), power[~rates].max(initial=0.0))
     return [name for name, dead in zip(states, ~(power > 1e-6 * largest), strict=True) if dead]

@@ -1,13 +1,13 @@
 """Following the maximum from hop to hop without searching it anew.
 
-A window that has slid by one hop is nearly the window before. The slopes of the expected spectra, which are most of a
-search's cost, are then those of the last search, and what is solved is
+A window that has slid by one hop is nearly the same as before. The slopes of the expected spectra, most of the cost of
+a search, are therefore taken from the last search, and the equation to solve is
 
     Σ ν tr{W_a (Ŝ - S(θ))} = pulls,    W_a = L₀⁻ᴴ (L₀⁻¹ ∂S/∂θ_a L₀⁻ᴴ) L₀⁻¹ at the last search's maximum,
 
-with S(θ) exact. Whatever the weights W, its expectation is zero at the truth (an unbiased estimating equation, V. P.
-Godambe, Annals of Mathematical Statistics 31 (1960)); near the last maximum they are the likelihood's own, so nothing
-worth speaking of is lost. Levels move as the elements of C, in which the spectra are linear.
+with S(θ) exact. For any weights W, the left side's expectation is zero at the true parameters (an unbiased estimating
+equation, V. P. Godambe, Annals of Mathematical Statistics 31 (1960)); near the last maximum W are the likelihood's own
+weights, so hardly any precision is lost. The levels are stepped as elements of C, in which the spectra are linear.
 """
 
 from collections.abc import Mapping
@@ -37,27 +37,27 @@ from models.diagnosis.window.moments import ComplexArray
 from models.signals.block import FloatArray
 
 _MOST_STEPS = 6
-_FARTHEST = 0.15  # relative change of the expected spectra (rms) beyond which the weights are no longer their own
-# Standard errors by which a stretch may differ from the window it is part of without being searched for itself.
+_FARTHEST = 0.15  # relative change of the expected spectra (rms) beyond which the weights no longer suit them
+# Standard errors by which a stretch may differ from the window it is part of without a search of its own.
 _NEWS = 3.0
-# A stretch further from the theory than this is searched for itself. The margin: at another level all of it counts as
-# excess.
+# Excess over the theory beyond which a stretch gets a search of its own. The margin is for a changed excitation level,
+# which counts as excess in full.
 _LEAST_EXCESS_Z, _EXCESS_MARGIN = 4.0, 1.15
 
 
 @dataclass(frozen=True, slots=True)
 class Glance:
-    """What one step from the window's maximum says of a stretch that holds nothing new."""
+    """Result of one step from the window's maximum for a stretch that agrees with the window."""
 
-    point: Expected  # the window's spectra at the stretch's parameters: what is not diagnosed is the window's
+    point: Expected  # the diagnosed parameters are the stretch's; all others, and the spectra, are the window's
     structural: FloatArray  # (n_diagnosed, n_diagnosed), covariance of the diagnosed parameters
 
 
 class Linearised:
-    """The spectra around the maximum of the last search, and where the maximum has moved since.
+    """The spectra linearised around the maximum of the last search, and the current maximum.
 
-    The search had these weights, ended at `searched` with these derivatives, and left `left`, shape (n_levels,), of the
-    data's gradient by the levels; the maximum is at `point` now.
+    The search used `weights` and ended at `searched` with `derivatives` and the gradient `left`, shape (n_levels,), of
+    the data with respect to the levels; the current maximum is at `point`.
     """
 
     def __init__(
@@ -81,19 +81,19 @@ class Linearised:
 
     @classmethod
     def around(cls, model: SpectralModel, weights: Weights, found: Maximum) -> "Linearised":
-        """The spectra around the maximum of a search that has just ended; its slopes are taken over."""
+        """Linearise around the maximum of a search that has just ended, with its slopes."""
         point, slopes = found.whitened.point.expected, found.slopes
         information = np.asarray(found.information - np.diag(weights.pull), dtype=np.float64)
         derivatives = Derivatives(slopes, information, found.slopes_rad_s)
-        # In directions that the data leave to the pulls on T the equation is solved as the search left it.
+        # Where only the pulls on T determine the levels, the equation keeps the gradient that the search ended with.
         left = _gradient(slopes, packed(found.whitened.excess), weights)[model.level_at]
         return cls(model, weights, point, point, derivatives, left, found.fitted)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """Everything that is neither the model's nor the weights', as named arrays.
+        """Everything that the model and the weights do not hold, as named arrays.
 
-        Spectra, slopes and information, megabytes, are computed again at the points where they were computed; of the
-        information the diagonal is kept, to which pulls have been added and taken away again.
+        Spectra, slopes and information (megabytes) are recomputed at the same points. Only the information's diagonal
+        is stored, because the pulls have been added to it and subtracted again.
         """
         return {
             "searched": self.theta,
@@ -109,14 +109,14 @@ class Linearised:
 
     @classmethod
     def restored(cls, model: SpectralModel, weights: Weights, arrays: Mapping[str, np.ndarray]) -> "Linearised":
-        """The same from what `checkpoint` gave.
+        """Restore what `checkpoint` returned.
 
         Raises
         ------
         CheckpointError
             If an array is missing or of another form.
         numpy.linalg.LinAlgError
-            If the point makes no valid spectra.
+            If the point gives no valid spectra.
         """
         size = (model.size,)
         theta = checked(arrays, "searched", np.float64, size)
@@ -140,9 +140,9 @@ class Linearised:
         )
 
     def follow(self, observed: ComplexArray, speed_rad_s: float, near: float, gain: float) -> Maximum | None:
-        """Solve for the next window's estimated spectra, in the units of the model; None where a new search is due.
+        """Find the maximum for the next window's estimated spectra, in the model's units; None if a new search is due.
 
-        It has converged as `FisherScoring.maximise` says, which `near` and `gain` are from.
+        `near` and `gain` define convergence as in `FisherScoring.maximise`.
         """
         model, point = self.model, self._point
         there: ModelPoint | None = None
@@ -184,7 +184,7 @@ class Linearised:
         return None
 
     def glance(self, observed: ComplexArray, share: float) -> Glance | None:
-        """Take one step from the latest maximum; None if the stretch, a share of the window's segments, is news."""
+        """Step from the latest maximum for a stretch with a share of the window's segments; None if they differ."""
         model, point = self.model, self._point
         rest = self._whitened(observed - point.S)
         gradient = _gradient(self.derivatives.slopes, rest, self.weights)
@@ -196,7 +196,7 @@ class Linearised:
             return None
         theta = point.theta.copy()
         theta[diagnosed] += step[diagnosed]
-        # Σ ν |rest - slopes · step|², with what is known of the slopes already.
+        # Σ ν |rest - slopes · step|², expanded in the known gradient and information.
         left = np.sum(rest**2, axis=1) @ self.weights.averages
         total = share * float(left - (2 * gradient - self.derivatives.information @ step) @ step)
         usual = model.n**2 * float(np.trace(model.groups.shared))
@@ -210,7 +210,7 @@ class Linearised:
         return packed(self._L_inverse @ difference @ self._L_inverse.conj().swapaxes(1, 2))
 
     def _pulled(self, gradient: FloatArray, point: Expected, share: float) -> FloatArray:
-        """The gradient of a share of the data with the pulls."""
+        """Gradient of a share of the data plus that of the pulls."""
         levels = self.model.level_at
         pulled = share * gradient - self.weights.ridge * (point.theta - self.weights.centre)
         pulled[levels] = share * (gradient[levels] - self._left)
@@ -223,7 +223,7 @@ class Linearised:
         return self._inverses[share]
 
     def _moved(self, point: Expected, step: FloatArray, speed_rad_s: float) -> ModelPoint:
-        """The point after a step: logarithms by one at most, variances as the step on the variance itself says."""
+        """The point after a step: logarithms move by at most one, noise variances and C linearly."""
         model = self.model
         theta = point.theta.copy()
         logarithms = slice(model.level_at.start)
@@ -237,6 +237,6 @@ class Linearised:
 
 
 def _gradient(slopes: FloatArray, rest: FloatArray, weights: Weights) -> FloatArray:
-    """What the data say about every parameter, levels by C."""
+    """Gradient of the data's log-likelihood with respect to every parameter, levels as elements of C."""
     weighted = (rest * weights.averages[:, None]).ravel()
     return np.asarray(slopes.reshape(slopes.shape[0], -1) @ weighted, dtype=np.float64)

@@ -1,9 +1,9 @@
-"""Whether the theory explains a window at all: where not, parameters fitted to it mean nothing, and what else would.
+"""Whether the theory explains a window at all (if not, its parameters mean nothing), and what else would explain it.
 
-At the maximum of the likelihood every direction that the model does not have is tried by its score (C. R. Rao, Proc.
-Cambridge Phil. Soc. 44 (1948)): gain and delay of every channel, what it shows of the other plane, masses, a shaft
-that is stiffer in one plane than in the other. Each is standard normal where the model holds, and its one-step estimate
-says how large the thing would be. What no such direction explains shows in the total excess of estimated over
+At the maximum of the likelihood, deviations for which the model has no parameter are tested by their scores (C. R. Rao,
+Proc. Cambridge Phil. Soc. 44 (1948)): gain and delay of every channel, its sensitivity to the other plane, masses, and
+a shaft stiffer in one plane than in the other. Each score is standard normal where the model holds, and its one-step
+estimate gives the size of the deviation. What none of them explains shows in the total excess of the estimated over the
 theoretical spectra.
 """
 
@@ -25,22 +25,22 @@ from models.physics.rotor import PARAMETER_TEXT, STATE_INDEX, Q_shaft
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, parts_seen, state_name
 
-# Of the elements of the dynamic matrix: what couples motions in y, and what couples motions in z.
+# Signs of the elements of the dynamic matrix that couple motions in y, and of those that couple motions in z.
 _SIGNS = np.kron([[1.0, 0.0], [0.0, -1.0]], np.ones((3, 3)))
-# In which degree of freedom of y; that of z is three further on.
+# Degree of freedom in y that each acts on; the one in z is three further on.
 _MASSES = {"mass at the bearing": 0, "mass of the disc": 1, "inertia of the disc": 2}
 _OTHER_PLANE = str.maketrans("yz", "zy")
-# An alternative of which less than this is left beside the model's own parameters cannot be told from them.
+# Least share of an alternative's information that the model's parameters leave; with less the two cannot be told apart.
 _LEAST_INFORMATION = 1e-4
 
 
 def goodness_of_fit(
     machine: Machine, model: SpectralModel, weights: Weights, found: Maximum, states: ComplexArray
 ) -> Goodness:
-    """Try the alternatives at the maximum of one window.
+    """Test the alternatives at the maximum of one window.
 
-    The estimated cross-spectra of the states, SI, are of shape (n_groups, n_states, n_states): displacement and
-    velocity are compared with each other, too.
+    `states` are the estimated cross-spectra of the states, SI, shape (n_groups, n_states, n_states); with them,
+    displacement and velocity are also compared with each other.
     """
     names, slopes = _alternatives(machine, model, found)
     seen = packed(found.whitened.excess)
@@ -59,10 +59,10 @@ def goodness_of_fit(
     )
     mismatches = model.motions.mismatches(states, model.centre, weights.averages)
     pairs = [_named(mismatch, {one.name: one for one in alternatives}) for mismatch in mismatches]
-    # The gains of a pair are nearly one test, and how far the pair disagrees is hardly random.
+    # The two gains of a pair are nearly one test, and a pair's mismatch is hardly random; the total excess adds one.
     tests = len(alternatives) - len(pairs) + 1
-    # Σ ν ‖L⁻¹ŜL⁻ᴴ - I‖² over its expectation, and its standard deviation. Where the model holds every element scatters
-    # as the groups say, less one for every parameter that was fitted.
+    # Σ ν ‖L⁻¹ŜL⁻ᴴ - I‖² minus its expectation where the model holds, and its standard deviation. The groups give the
+    # scatter of every element; each fitted parameter takes one off the sum.
     shared, excess = model.groups.shared, found.whitened.excess
     total = float(weights.averages @ np.einsum("fij,fji->f", excess, excess).real)
     over = total - (model.n**2 * float(np.trace(shared)) - found.fitted)
@@ -71,7 +71,7 @@ def goodness_of_fit(
 
 
 def _named(mismatch: Mismatch, alternatives: dict[str, AlternativeTest]) -> AlternativeTest:
-    """Displacement and velocity disagree: which of them deviates is the one whose gain explains the window better."""
+    """Attribute a mismatch of displacement and velocity to the one whose gain explains the window better."""
     x, v = (f"gain of {state}" for state in mismatch.states)
     z_x, z_v = (abs(alternatives[name].z) if name in alternatives else 0.0 for name in (x, v))
     if z_x > z_v:
@@ -80,7 +80,7 @@ def _named(mismatch: Mismatch, alternatives: dict[str, AlternativeTest]) -> Alte
 
 
 def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tuple[list[str], FloatArray]:
-    """Names and packed slopes of everything tried, shape (n_alternatives, n_groups, n²)."""
+    """Names and packed slopes of all alternatives, shape (n_alternatives, n_groups, n²)."""
     point, L_inverse = found.whitened.point, found.whitened.L_inverse
     whitened: ComplexArray = L_inverse[:, None] @ point.G
     response = through(point.C, whitened)
@@ -101,7 +101,7 @@ def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tup
 def _of_sensors(
     machine: Machine, model: SpectralModel, L_inverse: ComplexArray, coloured: ComplexArray
 ) -> tuple[list[str], FloatArray]:
-    """Names and packed slopes of what may be wrong with sensors: what each shows besides of which motion, or how late.
+    """Names and packed slopes of sensor errors: gain, sensitivity to the other plane, and delay.
 
     `coloured` is SL⁻ᴴ.
     """
@@ -123,15 +123,15 @@ _Places = npt.NDArray[np.intp]
 def _tried(
     channels: tuple[Channel, ...], states: tuple[str, ...]
 ) -> tuple[tuple[str, ...], int, FloatArray, _Places, _Places, _Places]:
-    """What is tried of sensors: names, how many of them are at once and not late, and what each state shows in it.
+    """Sensor errors to test: their names, how many of them (the first ones) are not delays, and their weights.
 
-    Weights by name and by state and motion that it shows; of each of these the state, the motion, and the state's own.
+    Weights are of shape (n_names, n_entries). Each entry's state, the motion it shows, and its own motion follow.
     """
     of = np.array([STATE_INDEX[state] % 6 for state in states])
     dofs, numbers = np.unique(of, return_inverse=True)
     own, alone = np.eye(dofs.size)[numbers], np.eye(numbers.size)
     tried = {f"gain of {state}": one[:, None] * own for state, one in zip(states, alone, strict=True)}
-    # A sensor that is turned, or sensitive across its axis, shows a part of its place's motion in the other plane.
+    # A sensor that is turned, or sensitive across its axis, shows part of the other plane's motion at its place.
     across = (of[:, None] + 3) % 6 == dofs
     for state, one, other in zip(states, alone, across, strict=True):
         if other.any():
@@ -143,9 +143,9 @@ def _tried(
 
 
 def _delays(channels: Sequence[Channel], states: Sequence[str]) -> dict[str, FloatArray]:
-    """Names of delays, and what part of each state comes late as part of which state; shape (n_states, n_states).
+    """Delays by name: the part of each state (row) that is a late part of a state (column), (n_states, n_states).
 
-    One channel comes late, or each a little after the one before, as of a converter that samples one after the other.
+    Either one channel is late, or each is a little later than the one before, as from a multiplexed converter.
     """
     measured = {part for channel in channels for part in parts_seen(channel)}
     sources = [state if state in measured else state.replace("_dot", "_ddot") for state in states]  # integrated
@@ -156,35 +156,34 @@ def _delays(channels: Sequence[Channel], states: Sequence[str]) -> dict[str, Flo
     return single | in_turn
 
 
-# No stiffness or damping is believed to have changed by more than a factor of five within the model.
+# Largest change of a stiffness or damping that the model is believed to describe: a factor of five.
 _MOST_LOG_RATIO = float(np.log(5))
-# Mean squared excess over its expectation, beyond which there is nothing to follow: the next search starts cold.
+# Mean squared excess over its expectation beyond which there is no maximum to follow: the next search starts cold.
 _MOST_EXCESS = 100.0
-# Deviation of the spectra from the theory (relative, rms, less what sampling makes) up to which readings mean a thing.
-# Where parameters of the model changed, by whatever, it stays below 0.05; a rub or a small mass makes up to 0.17.
+# Largest deviation of the spectra from the theory (relative rms, without sampling error) at which readings are valid.
+# However the model's parameters change, it stays below 0.05; a rub or a small mass causes up to 0.17.
 _MOST_DEVIATION = 0.2
-_SKIRTS = 2  # groups on either side in which a line is seen besides
-# The same where a parameter would have changed by more than a factor of two: a rub or a mass hardly moves them, and a
-# change as large as that must explain the window.
+_SKIRTS = 2  # groups on either side into which a line spreads
+# The same where a parameter reads as changed by more than a factor of two: a rub or a mass hardly moves the parameters,
+# so a real change of that size must explain the window.
 _LARGE, _MOST_DEVIATION_LARGE = float(np.log(2)), 0.1
-# Share of the motion that the theory takes for noise of the sensors though displacement and velocity show it alike, up
-# to which a rotor can be seen behind it: a spectrum without resonances is taken for coloured noise, and what is left of
-# it fits any rotor.
+# Largest share of the motion attributed to sensor noise although displacement and velocity agree on it. Beyond it, a
+# spectrum without resonances has been taken for coloured noise, and the remainder fits any rotor.
 _MOST_NOISE = 0.3
 _UNSHARED = 5.0  # how many times more noise one sensor of a pair may have than the other
-# Misfit that is no chance, and how many times less certain than on the rotor as it was most of its parameters may be
-# then. Within the model nothing makes them less certain than three times; a line that passes for the one resonance of a
-# softer shaft leaves bearings anywhere.
+# Misfit that is not chance, and the factor by which the standard errors of most parameters may then exceed those on the
+# nominal rotor. Within the model the factor stays below three; a line mistaken for the one resonance of a softer shaft
+# leaves the bearings undetermined.
 MOST_MISFIT, _BLIND = 4.0, 10.0
 
 
 def unexplained_at(
     model: SpectralModel, weights: Weights, reached: Whitened, states: ComplexArray, times: float = 1.0
 ) -> tuple[str, bool]:
-    """Why nothing at this point means anything, if so, and whether nothing within the model comes near the window.
+    """Why readings at this point mean nothing (empty if they do), and whether nothing in the model comes near.
 
-    The estimated cross-spectra of the states, SI, are of shape (n_groups, n_states, n_states); so many `times` what is
-    evaluated counts as too much.
+    `states` are the estimated cross-spectra of the states, SI, shape (n_groups, n_states, n_states); the limits are
+    multiplied by `times`.
     """
     excess, point, bins = reached.excess, reached.point, model.groups.bins
     squared = np.einsum("fij,fij->f", excess, excess.conj()).real / model.n**2
@@ -205,7 +204,7 @@ def unexplained_at(
         )
         why = f"its spectra deviate from it by {text} % (rms, without sampling error){line}, evaluation limit {limit} %"
         return why, far or impossible
-    # Noise is a sensor's own: what both sensors of a motion show is motion, and this one the theory does not explain.
+    # Noise is a sensor's own: what both sensors of a motion show is motion, here motion that the theory cannot explain.
     shared = np.maximum(model.noise(point.theta) - _UNSHARED * model.motions.rest(states, model.centre), 0)
     share = float(np.mean(bins @ shared / (bins @ np.einsum("fii->fi", point.S).real)))
     if share > times * _MOST_NOISE:
@@ -221,9 +220,9 @@ def unexplained_at(
 
 
 def unseen(model: SpectralModel, weights: Weights, found: Maximum, misfit_z: float) -> str:
-    """Say what a window does not show that the rotor as it was would show in one like it; empty if it shows most.
+    """Say which parameters of a nominal rotor such a window would show but hardly does; empty if at most half of them.
 
-    Beside a misfit a reading means something as long as the rotor is seen: then it is the nearest rotor's.
+    Despite a misfit, readings mean something while the rotor is visible: they are those of the nearest rotor.
     """
     n = len(STRUCTURAL)
     usual = weights.centre.copy()
@@ -235,7 +234,7 @@ def unseen(model: SpectralModel, weights: Weights, found: Maximum, misfit_z: flo
         np.sqrt(np.diag(np.linalg.inv(information))[:n])
         for information in (flat @ flat.T + np.diag(weights.pull), found.information)
     )
-    seen = expected < 1 / _BLIND  # by these sensors at all
+    seen = expected < 1 / _BLIND  # determined by these sensors at all
     lost = seen & ~(read < _BLIND * expected)
     if 2 * np.count_nonzero(lost) <= np.count_nonzero(seen):
         return ""

@@ -15,7 +15,7 @@ from models.machine import Machine
 
 
 class LengthFits:
-    """One fit for the window, and one for every shorter length that has news; and which lengths may have any."""
+    """One fit of the window and one of each shorter length that differs from it, and a cheap test whether any does."""
 
     def __init__(self, machine: Machine, *, sized: bool = False) -> None:
         self._machine, self._sized = machine, sized
@@ -36,12 +36,12 @@ class LengthFits:
         return found
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called: the next readings are the same to the last bit.
+        """Continue where `checkpoint` was called: the next readings are the same to the last bit.
 
         Raises
         ------
         CheckpointError
-            If they are not those of this machine; nothing is changed then.
+            If the arrays are not of this machine; nothing is changed then.
         """
         hop = int(checked(arrays, "hop", np.int64, ()))
         searched = dict(checked(arrays, "searched", np.int64, (None, 2)).tolist())
@@ -64,11 +64,11 @@ class LengthFits:
         return self._window.diagnose(window)
 
     def has_news(self, sliding: SlidingWindow, window: WindowStatistics, lengths: tuple[int, ...]) -> bool:
-        """Whether the latest hops, of any of these lengths, may say more than that the machine is as the window says.
+        """Whether the newest hops, at any of these lengths, may differ from the window or from the nominal machine.
 
-        The window is the latest of the sliding one. Its rotation is taken out of them, not their own: less work, and
-        hardly another spectrum away from it. Where no one rotation is that of all hops, accelerations are measured, or
-        the window is that of some of the sensors, they may.
+        `window` is the latest of `sliding`. Its synchronous part is removed from the hops instead of their own: this is
+        cheaper and hardly changes the spectrum away from the rotation. Always true if no single synchronous part holds
+        for all hops, if accelerations are measured, or if some sensors are left out of the window.
         """
         rotation, by_hop, plan = window.as_mounted.synchronous, window.hop_synchronous, sliding.plan
         if window.states != plan.states or integrated(window) is not window:
@@ -77,7 +77,7 @@ class LengthFits:
             return True
         n, hops = len(plan.states), sliding.hops[-max(lengths, default=1) :]
         segments = np.concatenate([hop.segments.swapaxes(0, 1) for hop in hops], axis=1, dtype=np.complex128)
-        if plan.equaliser is not None:  # as the sensors give it
+        if plan.equaliser is not None:  # back to the sensors' output
             rotation = rotation * plan.equaliser.response(np.array(window.speed_rad_s / (2 * np.pi)))
         remove, each = np.column_stack([np.eye(n), np.zeros(n), -rotation.real, rotation.imag]), len(hops[0].segments)
         by_bin = through(remove, segments)
@@ -89,9 +89,9 @@ class LengthFits:
         )
 
     def short(self, hops: int, stretch: WindowStatistics, *, closely: bool = False) -> Diagnosis:
-        """Estimate the parameters of the window's latest hops: at a glance if they say what the window says.
+        """Estimate the parameters of the window's newest hops, by `LikelihoodFit.glance` if they agree with the window.
 
-        If `closely`, not at a glance, which does not say whether the stretch is outside the model.
+        If `closely`, they are always searched: a glance does not tell whether the stretch is outside the model.
 
         Raises
         ------

@@ -2,23 +2,23 @@
 
 **Bins.** The spectrum that Hann-windowed segments estimate is not the spectrum at the bin but its average under the
 window's kernel. On the grid of the segment's own frequencies that kernel is (1, 4, 1)/6, exactly so for a motion that
-is forgotten within a segment; a motion that rings longer needs a grid twice as fine. A theory that is averaged the same
-way has no bias from leakage (P. D. Welch, IEEE Trans. Audio Electroacoust. 15 (1967), for the estimate; A. M. Sykulski
-et al., Biometrika 106 (2019), for comparing with the expectation). Averaging further over a few neighbouring bins is
+decays within a segment; a motion that rings longer needs a grid twice as fine. A theory that is averaged the same way
+has no bias from leakage (P. D. Welch, IEEE Trans. Audio Electroacoust. 15 (1967), for the estimate; A. M. Sykulski et
+al., Biometrika 106 (2019), for comparing with the expectation). Averaging further over a few neighbouring bins is
 linear too, and saves time where the spectrum is smooth.
 
-**Motions.** A displacement x and a velocity v of the same degree of freedom are the same motion twice: v = jωx but for
-sensor noise. Compared with theory side by side, what little finite segments let them differ by counts as information of
-its own, which it is not: near resonances it is the neighbouring bins once more. In units in which both noises are one,
+**Motions.** A displacement x and a velocity v of the same degree of freedom are one motion measured twice: v = jωx but
+for sensor noise. If both were compared with theory, the small difference that finite segments cause would count as
+further information, which it is not: near resonances it repeats the neighbouring bins. In units in which both noises
+are one,
 
     z = (x - jr v) / √(1 + r²),    r = ω · (unit of x) / (unit of v),
 
-is a rotation: its noise is one again, it holds everything that the pair says about the motion, and what is left,
+is a rotation: its noise is one again, and it holds everything that the pair says about the motion. The rest,
 (v - jr x) / √(1 + r²), holds noise and, if the gain of a sensor has drifted, the difference of the two gains.
 
-**Accelerations** become velocities. In the spectrum integration is a division by jω, exact at every frequency of the
-band and nowhere else: the valid band of the integrator is the band of the window (``band_hz`` of the machine file).
-Nothing is filtered in time.
+**Accelerations** become velocities. In the spectrum, integration is a division by jω, exact at every frequency of the
+window's band (``band_hz`` of the machine file) and valid only there. Nothing is filtered in time.
 """
 
 from dataclasses import dataclass, replace
@@ -37,7 +37,7 @@ from models.signals.channels import ACCELERATIONS
 # Independent averages per half-overlapped Hann segment and bin: one over the sum of the squared correlations with all
 # neighbouring segments and bins.
 AVERAGES_PER_BIN = 0.4737
-# Squared correlations with the bin itself and the two next to it: within a segment, and twice with a neighbour.
+# Squared correlations of a bin with itself and the next two, within a segment plus twice with a neighbouring segment.
 _SCATTER = AVERAGES_PER_BIN * np.array([1 + 2 / 36, 4 / 9 + 2 * 0.0200, 1 / 36 + 2 * 0.0069])
 _KERNEL = np.array([1.0, 4.0, 1.0]) / 6
 _OFFSETS = np.arange(-2.5, 2.6, 0.5)  # in bins
@@ -45,7 +45,7 @@ _FINE_KERNEL = (
     np.where(np.abs(_OFFSETS) == 1, 0.5, np.sinc(_OFFSETS) / np.where(np.abs(_OFFSETS) == 1, 1, 1 - _OFFSETS**2)) ** 2
 )
 _FINE_KERNEL = _FINE_KERNEL / _FINE_KERNEL.sum()
-# Decay over a segment, in nepers, of the longest ringing mode in the band, below which the fine grid is used.
+# Decay over a segment, in nepers, of the longest-ringing mode in the band, below which the fine grid is used.
 _RINGING = 8.0
 _PER_BANDWIDTH = 0.5  # width of a group over the half-power bandwidth of the nearest mode
 
@@ -59,20 +59,20 @@ class BinGroups:
     centre_hz: FloatArray  # (n_groups,), mean frequency
     # (n_groups, n_nodes): frequencies at which the theory is needed; padded with copies of weight zero
     nodes_hz: FloatArray
-    weights: FloatArray  # (n_groups, n_nodes), what each of them contributes to the group's expected spectrum
-    # (n_groups, n_groups): squared correlations of the groups' scatter, in units of what `AVERAGES_PER_BIN` says of
-    # each: a group of few bins scatters less than that, and together with its neighbours
+    weights: FloatArray  # (n_groups, n_nodes), weight of each node in the group's expected spectrum
+    # (n_groups, n_groups): squared correlations of the groups' scatter, relative to the variance that
+    # `AVERAGES_PER_BIN` implies: a group of few bins scatters less than that, and correlates with its neighbours
     shared: FloatArray
 
     def average(self, spectrum: ComplexArray) -> ComplexArray:
         """Average estimated cross-spectra over each group, shape (n_groups, n, n)."""
         places = np.array(self.edges).ravel()
-        # Every other sum is that of the bins between two groups; the end of the last may be the end of the band.
+        # Every other sum is of bins between two groups and is dropped; the last group may end with the band.
         sums = np.add.reduceat(spectrum, places[: -1 if places[-1] == spectrum.shape[0] else None], axis=0)[::2]
         return divided(np.ascontiguousarray(sums), self.bins[:, None, None])
 
     def cross_spectra(self, segments: ComplexArray) -> ComplexArray:
-        """The same from Fourier coefficients, shape (n_bins, n_segments, n): less work where there are few segments."""
+        """Average from Fourier coefficients, shape (n_bins, n_segments, n), which is cheaper for few segments."""
         m, runs = segments.shape[-1], _runs(self.edges)
         alike = [segments[first : first + n * width].reshape(n, -1, m) for first, n, width in runs]
         sums = np.concatenate([one.swapaxes(1, 2) @ one.conj() for one in alike])
@@ -161,7 +161,7 @@ def _shared_scatter(edges: list[tuple[int, int]], n_bins: int) -> FloatArray:
 
 
 _ABSENT = -1
-_GAIN_FLOOR = 0.005  # error of a pair's gain that no window length removes: unequal noise and leakage pass for as much
+_GAIN_FLOOR = 0.005  # error of a pair's gain that no window length removes: unequal noise and leakage look like it
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,10 +174,10 @@ class Mismatch:
 
 
 class Motions:
-    """Measured degrees of freedom, and how the measured states make them.
+    """Measured degrees of freedom, and how the measured states combine into them.
 
-    The scale, shape (n_states,), is the unit of each, in the ratio of the sensors' noise: the mean amplitude in the
-    band, for want of better.
+    `scale`, shape (n_states,), is the unit of each state. The units should be in the ratio of the sensors' noise; for
+    want of that, they are the mean amplitudes in the band.
     """
 
     def __init__(self, states: tuple[str, ...], scale: FloatArray) -> None:
@@ -196,15 +196,15 @@ class Motions:
         return self.dofs.size
 
     def _r(self, w: FloatArray) -> FloatArray:
-        """How many times stronger the velocity's share is, shape (…, n): 0 for a displacement alone."""
+        """Ratio r of the module's docstring, shape (…, n); 0 for a motion that only one sensor measures."""
         return np.asarray(
             np.where(self._has_x & self._has_v, w[..., None] * self._unit_x / self._unit_v, 0.0), dtype=np.float64
         )
 
     def factor(self, w: FloatArray, centre: FloatArray) -> ComplexArray:
-        """What a displacement of one, at angular frequencies w, rad/s, makes of each motion, shape (*w.shape, n).
+        """Motion per unit displacement at angular frequencies w, rad/s, shape (*w.shape, n).
 
-        The states are combined for a frequency of their own, the centre, that of the group w is seen in.
+        The states are combined with the weights of `centre`, the frequency of the group that w belongs to.
         """
         at_centre = self._r(centre)
         pair = (1 + at_centre * self._r(w)) / np.sqrt(1 + at_centre**2)
@@ -229,7 +229,7 @@ class Motions:
         return np.asarray(matrix @ states @ matrix.conj().swapaxes(-1, -2), dtype=np.complex128)
 
     def shares(self, w: FloatArray) -> dict[str, tuple[int, FloatArray]]:
-        """Of each state: the motion it is part of, and its share in that motion's amplitude at frequencies w."""
+        """For each state, the motion it is part of and its share of that motion's amplitude at frequencies w."""
         r2 = self._r(w) ** 2
         shares = {}
         for at in range(self.n):
@@ -241,9 +241,9 @@ class Motions:
         return shares
 
     def rest(self, states: ComplexArray, w: FloatArray) -> FloatArray:
-        """Power of what the two sensors of a motion do not share, shape (n_groups, n); infinite where there is one.
+        """Power that the two sensors of a motion do not share, shape (n_groups, n); infinite for a single sensor.
 
-        The cross-spectra of the states, SI, are of shape (n_groups, n_states, n_states).
+        `states` are the cross-spectra of the states, SI, shape (n_groups, n_states, n_states).
         """
         r = self._r(w)
         left = np.full(r.shape, np.inf)
@@ -258,11 +258,11 @@ class Motions:
     def mismatches(self, states: ComplexArray, w: FloatArray, averages: FloatArray) -> list[Mismatch]:
         """Compare displacement and velocity of every degree of freedom that has both.
 
-        With gains 1 and 1 + δ the rest d = (v - jr x)/√(1 + r²) of a pair holds jr δ z/(1 + r²) of its motion z; δ is
-        the least-squares regression of d on that, with standard error from what of d remains.
+        With gains 1 and 1 + δ, the rest d = (v - jr x)/√(1 + r²) of a pair contains jr δ z/(1 + r²) of its motion z. A
+        least-squares regression gives δ, and its residual the standard error.
 
-        The cross-spectra of the states, SI, are of shape (n_groups, n_states, n_states), each group of so many
-        independent averages.
+        `states` are the cross-spectra of the states, SI, shape (n_groups, n_states, n_states); `averages` is the number
+        of independent averages in each group.
         """
         both = np.flatnonzero(self._has_x & self._has_v)
         r, x, v = self._r(w)[:, both], self._x[both], self._v[both]
@@ -275,8 +275,8 @@ class Motions:
         power = regressor**2 * zz
         total = averages @ power
         delta = averages @ (dz * regressor) / total
-        # Group by group: leakage makes the rest largest where the motion is. Where noise is much of the motion, unequal
-        # noise of the two sensors passes for a difference of gain.
+        # Residual power is taken group by group: leakage makes it largest where the motion is. Where noise is much of
+        # the motion, unequal noise of the two sensors looks like a difference of gain.
         noise = averages @ (regressor**2 * dd) / total
         error = np.sqrt(averages @ (power * dd) / 2 / total**2 + noise**2 + _GAIN_FLOOR**2)
         pairs = [(self.states[i], self.states[j]) for i, j in zip(x.tolist(), v.tolist(), strict=True)]
@@ -286,10 +286,10 @@ class Motions:
 
 
 def integrated(window: WindowStatistics) -> WindowStatistics:
-    """Return the window with velocities in place of accelerations; the same where none is measured.
+    """Return the window with velocities in place of accelerations; unchanged if no acceleration is measured.
 
-    An acceleration beside a velocity of the same place is left out: it is the same motion with more noise at low
-    frequencies. Correlations are kept at lag zero alone, where they follow from the spectra.
+    An acceleration is left out if the same velocity is measured, too: it is the same motion with more noise at low
+    frequencies. Correlations are kept only at lag zero, where they follow from the spectra.
     """
     if not any(name in ACCELERATIONS for name in window.states):
         return window

@@ -16,22 +16,22 @@ LOG_NOISE = float(np.log(1e-3))
 # rank, or a channel without visible noise, leaves them undetermined.
 _WEAK = 0.05
 _COLOUR = 1.0  # the same for the noise's colour
-# How strongly the forces' own colours may be pulled towards none. The window itself says which (D. J. C. MacKay, Neural
-# Computation 4 (1992)): forces of one colour cost next to nothing, and a hump is left alone.
+# Strengths with which the forces' own colours may be pulled towards none. The evidence of the window selects one (D. J.
+# C. MacKay, Neural Computation 4 (1992)), so forces of one colour cost next to nothing, and a hump is not suppressed.
 _STRENGTHS = np.geomspace(0.5, 2000, 24)
-# How often a search asks for the strength anew, and the change of its logarithm that is not worth more steps.
+# How often a search re-estimates the strength, and the change of its logarithm that is not worth more steps.
 _LOOKS, _SAME_STRENGTH = 3, 0.5
-# The same for the low-pass: its logarithms have standard deviations of 1 and 0.3. A model without shapes of its own
-# keeps the order: on coarse groups a filter of order nought would pass for anything.
+# Pulls on the low-pass: the logarithms of cutoff and order have standard deviations of 1 and 0.3. A model without
+# colours of the forces keeps the order fixed: on coarse groups a filter of order near zero would fit anything.
 _CUTOFF, _ORDER, _FIXED = 1.0, 10.0, 1e4
-# Stiffness and damping of a bearing in each plane, y and z, among what is diagnosed; and the same for those of a plane
-# without a sensor: their logarithms have a standard deviation of 0.3.
+# Indices of the bearing's stiffness and damping in y and in z; and the pull on those of a plane without a sensor: their
+# logarithms have a standard deviation of 0.3.
 _OF_PLANES, _UNSHOWN = (slice(0, 2), slice(2, 4)), 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Whitened:
-    """Spectra at a point seen through its own Cholesky factors S = L Lᴴ."""
+    """Spectra whitened with the Cholesky factors S = L Lᴴ of the expected spectra at a point."""
 
     point: ModelPoint
     L_inverse: ComplexArray  # (n_groups, n, n)
@@ -40,10 +40,10 @@ class Whitened:
 
 @dataclass(frozen=True, slots=True)
 class Derivatives:
-    """Derivatives at the end of an earlier search: most of the first step of a search that starts there."""
+    """Derivatives at the end of an earlier search, which save most of the first step of a search that starts there."""
 
     slopes: FloatArray  # (size, n_groups, n²)
-    information: FloatArray  # (size, size), of the data alone, by C
+    information: FloatArray  # (size, size), of the data without pulls, levels as elements of C
     speed_rad_s: float  # speed for which they were computed
 
 
@@ -53,12 +53,12 @@ class Maximum:
 
     theta: FloatArray  # (size,), the parameter point
     information: FloatArray  # (size, size), Fisher information there, on the elements of C (not of T)
-    slopes: FloatArray  # (size, n_groups, n²), whitened slopes it is made of
-    # Speed for which they were computed: that of the window, or of the search whose slopes were taken over.
+    slopes: FloatArray  # (size, n_groups, n²), whitened slopes that the information is made of
+    # Speed for which they were computed: that of the window, or of the search whose slopes were reused.
     slopes_rad_s: float
     whitened: Whitened  # theory and estimate there
     steps: int  # steps tried
-    fitted: float  # parameters that the window determined; what the weak pulls determine does not count
+    fitted: float  # effective number of parameters that the window determined, not the weak pulls
     # (n_diagnosed,): step of the diagnosed parameters that the search would still take; a small part of a standard
     # error if it has converged
     remaining: FloatArray
@@ -66,11 +66,10 @@ class Maximum:
 
 
 class Weights:
-    """How much a window's data count, and how strongly usual values pull at what they leave undetermined.
+    """Weight of a window's data, and of the pulls towards usual values for what the data leave undetermined.
 
-    Estimated spectra are averaged over so many segments. The cutoff is pulled, weakly, to the usual one, if the band
-    does not show it; the strength is that with which the forces' own colours are pulled towards none, by default the
-    weakest.
+    Estimated spectra are means of `n_segments` segments. The cutoff is pulled weakly to the usual one, in case the band
+    does not show it; `strength` pulls the forces' own colours towards none, by default the weakest.
     """
 
     def __init__(
@@ -79,8 +78,8 @@ class Weights:
         self._shape_at, self._level_at = model.shape_at, model.level_at
         self.averages: FloatArray = AVERAGES_PER_BIN * n_segments * model.groups.bins
         self.ridge = np.full(model.size, _WEAK)
-        self.ridge[: model.cutoff_at] = 0.0  # what is diagnosed is pulled nowhere
-        for plane, own in enumerate(_OF_PLANES):  # but for what no sensor shows, which would be anywhere
+        self.ridge[: model.cutoff_at] = 0.0  # diagnosed parameters are not pulled
+        for plane, own in enumerate(_OF_PLANES):  # except in a plane without a sensor, which leaves them undetermined
             if not np.any(model.motions.dofs // 3 == plane):
                 self.ridge[own] = _UNSHOWN
         self.ridge[model.colour_at] = _COLOUR
@@ -95,7 +94,7 @@ class Weights:
 
     @property
     def pull(self) -> FloatArray:
-        """The pulls as they enter the information on C: next to nothing there, to keep it invertible."""
+        """Pulls as added to the information on C: for the levels just enough to keep it invertible."""
         pull = self.ridge.copy()
         pull[self._level_at] = 1e-3
         return pull
@@ -109,10 +108,10 @@ class Weights:
 class FisherScoring:
     """Fisher scoring with Levenberg-Marquardt damping: a step counts only if the likelihood rises.
 
-    The levels move as T of C = T Tᵀ. Where the data want less of a direction than there is, T's own curvature is added
-    to the information; without it the small columns of an excitation of low rank overshoot, and every other parameter
-    waits for them. The estimated cross-spectra, shape (n_groups, n, n), are in units of the model's scale. The strength
-    (`Weights`) holds until the window itself has said how strong it is.
+    The levels are stepped as T of C = T Tᵀ. Where the data call for less excitation in a direction, the curvature of
+    T Tᵀ is added to the information; without it the small columns of a low-rank excitation overshoot and hold up every
+    other parameter. `observed`, the estimated cross-spectra, shape (n_groups, n, n), are in the model's units. The
+    `strength` (see `Weights`) applies until it is re-estimated from the window.
     """
 
     def __init__(
@@ -183,8 +182,8 @@ class FisherScoring:
             steps += 1
             step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
             trial = theta + step
-            # Logarithms move by one at most, for far from the data the theory misleads. A variance moves as the
-            # scoring step on the variance itself says.
+            # Logarithms move by at most one: far from the data the slopes mislead. A noise variance takes the scoring
+            # step on the variance itself.
             trial[logarithms] = theta[logarithms] + np.clip(step[logarithms], -1, 1)
             trial[model.noise_at] = theta[model.noise_at] + np.log(np.clip(1 + step[model.noise_at], 0.2, 4))
             trial_value, trial_whitened = self._value(trial)
@@ -199,10 +198,10 @@ class FisherScoring:
         return Maximum(theta, on_levels, slopes, slopes_rad_s, whitened, steps, fitted, full_step[diagnosed])
 
     def _learn_strength(self, theta: FloatArray, covariance: FloatArray) -> bool:
-        """Pull the colours as strongly as is likeliest for the ones found; False if that is as before.
+        """Set the strength that has the largest evidence for the colours found; False if it hardly changed.
 
-        Around the present maximum the log-likelihood of the colours, everything else maximised, is quadratic, so the
-        evidence of every strength is known at once.
+        Around the current maximum the profile log-likelihood of the colours is quadratic, so the evidence of every
+        strength has a closed form.
         """
         at, old = self._model.shape_at, self.weights.strength
         precision = np.linalg.inv(covariance[at, at])
@@ -215,19 +214,19 @@ class FisherScoring:
         return bool(abs(np.log(new / old)) > _SAME_STRENGTH)
 
     def _value(self, theta: FloatArray) -> tuple[float, Whitened | None]:
-        """Log-likelihood and the weak pulls, up to a constant."""
+        """Log-likelihood with the weak pulls, up to a constant, and the whitened spectra."""
         whitened = whitened_at(self._model.at(theta, self._speed_rad_s), self._observed)
         if whitened is None:
             return -np.inf, None
         log_determinant = -2 * np.log(np.einsum("fii->fi", whitened.L_inverse).real).sum(axis=1)
-        trace = np.einsum("fii->f", whitened.excess).real  # and n, a constant
+        trace = np.einsum("fii->f", whitened.excess).real  # without the constant n
         pull = self.weights.ridge @ (theta - self.weights.centre) ** 2 / 2
         return float(-self.weights.averages @ (log_determinant + trace) - pull), whitened
 
     def _scores(
         self, theta: FloatArray, whitened: Whitened, derivatives: Derivatives | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Gradient, information for the step (both by T), packed slopes, and information by C."""
+        """Gradient and information with respect to T, packed slopes, and information with respect to C."""
         model, averages = self._model, self.weights.averages
         if derivatives is None:
             slopes = model.slopes(whitened.point, whitened.L_inverse, self._slopes)
@@ -250,14 +249,14 @@ class FisherScoring:
 
 
 def information_of(slopes: FloatArray, weights: Weights, out: FloatArray | None = None) -> FloatArray:
-    """Fisher information of the data from packed slopes, levels by C, without pulls; `out` has the shape of slopes."""
+    """Fisher information of the data, without pulls, from packed slopes; `out` is a buffer of the shape of `slopes`."""
     weighted = np.multiply(slopes, np.sqrt(weights.averages)[:, None], out=out).reshape(slopes.shape[0], -1)
     information: FloatArray = weighted @ weighted.T
     return information
 
 
 def whitened_at(point: ModelPoint, observed: ComplexArray) -> Whitened | None:
-    """See estimated spectra through the Cholesky factors of expected ones; None if those are no valid spectra."""
+    """Whiten estimated spectra with the Cholesky factors of the expected ones; None if those are no valid spectra."""
     try:
         L_inverse = inverse_factor(point.S)
     except np.linalg.LinAlgError:
@@ -274,7 +273,7 @@ def inverse_factor(S: ComplexArray) -> ComplexArray:
     Raises
     ------
     numpy.linalg.LinAlgError
-        If those are no valid spectra.
+        If S are no valid spectra.
     """
     return np.asarray(np.linalg.inv(np.linalg.cholesky(S)), dtype=np.complex128)
 
@@ -289,7 +288,7 @@ def _levels_by_factor(T: FloatArray) -> FloatArray:
 
 
 def _curvature(gradient: FloatArray) -> FloatArray:
-    """What T's second derivatives add to the information: 2 tr(δTᵀ N δT), N the part of -∂/∂C that is positive."""
+    """Second-derivative term of T Tᵀ in the information: 2 tr(δTᵀ N δT), N the positive part of -∂/∂C."""
     N = np.zeros((6, 6))
     N[ROWS, COLUMNS] = N[COLUMNS, ROWS] = -gradient * np.where(ROWS == COLUMNS, 1.0, 0.5)
     values, vectors = np.linalg.eigh(N)

@@ -6,18 +6,18 @@ The cross-spectral matrix of the measured motions (displacement and velocity of 
     S(f) = c(f; fc) · G D(f) C D(f) Gᴴ + diag(d(f)),   G = H at the measured rows, in the motions' units,
 
 with H = (-ω²M + jωP + Q)⁻¹ the receptance of Eq. (1), c the power gain of a low-pass of unknown cutoff and order, C an
-unknown full level matrix over all six degrees of freedom, and D = diag(exp(½ Σ_j a_ij b_j(f))) what every degree of
-freedom's force has of its own colour: b_j are polynomials in √f. So the excitation may be one source of any
-direction or many, of first or fourth order, with a cutoff each, or with a broad hump; all that is assumed of it is that
-its spectrum is smooth. The spectra are the Fourier transforms of the correlation functions of Eq. (18): this is the
-comparison of theoretical and estimated correlations with the right weight on every lag.
+unknown full level matrix over all six degrees of freedom, and D = diag(exp(½ Σ_j a_ij b_j(f))) the own colour of each
+degree of freedom's force, with polynomials b_j in √f. The excitation may thus be one source in any direction or many,
+of first or fourth order, each with its own cutoff or with a broad hump; only a smooth spectrum is assumed. The spectra
+are the Fourier transforms of the correlation functions of Eq. (18): this is the comparison of theoretical and estimated
+correlations with the right weight on every lag.
 
 C = T Tᵀ with T lower triangular, so that every point the search tries is a possible excitation. Standard errors come
-from the information on C itself, which stays honest where T loses rank (decision 0002).
+from the information on C itself, which stays right where T loses rank (decision 0002).
 
 The sensor noise has a smooth spectrum of its own in every motion, d(f) = d₀ (1 + (f/f_r)²)^b with f_r two thirds of
-the band's end: white for b = 0, first-order low-pass at f_r for b = -1; d₀ is made of a density of each sensor.
-Taken as white when it is not, it pulled the damping of the heavy machine down by up to 15 %.
+the band's end: white for b = 0, first-order low-pass at f_r for b = -1; d₀ combines the densities of the sensors.
+Assuming white noise where it is not white lowered the damping read on the heavy machine by up to 15 %.
 """
 
 from copy import copy
@@ -54,18 +54,18 @@ class Expected:
 
 @dataclass(frozen=True, slots=True)
 class ModelPoint(Expected):
-    """The same with what their derivatives are made of, a megabyte that nobody should keep."""
+    """Expected spectra and what their derivatives need: a megabyte, so do not keep it."""
 
     # (n_groups, n_nodes, n, 6): transfer from forces (in units of C, coloured) to measured motions, times the root of
     # the node's weight
     G: ComplexArray
     receptance: ComplexArray  # (n_frequencies, 6, 6), of all six degrees of freedom, SI, at distinct frequencies
-    place: npt.NDArray[np.intp]  # (n_groups, n_nodes), where each node's is among these
+    place: npt.NDArray[np.intp]  # (n_groups, n_nodes), index of each node's receptance among these
     unit: FloatArray  # (n_groups, 1, 1, 6), the forces' units and D
 
     @property
     def H(self) -> ComplexArray:
-        """The receptance for the same forces, without that root, shape (n_groups, n_nodes, 6, 6)."""
+        """Receptance for the same forces, without the root of the weight, shape (n_groups, n_nodes, 6, 6)."""
         return np.asarray(self.receptance[self.place] * self.unit, dtype=np.complex128)
 
     @property
@@ -81,8 +81,8 @@ class SpectralModel:
     cutoff (Hz) and order, the logarithms of the noise densities of the measured states (in units of `scale`² per
     Hz), their exponents b, the shape coefficients a (polynomial by polynomial), and the lower triangle of T.
 
-    The motions are measured in units that make all spectra of the order of one, and forces in `force_scale`, N/√Hz,
-    that makes the elements of C so. No polynomials of the forces' colour (`shapes`) leave one low-pass for all.
+    The motions are in units that make all spectra of order one, and forces in `force_scale`, N/√Hz, which does the same
+    for the elements of C. Without polynomials for the forces' colour (`shapes` = 0), all forces share one low-pass.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class SpectralModel:
         self._see(groups)
 
     def seen_in(self, groups: BinGroups) -> "SpectralModel":
-        """The same model in other groups."""
+        """The same model with other groups of bins."""
         other = copy(self)
         other._see(groups)
         return other
@@ -118,11 +118,11 @@ class SpectralModel:
         self.groups = groups
         low, high = self._band_hz
         self._noise_shape = np.log1p((groups.centre_hz / (2 / 3 * high)) ** 2)
-        # Over the root of frequency the polynomials resolve a low-pass at the lower and a hump at the upper end alike.
+        # In √f the polynomials resolve a low-pass at the lower end as well as a hump at the upper end.
         x = 2 * (np.sqrt(groups.centre_hz) - np.sqrt(low)) / (np.sqrt(high) - np.sqrt(low)) - 1
         self._b = eval_legendre(np.arange(1, self.shapes + 1), x[:, None])
         self._w = 2 * np.pi * groups.nodes_hz
-        # Neighbouring groups share nodes, and all are filled up to one number: half of them where damping is light.
+        # Neighbouring groups share nodes and are padded to equal numbers: with light damping half are duplicates.
         self._distinct_w, self._place = np.unique(self._w, return_inverse=True)
         self.centre = 2 * np.pi * groups.centre_hz
         self._factor = self.motions.factor(self._w, self.centre[:, None])
@@ -161,7 +161,7 @@ class SpectralModel:
         return np.asarray(matrix @ states @ matrix.conj().swapaxes(-1, -2), dtype=np.complex128)
 
     def measured(self, response: ComplexArray, w: FloatArray) -> ComplexArray:
-        """Measured motions, each frequency by itself, of all coordinates' responses; shape (n_frequencies, n, …)."""
+        """Measured motions from the responses of all coordinates at each frequency, shape (n_frequencies, n, …)."""
         return np.asarray(response[:, self.motions.dofs] * self.motions.factor(w, w)[:, :, None], dtype=np.complex128)
 
     def levels(self, theta: FloatArray) -> FloatArray:
@@ -176,7 +176,7 @@ class SpectralModel:
         return T
 
     def at(self, theta: FloatArray, speed_rad_s: float, C: FloatArray | None = None) -> ModelPoint:
-        """Expected spectra at a parameter point, or with another level matrix than its own."""
+        """Expected spectra at a parameter point, with the level matrix C instead of its own if given."""
         H = self.receptance(theta[: self.cutoff_at], speed_rad_s, self._distinct_w)
         colour = np.exp(0.5 * self._b @ theta[self.shape_at].reshape(self.shapes, 6))
         unit = self.force_unit * colour[:, None, None, :]
@@ -201,16 +201,16 @@ class SpectralModel:
         return noise
 
     def _noise_parts(self, theta: FloatArray) -> FloatArray:
-        """What each state brings into the noise of its motion, shape (n_groups, n_states)."""
+        """Contribution of each state to the noise density of its motion, shape (n_groups, n_states)."""
         exponent = theta[self.noise_at] + self._noise_shape[:, None] * theta[self.colour_at][self._motion_of]
         return np.asarray(self._share * np.exp(exponent), dtype=np.float64)
 
     def slopes(self, point: ModelPoint, L_inverse: ComplexArray, out: FloatArray | None = None) -> FloatArray:
-        """L⁻¹ (∂S/∂θ_a) L⁻ᴴ of every parameter a, packed, shape (size, n_groups, n²).
+        """L⁻¹ (∂S/∂θ_a) L⁻ᴴ for every parameter a, packed, shape (size, n_groups, n²).
 
-        The last 21 are by the elements of C, not of T. With ∂H = -H ∂D H every structural derivative, and
-        every level's, is an outer product of columns of G and of G C Hᴴ plus its conjugate transpose. `out` is where to
-        put them: megabytes, better not allocated at every step.
+        The last 21 are with respect to the elements of C, not of T. With ∂H = -H ∂D H every derivative for a structural
+        parameter or a level is an outer product of columns of G and of G C Hᴴ plus its conjugate transpose. `out` is a
+        buffer for the result: megabytes, better not allocated at every step.
         """
         theta = point.theta
         whitened = L_inverse[:, None] @ point.G
@@ -241,13 +241,13 @@ class SpectralModel:
         return out
 
     def sides(self, point: ModelPoint, whitened: ComplexArray, response: ComplexArray) -> "Sides":
-        """What stands on either side of a change of the dynamic matrix, from L⁻¹G and its response L⁻¹GC."""
+        """Left and right factors of a change of the dynamic matrix, from L⁻¹G and its response L⁻¹GC."""
         return Sides(whitened * (1 / point.unit), response.conj() @ point.H.swapaxes(2, 3))
 
 
 @dataclass(frozen=True, slots=True)
 class Sides:
-    """What stands on either side of a change of the dynamic matrix in the slope of the spectra."""
+    """Left and right factors of a change of the dynamic matrix in the slope of the spectra."""
 
     left: ComplexArray  # (n_groups, n_nodes, n, 6), L⁻¹G in SI units
     right: ComplexArray  # the same shape, conjugate of L⁻¹GC Hᴴ
@@ -255,10 +255,10 @@ class Sides:
     def slope(
         self, factor: ComplexArray | FloatArray, dofs: slice = slice(None), change: FloatArray | None = None
     ) -> FloatArray:
-        """Packed slope of the spectra by a change of the dynamic matrix, sign reversed.
+        """Packed slope of the spectra with respect to a change of the dynamic matrix, sign reversed.
 
-        Rows and columns of the degrees of freedom change by `factor`, shape (n_groups, n_nodes), times `change`,
-        symmetric and of shape (n_dofs, n_dofs), or times one on the diagonal without it.
+        The block of the `dofs` changes by `factor`, shape (n_groups, n_nodes), times the symmetric matrix `change`,
+        shape (n_dofs, n_dofs), by default the identity.
         """
         n_groups, _, n, _ = self.left.shape
         moved = self.left[..., dofs] * factor[..., None, None]
@@ -269,10 +269,10 @@ class Sides:
 
 
 def _receptance(M: FloatArray, P: FloatArray, Q: FloatArray, w: FloatArray) -> ComplexArray:
-    """(-ω²M + jωP + Q)⁻¹, shape (n_frequencies, 6, 6): both planes by their cofactors, then the gyroscopes' coupling g.
+    """(-ω²M + jωP + Q)⁻¹, shape (n_frequencies, 6, 6): both planes by cofactors, then the gyroscopic coupling g.
 
-    [[A, g eeᵀ], [-g eeᵀ, B]]⁻¹ is made of A⁻¹, B⁻¹ and their columns A⁻¹e and B⁻¹e. For hundreds of frequencies at once
-    that takes a quarter of the time of inverting one matrix after the other.
+    [[A, g eeᵀ], [-g eeᵀ, B]]⁻¹ follows from A⁻¹, B⁻¹ and their columns A⁻¹e and B⁻¹e. For hundreds of frequencies at
+    once this takes a quarter of the time of inverting one matrix after the other.
     """
     diagonal = np.diag(Q)[:, None] - np.diag(M)[:, None] * w**2 + 1j * np.diag(P)[:, None] * w
     p, q, r = diagonal.reshape(2, 3, w.size).swapaxes(0, 1)  # of each plane
@@ -291,7 +291,7 @@ def _receptance(M: FloatArray, P: FloatArray, Q: FloatArray, w: FloatArray) -> C
 
 
 def factor_of(C: FloatArray) -> FloatArray:
-    """T, lower triangular, of the level matrix nearest to C that an excitation can have; shape (6, 6)."""
+    """Lower triangular T of the positive semidefinite level matrix nearest to C, shape (6, 6)."""
     values, vectors = np.linalg.eigh(C)
     root = vectors * np.sqrt(np.maximum(values, 0))
     return np.asarray(np.linalg.qr(root.T)[1].T, dtype=np.float64)
@@ -313,7 +313,7 @@ def twice_packed(matrices: ComplexArray) -> FloatArray:
 
 @lru_cache
 def _upper(n: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Diagonal, rows and columns of what is above it."""
+    """Indices of the diagonal, and rows and columns of the elements above it."""
     return np.arange(n), *np.triu_indices(n, 1)
 
 
@@ -332,7 +332,7 @@ _LEAST_LEVEL = 1e-3
 
 
 def usual_force(machine: Machine, motions: Motions, groups: BinGroups, speed_rad_s: float, cutoff_hz: float) -> float:
-    """Unit of force, N/√Hz, in which equal independent sources of level one make the mean power that was measured.
+    """Unit of force, N/√Hz, in which equal independent sources of level one cause the mean power that was measured.
 
     A parameter point therefore stays a good start when the machine merely becomes louder.
     """
@@ -349,7 +349,7 @@ def starting_point(model: SpectralModel, observed: ComplexArray, centre: FloatAr
     """Guess the excitation with the nominal rotor.
 
     Forces follow from the response through the regularised inverse of G, bin group by bin group; their mean, divided by
-    the low-pass that fits its trace best, is the level matrix. Everything else has its usual value, from the centre.
+    the low-pass that fits its trace best, is the level matrix. Everything else has its usual value, from `centre`.
     """
     groups = model.groups
     w = 2 * np.pi * groups.centre_hz
@@ -373,7 +373,7 @@ def starting_point(model: SpectralModel, observed: ComplexArray, centre: FloatAr
 
 
 def _best_cutoff(frequency_hz: FloatArray, total: FloatArray, weight: FloatArray) -> float:
-    """Cutoff whose low-pass leaves the least scatter in the forces' logarithm, a few outliers aside."""
+    """Cutoff (Hz) whose low-pass leaves the least scatter in the logarithm of the forces, with outliers clipped."""
     scatter = {}
     for cutoff_hz in np.geomspace(frequency_hz[0] * 3, frequency_hz[-1] * 3, 24):
         rest = np.log(total / low_pass(frequency_hz, float(cutoff_hz)))

@@ -1,9 +1,9 @@
 """Unbalance from the rotation-synchronous vector: generalised least squares, as a number and as a vector.
 
-While the heavy spot is where it was, the unbalance is one real number times the nominal one, and is read as that. Once
-it has turned, that number would be the projection on the old direction: half a turn would read as -200 %. Then what is
-read is the complex ratio: how large the unbalance has become, or, where most of the change is the turn, the size of the
-vector by which it changed. Once the shaft angle itself has jumped, directions say nothing, and it is the size alone.
+While the heavy spot keeps its angle, the unbalance is read as a real number times the nominal one. Once the heavy spot
+has turned, that number would be the projection on the old direction: half a turn would read as -200 %. The complex
+ratio is read then: the size of the unbalance or, if most of the change is the turn, the size of the vector by which it
+changed. Once the shaft angle itself has jumped, directions mean nothing, and only the size is read.
 """
 
 import math
@@ -20,8 +20,7 @@ from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray
 
-# Probability that vectors of one unbalance contradict each other by chance, and the least error that is tried where
-# they do.
+# Probability that vectors of one unbalance contradict each other by chance, and the least relative error tried if so.
 _CHANCE, _LEAST_ERROR = 1e-3, 1e-3
 _HALVINGS = 12
 
@@ -39,20 +38,20 @@ class Unbalance:
 
 @dataclass(frozen=True, slots=True)
 class UnbalanceRatios:
-    """The unbalance over the nominal one: real with the phase as known, and as real and imaginary part without."""
+    """The unbalance over the nominal one: as a real number at the nominal phase, and as a complex number."""
 
-    # (3,): the real number; real and imaginary part
+    # (3,): the real number; real and imaginary part of the complex one
     values: FloatArray
     variances: FloatArray
     between: float  # covariance of the two parts
     covariance: FloatArray  # (3, 5), of the three with the logarithmic ratios of the structural parameters
     foreign: str  # see `UnbalanceVector`
-    # (n_states,): real and imaginary part are those of weights @ vector; none for several vectors
+    # (n_states,): weights @ vector gives the real and imaginary part; empty for several vectors
     weights: ComplexArray
-    explained: float  # how much of the vector is that of the unbalance, in squared standard errors
+    explained: float  # how much of the vector the unbalance explains, in squared standard errors
 
     def decided(self, *, directed: bool = True) -> Unbalance:
-        """Take that of the descriptions which holds, see this module; the size alone where directions say nothing."""
+        """Choose the description that holds, see this module; the size alone unless vectors are `directed`."""
         known, real, imaginary = self.values.tolist()
         variances = float(self.variances[1]), self.between, float(self.variances[2])
         vector = UnbalanceVector(real, imaginary, *variances, self.foreign, directed)
@@ -78,10 +77,10 @@ def estimate_unbalance(
     sized: bool = False,
     backward: bool = False,
 ) -> UnbalanceRatios:
-    """Estimate e from q of x_n = Re{q e^{jθ}}; `UnbalanceRatios.decided` makes one answer of it.
+    """Estimate e from q of x_n = Re{q e^{jθ}}; `UnbalanceRatios.decided` turns it into one reading.
 
-    The vector's covariance is the stochastic part's spectrum over the window length, averaged around Ω as a window of
-    that length sees it, plus what the uncertainty of the structural parameters makes of the predicted response.
+    The vector's covariance is the stochastic part's spectrum divided by the window length, averaged around Ω under the
+    kernel of a window of that length, plus the effect of the structural parameters' errors on the predicted response.
 
     Parameters
     ----------
@@ -90,14 +89,14 @@ def estimate_unbalance(
     synchronous : ndarray of complex, shape (n_states,)
         q, SI.
     sized : bool
-        Whether the vector is from an unknown angle, so that its size is all there is: it is turned to the heavy spot.
+        Whether the zero of the vector's angle is unknown, so that only its size counts: it is turned to the heavy spot.
     backward : bool
-        Whether the shaft turns from z to y although the speed is positive, as one that was found in the vibration is.
+        Whether the shaft turns from z to y although the speed is positive, as a speed found in the vibration always is.
 
     Raises
     ------
     EstimationError
-        If the vector says nothing about e.
+        If the vector does not determine e.
     """
     rotor = machine.rotor
     w = np.array([speed_rad_s])
@@ -149,15 +148,15 @@ def estimate_unbalance(
 
 
 def _contradiction(observed: FloatArray, design: FloatArray, spread: FloatArray, size: FloatArray) -> FloatArray:
-    """Covariance of the least relative error of every vector with which they are those of one unbalance; none mostly.
+    """Covariance of the least relative error that makes all vectors agree with one unbalance; zero mostly.
 
-    Run-out and gains that are a little off are no chance, and weights for chance alone, which where one force shakes
-    the machine are large and of either sign, make many times as much of them (R. C. Paule and J. Mandel, Journal of
+    Run-out and slightly wrong gains are not random. Weights for random errors alone, which are large and of either sign
+    where a single force moves the machine, would amplify them many times (R. C. Paule and J. Mandel, Journal of
     Research of the National Bureau of Standards 87 (1982)).
 
-    Observed are real parts of the vectors, then imaginary ones, shape (2n,), with `spread` as their covariance by
-    chance; the design, shape (2n, 2), holds those of the nominal unbalance, and of it turned by 90°; the error is
-    relative to the size, shape (n,).
+    `observed`, shape (2n,), holds the real parts of the vectors, then the imaginary ones, and `spread` their random
+    covariance; `design`, shape (2n, 2), the same of the nominal unbalance and of it turned by 90°; the error is
+    relative to `size`, shape (n,).
     """
     relative = np.diag(np.tile(size**2 / 2, 2))
 
@@ -189,13 +188,13 @@ def estimate_unbalance_by_hop(
 ) -> Unbalance:
     """Estimate e where the speed varies: every hop at its own speed, with its own vector.
 
-    The hops' own errors are independent; that of the structural parameters is one for all. If `sized`, the vectors of a
-    hop are from an unknown angle, and so is the way in which the shaft turns: that which explains more of them.
+    The hops' own errors are independent; the error of the structural parameters is common to all. If `sized`, the zero
+    of each hop's angle is unknown, and so is the sense of rotation: the one that explains more of the vectors is taken.
 
     Raises
     ------
     EstimationError
-        If a vector says nothing about e.
+        If a vector does not determine e.
     """
     known = machine, model, point, covariance
     ways = [
@@ -211,7 +210,7 @@ def estimate_unbalance_by_hop(
     common = np.einsum("hai,ij,hbj->hab", shared, precision, shared)
     own = np.array([hop.variances for hop in hops]) - np.einsum("haa->ha", common)
     weight = 1 / np.maximum(own, np.finfo(float).tiny)
-    weight[:, 1:] = weight[:, 1:].sum(axis=1, keepdims=True)  # one for both parts of a vector
+    weight[:, 1:] = weight[:, 1:].sum(axis=1, keepdims=True)  # the same for both parts of a vector
     weight /= weight.sum(axis=0)
     together = np.einsum("ha,hai->ai", weight, shared)
     left = together @ precision @ together.T
@@ -230,10 +229,10 @@ def estimate_unbalance_by_hop(
 def _around_rotation(
     machine: Machine, model: SpectralModel, point: Expected, speed_rad_s: float, duration_s: float
 ) -> ComplexArray:
-    """Stochastic cross-spectrum under the kernel of a plain window of the given length, centred on Ω, shape (n, n).
+    """Stochastic cross-spectrum under the kernel of a rectangular window of this length, centred on Ω, shape (n, n).
 
-    On the frequencies Ω ± (k + ½)/T the kernel has the weights 1/(π(k + ½))². Its tails are long: with one source, what
-    they let in from a resonance is more than the sensor noise. Beyond the excluded neighbourhood the mean kernel
+    At the frequencies Ω ± (k + ½)/T the kernel has the weights 1/(π(k + ½))². Its tails are long: with one source, the
+    leakage from a resonance exceeds the sensor noise. Beyond the excluded neighbourhood the mean kernel
     1/(2π²T (f - Ω)²) is applied to the groups' own spectra.
     """
     groups = model.groups
