@@ -1,1 +1,1 @@
-"""What a sliding window of samples is reduced to: moments of its hops, and the statistics that are made of them."""
+"""A sliding window of samples reduced to moments of its hops, and the statistics made of them."""

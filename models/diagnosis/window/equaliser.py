@@ -1,8 +1,8 @@
-"""What sensors and inputs do to a vibration, taken back: the high-pass of AC coupling, and delays between channels.
+"""Compensation of what sensors and inputs do to a vibration: the high-pass of AC coupling, and delays of channels.
 
-Both are exact in the frequency domain, where the moments of a window are already: cross-spectra and vectors are divided
-by the response that the machine file states. Samples are left as they are: put back in time, what a high-pass has taken
-away below the band would be mostly noise, and a window would depend on the samples before it.
+Both are compensated exactly in the frequency domain, where the moments of a window already are: cross-spectra and
+vectors are divided by the response that the machine file states. Samples are left as they are: an inverse high-pass in
+time would restore mostly noise below the band, and make a window depend on the samples before it.
 """
 
 import math
@@ -28,9 +28,9 @@ class Equaliser:
     delay_s: FloatArray
 
     def response(self, frequency_hz: FloatArray) -> _ComplexArray:
-        """What each sensor gives for a vibration of amplitude 1, shape (..., n); 1 where no frequency is known (nan).
+        """Complex gain of each sensor, shape (..., n); 1 where the frequency is unknown (nan).
 
-        Frequencies, shape (...), are negative for a shaft angle that falls.
+        Frequencies, shape (...), are negative for a shaft angle that decreases.
         """
         f = frequency_hz[..., np.newaxis]
         below = self.corner_hz / (1j * np.where(f == 0, np.nan, f))
@@ -38,10 +38,10 @@ class Equaliser:
         return np.asarray(np.nan_to_num(np.exp(-2j * np.pi * f * self.delay_s) / damped, nan=1.0), dtype=np.complex128)
 
     def missing(self, segments: _ComplexArray, frequencies_hz: FloatArray, lags_s: FloatArray) -> FloatArray:
-        """What correlations lack because the sensors are as they are, shape (n_hops, n_lags, n, n).
+        """What the sensors' responses remove from the correlations, shape (n_hops, n_lags, n, n).
 
-        It is to be added to E{x_i(t) x_j(t + τ)} of each hop. Segments, shape (n_hops, n_segments, n_bins, n), hold
-        Fourier coefficients as the sensors give them, two-sided densities.
+        Add it to E{x_i(t) x_j(t + τ)} of each hop. `segments`, shape (n_hops, n_segments, n_bins, n), are Fourier
+        coefficients of the sensors' output, two-sided densities.
         """
         n_hops, n_segments, n_bins, n = segments.shape
         of_bins = segments.transpose(0, 2, 3, 1)
@@ -54,7 +54,7 @@ class Equaliser:
 
 
 def equaliser_of(sensors: Sequence[Sensor]) -> Equaliser | None:
-    """Equaliser of sensors, one a column; None where the file says of none that it differs from the vibration."""
+    """Equaliser of sensors, one per column; None if the file states no high-pass and no delay."""
     if all(one.high_pass_hz is None and one.delay_us is None for one in sensors):
         return None
     return Equaliser(

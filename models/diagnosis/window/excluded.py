@@ -1,8 +1,8 @@
-"""Lines that say nothing of the machine, which theory leaves out: mains hum, and what the healthy machine had.
+"""Lines that say nothing about the machine and that theory leaves out: mains hum, and lines of the healthy machine.
 
-A line of a hundredth of a channel's rms matters where one force moves all channels: what is left between them is sensor
-noise alone. So all channels are looked at together, in parts of what surrounds a bin. The phase of a steady line goes
-on from segment to segment, and that of a multiple of the speed goes with the shaft; that of noise does neither.
+A line of a hundredth of a channel's rms matters where one force moves all channels, as channels then differ by sensor
+noise alone. So all channels are looked at together, relative to the bins around. The phase of a steady line advances
+evenly from segment to segment, and that of a multiple of the speed follows the shaft; that of noise does neither.
 """
 
 from collections.abc import Sequence
@@ -16,16 +16,16 @@ from models.signals.block import FloatArray
 
 _LOBE = 2  # a Hann window spreads a line over two bins on either side
 _BESIDE = range(_LOBE + 1, _LOBE + 4)  # bins away, that are the surroundings
-_STANDS_OUT = 4.0  # power of the motion that does so most, over that of its surroundings; of noise up to 2.5
-_SMOOTH = 3  # segments to either side over which the phase of a line that is taken out is a mean
-_HANN_POWER, _AT_ONE = 0.375, 1e-6  # power of a lobe over the square of the amplitudes in it, added up
-_CHANCE = 1e-4  # of one bin that stands out
+_STANDS_OUT = 4.0  # power of the motion that stands out most, over that of its surroundings; up to 2.5 for noise
+_SMOOTH = 3  # segments to either side over which the phase of a removed line is averaged
+_HANN_POWER, _AT_ONE = 0.375, 1e-6  # power of a lobe over the square of the sum of its amplitudes
+_CHANCE = 1e-4  # for one bin that stands out
 _FEWEST_SEGMENTS = 6
 _ORDERS = range(2, 13)
-_MAINS_HZ, _MAINS_VARY = (50.0, 60.0), 0.004  # frequencies of electric supplies, and how far these are off, relative
-_SAME = 0.02  # relative distance of a line from itself
-_HUM = 0.05  # part of the random power up to which a line is no more than hum; above it is told as any other
-_HALVES = (0.5, 1.5, 2.5)  # multiples of the speed that a rub or looseness makes
+_MAINS_HZ, _MAINS_VARY = (50.0, 60.0), 0.004  # mains frequencies, and their relative tolerance
+_SAME = 0.02  # relative tolerance for the same line
+_HUM = 0.05  # part of the random power up to which a line counts as hum; above, it is reported like any other
+_HALVES = (0.5, 1.5, 2.5)  # multiples of the speed that a rub or looseness causes
 
 KnownLine = tuple[float, float]
 """A line of the healthy machine: its frequency, Hz, and the same over the running speed."""
@@ -36,13 +36,13 @@ class ExcludedLine(NamedTuple):
 
     frequency_hz: float
     reach_hz: float
-    # (n, n): R_ij(τ) = Re{power e^{-j2π centre τ}} of it alone, where its phase is sure to be no resonance's, as that
-    # of hum and of multiples of the speed is; and its frequency between the bins
+    # (n, n): its own R_ij(τ) = Re{power e^{-j2π centre τ}}, if its phase is certainly not that of a resonance, as with
+    # hum and multiples of the speed; and its frequency, which may lie between bins
     power: ComplexArray | None = None
     centre_hz: float = 0.0
 
     def known(self, speed_rad_s: float) -> KnownLine:
-        """What is kept of it, to three digits: of a line that is found in every window one is kept, or few."""
+        """Frequency and order to three digits, so that a line found in every window is kept only once, or few times."""
         order = self.frequency_hz * 2 * np.pi / abs(speed_rad_s)
         return float(f"{self.frequency_hz:.3g}"), float(f"{order:.3g}")
 
@@ -60,7 +60,7 @@ def excluded_lines(
     turning: ComplexArray | None = None,
     alive: npt.NDArray[np.bool_] | None = None,
 ) -> tuple[ExcludedLine, ...]:
-    """Lines that say nothing of the machine, in Fourier coefficients without mean and rotation.
+    """Lines that say nothing about the machine, in Fourier coefficients without mean and rotation.
 
     Parameters
     ----------
@@ -70,11 +70,11 @@ def excluded_lines(
     speeds_rad_s : tuple of float
         Slowest and fastest hop. Where they are nan, or the shaft stands, no line can be told from the rotation.
     known : sequence of KnownLine, optional
-        Those of the healthy machine. None: all lines are taken for such, multiples of the speed too.
+        Those of the healthy machine. If None, all lines count as such, multiples of the speed too.
     turning : ndarray, shape (n_segments, n_bins), optional
         Fourier coefficients of the cosine of the shaft angle.
     alive : ndarray, shape (n,), optional
-        Channels that show anything: what a dead one has is rounding, which is a line anywhere.
+        Channels that have a signal: the rounding errors of a dead one look like lines anywhere.
     """
     if alive is not None and not alive.all():
         place = np.eye(alive.size)[:, alive]
@@ -100,7 +100,7 @@ def excluded_lines(
                 continue
             line = ExcludedLine(float(frequencies_hz[at[n]]), step_hz * _skirt(strength[n]))
             phases, centre_hz = _course(own, line, step_hz)
-            # In one lobe with a multiple of the speed, the phase says which of the two it is.
+            # If a multiple of the speed is in the same lobe, the phase says which of the two it is.
             is_hum = hum[at[n]] and _beside_multiples(centre_hz, slowest_hz, fastest_hz, step_hz / 2)
             if healthy[at[n]] or (is_hum and _share(segments, int(at[n]), own) <= _HUM):
                 found.append(_with_power(line, segments, frequencies_hz, phases, centre_hz) if is_hum else line)
@@ -113,7 +113,7 @@ def excluded_lines(
             had = known is not None and any(abs(one / order - 1) <= _SAME for _, one in known)
             if at.size and (had or known is None):
                 strength, motions = _outstanding(spectrum, at, (at[:1], at[-1:]))
-                # The phase in the middle of a segment is that of all bins of a lobe, with a sign that alternates.
+                # All bins of a lobe have the phase in the middle of the segment, with a sign that alternates.
                 own = ((-1.0) ** at[:, np.newaxis] * (segments[at] @ motions[strength.argmax()])).sum(axis=0)
                 if had or (strength.max() > _STANDS_OUT and _goes_with(own, rotation, order)):
                     line = ExcludedLine(order * speed_hz, half_hz + step_hz * _skirt(strength.max()))
@@ -128,7 +128,7 @@ def excluded_lines(
 def _wanted(
     frequencies_hz: FloatArray, slowest_hz: float, fastest_hz: float, known: Sequence[KnownLine] | None
 ) -> npt.NDArray[np.bool_]:
-    """Bins that are looked at: where a known line may be, or hum; not the rotation."""
+    """Bins to search: where a known line or hum may be, without the rotation."""
     step_hz = frequencies_hz[1] - frequencies_hz[0]
     if known is None:
         wanted = np.ones(frequencies_hz.size, dtype=np.bool_)
@@ -142,7 +142,7 @@ def _wanted(
 
 
 def _beside_multiples(line_hz: float, slowest_hz: float, fastest_hz: float, by_hz: float) -> bool:
-    """Whether a line is at least so far from what multiples of the speed, and a rub, make."""
+    """Whether a line is at least `by_hz` from all multiples of the speed, half ones from a rub included."""
     orders = np.array([*_HALVES, *_ORDERS])
     return bool((np.abs(line_hz - np.clip(line_hz, orders * slowest_hz, orders * fastest_hz)) >= by_hz).all())
 
@@ -150,7 +150,7 @@ def _beside_multiples(line_hz: float, slowest_hz: float, fastest_hz: float, by_h
 def _near_known(
     frequencies_hz: FloatArray, speed_hz: float, known: Sequence[KnownLine] | None
 ) -> npt.NDArray[np.bool_]:
-    """Bins where a line of the healthy machine may be; all where it is this window that says which it has."""
+    """Bins where a line of the healthy machine may be; all if this window is to say which lines it has."""
     near = np.full(frequencies_hz.size, known is None)
     for line_hz, order in known or ():
         for then in (line_hz, order * speed_hz):
@@ -159,9 +159,9 @@ def _near_known(
 
 
 def _share(segments: ComplexArray, at: int, own: ComplexArray) -> float:
-    """Part of the power of all channels in the band that goes with the line, as one motion of all of them does.
+    """Part of the power of all channels in the band that is coherent with the line.
 
-    Of a single channel it says little: where hardly anything but the rotation moves one, faint hum is most of the rest.
+    In a single channel it says little: where hardly anything but the rotation moves one, faint hum is most of the rest.
     """
     lobe = slice(max(0, at - _LOBE), at + _LOBE + 1)
     line = np.abs(_unit(own).conj() @ segments[lobe] / own.size) ** 2
@@ -170,9 +170,9 @@ def _share(segments: ComplexArray, at: int, own: ComplexArray) -> float:
 
 
 def _course(own: ComplexArray, line: ExcludedLine, step_hz: float) -> tuple[ComplexArray, float]:
-    """Phases of a line that goes on by one angle from segment to segment, shape (n_segments,), and its frequency.
+    """Phases of a line that advances by one angle per segment, shape (n_segments,), and its frequency.
 
-    They may wander, more slowly than a few segments: what follows every segment follows a resonance as well.
+    The phases may drift, but over more than a few segments: following every segment would follow a resonance as well.
     """
     unit = _unit(own)
     advance = np.angle(np.mean(unit[1:] * unit[:-1].conj()))
@@ -192,7 +192,7 @@ def _with_power(
     centre_hz: float,
     half_hz: float = 0.0,
 ) -> ExcludedLine:
-    """The line with what goes with its phases in all channels; `half_hz` is how far it wanders to either side."""
+    """The line with the power coherent with its phases in all channels; it wanders by `half_hz` to either side."""
     step_hz = frequencies_hz[1] - frequencies_hz[0]
     lobe = np.flatnonzero(np.abs(frequencies_hz - centre_hz) <= half_hz + (_LOBE + 0.5) * step_hz)
     if not lobe.size:
@@ -200,8 +200,8 @@ def _with_power(
     off = np.abs(frequencies_hz[lobe] - centre_hz) / step_hz
     hann = np.sinc(off) / np.where(np.abs(off - 1) < _AT_ONE, 2.0, 2 * (1 - off**2))
     hann = np.where(np.abs(off - 1) < _AT_ONE, 0.25, hann)
-    # The amplitude in the middle of a segment is that of all bins of a lobe, with a sign that alternates: as the taper
-    # has them, or of a line that goes through them one as the other.
+    # All bins of a lobe have the amplitude in the middle of the segment with a sign that alternates, weighted by the
+    # taper or, for a line that moves through the bins, equally.
     weights = hann / (hann @ hann) if half_hz < step_hz else np.ones(lobe.size)
     middle = np.tensordot((-1.0) ** lobe * weights, segments[lobe], axes=1)
     amplitudes = phases.conj() @ middle / phases.size
@@ -212,14 +212,14 @@ def _with_power(
 def _outstanding(
     spectrum: ComplexArray, at: npt.NDArray[np.intp], between: tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]
 ) -> tuple[FloatArray, ComplexArray]:
-    """Power of the motion that stands out most in each bin, and the weights of the channels that make it from them.
+    """Power of the motion that stands out most in each bin, and the weights of the channels in that motion.
 
-    In parts of what surrounds the first and the last of the bins that it is `between`.
+    The power is relative to the bins around the first and the last of those it is `between`.
     """
     low, high = between
     size = spectrum.shape[0]
     beside = np.array([one for k in _BESIDE for one in (low - k, high + k)])
-    beside = np.where((beside < 0) | (beside >= size), low + high - beside, beside)  # of one side at the band's ends
+    beside = np.where((beside < 0) | (beside >= size), low + high - beside, beside)  # one side alone at the band's ends
     unit = np.linalg.inv(np.linalg.cholesky(spectrum[np.clip(beside, 0, size - 1)].mean(axis=0)))
     powers, motions = np.linalg.eigh(unit @ spectrum[at] @ unit.conj().swapaxes(1, 2))
     weights = (motions[:, :, -1:].conj().swapaxes(1, 2) @ unit)[:, 0]
@@ -227,25 +227,25 @@ def _outstanding(
 
 
 def _skirt(strength: float) -> float:
-    """How many bins from a line its skirts are seen: those of a Hann window fall with the sixth power."""
+    """Number of bins from a line at which its skirts are still seen: a Hann window's fall with the sixth power."""
     return float(max(_LOBE + 1, 2 * strength ** (1 / 6)))
 
 
 def _keeps_course(own: ComplexArray) -> bool:
-    """Whether the phase of segments, shape (n_segments,), goes on by one angle each time, as that of noise does not.
+    """Whether the phase of segments, shape (n_segments,), advances by the same angle each time, unlike that of noise.
 
-    The frequency may be off the bin, and wander slowly. The mean of unit vectors that turn by what the angle changes is
-    of length u or more with about the probability (1 - u²)ⁿ⁻⁴, of n pieces of noise that overlap by half.
+    The frequency may be off the bin and drift slowly. For n segments of noise that overlap by half, the mean of unit
+    vectors at the change of that angle has length u or more with about the probability (1 - u²)ⁿ⁻⁴.
     """
     unit = _unit(own)
     return bool((1 - _length(unit[:-2] * unit[1:-1].conj() ** 2 * unit[2:]) ** 2) ** (own.size - 4) < _CHANCE)
 
 
 def _goes_with(own: ComplexArray, rotation: ComplexArray, order: int) -> bool:
-    """Whether the phase of segments, shape (n_segments,), goes with a multiple of the rotation.
+    """Whether the phase of segments, shape (n_segments,), follows a multiple of the rotation.
 
-    The mean of n unit vectors is of length u or more with the probability (1 - u²)ⁿ⁻¹; of segments that overlap one of
-    two is evidence.
+    The mean of n unit vectors has length u or more with the probability (1 - u²)ⁿ⁻¹; the segments overlap, so every
+    second one is evidence.
     """
     return bool((1 - _length(_unit(own) * rotation.conj() ** order) ** 2) ** (own.size / 2) < _CHANCE)
 

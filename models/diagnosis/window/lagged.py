@@ -1,4 +1,4 @@
-"""Sums of products of samples with earlier ones: what correlation functions are made of."""
+"""Sums of products of samples with earlier ones, from which correlation functions are made."""
 
 import numpy as np
 import numpy.typing as npt
@@ -8,12 +8,12 @@ from models.signals.block import FloatArray
 
 
 def lagged_products(a: FloatArray, lags: npt.NDArray[np.intp], before: int) -> FloatArray:
-    """Sums of products at all lags: history as reference, what follows it as response.
+    """Sums of lagged products; samples of the history are references only.
 
-    The lags are short and there are many samples, so these are cut into blocks of twice the longest lag; their
-    cross-spectra (each block's reference reaches back by the longest lag, its response is zero there) are added up
-    before one inverse transform. Where only some lags are wanted, the cross-spectra are folded before it, and it is
-    shorter: every second sample has a spectrum that is the sum of both halves.
+    The lags are short and the samples many, so the samples are cut into blocks of twice the longest lag. The blocks'
+    cross-spectra (each block's reference reaches back by the longest lag, where its response is zero) are added up
+    before one inverse transform. If only every k-th lag is wanted, the cross-spectra are folded first, which shortens
+    the transform: for every second lag, the two halves of the spectrum are added.
 
     Parameters
     ----------

@@ -1,16 +1,16 @@
-"""Lines that are not the rotation: of a neighbouring machine, a gear, whirl.
+"""Lines that are not the rotation, such as those of a neighbouring machine, a gear or whirl.
 
-A line has the same strength in every segment, noise has not: of a steady line the mean fourth power of the Fourier
-coefficient is the square of the mean second power, of noise twice that. And it turns by the same angle from each
-segment to the next, where a resonance has forgotten its phase: their coherence is 1 of a line, and of n segments of
-noise c or more with the probability (1 - c²)ⁿ⁻¹. A line too faint to be certain of in one window is certain when two
-that do not overlap have it: no resonance is remembered from one to the other, so that their chances multiply.
+A line has the same strength in every segment, noise has not: for a steady line the mean fourth power of the Fourier
+coefficient is the square of the mean second power, for noise twice that. A line also turns by the same angle from each
+segment to the next, while a resonance loses its phase: the coherence of successive segments is 1 for a line, and c or
+more for n segments of noise with the probability (1 - c²)ⁿ⁻¹. A line too faint to be certain in one window is certain
+if two windows that do not overlap have it: no resonance lasts from one to the other, so the probabilities multiply.
 
-Beside a multiple of the speed a line beats with it. Seen from the turning shaft that multiple stands still, and the
-line turns: of what is left without the mean, one rotation holds nearly all, where of n segments of noise it holds a
-part p or more with the probability (1 - p)ⁿ⁻². A change of the multiple itself, a step or a pulsation, turns both ways
-alike, and one that drifts does not get round. What rings from one segment to the next turns one way for a while: a line
-has to keep its phase besides.
+Next to a multiple of the speed a line beats with it. In coordinates that turn with the shaft, the multiple stands still
+and the line turns. Without the mean, a single rotation holds nearly all of the rest; with n segments of noise it holds
+a part p or more with the probability (1 - p)ⁿ⁻². A change of the multiple itself, a step or a pulsation, turns both
+ways alike, and a drift does not complete a turn. What rings from one segment to the next turns one way for a while, so
+a line must keep its phase as well.
 """
 
 import math
@@ -27,43 +27,43 @@ from models.diagnosis.window.moments import ComplexArray, HopMoments, Plan
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 
-_STEADY = 1.35  # fourth power over the square of the second: 2 for noise, 1 for a line; between them with little data
+_STEADY = 1.35  # fourth power over the square of the second: 2 for noise, 1 for a line; in between with little data
 _NO_BURST = 1.8
 """The same: 1.2 to 1.4 for a faint line, over 2.2 for what rings in a few segments and keeps its phase there."""
-_STANDS_OUT, _FAINT = 8.0, 4.0  # power over that of its surroundings: seen in one window alone, and in two
+_STANDS_OUT, _FAINT = 8.0, 4.0  # power over that of its surroundings, for a line seen in one window alone, and in two
 _NEIGHBOURHOOD_HZ = 4.0
 _LOBE = 2  # a Hann window spreads a line over two bins on either side
 _FEWEST_SEGMENTS = 6
 _HARMONICS = 12
 _CHANCE = 1e-9
 _NEARLY_ALL, _OTHER_WAY, _TURNS = 0.8, 0.2, 1.5
-"""Least part that turns one way, most of it that turns the other way, and how often it gets round at least."""
+"""Least part that turns one way, largest part of that which turns the other way, and least number of turns."""
 _LOUD, _SAME = 0.02, 0.02
-"""Part of a channel's random power from which on a new line is told, and relative distance of a line from itself."""
+"""Part of a channel's random power above which a new line is reported, and relative tolerance for the same line."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A line."""
+    """A spectral line."""
 
     state: str  # where it is strongest
     frequency_hz: float
-    share: float  # of the power of that channel's part that does not turn with the shaft
-    certain: bool  # whether no noise is coherent like that
+    share: float  # of that channel's power without the part that turns with the shaft
+    certain: bool  # whether noise cannot be as coherent
     beside: int = 0  # the multiple of the speed it is next to, within three bins of the spectra; 0 if next to none
-    likely: bool = False  # whether noise is coherent like that by so small a chance that it is not in two windows
+    likely: bool = False  # whether noise is as coherent so seldom that it is not so in two windows
 
     def known(self, speed_rad_s: float) -> KnownLine:
-        """What is kept of it."""
+        """Its rounded frequency and order, for later comparison."""
         return round(self.frequency_hz, 4), round(self.frequency_hz * 2 * np.pi / abs(speed_rad_s), 4)
 
 
 def steady_lines(
     plan: Plan, hops: Sequence[HopMoments], window: WindowStatistics, faulty: Collection[str] = ()
 ) -> tuple[Line, ...]:
-    """Lines that are neither noise nor a multiple of the speed, strongest first, of the hops that make up a window.
+    """Lines in the hops of a window that are neither noise nor a multiple of the speed, strongest first.
 
-    Nothing that `faulty` sensors show is one.
+    `faulty` sensors are ignored.
     """
     window = window.as_mounted
     states = plan.mounted
@@ -96,7 +96,7 @@ def steady_lines(
             share = min(1.0, float(2 * step_hz * mean[lobe, column].sum() / total[column]))
             certain = bool(clear and chance < _CHANCE)
             line = Line(states[column], float(frequencies_hz[at]), share, certain, likely=likely)
-            # A channel that is sure of it goes before one that it is louder in.
+            # A channel in which the line is certain goes before one in which it is louder.
             found[at] = max(found.get(at, line), line, key=lambda one: (one.certain, one.likely, one.share))
     lines = [*found.values(), *_beside_multiples(plan, window, every, mean, total)]
     return tuple(sorted(lines, key=lambda line: -line.share))
@@ -105,16 +105,16 @@ def steady_lines(
 def _beside_multiples(
     plan: Plan, window: WindowStatistics, every: ComplexArray, mean: FloatArray, total: FloatArray
 ) -> Iterator[Line]:
-    """The strongest line that is certain beside each multiple of the speed, where this is steady.
+    """The strongest certain line beside each multiple of the speed, if the speed is steady.
 
-    `every` is of shape (n_segments, n_bins, n_states + n_regressors), the power of a bin, `mean`, of shape (n_bins,
-    n_states). The noise is the median of bins around a multiple: it reaches none of them, and a line beside it few.
+    `every` has shape (n_segments, n_bins, n_states + n_regressors); `mean`, the power in each bin, (n_bins, n_states).
+    The noise is the median of bins around a multiple: the multiple reaches none of them, and a line beside it few.
     """
     if window.speed_source != "phase reference" or window.removed_by_hop:
         return
     frequencies_hz, states = plan.frequencies_hz, plan.mounted
     step_hz, speed_hz = float(frequencies_hz[1] - frequencies_hz[0]), abs(window.speed_rad_s) / (2 * np.pi)
-    if speed_hz <= (2 * _LOBE + 1) * step_hz:  # one multiple would be a line beside the next
+    if speed_hz <= (2 * _LOBE + 1) * step_hz:  # a multiple would look like a line beside the next one
         return
     turning = every[:, np.abs(frequencies_hz - speed_hz).argmin(), len(states) + 1]
     turning = turning / np.maximum(np.abs(turning), np.finfo(float).tiny)
@@ -135,7 +135,7 @@ def _beside_multiples(
         at, multiple_hz = int(own[:, column].argmax()), order * speed_hz
         every_s = plan.segment // 2 / plan.rate_hz
         offset_hz, certain = _turning(left[:, :, column], at, every_s, frequencies_hz[near][at] - multiple_hz)
-        # Or the multiple may have changed: no reason to refuse a recording, and nothing that hides a line.
+        # Otherwise the multiple may have changed, which is no reason to refuse a recording and hides no line.
         if certain:
             yield Line(states[column], multiple_hz + offset_hz, min(1.0, float(shares[column])), certain, order)
 
@@ -145,22 +145,22 @@ def new_line(
 ) -> Line | None:
     """The strongest line that the healthy machine did not have, at its frequency or order; None without one.
 
-    `beside` says whether the known ones are all, those next to a multiple of the speed too.
+    `beside` says whether `known` includes lines next to a multiple of the speed; if not, such lines are passed over.
     """
     told = (line for line in lines if line.certain and line.share > _LOUD and (beside or not line.beside))
     return next((line for line in told if not _among(line, known, speed_rad_s)), None)
 
 
 class LatestLines:
-    """The lines of the latest windows, to be sure of those that are too faint for one."""
+    """The lines of the latest windows, to confirm those that are too faint for one window."""
 
     def __init__(self) -> None:
         self._seen: list[tuple[int, KnownLine]] = []  # by the end of the window
 
     def take(self, lines: Sequence[Line], window: WindowStatistics) -> tuple[Line, ...]:
-        """Go on with a window: its lines, those certain too that one had which ended before it began."""
+        """Add a window and return its lines; likely ones become certain if a window that ended before had them."""
         length_ns = window.end_ns - window.start_ns
-        # What is later is of a clock that was set back. Where clocks run apart, a window begins a little early.
+        # Later lines are from before the clock was set back. Where clocks run apart, a window begins a little early.
         self._seen = [one for one in self._seen if window.start_ns - length_ns <= one[0] < window.end_ns]
         before = [line for end_ns, line in self._seen if end_ns <= window.start_ns + length_ns // 100]
         self._seen += [(window.end_ns, line.known(window.speed_rad_s)) for line in lines if line.likely]
@@ -175,7 +175,7 @@ class LatestLines:
         return {"lines_end_ns": ends, "lines": np.array([line for _, line in self._seen]).reshape(-1, 2)}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called.
+        """Continue where `checkpoint` was called.
 
         Raises
         ------
@@ -194,7 +194,7 @@ def _among(line: Line, known: Sequence[KnownLine], speed_rad_s: float) -> bool:
 
 
 def _chance(own: ComplexArray) -> float:
-    """How seldom noise keeps its phase as segments do; those that overlap are no evidence, one of two is left."""
+    """Probability that noise keeps its phase as these segments do; they overlap, so every second one is evidence."""
     earlier, later = own[:-2], own[2:]
     norms = np.linalg.norm(earlier) * np.linalg.norm(later)
     coherence = min(1.0, float(abs(np.vdot(earlier, later)) / norms))
@@ -202,7 +202,7 @@ def _chance(own: ComplexArray) -> float:
 
 
 def _turning(left: ComplexArray, at: int, every_s: float, near_hz: float) -> tuple[float, bool]:
-    """How fast most of a bin turns, of what is possible nearest to a frequency; and whether only a line does that."""
+    """Frequency at which most of a bin turns, the alias nearest to `near_hz`; and whether only a line does that."""
     n_segments = left.shape[0]
     size = 16 * n_segments
     rotations = np.abs(np.fft.fft(left, size, axis=0)) ** 2
@@ -210,7 +210,7 @@ def _turning(left: ComplexArray, at: int, every_s: float, near_hz: float) -> tup
     own = left[:, at]
     part = min(1.0, float(rotations[most, at]) / (n_segments * float((own.real**2 + own.imag**2).sum())))
     found_hz = most / size / every_s
-    # Segments that overlap are no evidence, one of two is left.
+    # Segments overlap, so every second one is evidence.
     one_way = part > _NEARLY_ALL and (1 - part) ** (n_segments / 2 - 2) < _CHANCE
     # The two sides of a pulsation may be in different bins, or look alike from one segment to the next.
     there, back = rotations[[most, -most]].sum(axis=1)

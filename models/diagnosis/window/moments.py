@@ -1,16 +1,16 @@
-"""Moments of one hop of samples: what a window is the sum of; and what of them goes with the rotation.
+"""Moments of one hop of samples, of which a window is the sum, and the part of them that turns with the shaft.
 
 A window's statistics are sums over its hops, so a sliding window is a ring of hop moments that are added up anew each
 time. Nothing is ever subtracted: a running sum would keep the rounding of everything that went through it.
 
-The rotation-synchronous part and the mean are not removed sample by sample. The regressors n = (1, cos θ, sin θ) ride
-along as further channels, and the window takes out their part by algebra (`statistics.py`). That is exact for any
+The rotation-synchronous part and the mean are not removed sample by sample. The regressors n = (1, cos θ, sin θ) are
+treated as further channels, and the window removes their part by algebra (`statistics.py`). That is exact for any
 window and needs no second pass over samples.
 
 The rotation is taken out of every hop and segment. At a steady speed one set of coefficients serves the whole window.
-Where the speed changes, the amplitude at the rotation changes with it, and what one set leaves behind is no longer next
-to the line. Then every hop has its own, and a segment of the spectra those between the hops on which its middle lies.
-Without a phase reference the angle begins anew in every hop, and each of its segments has its own hop's.
+Where the speed changes, the 1x amplitude changes with it, and the residue of a single set would no longer lie next to
+the line. Then every hop has its own coefficients, and a segment of the spectra has those interpolated at its middle.
+Without a phase reference the angle begins anew in every hop, and each segment has the coefficients of its own hop.
 """
 
 import itertools
@@ -48,8 +48,8 @@ class Plan:
     # Measured state variables (``y1`` … ``phi_dot``), then accelerations (``y1_ddot`` …), in the order of the
     # statistics' columns.
     states: tuple[str, ...]
-    # Column of the stream, and factor to SI, for each of `states` and then for channels at other places, of which only
-    # levels are taken.
+    # Column of the stream, and factor to SI, for each of `states` and then for channels at other places, which have
+    # levels only.
     columns: npt.NDArray[np.intp]
     scales: FloatArray
     # Column of the shaft angle; without it the regressors are the mean and, where `speed_rad_s` is given, the most
@@ -61,7 +61,7 @@ class Plan:
     segment: int
     lags: npt.NDArray[np.intp]  # lags of the correlation functions, samples
     bins: npt.NDArray[np.intp]  # frequency bins of a segment's Fourier transform that are kept
-    # Samples from the start of a hop to the next one: more than it has where there is silence between snapshots.
+    # Samples from the start of a hop to that of the next: more than a hop has if there is silence between snapshots.
     stride: int
     hops: int  # hops in a full window
     max_span_ns: int  # oldest data a window may hold
@@ -71,29 +71,29 @@ class Plan:
     speed_tolerance: float = 0.0  # how far the speed may be off, relative
     others: tuple[str, ...] = ()  # channels at other places, of which only levels are taken
     levels: LevelPlan | None = None  # of all `columns`; None where no levels are wanted
-    thorough: bool = True  # whether with levels all is looked for that is compared with a healthy machine alone
+    thorough: bool = True  # whether levels include those that are only compared with a healthy machine
     # Where sensors are at an angle: what each column of `states` is as mounted (``bearing@45``), and the matrix that
     # turns those, shape (n, n), states = turn @ mounted.
     angled: tuple[str, ...] = ()
     turn: FloatArray | None = None
-    # What each sensor of `states` shows at running speed without a vibration: q of x = Re{q e^{jθ}} for an angle that
-    # grows; None where none is known.
+    # Run-out of each sensor of `states` at running speed: q of x = Re{q e^{jθ}} for an increasing angle; None if no
+    # run-out is known.
     runout: ComplexArray | None = None
-    equaliser: Equaliser | None = None  # of the sensors of `states`, where they do not show the vibration as it is
+    equaliser: Equaliser | None = None  # of the sensors of `states`, if any has a high-pass or a delay
 
     @property
     def need(self) -> int:
-        """Samples that a hop is made of."""
+        """Samples that a hop is made of, its history included."""
         return self.preamble + self.hop
 
     @property
     def fresh(self) -> int:
-        """How many of them, the last ones, no other hop has: of a snapshot all."""
+        """How many of them, the last ones, belong to no other hop; all in a snapshot."""
         return min(self.need, self.stride)
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """What the columns of a waveform are: of the mounted sensors, of the shaft angle, and of channels elsewhere."""
+        """Columns of a waveform: the mounted sensors, the shaft angle if there is one, and channels elsewhere."""
         return (*self.mounted, *(() if self.angle_column is None else ("theta",)), *self.others)
 
     @property
@@ -117,13 +117,13 @@ class Plan:
         return self.states if self.turn is None else self.angled
 
     def states_without(self, lost: Collection[str]) -> tuple[str, ...]:
-        """States that are measured without some of the mounted sensors: at an angle it takes both of a place."""
+        """States measured without the `lost` mounted sensors; at an angle, both sensors of a place are needed."""
         turn = np.eye(len(self.states)) if self.turn is None else self.turn
         part = np.abs(turn[:, np.isin(self.mounted, list(lost))]).sum(axis=1)
         return tuple(state for state, gone in zip(self.states, part.tolist(), strict=True) if not gone)
 
     def motions(self, alive: npt.NDArray[np.bool_]) -> list[int]:
-        """Columns of sensors that are alive, one of each motion."""
+        """Columns of sensors that are alive, one for each motion."""
         twice = {pair.second for pair in self.pairs if alive[pair.first]}
         return [column for column in np.flatnonzero(alive).tolist() if column not in twice]
 
@@ -135,7 +135,7 @@ class Plan:
     def to_si(self, samples: npt.NDArray[np.float32] | FloatArray) -> FloatArray:
         """Sensors as mounted, and other channels, in SI units and, last, the shaft angle if there is one.
 
-        Of shape (n_samples, width), with a channel's samples side by side.
+        The shape is (n_samples, width), with each channel's samples contiguous in memory.
         """
         si = np.empty((self.width, samples.shape[0]))
         np.multiply(samples.T[self.columns], self.scales[:, np.newaxis], out=si[: self.columns.size])
@@ -145,7 +145,7 @@ class Plan:
 
 
 def states_of(machine: MachineFile) -> tuple[str, ...]:
-    """Measured motions of bearing and disc, in the order of a plan; without one there are levels alone."""
+    """Measured motions of bearing and disc, in the order of a plan; if there are none, there are only levels."""
     measured = machine.descriptor.states
     return tuple(name for name in (*STATE_INDEX, *ACCELERATIONS) if name in measured and machine.holds_band)
 
@@ -209,7 +209,7 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False,
 
 @dataclass(frozen=True, slots=True)
 class HopMoments:
-    """Sums over one hop, of what the sensors give as mounted, x, followed by the regressors n."""
+    """Sums over one hop of the signals x of the sensors as mounted, followed by the regressors n."""
 
     # Time of the first sample and of the one after the last.
     start_ns: int
@@ -217,14 +217,13 @@ class HopMoments:
     # (n_lags, n, n): ``products[l, i, j] = Σ_t a_i(t - lag_l) a_j(t)`` over the t of the hop, a = (x, n)
     products: FloatArray
     # (n_segments, n_bins, n): Fourier coefficients of Hann-windowed segments, scaled so that their squared magnitude
-    # estimates the two-sided power spectral density per Hz. Single precision, which is that of the samples, keeps them.
+    # estimates the two-sided power spectral density per Hz. Kept in single precision, which is that of the samples.
     segments: npt.NDArray[np.complex64]
     turned_rad: float  # shaft angle covered in the hop (nan without a phase reference)
-    jump_rad: float  # by which the angle jumped in it or just before (nan without a phase reference)
+    jump_rad: float  # jump of the angle in it or just before (nan without a phase reference)
     # The most likely rotation where there is no phase reference. The regressors follow it, from an unknown angle.
     line: RotationLine | None
-    # What the samples of each measured state look like and, last, those of the shaft angle if there is one.
-    waveform: Waveform
+    waveform: Waveform  # of the samples, with the columns of `Plan.sensors`
     # (n_pairs, n_bands, 3): powers of the motions that are measured twice, their mean taken out
     # (`motion.pair_powers`)
     pair_powers: ComplexArray
@@ -284,7 +283,7 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
         Time of the first sample of the hop itself.
     """
     n_states = len(plan.states)
-    rows = np.ascontiguousarray(samples.T)  # a channel's samples side by side: all that follows goes along them
+    rows = np.ascontiguousarray(samples.T)  # each channel's samples contiguous: all that follows runs along them
     a = np.empty((n_states + (1 if plan.angle_column is None and plan.speed_rad_s is None else 3), rows.shape[1]))
     np.subtract(rows[:n_states], level[:, np.newaxis], out=a[:n_states])
     a[n_states] = 1
@@ -293,7 +292,7 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
     if plan.angle_column is not None:
         theta = rows[-1]
         steps = np.diff(theta)
-        steps -= 2 * np.pi * np.floor((steps + np.pi) / (2 * np.pi))  # in half the time of a remainder
+        steps -= 2 * np.pi * np.floor((steps + np.pi) / (2 * np.pi))  # half the time of a remainder
         turned_rad = float(np.sum(steps[plan.preamble - 1 :]))
         jump_rad = jump_within_a_turn(steps)
     elif plan.speed_rad_s is not None:
@@ -362,7 +361,7 @@ def _hann(size: int, rate_hz: float) -> FloatArray:
 
 
 SpeedSource = Literal["phase reference", "estimated", "unknown"]
-_DEPENDENT = 1e-15  # eigenvalue over the largest one, below which a regressor is made of the others
+_DEPENDENT = 1e-15  # eigenvalue over the largest one, below which regressors are linearly dependent
 STEADY = 0.01  # range of the hops' speeds, relative, up to which one set of coefficients serves the window
 
 
@@ -390,7 +389,7 @@ def rotation_of(plan: Plan, hops: tuple[HopMoments, ...]) -> Rotation:
         followed = followed_speeds(lines, hop_s)
     if followed is None:
         return Rotation("unknown", np.full(len(hops), np.nan), by_hop=False, settled=settled)
-    # The line is known in the middle of all samples of the hop; the hop's own middle comes later.
+    # The line's speed is that in the middle of the hop with its history; the middle of the hop itself is later.
     sweep = np.array([0.0 if hop.line is None else hop.line.sweep_rad_s2 for hop in hops])
     speeds_rad_s = followed + sweep * plan.preamble / 2 / plan.rate_hz
     return Rotation("estimated", speeds_rad_s, by_hop=True, settled=settled_hops(lines, followed, hop_s))
@@ -430,7 +429,7 @@ def hop_coefficients(
 
 
 def _between(hops: tuple[HopMoments, ...], beta: FloatArray, number: int, part: float) -> FloatArray:
-    """Coefficients at a part of a hop from its middle, on the line through the neighbour; its own next to a gap."""
+    """Coefficients at a part of a hop from its middle, on the line through an adjoining hop; its own without one."""
     for neighbour in (number + 1, number - 1) if part > 0 else (number - 1, number + 1):
         if 0 <= neighbour < len(hops) and _adjoin(hops[min(number, neighbour)], hops[max(number, neighbour)]):
             return np.asarray(beta[number] + part * (neighbour - number) * (beta[neighbour] - beta[number]))
@@ -443,7 +442,7 @@ def turns(hop: HopMoments) -> bool:
 
 
 def angle_jumps(hops: tuple[HopMoments, ...]) -> FloatArray:
-    """By how much the shaft angle jumped in each hop; nan where the one before it does not adjoin, and nobody knows."""
+    """Jump of the shaft angle in each hop; nan if unknown, because the hop before does not adjoin."""
     known = [one.jump_rad if _adjoin(before, one) else np.nan for before, one in itertools.pairwise(hops)]
     return np.array([np.nan, *known])
 
@@ -456,13 +455,13 @@ _Number = TypeVar("_Number", np.float64, np.complex128)
 
 
 def through(matrix: FloatArray, rows: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
-    """Rows seen through a matrix, ``rows @ matrix.T``, in one large product: many small ones take longer."""
+    """Multiply rows by a matrix, ``rows @ matrix.T``, in one large product: many small ones take longer."""
     seen = rows.reshape(-1, rows.shape[-1]) @ matrix.T
     return np.asarray(seen.reshape(*rows.shape[:-1], matrix.shape[0]), dtype=rows.dtype)
 
 
 def divided(values: ComplexArray, by: int | FloatArray) -> ComplexArray:
-    """Divide by real numbers, in place and contiguous: part by part, which takes a fifth of a complex division."""
+    """Divide a contiguous array by real numbers in place, which takes a fifth of the time of a complex division."""
     parts = values.view(np.float64)
     parts /= by
     return values

@@ -1,8 +1,8 @@
-"""Two channels of one motion, before anything is averaged.
+"""Powers and cross-powers, hop by hop, of channels that measure the same motion.
 
-What holds between displacement, velocity and acceleration of one motion is kinematics, not the machine: v = jωx. Per
-hop the powers and the cross-power of jωx and v are kept in a few bands, so that a gain or a delay that drifts shows
-within a window.
+Displacement, velocity and acceleration of one motion are related by kinematics, not by the machine: v = jωx. Per hop
+the powers and the cross-power of jωx and v are kept in a few bands, so that a gain or a delay that drifts shows within
+a window.
 """
 
 from dataclasses import dataclass
@@ -64,7 +64,7 @@ def pair_bands(n_bins: int) -> npt.NDArray[np.intp]:
 
 
 def pair_powers(segments: _ComplexArray, frequencies_hz: FloatArray, pairs: tuple[MotionPair, ...]) -> _ComplexArray:
-    """Sum powers over Fourier coefficients, shape (n_segments, n_bins, n), of segments and the bins of each band.
+    """Sum powers of Fourier coefficients, shape (n_segments, n_bins, n), over segments and the bins of each band.
 
     With z = (jω)ᵒʳᵈᵉʳ x: Σ|z|², Σ z* v, Σ|v|², shape (n_pairs, n_bands, 3).
     """

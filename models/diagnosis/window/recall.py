@@ -1,12 +1,12 @@
-"""A window's hops computed again from the samples they were made of, which were recorded or are sent once more.
+"""A window's hops, computed again from their samples, which were recorded or are sent once more.
 
 ::
 
     remembered   level | hops: start, first block, row in it, digest of the samples | the same of the unfinished hop
     taken again  blocks ------------------------------------------------------------> those whose digest fits
 
-A hop is itself again to the last bit, or it is not there: its samples are compared by their digest, so neither blocks
-that were refused, nor other data of the same time, can get into it.
+A hop is either the same to the last bit or missing: its samples are checked by their digest, so neither refused blocks
+nor other data of the same time can get into it.
 """
 
 import hashlib
@@ -25,10 +25,10 @@ _DIGEST = 16
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Consecutive samples, known by where they begin and by their digest."""
+    """Consecutive samples, identified by where they begin and by their digest."""
 
     start_ns: int  # time of the hop, or of the first pending sample
-    # Start of the block that the first sample is of, and its row there.
+    # Start of the block that holds the first sample, and the sample's row there.
     block_ns: int
     row: int
     rows: int  # how many samples, those before the hop included
@@ -40,7 +40,7 @@ def digest_of(samples: SampleArray) -> bytes:
     with np.errstate(over="ignore"):
         single = samples.astype(np.float32, copy=False)
     samples = single if single is samples or np.array_equal(single, samples) else samples
-    # Processors have instructions for it: half the time of blake2b, which was a fiftieth of a hop.
+    # Processors have instructions for SHA-256: half the time of blake2b, which took a fiftieth of that of a hop.
     return hashlib.sha256(np.ascontiguousarray(samples).data).digest()[:_DIGEST]
 
 
@@ -62,10 +62,10 @@ def samples_of(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, in
 
 
 class Recall:
-    """Blocks that are taken again, and what can be made of them.
+    """Blocks that are taken again, and the hops that can be computed from them.
 
-    The arrays are from `pieces_of`: the hops, oldest first, and last the unfinished one; the level, shape (n_states,)
-    or (0,), was subtracted from all samples.
+    `arrays` are from `pieces_of`: the hops, oldest first, and last the unfinished one; `level`, shape (n_states,) or
+    (0,), was subtracted from all samples.
 
     Raises
     ------
@@ -80,7 +80,7 @@ class Recall:
             Piece(start_ns, block_ns, row, rows, digest.tobytes())
             for (start_ns, block_ns, row, rows), digest in zip(numbers.tolist(), digests, strict=True)
         ]
-        self.arrays: dict[str, np.ndarray] = {"level": level, "pieces": numbers, "digests": digests}  # the same again
+        self.arrays: dict[str, np.ndarray] = {"level": level, "pieces": numbers, "digests": digests}  # as given
         self.pieces, self.last = tuple(hops), last
         self._plan, self._level = plan, level
         self._oldest_ns = min(one.block_ns for one in (*hops, last) if one.rows) if hops or last.rows else 0
@@ -88,12 +88,12 @@ class Recall:
         self._found: dict[Piece, HopMoments] = {}
 
     def take(self, samples: SampleArray, start_ns: int) -> None:
-        """Take a block; one that is not of the window is left."""
+        """Take a block; one from before the window is ignored."""
         if start_ns >= self._oldest_ns:
             self._blocks[start_ns] = samples
 
     def complete(self) -> bool:
-        """Whether everything can be made of what is there."""
+        """Whether the blocks hold all hops and the unfinished one."""
         return len(self.hops()) == len(self.pieces) and self.pending() is not None
 
     def hops(self) -> tuple[tuple[Piece, HopMoments], ...]:
@@ -104,7 +104,7 @@ class Recall:
         return tuple((piece, self._found[piece]) for piece in self.pieces if piece in self._found)
 
     def pending(self) -> tuple[SampleArray, tuple[tuple[int, int], ...]] | None:
-        """Samples of the unfinished hop, and the blocks they are of; None if they are not there."""
+        """Samples of the unfinished hop, and start and length of the blocks they are from; None if incomplete."""
         return self._samples(self.last)
 
     def _samples(self, piece: Piece) -> tuple[SampleArray, tuple[tuple[int, int], ...]] | None:

@@ -1,9 +1,9 @@
 """Finding the rotation in the vibration itself, where no phase reference is measured.
 
 The unbalance is a line that all channels share. In one hop its frequency hardly changes, so it is a sinusoid with a
-linear sweep, and the most likely frequency and sweep are those at which the channels together hold the most power over
-their own surroundings. Whether there is a line at all is decided over several hops: noise has its largest peak anywhere
-in the band, a shaft stays where it was.
+linear sweep. The most likely frequency and sweep are those at which the channels together have the most power relative
+to their surroundings. Whether there is a line at all is decided over several hops: the largest peak of noise is
+anywhere in the band, while a shaft keeps its speed.
 """
 
 from dataclasses import dataclass
@@ -17,25 +17,25 @@ from models.signals.block import FloatArray
 _ComplexArray = npt.NDArray[np.complex128]
 _MARGIN_HZ = 1.0
 _SURROUNDINGS_HZ = 3.0
-_SWEEP_PER_S = 0.005  # fastest sweep looked for, as a part of the expected speed and second
+_SWEEP_PER_S = 0.005  # fastest sweep searched for, as a part of the expected speed per second
 _PADDING = 4
 _REFINEMENTS = 5
-# Relative difference of speed between neighbouring hops that one shaft may have, its sweep taken into account: a
-# lightly damped resonance looks like a line, but its peak wanders by its width.
+# Largest relative difference of speed between neighbouring hops of one shaft, apart from its sweep: a lightly damped
+# resonance looks like a line, but its peak wanders by its width.
 _NEIGHBOUR = 0.004
 _RESOLVED = 0.25  # part of a hop's frequency resolution below which no difference is believed
-# Relative distance from the straight course through most of the hops, beyond which a peak is another one.
+# Relative distance from the straight line through the speeds of most hops beyond which a peak is not the shaft's.
 _COURSE = 0.03
 _FOLLOWED_PART = 0.8
-_FEW_HOPS = 6  # a stretch of as few needs lines that stand out by themselves
-# Hops in a row that one set point of a drive is held for at least, and part of a window that such rows make up.
+_FEW_HOPS = 6  # fewer hops need lines that stand out by themselves
+# Least number of hops in a row at one set point of a drive, and least part of a window that is in such rows.
 _HELD, _HELD_PART = 4, 0.5
-# Strength of a hop's line over that of the window's others, up to which its speed was another one in a part of it.
+# Strength of a hop's line relative to the other hops' up to which a part of the hop had another speed.
 _WEAKER = 0.25
 LEAST_SETTLED = 0.5
-"""Part of a window that is left, at least, where a drive goes from one set point to another."""
+"""Least part of a window that must be left where a drive goes from one set point to another."""
 STRONG = 15.0
-"""Strength from which a line stands out by itself: noise has none like it."""
+"""Strength from which a line stands out by itself: no peak of noise is as strong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +54,10 @@ class RotationLine:
 
 
 def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: float) -> RotationLine | None:
-    """Find the line in one hop; None if no channel fluctuates or the range holds no frequency.
+    """Find the line in one hop; None if no channel fluctuates or the range holds too few frequencies.
 
-    All samples of the hop and what it needs before it, shape (n, n_samples), are looked at, near the expected speed,
-    with a relative tolerance.
+    `x`, shape (n, n_samples), is the hop with its history. Speeds within the relative `tolerance` of the expected one
+    are searched.
     """
     n_samples = x.shape[1]
     duration_s, expected_hz = n_samples / rate_hz, speed_rad_s / (2 * np.pi)
@@ -75,7 +75,7 @@ def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: 
     base_hz, base_rate_hz = low / duration_s, count / duration_s
     baseband = np.fft.ifft(spectrum[:, alive] / np.sqrt(power[alive]), axis=0)
     t_s = (np.arange(count) + 0.5) / base_rate_hz - duration_s / 2
-    # The first sample of the baseband stands at the first one of x, half a step before the middle of its own cell.
+    # The first sample of the baseband coincides with that of x, half a step before the middle of its own cell.
     t_s -= 0.5 / base_rate_hz
     grid_hz = base_hz + base_rate_hz * np.arange(_PADDING * count) / (_PADDING * count)
     inside = np.abs(grid_hz - expected_hz) <= reach_hz
@@ -127,10 +127,10 @@ def _top(values: list[float]) -> float:
 
 
 def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> FloatArray | None:
-    """Speed of each hop if the lines are those of one shaft; nan where a hop's largest peak was another one.
+    """Speed of each hop if the lines are those of one shaft; nan where a hop's largest peak is not the shaft's.
 
-    A drive that goes from one set point to another is followed at each of them. The hops follow each other, apart from
-    gaps. None if no line can be followed.
+    None if no line can be followed. A drive that goes from one set point to another is followed at each of them. The
+    hops are consecutive but for gaps.
     """
     speed = np.array([np.nan if line is None else line.speed_rad_s for line in lines])
     strength = np.array([0.0 if line is None else line.strength for line in lines])
@@ -146,8 +146,8 @@ def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> Flo
         number = np.flatnonzero(followed)
         followed[number] = np.abs(speed[number] / _course(speed, number)[number] - 1) < _COURSE
     if (number := np.flatnonzero(np.isfinite(speed))).size > 1:
-        # The sweep of a line that noise surrounds is uncertain by more than a steady shaft has. A line left in a window
-        # is worse than one taken out of noise, and noise does not keep to a straight course.
+        # In noise the error of a line's sweep exceeds the sweep of a steady shaft. Leaving a line in a window is worse
+        # than removing one from noise, and the peaks of noise do not keep to a straight line.
         steady = np.abs(speed - _course(speed, number)) < near
         followed |= steady & (steady.mean() >= _FOLLOWED_PART)
     apart = ~(together | (np.abs(steps) < near[1:]))
@@ -158,11 +158,11 @@ def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> Flo
 
 
 def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, hop_s: float) -> npt.NDArray[np.bool_]:
-    """Which hops had one speed from beginning to end; all where a line does not stand out enough to tell.
+    """Which hops had one speed from beginning to end; all if the lines do not stand out enough to tell.
 
-    Of a hop beside one with another speed a part may have had that already. A line that is weaker at the speed of its
-    neighbours is one in more vibration: of a load that has grown. What `followed_speeds` made of the lines is
-    `followed`.
+    A part of a hop next to one with another speed may already have had that speed. A line that is weaker at the same
+    speed as its neighbours stands in more vibration, as of a load that has grown. `followed` is what `followed_speeds`
+    returned for the lines.
     """
     strength = np.array([0.0 if line is None else line.strength for line in lines])
     found = np.isfinite(followed)
@@ -172,7 +172,7 @@ def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, h
     steps = np.diff(followed)
     near = _near(followed, hop_s)[1:]
     steady, held = np.abs(steps) < near, np.minimum(np.abs(steps), np.abs(steps - _swept(lines, hop_s))) < near
-    # Of the first and the last hop one neighbour alone tells.
+    # The first and the last hop have only one neighbour.
     level = steady & (np.minimum(strength[1:], strength[:-1]) > _WEAKER * np.maximum(strength[1:], strength[:-1]))
     as_it_was = np.append(steady, level[-1:]) & np.insert(steady, 0, level[:1])
     settled = found & (as_it_was | (strength > _WEAKER * usual))
@@ -181,18 +181,18 @@ def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, h
 
 
 def _near(speed: FloatArray, hop_s: float) -> FloatArray:
-    """Up to which difference two hops may be of one shaft."""
+    """Largest difference of speed between neighbouring hops of one shaft, rad/s."""
     return np.asarray(np.maximum(_NEIGHBOUR * speed, _RESOLVED * 2 * np.pi / hop_s), dtype=np.float64)
 
 
 def _swept(lines: tuple[RotationLine | None, ...], hop_s: float) -> FloatArray:
-    """By how much the speed changes from hop to hop as their lines sweep."""
+    """Change of speed from hop to hop according to the sweep of their lines, rad/s."""
     sweep = np.array([np.nan if line is None else line.sweep_rad_s2 for line in lines])
     return np.asarray((sweep[1:] + sweep[:-1]) / 2 * hop_s, dtype=np.float64)
 
 
 def _course(speed: FloatArray, number: npt.NDArray[np.intp]) -> FloatArray:
-    """Straight course of the speed through most of the hops of these numbers, at every hop."""
+    """Robust straight line through the speeds of the hops `number`, evaluated at every hop."""
     slope, start = scipy.stats.theilslopes(speed[number], number)[:2]
     return np.asarray(start + slope * np.arange(speed.size), dtype=np.float64)
 
@@ -200,7 +200,7 @@ def _course(speed: FloatArray, number: npt.NDArray[np.intp]) -> FloatArray:
 def relative_vectors(vectors: _ComplexArray) -> _ComplexArray:
     """Turn each hop's vectors, shape (n_hops, n), so that the channel with the clearest line is at angle zero.
 
-    Its amplitude varies least from hop to hop, relative.
+    That is the channel whose relative amplitude varies least from hop to hop.
     """
     size = np.abs(vectors)
     mean = size.mean(axis=0)

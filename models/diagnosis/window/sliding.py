@@ -1,8 +1,7 @@
 """The sliding window: a ring of hop moments.
 
-What is remembered of a window with every hop is small: from where to where its hops reach, and which samples they are
-made of. The moments themselves, megabytes, are computed again from the same samples (`recall.py`), unless all of them
-were stored.
+What is remembered of a window at every hop is small: where its hops begin, and which samples they are made of. The
+moments themselves, megabytes, are computed again from the same samples (`recall.py`), unless all of them were stored.
 """
 
 from collections import deque
@@ -31,12 +30,12 @@ class SlidingWindow:
     Parameters
     ----------
     remembered : bool
-        Whether `checkpoint` will be asked for: the samples of every hop have their digest taken then.
+        Whether `checkpoint` will be called: it needs a digest of the samples of every hop.
     lines : sequence of KnownLine
         Those of the healthy machine.
     channels : int, optional
-        Of the samples, where these come as they were received; without it they are SI. What waits for its hop is then
-        what was received, which takes less memory, and less time than the samples of one block after the other.
+        Number of channels if samples come as they were received; without it they are SI. Pending samples are then kept
+        as received, which takes less memory, and conversion hop by hop takes less time than block by block.
     """
 
     def __init__(
@@ -47,12 +46,12 @@ class SlidingWindow:
         self._lines = lines
         self._remembered = remembered
         self._hops: deque[HopMoments] = deque(maxlen=plan.hops)
-        self._pieces: deque[Piece] = deque(maxlen=plan.hops)  # what each of them is made of
+        self._pieces: deque[Piece] = deque(maxlen=plan.hops)  # the samples that each hop is made of
         self._pending: list[np.ndarray] = []
         self._pending_samples = 0
         self._pending_start_ns = 0
-        self._blocks: deque[tuple[int, int]] = deque()  # start and length of those that the pending samples are of
-        self._row = 0  # of the first of them, with which the pending samples begin
+        self._blocks: deque[tuple[int, int]] = deque()  # start and length of the blocks that hold the pending samples
+        self._row = 0  # row of the first of these blocks at which the pending samples begin
         self._level: FloatArray | None = None
         self._recall: Recall | None = None
 
@@ -63,7 +62,7 @@ class SlidingWindow:
 
     @property
     def lacking(self) -> int:
-        """How many samples the next hop lacks, if none are left out before."""
+        """How many samples the next hop lacks, apart from any to be skipped before it."""
         return self.plan.need - self._pending_samples
 
     @property
@@ -73,7 +72,7 @@ class SlidingWindow:
 
     @property
     def first_ns(self) -> int:
-        """When the oldest samples in the window begin: those that its first hop needs before it, too."""
+        """When the oldest samples in the window begin, including the history that its first hop needs."""
         return self._hops[0].start_ns - round((self.plan.need - self.plan.fresh) * 1e9 / self.plan.rate_hz)
 
     @property
@@ -82,20 +81,20 @@ class SlidingWindow:
         return self._hops[-1] if self._hops else None
 
     def feed(self, samples: SampleArray, start_ns: int) -> Iterator[int]:
-        """Add samples that continue the previous ones, stopping at every completed hop, whose end time is yielded.
+        """Add samples that continue the previous ones, and yield the end time of every completed hop.
 
-        They are finite, of shape (n_samples, width or channels), in SI units as `Plan.to_si` gives them; as received
-        where the window was told of how many channels. A long block may complete several hops: ask for the statistics
-        between them, and take all, or the rest of the block is lost.
+        The samples are finite: in SI units as `Plan.to_si` gives them, shape (n_samples, width), or, if the window was
+        given `channels`, as received, shape (n_samples, channels). A long block may complete several hops: ask for the
+        statistics between them, and exhaust the iterator, or the rest of the block is lost.
         """
         self.give_up()
-        # Anchored anew by every block: the device's clock is the time, however its rate deviates from nominal.
+        # Every block sets the time anew: the device's clock counts, however its rate deviates from nominal.
         self._pending_start_ns = start_ns - round(self._pending_samples * 1e9 / self.plan.rate_hz)
-        # Rows first, whatever the caller has: sums must not depend on how samples lie in memory.
+        # Row-major, whatever the caller has: sums must not depend on how samples lie in memory.
         self._pending.append(np.ascontiguousarray(samples))
         self._pending_samples += samples.shape[0]
         self._blocks.append((start_ns, samples.shape[0]))
-        if self._pending_samples == samples.shape[0]:  # they may be what is to be left after a snapshot
+        if self._pending_samples == samples.shape[0]:  # they may be samples to skip after a snapshot
             self._pending = self._pending[-1:]
             self._leave(self._row)
         while self._pending_samples >= self.plan.need:
@@ -105,7 +104,7 @@ class SlidingWindow:
             self._pending, self._row = [buffer], self._row + self.plan.stride
             self._leave(self.plan.stride)
             yield self._complete(buffer[: self.plan.need], first_ns, block_ns, row)
-        if self._pending and self._pending[0].base is not None:  # a rest would hold all that it is the rest of
+        if self._pending and self._pending[0].base is not None:  # a view would keep the whole buffer in memory
             self._pending[0] = self._pending[0].copy()
 
     def _joined(self) -> np.ndarray:
@@ -115,7 +114,7 @@ class SlidingWindow:
         return np.concatenate(self._pending or [np.empty((0, self._width), np.float32)])
 
     def _leave(self, count: int) -> None:
-        """Go on so many samples after the first pending one; those that have not come yet are left when they come."""
+        """Drop the first `count` pending samples; those that have not come yet are dropped when they come."""
         if not count:
             return
         (pending,) = self._pending
@@ -156,13 +155,13 @@ class SlidingWindow:
 
     @property
     def lacks(self) -> bool:
-        """Whether samples are to be taken again: `recall` wants them."""
+        """Whether samples are to be taken again with `recall`."""
         return self._recall is not None
 
     def recall(self, samples: SampleArray, start_ns: int, *, newest: bool) -> None:
         """Take a block again, as received, that was in the window when `checkpoint` was called.
 
-        If no later one has been there (`newest`), everything may be complete now.
+        `newest` says that no later block came before then: everything may be complete now.
         """
         if self._recall is None:
             return
@@ -171,7 +170,7 @@ class SlidingWindow:
             self.give_up()
 
     def give_up(self) -> int:
-        """Go on with what could be recalled; how many hops could not."""
+        """Continue with the hops that could be recalled; return how many could not."""
         recall, self._recall = self._recall, None
         if recall is None:
             return 0
@@ -187,14 +186,15 @@ class SlidingWindow:
         return len(recall.pieces) - len(there)
 
     def checkpoint(self, *, whole: bool = False) -> dict[str, np.ndarray]:
-        """What a window goes on from, as named arrays, between two blocks.
+        """State from which a window continues, as named arrays; call it between two blocks.
 
-        The whole has moments and samples, megabytes; otherwise the same samples have to be taken again with `recall`.
+        If `whole`, it has the moments and samples, megabytes; otherwise the same samples must be taken again with
+        `recall`.
 
         Raises
         ------
         ValueError
-            If the window is not one that is remembered.
+            If the window was not made to be `remembered`.
         """
         if not self._remembered:
             raise ValueError("the window takes no digests: it cannot be remembered")
@@ -202,7 +202,7 @@ class SlidingWindow:
             return dict(self._recall.arrays)
         pending = self._joined()
         block_ns = self._blocks[0][0] if self._blocks else 0
-        start_ns = self._pending_start_ns if pending.size else 0  # that of what a gap has taken away is of no use
+        start_ns = self._pending_start_ns if pending.size else 0  # the time of samples lost to a gap is of no use
         last = Piece(start_ns, block_ns, self._row, pending.shape[0], digest_of(pending))
         found: dict[str, np.ndarray] = {
             "level": np.array([] if self._level is None else self._level, dtype=np.float64),
@@ -215,7 +215,7 @@ class SlidingWindow:
         return found
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called; without moments the window `lacks` its samples until they are recalled.
+        """Continue where `checkpoint` was called; without moments the window `lacks` its samples until recalled.
 
         Raises
         ------
@@ -263,10 +263,10 @@ class SlidingWindow:
     def statistics(
         self, hops: int | None = None, *, lagged: bool = False, lost: tuple[str, ...] = ()
     ) -> WindowStatistics | None:
-        """Statistics of a full window, or of so many of its latest hops; None while there are not so many.
+        """Statistics of a full window, or of its newest `hops`; None while there are too few.
 
-        The latest hops have correlations at all lags, as a full window has, only if `lagged`; otherwise at lag zero.
-        Without `lost` sensors, see `window_statistics`.
+        The newest hops have correlations at all lags, as a full window has, only if `lagged`; otherwise at lag zero.
+        For `lost` sensors see `window_statistics`.
         """
         count = self.plan.hops if hops is None else hops
         if not 0 < count <= len(self._hops):
@@ -275,14 +275,14 @@ class SlidingWindow:
         return window_statistics(self.plan, tuple(self._hops)[-count:], lagged=lagged, lines=self._lines, lost=lost)
 
     def settled(self, lost: tuple[str, ...] = ()) -> WindowStatistics:
-        """Statistics of the hops in which the shaft had one speed, see `WindowStatistics.settled`; there are some."""
+        """Statistics of the hops in which the shaft had one speed (`WindowStatistics.settled`); there must be some."""
         return window_statistics(self.plan, tuple(self._hops), lines=self._lines, settled=True, lost=lost)
 
     def again(self) -> Callable[[], WindowStatistics] | None:
-        """What makes the statistics of the window as it is judged now when they are asked for; None before it is full.
+        """Return a function that makes the statistics of the window as it is judged now; None before it is full.
 
         Hops in which the speed changed are left out where they are not judged (`settled`). Statistics are megabytes,
-        and the hops they are made of are there anyway. Once made they stay with it.
+        while the hops they are made of are there anyway. The function keeps its result.
         """
         if len(self._hops) < self.plan.hops:
             return None

@@ -1,8 +1,8 @@
-"""Random forces whose level changes within a window: the level of each of its segments.
+"""Level of each segment of a window, for random forces whose level changes within the window.
 
-The cross-spectra of a window are taken for a mean over segments of one level. Where the level steps or drifts, few
-segments make up most of that mean; it scatters as one of fewer segments, which looks like a misfit. Segments of a rotor
-that are scaled to one level are alike; those with another rotor, a rub or a line are not, and remain a misfit.
+The cross-spectra of a window are treated as a mean over segments of equal level. If the level steps or drifts, few
+segments dominate that mean; it scatters like a mean over fewer segments, which looks like a misfit. Scaled to one
+level, segments of one rotor are alike; those with another rotor, a rub or a line are not, and remain a misfit.
 """
 
 from collections.abc import Sequence
@@ -12,22 +12,22 @@ import numpy as np
 from models.diagnosis.window.moments import ComplexArray
 from models.signals.block import FloatArray
 
-_BLOCK = 16  # bins that are compared at once: many more than channels, and few enough for one colour
-_CHANCE = 30.0  # variance of the levels, in parts of that of one value, up to which a window is stationary; 3 is usual
-_ROUNDS = 2  # in the first, loud segments weigh too much in the mean that all are compared with
+_BLOCK = 16  # bins that are compared at once: many more than channels, and few enough to share one colour
+_CHANCE = 30.0  # variance of the levels times the values behind each, up to which a window is stationary; 3 is usual
+_ROUNDS = 2  # in the first, loud segments weigh too much in the mean that all segments are compared with
 
 
 def summed(segments: ComplexArray) -> ComplexArray:
-    """Cross-products of Fourier coefficients, shape (..., n_segments, n), over the segments: shape (..., n, n)."""
+    """Cross-products of Fourier coefficients, shape (..., n_segments, n), summed over segments: shape (..., n, n)."""
     return np.asarray(segments.swapaxes(-1, -2) @ segments.conj(), dtype=np.complex128)
 
 
 def segment_levels(segments: ComplexArray, spectrum: ComplexArray, columns: Sequence[int]) -> FloatArray | None:
     """Powers of the segments of a window relative to their mean, shape (n_segments,); None if it is stationary.
 
-    They are medians over the band and over motions that do not go together: lines that come, and forces on a part of
-    either, are not the level. Segments are Fourier coefficients, shape (n_bins, n_segments, n), without mean and
-    rotation, and the spectrum is `summed` of them; one channel of each motion counts.
+    They are medians over the band and over uncorrelated motions, so a line that appears, or a force on a part of the
+    band or of the motions, does not change them. `segments` are Fourier coefficients, shape (n_bins, n_segments, n),
+    without mean and rotation, and `spectrum` is `summed` of them; `columns` are one channel of each motion.
     """
     n, count = len(columns), segments.shape[1]
     blocks = segments.shape[0] // _BLOCK

@@ -30,11 +30,11 @@ from models.levels.measures import WindowLevels, window_levels
 from models.signals.block import FloatArray
 from models.signals.waveform import Waveform, stacked_waveform
 
-_DRIFT = 0.1  # rms of a channel by which its mean may drift before that of every hop is taken out of it
+_DRIFT = 0.1  # drift of a channel's mean, over its rms, above which every hop's own mean is removed
 _VARIED = 0.06  # relative range of a speed found in the vibration up to which levels at its multiples are taken
 _LOBE = 2  # bins to either side over which a Hann window spreads a line
-_BESIDE = 3  # bins beside a line whose mean is where the spectra go over it
-_SMOOTH = 0.5  # squares of a drift's steps from hop to hop over those about its mean, at most; of chance 2
+_BESIDE = 3  # bins on either side of a line over whose means the spectra are interpolated
+_SMOOTH = 0.5  # largest ratio of a drift's squared steps from hop to hop to its squared deviations; 2 by chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,35 +59,33 @@ class WindowStatistics:
     frequencies_hz: FloatArray  # (n_bins,), their frequencies
     synchronous: ComplexArray | None  # (n,), q of x_n = Re{q e^{jθ}} over the window; None without a phase reference
     hop_synchronous: ComplexArray | None  # (n_hops, n), the same of every hop alone; 0 without a quarter turn
-    # (n_hops, n): where the speed is estimated: the same of every hop, from an angle at which one state is
-    # largest. Lengths and angles between channels hold, the angle to the shaft is unknown; zero in hops without a
-    # speed.
+    # (n_hops, n), if the speed is estimated: the same of every hop, from an angle at which one state is largest.
+    # Amplitudes and angles between channels are valid, the angle to the shaft is unknown; zero in hops without a speed.
     relative_synchronous: ComplexArray | None
-    # ``phase reference``, ``estimated`` (from the line in the vibration), or ``unknown``: the rotation was not taken
-    # out then
+    # ``phase reference``, ``estimated`` (from the line in the vibration), or ``unknown`` (the rotation was not removed)
     speed_source: SpeedSource
     speed_rad_s: float  # mean speed (nan if unknown)
     speed_range: tuple[float, float]  # slowest and fastest hop, rad/s (nan if unknown)
     hop_speed_rad_s: FloatArray  # (n_hops,), mean speed of each hop (nan if unknown)
-    # (n_hops,), by how much the most likely rotation stands out of each (`RotationLine.strength`); nan with an angle
+    # (n_hops,), how far the most likely rotation stands out in each (`RotationLine.strength`); nan with an angle
     hop_strength: FloatArray
     settled: npt.NDArray[np.bool_]  # (n_hops,), whether each had one speed that was taken out, see `settled_hops`
-    hop_jump_rad: FloatArray  # (n_hops,), by which the shaft angle jumped in each (nan if unknown)
+    hop_jump_rad: FloatArray  # (n_hops,), jump of the shaft angle in each (nan if unknown)
     removed_by_hop: bool  # whether the rotation was taken out hop by hop, each with its own amplitude
     # (n_bins, n): squared coherence of each bin with the angle or, where the rotation was taken out hop by hop, with
-    # itself a segment later: none of noise, all of a line. None without a phase reference
+    # itself a segment later: 0 for noise, 1 for a line. None without a phase reference
     phase_kept: FloatArray | None
     duration_s: float  # length of the data in the window
-    # What the samples of each hop look like: of each of `sensors`, those of `states` first.
+    # Of the samples of each hop, with a column for each of `sensors`, those of `states` first.
     waveforms: tuple[Waveform, ...]
     sensors: tuple[str, ...]
     # (n_pairs, n_bands, 3): powers of the motions that are measured twice, of each hop (`motion.py`)
     pair_powers: tuple[ComplexArray, ...]
-    # The same window of the sensors as they are mounted, run-out included, where some of them are at an angle or have a
-    # slow-roll vector. `waveforms` and `pair_powers` are those of mounted sensors in either, and what the file states
-    # of a sensor's high-pass and delay is divided out of all but the waveforms.
+    # The same window for the sensors as mounted, run-out included, if some of them are at an angle or have a slow-roll
+    # vector. `waveforms` and `pair_powers` are those of mounted sensors in either; a high-pass and a delay that the
+    # file states for a sensor are divided out of all but the waveforms.
     mounted: "WindowStatistics | None" = None
-    lines: tuple[ExcludedLine, ...] = ()  # that say nothing of the machine
+    lines: tuple[ExcludedLine, ...] = ()  # lines that say nothing about the machine
     time_scale: float = 1.0  # how much slower the machine moves than usual (`models.stream_settings.time_scale`)
     lost: tuple[str, ...] = ()  # sensors, as mounted, that it was made without
     directed: bool = True  # whether vectors keep their directions: the shaft angle has not jumped since it was set up
@@ -98,7 +96,7 @@ class WindowStatistics:
         return self if self.mounted is None else self.mounted
 
     def of(self, states: tuple[str, ...]) -> "WindowStatistics":
-        """The same window of some of its states alone; waveforms, pairs and mounted sensors are left out."""
+        """The same window with some of its states only, without waveforms, pairs and mounted sensors."""
         if states == self.states:
             return self
         kept = [self.states.index(state) for state in states]
@@ -122,7 +120,7 @@ class WindowStatistics:
 
     @property
     def rotation_vectors(self) -> ComplexArray | None:
-        """Rotation-synchronous vectors of each hop, from an angle that may be another one in each; None if unknown."""
+        """Rotation-synchronous vectors of each hop, each from an angle that may be its own; None if unknown."""
         return self.hop_synchronous if self.relative_synchronous is None else self.relative_synchronous
 
     @cached_property
@@ -133,9 +131,9 @@ class WindowStatistics:
 
     @property
     def spectrum_without_lines(self) -> ComplexArray:
-        """Spectra that go straight over the bins of `lines`, for what needs a value in every bin.
+        """Spectra interpolated linearly over the bins of `lines`, for what needs a value in every bin.
 
-        Those of the window where lines are in all of them.
+        Unchanged if lines are in all bins.
         """
         found, clear = self.spectrum, ~self.line_bins
         if clear.all() or not clear.any():
@@ -158,7 +156,7 @@ class WindowStatistics:
     def without_lines(self) -> "WindowStatistics":
         """The same window without `lines` in its correlations and spectra.
 
-        A line is as strong at all lags, and neither goes with the motion at a bearing nor is forgotten by any force.
+        A line is as strong at all lags, and neither follows the motion at a bearing nor is forgotten by any force.
         """
         return self if all(line.power is None for line in self.lines) else self._cleared
 
@@ -173,10 +171,10 @@ class WindowStatistics:
 
     @property
     def with_steady_rotation(self) -> "WindowStatistics":
-        """The same window without what a 1x that drifts leaves beside its mean in correlations and spectra.
+        """The same window without what a drifting 1x vector, less its mean, leaves in correlations and spectra.
 
-        That is as strong at all lags, like a line, and no relation between motions holds for it. Vectors that scatter
-        from hop to hop are noise, and left as they are.
+        That residue is equally strong at all lags, like a line, and no relation between motions holds for it. Vectors
+        that scatter from hop to hop are noise and stay in.
         """
         vectors = self.hop_synchronous
         if vectors is None or self.removed_by_hop or (vectors == 0).all(axis=1).any():
@@ -215,12 +213,12 @@ def window_statistics(
 ) -> WindowStatistics:
     """Add hops up to a window and take out its mean and its rotation-synchronous part.
 
-    Without `lagged`, correlations are at lag zero alone, and no lines are looked for: the spectra are all that is asked
-    for. For `lines` see `excluded_lines`. With `settled`, hops that are not (see `settled_hops`) are left out. Mounted
-    sensors that are `lost` say nothing of the states, of the level of forces or of lines.
+    Without `lagged`, correlations are at lag zero only, and no lines are searched for: only the spectra are wanted. For
+    `lines` see `excluded_lines`. With `settled`, hops that are not (see `settled_hops`) are left out. Mounted sensors
+    that are `lost` are not used for the states, the level of forces or the lines.
 
     With a = (x, n) and β the least-squares coefficients of x on n over the window, the sum of
-    (x - βn)(t-τ) (x - βn)ᵀ(t) is the product sum seen through the matrix (I, -β) from both sides.
+    (x - βn)(t-τ) (x - βn)ᵀ(t) is the product sum multiplied by the matrix (I, -β) from both sides.
     """
     n = len(plan.states)
     n_lags = plan.lags_s.size if lagged else 1
@@ -228,7 +226,7 @@ def window_statistics(
     hops, rotation = _settled(hops, rotation) if settled else (hops, rotation)
     products = np.stack([hop.products[:n_lags] for hop in hops])
     segments = np.concatenate([hop.segments.swapaxes(0, 1) for hop in hops], axis=1, dtype=np.complex128)  # bin by bin
-    if rotation.source == "unknown":  # a line may ride along, but it is not the shaft's
+    if rotation.source == "unknown":  # the regressors may follow a line, but it is not the shaft's
         products, segments = products[:, :, : n + 1, : n + 1], segments[:, :, : n + 1]
     total = products[0].copy()
     for hop in products[1:]:  # one by one, in order: the sum must not depend on how numpy would pair them
@@ -244,7 +242,7 @@ def window_statistics(
         by_bin = segments[:, :, :n] - (segments[:, :, n:].swapaxes(0, 1) @ of_segments.swapaxes(1, 2)).swapaxes(0, 1)
         if phase_reference:
             synchronous = _synchronous(level)
-            one, other = by_bin[:, :-2], by_bin[:, 2:]  # those between overlap both
+            one, other = by_bin[:, :-2], by_bin[:, 2:]  # the segments between overlap both
             powers = (np.abs(one) ** 2).sum(axis=1) * (np.abs(other) ** 2).sum(axis=1)
             phase_kept = _coherence((one * other.conj()).sum(axis=1), powers)
         elif plan.states:
@@ -315,7 +313,7 @@ def window_statistics(
 
 
 def _settled(hops: tuple[HopMoments, ...], rotation: Rotation) -> tuple[tuple[HopMoments, ...], Rotation]:
-    """The hops in which the shaft had one speed, and how fast it turned in them as all have told."""
+    """The hops in which the shaft had one speed, and their rotation as found from all hops."""
     kept, speeds = rotation.settled, rotation.hop_speed_rad_s
     found = replace(rotation, hop_speed_rad_s=speeds[kept], settled=kept[kept])
     return tuple(hop for hop, there in zip(hops, kept, strict=True) if there), found
@@ -324,7 +322,7 @@ def _settled(hops: tuple[HopMoments, ...], rotation: Rotation) -> tuple[tuple[Ho
 def _of_the_shaft(
     window: WindowStatistics, plan: Plan, by_bin: ComplexArray, lost: tuple[str, ...]
 ) -> WindowStatistics:
-    """The window of the motion itself, from that of the samples; `by_bin` has shape (n_bins, n_segments, n)."""
+    """The window of the shaft's motion, from that of the samples; `by_bin` has shape (n_bins, n_segments, n)."""
     mounted = window if plan.equaliser is None else _equalised(window, plan.equaliser, by_bin)
     shaft = mounted if plan.runout is None else _without(mounted, plan.runout)
     shaft = shaft if plan.turn is None else _turned(shaft, plan.states, plan.turn)
@@ -332,7 +330,7 @@ def _of_the_shaft(
 
 
 def _equalised(window: WindowStatistics, equaliser: Equaliser, by_bin: ComplexArray) -> WindowStatistics:
-    """The window as sensors would give it that show the vibration as it is."""
+    """The window with the response of the sensors divided out."""
     n_bins, _, n = by_bin.shape
     by_hop = by_bin.swapaxes(0, 1).reshape(len(window.waveforms), -1, n_bins, n)
     missing = equaliser.missing(by_hop, window.frequencies_hz, window.lags_s)
@@ -354,7 +352,7 @@ def _equalised(window: WindowStatistics, equaliser: Equaliser, by_bin: ComplexAr
 
 
 def _without(window: WindowStatistics, runout: ComplexArray) -> WindowStatistics:
-    """The window without what sensors show at running speed although nothing vibrates."""
+    """The window without run-out: what sensors show at running speed although nothing vibrates."""
     known = runout if window.speed_rad_s >= 0 else runout.conj()
     return replace(
         window,
@@ -365,7 +363,7 @@ def _without(window: WindowStatistics, runout: ComplexArray) -> WindowStatistics
 
 
 def _turned(window: WindowStatistics, states: tuple[str, ...], turn: FloatArray) -> WindowStatistics:
-    """Statistics of the states, from those of sensors at an angle: every moment is turned from both sides."""
+    """Statistics of the states, from those of sensors at an angle: every moment is multiplied from both sides."""
 
     def vectors(mounted: ComplexArray | None) -> ComplexArray | None:
         return None if mounted is None else np.asarray(mounted @ turn.T, dtype=np.complex128)
@@ -398,7 +396,7 @@ def levels_of(plan: Plan, hops: tuple[HopMoments, ...], *, errors: bool = True) 
     rotation = rotation_of(plan, hops)
     speeds, (slowest, fastest) = rotation.hop_speed_rad_s, _speeds(rotation, hops, plan)[1]
     if rotation.source == "estimated" and not (rotation.settled.all() and fastest < (1 + _VARIED) * slowest):
-        speeds = np.full(len(hops), np.nan)  # what turns while the speed changes is at no multiple of what is found
+        speeds = np.full(len(hops), np.nan)  # while the speed changes, orders are not at multiples of the speed found
     return window_levels(
         plan.levels,
         [hop.levels for hop in hops if hop.levels is not None],
@@ -436,9 +434,9 @@ def _undrifted(
     remove: FloatArray,
     usual: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """Correlations of every hop, and of all: about its own mean where means drift, the usual ones where they do not.
+    """Correlations of every hop, and of all: about each hop's own mean if means drift, otherwise the usual ones.
 
-    A drift is no vibration, though it correlates at any lag; means that scatter from hop to hop are none.
+    A drift is no vibration, though it correlates at any lag; means that scatter from hop to hop are no drift.
     """
     n = len(remove)
     means = products[:, 0, n, :n] / plan.hop
@@ -450,7 +448,7 @@ def _undrifted(
     own[:, :, n] = -means - products[:, 0, n, n + 1 :] @ remove[:, n + 1 :].T / plan.hop
     at_hops = np.array([hop.start_ns - hops[0].start_ns for hop in hops]) * 1e-9 * plan.rate_hz / plan.hop
     trend = np.gradient(means, at_hops, axis=0)[:, np.newaxis]
-    within = trend.swapaxes(1, 2) @ trend / 12  # of a straight line about its mean
+    within = trend.swapaxes(1, 2) @ trend / 12  # variance of a straight line about its mean
     own = own[:, np.newaxis]
     by_hop = own @ products @ own.swapaxes(2, 3) / plan.hop - within[:, np.newaxis]
     return by_hop, by_hop.sum(axis=0) / len(hops)
