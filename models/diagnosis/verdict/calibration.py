@@ -1,4 +1,4 @@
-"""Declared false-alarm rates, thresholds that keep them, changes that they let show, and diagnosticians that differ."""
+"""Thresholds that keep declared false-alarm rates, minimum detectable changes, and agreement of diagnosticians."""
 
 import math
 from dataclasses import dataclass, replace
@@ -37,7 +37,7 @@ def _shared(probability: float, tests: int) -> float:
 
 
 def window_thresholds(rate: float, n_parameters: int) -> Thresholds:
-    """Thresholds of one window by itself, at a probability that a healthy one is called changed, over all parameters.
+    """Thresholds of one window by itself; `rate` is the probability, over all parameters, of a false alarm in it.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def window_thresholds(rate: float, n_parameters: int) -> Thresholds:
 
 
 def overshoot_correction(x: float) -> float:
-    """Siegmund's ν(x): how much rarer a crossing is when time goes in steps.
+    """Siegmund's ν(x): how much rarer a crossing is in discrete time.
 
     x is the threshold times the standard deviation of one step; 0 is continuous time, where ν = 1.
     """
@@ -69,9 +69,9 @@ def overshoot_correction(x: float) -> float:
 def crossing_rate(threshold: float, overlap: int) -> float:
     """How often per hop a sliding window's test value newly exceeds a threshold, upwards only.
 
-    The test value of a window of `overlap` hops is a moving average of independent hops: its autocorrelation falls
-    linearly to zero over the window, of one hop where windows do not overlap. For such a process the rate is b φ(b) μ
-    ν(b √(2μ)) with μ = 1/overlap and the threshold b, in standard errors; -b is crossed as often again.
+    The test value of a window of `overlap` hops (one if windows do not overlap) is a moving average of independent
+    hops: its autocorrelation falls linearly to zero over the window. For such a process the rate is b φ(b) μ ν(b √(2μ))
+    with μ = 1/overlap and the threshold b, in standard errors; -b is crossed downwards as often.
     """
     tail = float(ndtr(-threshold))
     if overlap <= 1:
@@ -86,8 +86,8 @@ def month_thresholds(
 ) -> Thresholds:
     """Thresholds of a sliding window of `overlap` hops that is tested at every hop.
 
-    The machine is to have so many false alarms in 30 days of data. Windows of different lengths that are tested side by
-    side (`n_stretches`) get an equal share of the rate each.
+    The machine is to have `per_month` false alarms in 30 days of data. If windows of `n_stretches` different lengths
+    are tested side by side, each gets an equal share of that rate.
 
     Raises
     ------
@@ -124,9 +124,9 @@ _RATE = 1e-3
 
 
 def agreements(first: Diagnosis, second: Diagnosis) -> tuple[Agreement, ...]:
-    """Compare what two diagnosticians say of one window, parameter by parameter, in the order of `PARAMETERS`.
+    """Compare two diagnosticians' readings of one window, parameter by parameter, in the order of `PARAMETERS`.
 
-    What neither of them could read is left out.
+    Parameters that neither of them could read are left out.
     """
     one, other = ({reading.name: reading for reading in diagnosis.evaluable} for diagnosis in (first, second))
     between = (first.by, second.by)
@@ -147,8 +147,8 @@ def agreements(first: Diagnosis, second: Diagnosis) -> tuple[Agreement, ...]:
 def _difference_z(one: Parameter, other: Parameter, freedom: tuple[float, float]) -> float:
     """Difference of two readings as a standard normal value.
 
-    Standard errors are those whose 95 % interval holds 95 %. With few degrees of freedom the tails beyond are heavier;
-    those of the difference are Satterthwaite's (F. E. Satterthwaite, Biometrics Bulletin 2 (1946)).
+    Standard errors are such that the 95 % interval holds 95 %. With few degrees of freedom the tails beyond are heavier
+    than normal; those of the difference are approximated after F. E. Satterthwaite, Biometrics Bulletin 2 (1946).
     """
     difference = (other.relative_change or 0.0) - (one.relative_change or 0.0)
     errors = (one.standard_error or 0.0, other.standard_error or 0.0)
@@ -165,7 +165,7 @@ def _difference_z(one: Parameter, other: Parameter, freedom: tuple[float, float]
 
 
 def _scale(freedom: float) -> float:
-    """Scale of the t distribution of which a standard error of 1 holds 95 % in 1.96 either way."""
+    """Scale of the t distribution that has 95 % within ±1.96."""
     return Z95 / float(stdtrit(freedom, 0.975)) if freedom < math.inf else 1.0
 
 
@@ -184,9 +184,9 @@ def widened(diagnosis: Diagnosis, rate: float) -> Diagnosis:
 
 
 def beside(first: Diagnosis, second: Diagnosis) -> Diagnosis:
-    """The second diagnosis without what it would only take for changed, because the first finds that another one did.
+    """The second diagnosis without readings that may only reflect changes of other parameters found by the first.
 
-    Equation (29) reads the unbalance with the shaft as it was: a shaft that has changed looks to it like an unbalance.
+    Equation (29) reads the unbalance assuming an unchanged shaft: a changed shaft looks to it like an unbalance.
     """
     read = {reading.name: reading for reading in first.evaluable}
     changed = {name for name, one in read.items() if abs(one.z or 0.0) > window_thresholds(_RATE, 1).first}
@@ -213,9 +213,9 @@ def detectable_changes(
     """Minimum detectable changes of a stretch of data, from its own information.
 
     In the scale of the errors the change is (threshold + quantile of the power) times the standard error. The standard
-    error is the one with all other parameters free: the change shall not only be noticed, it shall be told from a
-    change of any other parameter, so where estimates hang together the power, with which the change is found, is higher
-    than stated. The errors of a parameter hardly depend on its value.
+    error is the one with all other parameters free, because the change is not only to be noticed but also to be told
+    from a change of any other parameter; where estimates are correlated, the power with which it is found is therefore
+    higher than stated. The errors of a parameter hardly depend on its value.
     """
     distance, errors = thresholds.first + float(ndtri(power)), np.sqrt(np.diag(stretch.estimate()[1])).tolist()
     return tuple(
@@ -230,7 +230,7 @@ def detectable_changes(
 
 
 def length_to_find(found: Detectable, change: float) -> float:
-    """Data, s, to find another change of the parameter: standard errors fall as one over the root of the length.
+    """Length of data, s, that finds another change of the parameter: errors fall with the square root of the length.
 
     Raises
     ------

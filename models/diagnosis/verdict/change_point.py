@@ -1,14 +1,14 @@
-"""How large a change is, and when it came, over all that may be so.
+"""Size and time of a change, averaged over all possible moments and over what else may have changed.
 
-What is read of a changed parameter depends on what else changed, perhaps too little to be named, and on how much of the
-window is from after the change. Neither is known. So every set of parameters that holds the named ones and every moment
-are tried, and what is said is the mean over them by their probability, with the variance within and between.
+The reading of a changed parameter depends on what else changed, perhaps too little to be named, and on how much of the
+window is from after the change. Neither is known. So every set of parameters that includes the named ones is tried with
+every moment, and the result is the mean over them by their probability, with the variance within and between.
 
 A window that holds the new state for a share of its time reads about that share of the change. One window cannot tell
 a small change from a late one; the windows before, which overlap it, show the share growing. Given the moment, the
-values before and after it are linear in what the windows read. Moments are tried so close to each other that being
-between two of them is less than the windows' errors: a growth that is seen far more sharply would otherwise fit another
-moment, another power and another size better than the true ones.
+values before and after it are linear in the windows' readings. Moments are tried so close together that the difference
+between two of them is less than the windows' errors: otherwise a growth that is seen far more sharply would fit another
+moment, power and size better than the true ones.
 """
 
 import math
@@ -22,15 +22,15 @@ from models.diagnosis.verdict.stretch import Stretch
 from models.signals.block import FloatArray
 
 _STEPS, _MOST_STEPS = 2, 20  # moments that are tried in every hop, at least and at most
-_APART = 2.0  # standard errors by which a window may read otherwise from one of these moments to the next
-# How much a second of the new state weighs beside one of the old one: as much as it vibrates.
+_APART = 2.0  # standard errors by which a window's reading may differ from one of these moments to the next
+# Weight of a second of the new state relative to one of the old state: their ratio of vibration power.
 _POWERS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
-# Variance that every window has for itself, over that of a window: its maximum is followed to a fraction of an error.
+# Independent variance of each window over a window's variance: its maximum is followed to a fraction of an error.
 _FOLLOWED = 0.1
-_BENT = 0.1  # how far the reading of a mixture is from the mixture of the readings, over the change
+_BENT = 0.1  # difference between the reading of a mixture and the mixture of the readings, over the change
 _SIZE = 0.3  # standard deviation of possible changes, in the scale of the errors
 _HELD = 0.002  # the same of a parameter before it changes for the first time
-_ODDS = 0.1  # of each further parameter to have changed, once one has
+_ODDS = 0.1  # that each further parameter has changed, once one has
 _BEFORE = 100.0  # odds of a change before data that have just begun
 _MOST = 2  # further parameters that are tried
 _QUANTILES = (0.5, 0.025, 0.975)
@@ -47,10 +47,10 @@ class Changes:
 
 
 def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, by_ns: int) -> Changes:
-    """Read what parameters, named as indices into `PARAMETERS`, have changed to by the end of the latest window.
+    """Estimate the values that the `named` parameters (indices into `PARAMETERS`) have at the end of the latest window.
 
-    The windows are of as much data each and overlap, the latest one last; all know the same parameters, and a gap may
-    be in some. The parameters had changed by `by_ns` at the latest.
+    The windows overlap and hold equally much data, the latest one last; all know the same parameters, and some may
+    contain a gap. The parameters had changed by `by_ns` at the latest.
     """
     last = windows[-1]
     known = list(last.known)
@@ -69,7 +69,7 @@ def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, 
     odds = max(1, moments.size - 1) * (1.0 if watched else _BEFORE)
     before = np.log(np.where(moments < starts[0], odds, 1.0))
     length = np.min(ends - starts)
-    # Gaps are taken out of the time: one comes in with an end that is late, and goes out with a start.
+    # Gaps are taken out of the time: a gap enters with a window that ends late and leaves with one that starts late.
     gone = np.append(0.0, np.cumsum(np.maximum(np.diff(ends) - np.diff(starts), 0.0)))
     times, gaps = np.append(starts, ends), np.append(gone - (ends - starts - length), gone)
     order = np.argsort(times)
@@ -88,7 +88,7 @@ def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, 
     for count in range(min(_MOST, len(others)) + 1):
         sets = np.array([[*first, *further] for further in combinations(others, count)])
         basis, scale = np.linalg.qr(np.moveaxis(whiten[:, sets], 0, 1))  # (n_sets, m, n), (n_sets, n, n)
-        back = np.linalg.inv(scale)  # from what is seen along the basis to the set's parameters
+        back = np.linalg.inv(scale)  # from observations along the basis to the set's parameters
         gain = back @ np.swapaxes(basis, -1, -2) @ whiten
         common, errors = (np.sum(gain @ side * gain, axis=-1) for side in (shared, own))
         unit = np.mean(np.sum(back**2, axis=-1), axis=-1)
@@ -110,14 +110,14 @@ def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, 
 
 
 def _resolution(seen: FloatArray) -> tuple[int, float]:
-    """How many moments are tried in a hop, and where those are not close enough, how much larger errors count."""
+    """Number of moments to try in a hop, and the factor on all errors if those moments are not close enough."""
     moved = float(np.max(np.linalg.norm(np.diff(seen, axis=0), axis=1), initial=0.0))
     steps = min(max(_STEPS, math.ceil(moved / _APART)), _MOST_STEPS)
     return steps, max(1.0, moved / (_APART * steps))
 
 
 def _fitted(gram: FloatArray, right: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fit the values before, after and of the mixture, in closed form: the one after is eliminated last.
+    """Fit the values before, after and of the mixture, in closed form: the value after is eliminated last.
 
     Parameters
     ----------
@@ -129,8 +129,8 @@ def _fitted(gram: FloatArray, right: FloatArray, prior: FloatArray) -> tuple[Flo
     Returns
     -------
     tuple
-        Log likelihood over that without any values, shape (2, n_powers, n_moments, n_sets); the value after, the same
-        and n; its variance in units of what is seen, without n.
+        Log likelihood relative to that without any values, shape (2, n_powers, n_moments, n_sets); the value after, of
+        the same shape with a last axis n; its variance in units of the observations, without that axis.
     """
     before, after, mixed = 0, 1, 2
     own = gram[..., None, :, :]

@@ -1,15 +1,15 @@
 """Which parameters changed: a choice among all sets of parameters, with its confidence.
 
-For every set A the parameters outside A are held at nominal. What is then left of the window's information,
+For every set A the parameters outside A are held at nominal. What the set then leaves unexplained,
 R(A) = x'Jx - x_A' J_AA x_A with the restricted estimate x_A = J_AA⁻¹ (Jx)_A, is χ² with one degree of freedom per
 parameter outside A if nothing outside A changed. A set pays for its size, R(A) + h₁² + (|A| - 1) h₂², and the cheapest
-set is the verdict. So a single parameter is named where its restricted test value exceeds h₁, the declared rate's
-threshold, and another one is added where it takes more than h₂² further off R. That price of two would hide two small
-changes, so what the best pair explains is compared with what chance lets a pair explain as well: beyond that something
-has changed, and the cheapest set that is not empty is the verdict.
+set is the verdict. So a single parameter is named if its restricted test value exceeds h₁, the declared rate's
+threshold, and another one is added if it reduces R by more than h₂². The price of two would hide two small changes, so
+what the best pair explains is also compared with what chance lets a pair explain: if it is more, something has changed,
+and the cheapest set that is not empty is the verdict.
 
-The prior that belongs to this: odds of exp(-h₁²/2) against the first and exp(-h₂²/2) against every further changed
-parameter, the spread of possible sizes included. The confidence is the posterior under that prior.
+This amounts to prior odds of exp(-h₁²/2) for the first and exp(-h₂²/2) for every further changed parameter, with the
+spread of possible sizes included. The confidence is the posterior probability under that prior.
 """
 
 import math
@@ -28,7 +28,7 @@ from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Alternative, Parameter
 
-_LIKELIEST = 4  # sets that are told whatever they hold
+_LIKELIEST = 4  # most probable sets, which are reported whatever they hold
 _BY_PAIRS = 0.1  # false alarms by two parameters together, over those of the declared rate
 
 
@@ -50,12 +50,12 @@ class Isolation:
 
     @property
     def low_confidence(self) -> bool:
-        """Whether what is said of parameters should be believed with reserve."""
+        """Whether the verdict on parameters should be taken with reserve."""
         return self.outside or self.confidence < 0.5
 
 
 def outside_confidence(misfit_z: float) -> float:
-    """Most that a misfit can say for "outside the model", at even odds beforehand.
+    """Largest confidence in "outside the model" that a misfit can give, at even prior odds.
 
     One minus the bound of Sellke, Bayarri and Berger (The American Statistician 55, 2001) on the posterior of the
     model: 1 / (1 + 1/(-e p ln p)) with the one-sided probability p of the misfit.
@@ -68,7 +68,7 @@ def outside_confidence(misfit_z: float) -> float:
 
 
 def isolate_window(diagnosis: Diagnosis, rate: float) -> Isolation:
-    """Decide one window by itself at a declared rate of false alarms per window; the test of the model has as much."""
+    """Decide one window by itself at a declared rate of false alarms per window; the test of the model has the same."""
     stretch = stretch_of(widened(diagnosis, rate), 0, 0).complete().believed()
     isolation = isolate(stretch, window_thresholds(rate, max(1, len(stretch.known))), by=diagnosis.by)
     return replace(isolation, changed=(), readings=(), outside=True) if stretch.unexplained else isolation
@@ -129,7 +129,7 @@ def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") ->
 
 @lru_cache
 def _pair_price(first: float, n: int) -> float:
-    """What chance explains with the best pair of n parameters in a tenth of the cases in which one exceeds `first`."""
+    """What the best pair of n parameters explains by chance, a tenth as often as one parameter exceeds `first`."""
     alone = 2 * n * float(ndtr(-first))
     return -2 * math.log(_BY_PAIRS * alone / (n * (n - 1) / 2))
 
@@ -163,7 +163,7 @@ def _members(n: int) -> FloatArray:
 
 
 def _explained(J: FloatArray, b: FloatArray, members: FloatArray) -> FloatArray:
-    """What each set explains, b_A' J_AA⁻¹ b_A, all in one go: what is not in a set stands alone there."""
+    """What each set explains, b_A' J_AA⁻¹ b_A, for all sets at once: parameters outside a set are decoupled from it."""
     scale = 1 / np.sqrt(np.diag(J))
     alone = J * np.outer(scale, scale) * members[:, :, None] * members[:, None, :]
     alone[:, range(b.size), range(b.size)] = 1.0
@@ -188,7 +188,7 @@ def reading_of(stretch: Stretch, name: str, by: str, value: float, error: float)
     """A parameter's reading from its value and standard error in the scale of the errors."""
     if name != "e":
         return possible_reading(name, by, from_scale(name, value), error * slope(name, value))
-    # Where errors put an unbalance that is all but gone below none, it is as much of one on the other side.
+    # If errors put an unbalance that has almost vanished below zero, it is one of that size on the other side.
     own = float(stretch.estimate()[0][stretch.names.index(name)])
     vector = None if stretch.unbalance is None else stretch.unbalance.read_as(value, own)
     return possible_reading(name, by, abs(1 + value) - 1, error, vector)

@@ -1,15 +1,14 @@
 """Sequential test: large changes at once, small ones as soon as enough data is there.
 
-At every hop stretches of several lengths that end now are looked at: short ones inside the window, the window itself,
-and sums of 2, 4, 8, … windows that do not overlap. This is a generalised likelihood ratio over dyadic lengths. Each
-length has its share of the declared rate of false alarms.
+At every hop, stretches of several lengths that end now are tested: short ones inside the window, the window itself, and
+sums of 2, 4, 8, … windows that do not overlap. This is a generalised likelihood ratio over dyadic lengths. Each length
+has its share of the declared rate of false alarms.
 
 A stretch that straddles a change mixes two machines, and a parameter that did not change may then read wrong. So as
-soon as a short stretch and a longer one contradict each other, the change is dated, and what is older no longer counts:
+soon as a short stretch and a longer one contradict each other, the change is dated, and older data no longer count:
 only *clean* stretches, which begin after that date, say which parameters changed. Until one is long enough, a
 straddling stretch may name one parameter, the one that stands out most. A change too small for the short stretches to
-see leaves no bias worth speaking of (it is of second order in the change), so sums of windows across it are taken as
-they are.
+see leaves a negligible bias (of second order in the change), so sums of windows across it are used as they are.
 
 All times are those of the data.
 """
@@ -32,18 +31,18 @@ from models.physics.rotor import PARAMETER_TEXT, PARAMETERS
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Candidate, Finding, Parameter, Verdict
 
-# Stretches shorter than the window in which larger changes are looked for. Their standard errors are right as stated:
+# Stretches, in hops, shorter than the window, in which larger changes are looked for. Their standard errors are right:
 # on 150 healthy stretches of each length and either layout of sources (rotor kit, seed 301) z of no parameter scatters
 # by more than 1.04.
 _SHORT_HOPS = (2, 4, 7)
 _DOUBLINGS = 6
-# Probability that stretches of an unchanged machine contradict each other at one hop. It costs only older data.
+# Probability that stretches of an unchanged machine contradict each other at one hop, which costs only older data.
 _CONTRADICTION_RATE = 1e-7
-_PROBABLE = 0.05  # least probability of a parameter that is told as one that may have changed
-# Standard errors that a reading astride its change must be from zero; with fewer it is a guess of when rather than of
-# how much, and leans to what is too large.
+_PROBABLE = 0.05  # least probability with which a parameter is reported as one that may have changed
+# Least distance from zero, in standard errors, of a reading astride its change; a smaller one says more about the date
+# of the change than about its size, and tends to be too large.
 _CLEAR = 3.0
-# Standard deviations of the misfit below which a short stretch takes back that the machine is outside the model.
+# Misfit, in standard deviations, below which a short stretch ends the verdict that the machine is outside the model.
 _INSIDE = 2.0
 _EITHER = "; or all sensors of a place have a wrong gain, which explains the data as well"
 
@@ -52,12 +51,12 @@ _EITHER = "; or all sensors of a place have a wrong gain, which explains the dat
 class SequentialSettings:
     """Lengths and declared rate."""
 
-    hop_s: float  # data time between looks, s
+    hop_s: float  # data time between tests, s
     window_hops: int  # hops of a full window
     short_hops: tuple[int, ...] = _SHORT_HOPS  # hops of the short stretches, shortest first
     false_alarms_per_month: float = 1.0  # over all parameters and lengths together
-    # Standard error that more windows do not remove, of every parameter: an estimate on nominal values is not true to
-    # the last digit however long it is averaged.
+    # Standard error of every parameter that more windows do not remove: an estimate relative to nominal values does not
+    # become exact however long it is averaged.
     systematic: float = 0.002
 
     @classmethod
@@ -66,7 +65,7 @@ class SequentialSettings:
     ) -> "SequentialSettings":
         """Settings with which a machine is monitored, at its declared rate or at another one.
 
-        They are `short` where stretches shorter than the window can be evaluated.
+        `short` says whether stretches shorter than the window can be evaluated.
         """
         return cls(
             hop_s=machine.window.hop_s,
@@ -94,13 +93,12 @@ class SequentialSettings:
 
 
 class SequentialTest:
-    """Looks at one hop after the other."""
+    """Tests one hop after the other."""
 
     def __init__(self, settings: SequentialSettings, by: str = "likelihood") -> None:
         self.settings = settings
         self.state = SequentialState()
-        # Why nothing can be said of parameters at the latest hop, see `Diagnosis`: then none is named, and none is
-        # read.
+        # Why no parameter is named or read at the latest hop, see `Diagnosis`; empty if it is evaluable.
         self.unexplained = ""
         self._by = by
         self._thresholds = {hops: settings.thresholds(hops) for hops in settings.lengths}
@@ -116,9 +114,9 @@ class SequentialTest:
         self.state = SequentialState()
 
     def wanted(self) -> tuple[int, ...]:
-        """Short stretches worth evaluating at the next hop, by their hops; every one costs as much as a window.
+        """Lengths, in hops, of the short stretches worth evaluating at the next hop; each costs as much as a window.
 
-        On an unchanged machine all of them. After a change the longest clean one is wanted, or, before there is one,
+        On an unchanged machine these are all of them; after a change, the longest clean one or, before there is one,
         the shortest.
         """
         short, state = self.settings.short_hops, self.state
@@ -134,7 +132,7 @@ class SequentialTest:
 
     @property
     def unchanged(self) -> bool:
-        """Whether nothing is found changed, and no window is astride a change: `update` needs short ones with news."""
+        """Whether no change is found and no window is astride one: `update` then needs only short ones with news."""
         return not self.state.findings and self.wanted() == self.settings.short_hops
 
     @property
@@ -145,7 +143,7 @@ class SequentialTest:
 
     @property
     def astride_s(self) -> float:
-        """For how long windows that are outside the model may be astride a change, s."""
+        """For how much longer windows that are outside the model may be astride a change, s."""
         began_ns, windows = self.state.outside_ns, self.state.sums.get(1)
         if began_ns is None or not windows:
             return 0.0
@@ -158,12 +156,12 @@ class SequentialTest:
         Parameters
         ----------
         looks : mapping of int to Stretch
-            Stretches that end with this hop, by their hops: the full window, and those of the short ones that are
+            Stretches that end with this hop, by their length in hops: the full window, and the short ones that are
             there. `wanted` says which suffice.
         foreign : bool
-            Whether something was seen that no change of a parameter makes.
+            Whether something was seen that no change of a parameter causes.
         rivals : collection of str
-            Parameters whose change would explain it as well: if one of them alone has changed, that need not be so.
+            Parameters whose change would explain it as well: if only such are found changed, it need not be foreign.
 
         Raises
         ------
@@ -175,7 +173,7 @@ class SequentialTest:
         for windows, total in self._accumulate(looks[window_hops].believed()).items():
             own[windows * window_hops] = total.blurred(self.settings.systematic)
         own[window_hops] = looks[window_hops]
-        self._watch_for_contradiction(own)  # an error that all stretches share makes none contradict another
+        self._watch_for_contradiction(own)  # without the shared error, which makes none contradict another
         every = {hops: look.complete().believed() for hops, look in own.items()}
         clean = {hops: look for hops, look in every.items() if self._is_clean(look)}
         deciding = [hops for hops in clean if hops <= window_hops]
@@ -190,7 +188,7 @@ class SequentialTest:
         verdicts = {hops: verdict for hops, verdict in loud.items() if verdict.changed}
         decided, isolation = self._decide(every, clean, verdicts)
         if unexplained:
-            # What was found before may hold on; it is neither confirmed nor taken back by data that say nothing.
+            # Earlier findings stay: data that say nothing neither confirm nor withdraw them.
             isolation = replace(isolation, changed=(), readings=())
         else:
             self._note(isolation.changed, every, clean, verdicts)
@@ -237,7 +235,7 @@ class SequentialTest:
             before = bisect_right(ring, total.start_ns + self._slack_ns, key=lambda one: one.end_ns)
             if not before:
                 return found
-            del ring[: before - 1]  # nothing that comes will reach further back
+            del ring[: before - 1]  # no later sum will reach further back
             total = added([ring[0], total])
             windows *= 2
             found[windows] = total
@@ -246,11 +244,11 @@ class SequentialTest:
     def _outside(self, said: bool, by: Stretch | None, window: Stretch) -> bool:
         """Whether the machine counts as outside the model.
 
-        While the window is outside, a short stretch takes back what has been said only if it is well inside: it has
-        little power, and with a few hops none. What has been said for longer than any window is astride a change, a
-        whole clean window alone takes back: on a machine that no parameters explain stretches contradict each other,
-        and a short one explains little of what it is asked. It is said by the longest clean stretch of a window at
-        most, if there is one.
+        `said` is the verdict of `by`, the longest clean stretch of a window at most, if there is one. While the window
+        is outside, a short stretch withdraws an earlier verdict only if it is well inside: it has little power, and
+        with a few hops none. A verdict that has lasted longer than any window is astride a change is withdrawn only by
+        a whole clean window: on a machine that no parameters explain, stretches contradict each other, and a short one
+        decides little.
         """
         state = self.state
         if said:
@@ -273,7 +271,7 @@ class SequentialTest:
     def _watch_for_contradiction(self, every: Mapping[int, Stretch]) -> None:
         """Date a change if a stretch contradicts a longer clean one that contains it.
 
-        So does one that the model explains, one that it does not: the longer one is of two machines.
+        A stretch that the model explains also contradicts a longer one that it does not: that one mixes two machines.
         """
         clean = [(hops, look) for hops, look in every.items() if self._is_clean(look)]
         values = [_values(look) for _, look in clean]
@@ -294,10 +292,10 @@ class SequentialTest:
     def _decide(
         self, every: Mapping[int, Stretch], clean: Mapping[int, Stretch], verdicts: Mapping[int, Isolation]
     ) -> tuple[Stretch, Isolation]:
-        """The stretch that says which parameters changed: the longest clean one that says any.
+        """The stretch that decides which parameters changed: the longest clean one that names any.
 
-        But not one that names others than a shorter one does: it holds older data, and what has changed little by
-        little passes there for a change of another parameter, whose errors go with its own.
+        One with no name in common with a shorter one is left out: it holds older data, in which a gradual change looks
+        like a change of another parameter with correlated errors.
         """
         names: list[set[str]] = []
         decided = None
@@ -313,15 +311,15 @@ class SequentialTest:
                 if leader is not None:
                     return look, leader
         shown = self.settings.window_hops if self.settings.window_hops in clean else min(clean, default=min(every))
-        verdict = self._isolate(shown, every[shown])  # of a straddling stretch nothing is believed here
+        verdict = self._isolate(shown, every[shown])  # nothing that a straddling stretch names is believed
         return every[shown], replace(verdict, changed=(), readings=())
 
     def _leader(self, look: Stretch, verdict: Isolation, clean: Mapping[int, Stretch]) -> Isolation | None:
-        """What a straddling stretch may say: the parameter that moved most, if it moved away from nominal.
+        """What a straddling stretch may name: the parameter that moved most, if it moved away from nominal.
 
-        One on its way back to nominal reads as changed for as long as the stretch holds old data. A stretch that no
-        single machine explains says nothing at all: with one source of force whatever it reads is far outside its
-        errors, and may be another parameter than the one that changed.
+        A parameter on its way back to nominal reads as changed for as long as the stretch holds old data. A stretch
+        that no single machine explains names nothing: with one source of force, all its readings are far outside their
+        errors, and the one that stands out may not be the parameter that changed.
         """
         if verdict.outside:
             return None
@@ -344,20 +342,20 @@ class SequentialTest:
         clean: Mapping[int, Stretch],
         verdicts: Mapping[int, Isolation],
     ) -> None:
-        """Keep when each changed parameter was first found; forget what is no longer so."""
+        """Keep when each changed parameter was first found; forget findings that no longer hold."""
         known = {one.name: one for one in self.state.findings}
         found = {name: known[name] for name in known if name in changed or self._still(name, clean)}
         for name in changed:
             if name not in known:
                 by = [every[hops] for hops, verdict in verdicts.items() if name in verdict.changed]
-                # What all of the first window says may have been so from its beginning; later, a change has just come.
+                # A change that the first window shows may be as old as that window; a later change has just come.
                 first = self.state.change_ns is None and len(self.state.sums[1]) == 1
                 look = by[-1 if first else 0]
                 found[name] = finding(name, look.start_ns, look.end_ns, look.duration_s)
         self.state.findings = tuple(found[name] for name in PARAMETERS if name in found)
 
     def _still(self, name: str, clean: Mapping[int, Stretch]) -> bool:
-        """Whether a parameter found earlier holds on: there is no whole clean window yet, and the clean data agree."""
+        """Whether an earlier finding still holds: there is no whole clean window yet, and the clean data agree."""
         if self.settings.window_hops in clean:
             return False
         if not clean:
@@ -367,7 +365,7 @@ class SequentialTest:
         return bool(abs(values[at] - self.state.before[at]) < self._contradiction * np.sqrt(variances[at]))
 
     def _current(self, look: Stretch, changed: tuple[str, ...]) -> tuple[Parameter, ...]:
-        """Free readings of a stretch; those of the changed parameters over all that may be so beside them."""
+        """Free readings of a stretch; those of changed parameters are means over what else may have changed."""
         values, covariance = look.estimate()
         errors = np.sqrt(np.diag(covariance)).tolist()
         read = {name: (value, error) for name, value, error in zip(look.names, values.tolist(), errors, strict=True)}
@@ -390,13 +388,13 @@ class SequentialTest:
         return tuple(reading_of(look, name, self._by, value, error) for name, (value, error) in read.items())
 
     def _changed_by_ns(self) -> int:
-        """When everything found had come: at the latest what is dated, or the end of what found it later."""
+        """When all that is found had changed at the latest: the end of the stretch that dated it, or found it later."""
         dated = self.state.dated_ns or 0
         later = [one.found_ns for one in self.state.findings if one.found_ns - one.stretch_s * 1e9 > dated]
         return max(dated, *later, 0)
 
     def _date(self, changed: tuple[str, ...], since_ns: tuple[int, int, int] | None) -> None:
-        """Say when the changed parameters did so; one that was found before that moment changed earlier."""
+        """Date the changed parameters; one that was found before that moment changed earlier and keeps its date."""
         if since_ns is not None:
             dates = {"since_ns": since_ns[0], "between_ns": since_ns[1:]}
             self.state.findings = tuple(
@@ -422,7 +420,7 @@ def _in_words(findings: Sequence[Finding], isolation: Isolation, *, detected: bo
             f"{one.stretch_s:.0f} s of data"
             for one in findings
         )
-        # Never more sure than can be.
+        # Never printed as 100.0 %.
         sure = "above 99.9 %" if isolation.confidence > 0.9995 else f"{100 * isolation.confidence:.1f} %"
         within = " among changes of parameters" if isolation.outside else ""
         text = f"changed: {found}; confidence {sure}{within}"
@@ -444,8 +442,8 @@ def _clock(time_ns: int) -> str:
 def _worst(part: tuple[FloatArray, FloatArray], wholes: Sequence[tuple[FloatArray, FloatArray]]) -> list[float]:
     """Largest difference of a stretch from each that contains it, in standard errors of the difference.
 
-    The errors of a part and of the whole differ by as much as their variances do (Hausman); half of the part's variance
-    is the least that is believed, because both variances are estimates.
+    The variance of the difference between a part and the whole is the difference of their variances (Hausman), but at
+    least half of the part's variance, because both variances are estimates.
     """
     if not wholes:
         return []

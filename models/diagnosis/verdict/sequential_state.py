@@ -1,4 +1,4 @@
-"""What the sequential test remembers from hop to hop, as named arrays and back."""
+"""State of the sequential test from hop to hop, and its conversion to named arrays and back."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,22 +12,22 @@ from models.physics.rotor import PARAMETER_TEXT, PARAMETERS
 from rotorwatch.records.windows import Finding
 
 _LOWER = np.tril_indices(len(PARAMETERS))  # elements of an information matrix that are remembered: it is symmetric
-_NO_LIMITS = (1, 0)  # of a date
+_NO_LIMITS = (1, 0)  # for a date that has none
 
 
 @dataclass(slots=True)
 class SequentialState:
     """All that the test remembers."""
 
-    # Latest stretches of one window (key 1) and of the sums of 2, 4, … windows that longer sums may be made of, oldest
+    # Latest stretches of one window (key 1) and sums of 2, 4, … windows from which longer sums may be made, oldest
     # first.
     sums: dict[int, list[Stretch]] = field(default_factory=dict)
     change_ns: int | None = None  # data before this belongs to another condition of the machine
     # Values of `PARAMETERS` in that condition, in the scale of their errors.
     before: tuple[float, ...] = (0.0,) * len(PARAMETERS)
     findings: tuple[Finding, ...] = ()  # what has been found and still holds
-    dated_ns: int | None = None  # end of the stretch that showed the latest change: it had come by then
-    outside_ns: int | None = None  # end of the first of the stretches that have been outside the model since
+    dated_ns: int | None = None  # end of the stretch that showed the latest change: the change had come by then
+    outside_ns: int | None = None  # end of the first stretch outside the model, if it has been outside ever since
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything but the sums, which are in `hops`, as named arrays."""
@@ -46,7 +46,7 @@ class SequentialState:
         }
 
     def hops(self) -> dict[int, list[tuple[int, Stretch]]]:
-        """What each hop has added to `sums`, by its end: windows and stretch. A hop that is past does not change."""
+        """What each hop, by its end, has added to `sums`: number of windows and stretch. Past hops do not change."""
         found: dict[int, list[tuple[int, Stretch]]] = {}
         for windows, ring in self.sums.items():
             for one in ring:
@@ -57,7 +57,7 @@ class SequentialState:
     def restored(
         cls, arrays: Mapping[str, np.ndarray], hops: Iterable[Mapping[str, np.ndarray]] = ()
     ) -> "SequentialState":
-        """State from what `checkpoint` gave, and the `hops`, oldest first, as `hop_arrays` has them.
+        """State from what `checkpoint` returned, and the `hops`, oldest first, as `hop_arrays` returned them.
 
         Raises
         ------
@@ -71,7 +71,7 @@ class SequentialState:
         lengths = checked(arrays, "finding_stretch_s", np.float64, (len(findings),))
         if np.any((findings[:, 0] < 0) | (findings[:, 0] >= len(PARAMETERS))):
             raise CheckpointError(f"findings are of parameters {findings[:, 0].tolist()}, there are {len(PARAMETERS)}")
-        # What an earlier version stored is without these.
+        # Checkpoints of earlier versions lack these.
         never = np.zeros(0, np.int64)
         between = np.tile(_NO_LIMITS, (len(findings), 1))
         added = {"dated_ns": never, "outside_ns": never, "between_ns": between, **arrays}

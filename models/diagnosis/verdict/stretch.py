@@ -4,8 +4,8 @@ Changes are held in the scale in which their errors are normal and do not depend
 ratio to nominal for stiffness and damping, the relative change itself for the eccentricity, which enters linearly. They
 are held as information: matrix J (the inverse covariance) and vector J x. Independent stretches add both.
 
-An error that all stretches share, as that of a commissioning, does not shrink when they are added. It is carried beside
-the information and comes in when a stretch is looked at (`Stretch.complete`).
+An error that all stretches share, such as that of a commissioning, does not shrink when they are added. It is carried
+beside the information and added when a stretch is judged (`Stretch.complete`).
 """
 
 import math
@@ -49,9 +49,9 @@ def slope(name: str, value: float) -> float:
     return 1.0 if name in _LINEAR else math.exp(value)
 
 
-@dataclass(frozen=True, eq=False)  # without slots: what is worked out is kept
+@dataclass(frozen=True, eq=False)  # without slots, as properties are cached
 class Stretch:
-    """What a stretch of data says."""
+    """What a stretch of data says about the parameters."""
 
     # Oldest and newest data.
     start_ns: int
@@ -61,18 +61,18 @@ class Stretch:
     misfit_z: float | None = None  # over-identification, standard normal where the model holds
     # (6, 6): covariance shared with every other stretch, not contained in `information`
     common: FloatArray | None = None
-    # Why nothing of it should be believed, see `Diagnosis`; of one window at most, sums do not say.
+    # Why nothing of it should be believed, see `Diagnosis`; only for one window at most, not for sums.
     unexplained: str = ""
-    unbalance: UnbalanceVector | None = None  # its unbalance with its direction; of one window at most, too
+    unbalance: UnbalanceVector | None = None  # unbalance with its direction; only for one window at most, too
 
     @cached_property
     def known(self) -> tuple[int, ...]:
-        """Indices into `PARAMETERS` of what was evaluable."""
+        """Indices into `PARAMETERS` of the evaluable parameters."""
         return tuple(int(i) for i in np.flatnonzero(self.information.diagonal() > 0))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What was evaluable."""
+        """Names of the evaluable parameters."""
         return tuple(PARAMETERS[i] for i in self.known)
 
     @property
@@ -92,20 +92,20 @@ class Stretch:
         return np.asarray(covariance @ self.vector[known], dtype=np.float64), covariance
 
     def blurred(self, standard_error: float) -> "Stretch":
-        """Return the same with an error, in their scale, added to every parameter that further data does not remove."""
+        """Return the stretch with an error that more data do not remove added to every parameter, in its scale."""
         return self._widened(standard_error**2 * np.eye(len(self.known)), self.common)
 
     def complete(self) -> "Stretch":
-        """Return the same with the shared error in its information: what may be said of this stretch alone."""
+        """Return the stretch with the shared error in its information, as needed to judge this stretch alone."""
         if self.common is None:
             return self
         known = list(self.known)
         return self._widened(self.common[np.ix_(known, known)], None)
 
     def believed(self) -> "Stretch":
-        """Return the same without what it reads as unbalance, if that is none.
+        """Return the stretch without its reading of e, if its 1x vectors are not those of an unbalance.
 
-        It stays part of what tells two conditions of a machine apart: a window of two rotors has vectors of neither.
+        Two conditions of a machine are still told apart with that reading: a window of both has the vectors of neither.
         """
         if self.unbalance is None or not self.unbalance.foreign:
             return self
@@ -178,7 +178,7 @@ def added(stretches: Sequence[Stretch]) -> Stretch:
     )
 
 
-_VAGUE = 0.2  # a larger standard error of a full window is no longer one: the reading says nothing
+_VAGUE = 0.2  # largest standard error in a full window with which a reading says anything
 _NO_PHASE = "no phase reference"
 _NO_ROTATION = f"{_NO_PHASE}, and no rotation found in the vibration: measure the shaft angle to have it judged"
 _NO_ROTOR = "cannot be told without the rotor's own parameters"
@@ -188,7 +188,7 @@ _PLANES = {"k_by": "y", "c_by": "y", "k_bz": "z", "c_bz": "z"}  # plane in which
 def determined(diagnosis: Diagnosis, window: WindowStatistics, length_s: float) -> Diagnosis:
     """Return the diagnosis with every parameter in the order of `PARAMETERS`, read or with the reason why not.
 
-    A stretch of a tenth of the window has three times its errors, and says as much as that.
+    The limit of the standard errors grows as they do: in a tenth of the window, errors are three times as large.
     """
     vague = _VAGUE * max(1.0, length_s / window.duration_s) ** 0.5
     found = {reading.name: reading for reading in diagnosis.parameters}
@@ -203,8 +203,8 @@ def determined(diagnosis: Diagnosis, window: WindowStatistics, length_s: float) 
 def with_shared_error(diagnosis: Diagnosis, covariance: FloatArray) -> Diagnosis:
     """Return the diagnosis with an error added that all windows share.
 
-    It is the covariance, shape (6, 6), of the values that changes are relative to, in the scale of the errors, in the
-    order of `PARAMETERS`.
+    `covariance`, shape (6, 6), is that of the values to which changes are relative, in the scale of the errors and in
+    the order of `PARAMETERS`.
     """
     readings = diagnosis.evaluable
     at = [PARAMETERS.index(reading.name) for reading in readings]
