@@ -404,7 +404,7 @@ class LikelihoodFit:
         return f"{self._machine.name}: the theory does not explain this window: {why}; {_OUTSIDE}"
 
     def _too_stiff(self, read: Diagnosis) -> str:
-        """Why a shaft that reads far too stiff shows that the file does not fit the machine; empty for any other."""
+        """Why no fault of the shaft explains how stiff it reads; empty if it does not read that stiff."""
         at = STRUCTURAL.index("EI")
         change, error = read.parameters[at].relative_change, read.parameters[at].standard_error
         if change is None or error is None or change - _SURELY * error < _STIFFEST:

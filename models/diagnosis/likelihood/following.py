@@ -184,7 +184,7 @@ class Linearised:
         return None
 
     def glance(self, observed: ComplexArray, share: float) -> Glance | None:
-        """Step from the latest maximum for a stretch with a share of the window's segments; None if they differ."""
+        """Take one step from the latest maximum for a stretch, a share of the window; None if it differs from that."""
         model, point = self.model, self._point
         rest = self._whitened(observed - point.S)
         gradient = _gradient(self.derivatives.slopes, rest, self.weights)

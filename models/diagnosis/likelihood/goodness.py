@@ -1,4 +1,4 @@
-"""Whether the theory explains a window at all (if not, its parameters mean nothing), and what else would explain it.
+"""Whether the theory explains a window (if not, parameters fitted to it mean nothing), and what else would explain it.
 
 At the maximum of the likelihood, deviations for which the model has no parameter are tested by their scores (C. R. Rao,
 Proc. Cambridge Phil. Soc. 44 (1948)): gain and delay of every channel, its sensitivity to the other plane, masses, and
@@ -25,7 +25,7 @@ from models.physics.rotor import PARAMETER_TEXT, STATE_INDEX, Q_shaft
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, parts_seen, state_name
 
-# Signs of the elements of the dynamic matrix that couple motions in y, and of those that couple motions in z.
+# Signs for the elements of the dynamic matrix: +1 where they couple motions in y, -1 where they couple motions in z.
 _SIGNS = np.kron([[1.0, 0.0], [0.0, -1.0]], np.ones((3, 3)))
 # Degree of freedom in y that each acts on; the one in z is three further on.
 _MASSES = {"mass at the bearing": 0, "mass of the disc": 1, "inertia of the disc": 2}

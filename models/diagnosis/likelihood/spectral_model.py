@@ -146,7 +146,7 @@ class SpectralModel:
         return _receptance(self._M, P, Q, w)
 
     def dynamic_changes(self, structural: FloatArray, w: float) -> ComplexArray:
-        """Derivatives of -ω²M + jωP + Q by the logarithmic ratios of `STRUCTURAL`, shape (5, 6, 6)."""
+        """Derivatives of -ω²M + jωP + Q with respect to the logarithmic ratios of `STRUCTURAL`, shape (5, 6, 6)."""
         changes = np.zeros((len(STRUCTURAL), 6, 6), dtype=np.complex128)
         for number, dof in enumerate(_BEARING_DOFS):
             changes[number, dof, dof] = (

@@ -91,7 +91,7 @@ def estimate_unbalance(
     sized : bool
         Whether the zero of the vector's angle is unknown, so that only its size counts: it is turned to the heavy spot.
     backward : bool
-        Whether the shaft turns from z to y although the speed is positive, as a speed found in the vibration always is.
+        Whether the shaft turns from z to y although the speed is positive (one found in the vibration always is).
 
     Raises
     ------

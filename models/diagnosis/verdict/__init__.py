@@ -1,1 +1,1 @@
-"""From readings to a verdict: thresholds, which set changed, when, and what would be noticed."""
+"""From readings to a verdict: thresholds, which parameters changed, when, and which changes are detectable."""

@@ -137,7 +137,7 @@ def _pair_price(first: float, n: int) -> float:
 def _alternatives(
     sets: tuple[tuple[int, ...], ...], known: tuple[int, ...], weight: FloatArray, explained: FloatArray
 ) -> tuple[Alternative, ...]:
-    """The likeliest sets, each parameter by itself, and none: what a reader would ask for."""
+    """The most probable sets, each parameter by itself, and the empty set: what a reader would ask for."""
     likeliest = np.argsort(-weight)[:_LIKELIEST].tolist()
     simple = [number for number, one in enumerate(sets) if len(one) < 2]
     return tuple(

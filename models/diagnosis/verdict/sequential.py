@@ -36,7 +36,7 @@ from rotorwatch.records.windows import Candidate, Finding, Parameter, Verdict
 # by more than 1.04.
 _SHORT_HOPS = (2, 4, 7)
 _DOUBLINGS = 6
-# Probability that stretches of an unchanged machine contradict each other at one hop, which costs only older data.
+# Probability that stretches of an unchanged machine contradict each other at one hop. It would cost only older data.
 _CONTRADICTION_RATE = 1e-7
 _PROBABLE = 0.05  # least probability with which a parameter is reported as one that may have changed
 # Least distance from zero, in standard errors, of a reading astride its change; a smaller one says more about the date

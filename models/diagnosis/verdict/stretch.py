@@ -92,7 +92,7 @@ class Stretch:
         return np.asarray(covariance @ self.vector[known], dtype=np.float64), covariance
 
     def blurred(self, standard_error: float) -> "Stretch":
-        """Return the stretch with an error that more data do not remove added to every parameter, in its scale."""
+        """Return the stretch with an error added to every parameter, in its scale, that more data do not remove."""
         return self._widened(standard_error**2 * np.eye(len(self.known)), self.common)
 
     def complete(self) -> "Stretch":
@@ -188,7 +188,8 @@ _PLANES = {"k_by": "y", "c_by": "y", "k_bz": "z", "c_bz": "z"}  # plane in which
 def determined(diagnosis: Diagnosis, window: WindowStatistics, length_s: float) -> Diagnosis:
     """Return the diagnosis with every parameter in the order of `PARAMETERS`, read or with the reason why not.
 
-    The limit of the standard errors grows as they do: in a tenth of the window, errors are three times as large.
+    The limit on standard errors grows in short stretches as they do: in a tenth of the window they are three times as
+    large.
     """
     vague = _VAGUE * max(1.0, length_s / window.duration_s) ** 0.5
     found = {reading.name: reading for reading in diagnosis.parameters}

@@ -1,6 +1,6 @@
 """Lines that are not the rotation, such as those of a neighbouring machine, a gear or whirl.
 
-A line has the same strength in every segment, noise has not: for a steady line the mean fourth power of the Fourier
+A line has the same strength in every segment, noise does not: for a steady line the mean fourth power of the Fourier
 coefficient is the square of the mean second power, for noise twice that. A line also turns by the same angle from each
 segment to the next, while a resonance loses its phase: the coherence of successive segments is 1 for a line, and c or
 more for n segments of noise with the probability (1 - c²)ⁿ⁻¹. A line too faint to be certain in one window is certain
@@ -39,7 +39,7 @@ _CHANCE = 1e-9
 _NEARLY_ALL, _OTHER_WAY, _TURNS = 0.8, 0.2, 1.5
 """Least part that turns one way, largest part of that which turns the other way, and least number of turns."""
 _LOUD, _SAME = 0.02, 0.02
-"""Part of a channel's random power above which a new line is reported, and relative tolerance for the same line."""
+"""Part of a channel's random power above which a new line is reported, and relative distance of one and the same."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -161,7 +161,7 @@ class SlidingWindow:
     def recall(self, samples: SampleArray, start_ns: int, *, newest: bool) -> None:
         """Take a block again, as received, that was in the window when `checkpoint` was called.
 
-        `newest` says that no later block came before then: everything may be complete now.
+        `newest` says that there was no later block: everything may be complete now.
         """
         if self._recall is None:
             return

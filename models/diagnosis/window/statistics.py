@@ -33,7 +33,7 @@ from models.signals.waveform import Waveform, stacked_waveform
 _DRIFT = 0.1  # drift of a channel's mean, over its rms, above which every hop's own mean is removed
 _VARIED = 0.06  # relative range of a speed found in the vibration up to which levels at its multiples are taken
 _LOBE = 2  # bins to either side over which a Hann window spreads a line
-_BESIDE = 3  # bins on either side of a line over whose means the spectra are interpolated
+_BESIDE = 3  # bins on either side of a line between whose means the spectra are interpolated
 _SMOOTH = 0.5  # largest ratio of a drift's squared steps from hop to hop to its squared deviations; 2 by chance
 
 
@@ -76,7 +76,7 @@ class WindowStatistics:
     # itself a segment later: 0 for noise, 1 for a line. None without a phase reference
     phase_kept: FloatArray | None
     duration_s: float  # length of the data in the window
-    # Of the samples of each hop, with a column for each of `sensors`, those of `states` first.
+    # Waveform of the samples of each hop, with a column for each of `sensors`, those of `states` first.
     waveforms: tuple[Waveform, ...]
     sensors: tuple[str, ...]
     # (n_pairs, n_bands, 3): powers of the motions that are measured twice, of each hop (`motion.py`)
