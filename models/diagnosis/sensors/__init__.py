@@ -1,1 +1,1 @@
-"""Sensor faults told from machine faults: what each channel's samples and what pairs of channels say."""
+"""Sensor faults, distinguished from machine faults by each channel's samples and by comparing pairs of channels."""

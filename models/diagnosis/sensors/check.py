@@ -17,7 +17,7 @@ from models.signals.channels import Channel
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
-_ALL = 0.999  # of a window
+_ALL = 0.999  # part of a window from which on its shaft angle counts as missing throughout
 
 
 def sensor_findings(
@@ -30,17 +30,17 @@ def sensor_findings(
 ) -> tuple[SensorFault, ...]:
     """Check the sensors of a window.
 
-    Without a reference only what is impossible for any healthy sensor is found. A channel that is missing, stuck or
-    clipped is not looked at further; where the shaft angle jumps, slips or jitters, channels are not compared: what
-    turns with the shaft stays among what they share. Nor are they where the angle is missing from a part of the window,
-    or where the machine stood in it; no angle has to turn then. Without any angle none is found incoherent or noisy.
+    Without a reference only faults that no healthy sensor can show are found. A channel that is missing, stuck or
+    clipped is not checked further. Channels are not compared with each other while the shaft angle jumps, slips or
+    jitters or is missing from part of the window, because the synchronous part then remains in their spectra, nor where
+    the machine stood, when the angle need not turn either. Without any angle, no channel is found incoherent or noisy.
     """
     window, naming = window.as_mounted, Naming(channels)
     stood = np.full(len(window.waveforms), True) if standing else runs_down(window)
     bare = implicated(missing)
     still = [*stuck(window, naming, stood), *dropped(window, naming)]
     findings = [*missing, *(found for found in still if not set(found.states) & bare)]
-    lost = implicated(findings)  # where a channel falls to the end of its range it is not cut off there
+    lost = implicated(findings)  # a channel that drops to the end of its range is not clipped
     findings += [found for found in clipped(window, naming) if not set(found.states) & lost]
     wrong_angle = [] if "theta" in bare else no_angle(window, naming)
     if stood.any() or wrong_angle:
@@ -50,7 +50,7 @@ def sensor_findings(
         findings += [found for found in check(window, naming, reference) if not set(found.states) & bad]
     bad = implicated(findings)
     if any("theta" in one.states and (one.value or 0.0) < _ALL * window.duration_s for one in missing):
-        return tuple(findings)  # where the angle comes or goes, what turns with the shaft is left in a hop
+        return tuple(findings)  # a hop in which the angle comes or goes keeps its synchronous part
 
     def sound(*columns: int) -> bool:
         return not {window.states[column] for column in columns} & bad
@@ -75,7 +75,7 @@ def sensor_findings(
             readings.append(reading)
             continue
         if "theta" in bad:
-            continue  # run-out, which turns with the shaft, is in the displacement alone
+            continue  # the synchronous part is still there, and its run-out is in the displacement alone
         text = (
             f"{naming.name(second)} and {naming.name(first)} measure the same motion but share only "
             f"{reading.shared:.2f} of it, expected nearly 1: noise, a loose sensor, or a wrong channel"
@@ -85,6 +85,6 @@ def sensor_findings(
     findings += gain_and_delay(window, readings, bands, naming, reference)
     findings += [found for found in gain_jump(window, naming) if not set(found.states) & bad]
     bad = implicated(findings)
-    if "theta" not in bad:  # what a wrong angle leaves in the spectra looks like noise
+    if "theta" not in bad:  # the synchronous part that a wrong angle leaves in the spectra looks like noise
         findings += noisy(window, readings, bands, naming, reference, sound)
     return tuple(findings)

@@ -1,4 +1,4 @@
-"""Two sensors of a motion that disagree: gain or delay of one of them, or channels that changed places."""
+"""Two sensors of one motion that disagree: wrong gain or delay of one of them, or swapped channels."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,24 +15,25 @@ from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
 MOST_ERRORS = 5.0  # standard errors beyond which two sensors disagree
-# Gains that differ by less are calibration where there is no reference; with one, changes that are smaller.
+# Smaller relative differences of gain are put down to calibration: without a reference, and from the reference.
 LEAST_GAIN, LEAST_GAIN_CHANGE = 0.06, 0.015
-LEAST_COURSE = 0.02  # change of the gain within a window that is not reported
-# The same for delays. A delay of a quarter of a millisecond already reads as a quarter of a bearing's damping.
+LEAST_COURSE = 0.02  # smaller relative changes of the gain within a window are not reported
+# Smaller delays are not reported, without and with a reference. A delay of 0.25 ms already shifts the estimate of a
+# bearing's damping by a quarter.
 LEAST_DELAY_S, LEAST_DELAY_CHANGE_S = 1e-4, 3e-5
-# Phase times angular frequency by which one of two may run ahead of the other: behind a high-pass with its corner at
+# Largest allowed phase lead of one sensor over the other, times angular frequency: that of a first-order high-pass at
 # 1.1 Hz. At 1 Hz no parameter of machines of 15 to 40 Hz was taken for changed, at 2 Hz damping read up to 16 % more.
 MOST_LEAD_RAD_S = 7.0
-# Of a disagreement, the channel that accounts for it shows all but this part, and the other one less than it.
+# The faulty channel's own change must match the disagreement within this part of it, and the other's stay below it.
 _ALIKE = 1 / 3
 _SAME_SPEED = 0.01
 _TOGETHER = 0.5  # coherence of bearing and disc across the planes, and how much less it must be within them
-_SURE = 0.2  # standard error of a channel's own change, as a part of the disagreement, up to which it may convict
+_SURE = 0.2  # largest standard error of a channel's own change, as part of the disagreement, that may name a sensor
 
 
 @dataclass(frozen=True, slots=True)
 class _Departure:
-    """How a pair differs from what was expected of it."""
+    """A pair's reading less its reference, or less zero without one."""
 
     reading: PairReading
     log_gain: float
@@ -53,7 +54,7 @@ def gain_and_delay(
     naming: Naming,
     reference: SensorReference | None,
 ) -> list[SensorFault]:
-    """Findings on pairs that do see the same motion, but not at the same size or time."""
+    """Findings on pairs that see the same motion but differ in gain or delay."""
     departures = {reading.pair: _departure(window, reading, bands[reading.pair], reference) for reading in readings}
     rate_hz = window.n_samples / window.duration_s
     findings: list[SensorFault] = []
@@ -62,7 +63,7 @@ def gain_and_delay(
         least_delay = LEAST_DELAY_CHANGE_S if departure.known else LEAST_DELAY_S
         steady = departure.gain_z > MOST_ERRORS and abs(np.expm1(departure.log_gain)) > least_gain
         late = departure.delay_z > MOST_ERRORS and abs(departure.delay_s) > least_delay
-        if late:  # of two delays in turn, the mean is smaller than either, and passes for a gain
+        if late:  # alternating delays partly cancel, which looks like a loss of gain
             step_s, z = _largest_part(*delay_course(window, departure.reading, bands[departure.reading.pair]))
             steady &= not (z > MOST_ERRORS and abs(step_s) > least_delay)
         moving = departure.course_z > MOST_ERRORS and abs(departure.course_step) > LEAST_COURSE
@@ -98,7 +99,7 @@ def _departure(
 
 
 def _largest_part(course: FloatArray, error: FloatArray) -> tuple[float, float]:
-    """Largest difference between the hops before and after a moment, and its size in standard errors."""
+    """Most significant difference of the means after and before a hop boundary, and its size in standard errors."""
     n = course.size
     if n < 4:
         return 0.0, 0.0
@@ -178,7 +179,7 @@ def _delay(
 
 
 def _ahead(window: WindowStatistics, reading: PairReading, bands: Banded, naming: Naming) -> SensorFault:
-    """One of two runs ahead as behind a high-pass: what it comes too early by is that at the frequencies that count."""
+    """Finding on a sensor that leads as behind a high-pass; its value is the lead in s, weighted with the power."""
     pair, power = reading.pair, bands.spectra[:, 1, 1].real
     guilty, other = (pair.second, pair.first) if reading.lead_rad_s > 0 else (pair.first, pair.second)
     state, lead_rad_s = window.states[guilty], abs(reading.lead_rad_s)
@@ -195,7 +196,7 @@ def _ahead(window: WindowStatistics, reading: PairReading, bands: Banded, naming
 def _by_chain(
     departure: _Departure, departures: dict[MotionPair, _Departure], kind: FaultKind, *, moving: bool
 ) -> int | None:
-    """With three sensors of a motion, the two that still agree convict the third."""
+    """Faulty column of three sensors of one motion: the one that disagrees while the other two agree."""
     pair = departure.reading.pair
     for other, theirs in departures.items():
         if other == pair or not {other.first, other.second} & {pair.first, pair.second}:
@@ -215,7 +216,7 @@ def _by_chain(
 
 
 def _by_level(window: WindowStatistics, departure: _Departure, reference: SensorReference | None) -> int | None:
-    """The one whose rotation departs from its healthy amplitude by just the disagreement, while the other's stays."""
+    """Column whose 1x amplitude departs from the healthy one by the disagreement, while the other's stays."""
     vectors = window.rotation_vectors
     if vectors is None or reference is None or reference.speed_rad_s is None:
         return None
@@ -236,7 +237,7 @@ def _by_level(window: WindowStatistics, departure: _Departure, reference: Sensor
 
 
 def _by_course(window: WindowStatistics, departure: _Departure) -> int | None:
-    """The one whose own level went along with the gain from hop to hop: of its rotation, or against other places'."""
+    """Column whose own level (its 1x amplitude, or its rms over other places' rms) follows the gain from hop to hop."""
     pair, course = departure.reading.pair, departure.course - departure.course.mean()
     power = float(course @ course)
     if not power > 0:
@@ -248,7 +249,7 @@ def _by_course(window: WindowStatistics, departure: _Departure) -> int | None:
     others = [column for column, name in enumerate(window.states) if name.partition("_")[0] != own]
     levels = [rms[:, columns] - (rms[:, others].mean(axis=1, keepdims=True) if others else 0.0)]
     vectors = window.rotation_vectors
-    if vectors is not None and not window.removed_by_hop:  # at another speed the amplitude is another one
+    if vectors is not None and not window.removed_by_hop:  # the amplitude depends on the speed
         levels.append(np.log(np.maximum(np.abs(vectors[:, columns]), tiny)))
     best, least = None, _SURE
     for level in levels:
@@ -270,7 +271,7 @@ def _one_of(departure: _Departure, changes: list[float], size: float) -> int | N
 
 
 def _once(findings: list[SensorFault]) -> list[SensorFault]:
-    """The same fault of the same channel once, as its clearest pair shows it."""
+    """Each fault of the same channels once, as found with the largest z."""
     best: dict[tuple[tuple[str, ...], str], SensorFault] = {}
     for finding in sorted(findings, key=lambda one: -(one.z or 0.0)):
         best.setdefault((finding.states, finding.kind), finding)
@@ -278,10 +279,11 @@ def _once(findings: list[SensorFault]) -> list[SensorFault]:
 
 
 BROKEN = 0.9  # two sensors of one motion that share less than this do not see the same motion
-_SUSPECT = 0.985  # below this they may see each other's: two places of a stiff shaft move much alike
-_RESTORED = 0.97  # what every pair must share again after the exchange, unless less was usual when healthy
-_CLEARLY = 5.0  # how much smaller the exchange must make what the worse of the pairs does not share
-# Relative difference of rotation vectors that tells which of two exchanges restores the healthy pattern.
+_SUSPECT = 0.985  # below this, channels may be swapped: two places of a stiff shaft move much alike
+_RESTORED = 0.97  # part that both pairs must share after the exchange, relative to the healthy one
+_CLEARLY = 5.0  # factor by which the exchange must reduce the part that the worse pair does not share
+# Two channels count as exchanged if their 1x amplitudes differ from each other's healthy ones by less than this part of
+# the difference from their own.
 _CROSSED = 0.25
 
 
@@ -293,7 +295,7 @@ def _usual(reference: SensorReference | None, first: str, second: str) -> float:
 def suspect_pairs(
     states: tuple[str, ...], bands: Mapping[MotionPair, Banded], reference: SensorReference | None
 ) -> list[MotionPair]:
-    """Pairs that at any one time show less of the same motion than two sensors of one motion do."""
+    """Pairs that share too little of their motion, at equal time and size, to be two sensors of one motion."""
     return [
         pair
         for pair, own in bands.items()
@@ -304,7 +306,7 @@ def suspect_pairs(
 def swapped(
     window: WindowStatistics, broken: list[MotionPair], naming: Naming, reference: SensorReference | None
 ) -> tuple[list[SensorFault], set[MotionPair]]:
-    """Find the exchange of two channels of one quantity that restores broken pairs, which need no other explanation."""
+    """Find exchanges of two channels of one quantity that restore broken pairs; return them and the explained pairs."""
     findings: list[SensorFault] = []
     explained: set[MotionPair] = set()
     for one, other in combinations(broken, 2):
@@ -335,9 +337,10 @@ def swapped(
 
 
 def crossed_planes(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
-    """Find bearing and disc that move together across the planes and not within them; nothing where one source does.
+    """Find bearing and disc channels that are coherent across the planes but not within them, as swapped channels are.
 
-    Bearings and unbalance couple a shaft's planes weakly: what moves the bearing in one moves the disc in the same.
+    Bearings and unbalance couple the planes of a shaft only weakly: a force in one plane moves bearing and disc in it.
+    Nothing is found if one source moves both planes, as then the channels are coherent within them, too.
     """
     column = {name.split("_")[0]: number for number, name in enumerate(window.states)}
     if not {"y1", "z1", "y2", "z2"} <= column.keys():
@@ -366,7 +369,11 @@ def crossed_planes(window: WindowStatistics, naming: Naming) -> list[SensorFault
 def _guilty(
     window: WindowStatistics, sides: list[tuple[int, int]], broken: list[MotionPair], reference: SensorReference | None
 ) -> int | None:
-    """Which side was exchanged: the one that breaks two pairs of a chain of three, or whose rotation is the other's."""
+    """Which side was exchanged, 0 or 1; None if unclear.
+
+    It is the side whose channels break two pairs each in a chain of three sensors, or whose 1x amplitudes are each
+    other's healthy ones.
+    """
     for number, side in enumerate(sides):
         if all(sum(column in (pair.first, pair.second) for pair in broken) > 1 for column in side):
             return number
@@ -382,13 +389,13 @@ def _guilty(
 
 
 def _agrees(window: WindowStatistics, side: int, column: int) -> bool:
-    """Whether a column still agrees with one that it shares a pair with on the side away from the broken pair."""
+    """Whether a column still agrees with a third sensor of its motion, on the side away from the broken pair."""
     pairs = [pair for pair in motion_pairs(window.states) if column == (pair.first if side else pair.second)]
     return any(same(banded(window, pair)) > _RESTORED for pair in pairs)
 
 
 def _exchanged(window: WindowStatistics, sizes: FloatArray, side: tuple[int, int], reference: SensorReference) -> bool:
-    """Whether the rotation's amplitudes at two channels are the healthy ones of each other and not their own."""
+    """Whether the 1x amplitudes of two channels match each other's healthy ones rather than their own."""
     known = [reference.channel(window.states[column]) for column in side]
     first, second = (None if one is None else one.rotation for one in known)
     if not first or not second:

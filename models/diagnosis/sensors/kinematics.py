@@ -1,11 +1,11 @@
 """Gain and delay between two sensors of one motion: v = jωx, whatever the machine does.
 
-Sensor noise makes |S_xv| / S_xx too small and S_vv / |S_xv| too large. What the other places of the machine have in
-common with the motion is free of both noises, so it serves as the instrument: h = S_wv / S_wx. Where there is no other
-place, the two biased ratios bracket the gain. The rotation-synchronous vectors add a line with little noise on it.
+Sensor noise makes |S_xv| / S_xx too small and S_vv / |S_xv| too large. The signals w at the machine's other places
+contain neither noise, so they serve as instrumental variables: h = S_wv / S_wx. Without any other place, the two biased
+ratios bracket the gain. The rotation-synchronous vectors add one more frequency, with little noise.
 
-A sensor or amplifier that is AC-coupled, as all that measure a rate on a casing are, runs ahead: well above the corner
-of its high-pass by a phase that falls as one over the frequency, where a delay's grows with it.
+AC-coupled sensors and amplifiers, including all that measure a rate on a casing, lead. Well above the corner of the
+high-pass the lead in phase falls as 1/frequency, whereas the lag of a delay grows in proportion to the frequency.
 """
 
 import math
@@ -19,39 +19,40 @@ from models.diagnosis.window.motion import MotionPair, motion_pairs, pair_bands
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 
-LONGEST_DELAY_S = 0.02  # longest delay that is looked for
+LONGEST_DELAY_S = 0.02  # longest delay searched for
 _DELAY_STEP_S = 2.5e-4
-_AS_GOOD = 0.98  # a shorter delay that fits this well is preferred: a narrow band repeats itself after a period
-# Standard errors within which the rotation must agree with the rest of the motion, in size and in time, or it is not
-# counted: run-out, and what a sensor sees of the other plane, which turns a quarter turn later.
+# The shortest delay with at least this part of the best fit is taken: narrow-band signals fit again a period later.
+_AS_GOOD = 0.98
+# The 1x vectors are used only if gain and delay with them agree with those without within so many standard errors:
+# run-out falsifies them, and so does cross-axis sensitivity, as the other plane's 1x comes a quarter turn later.
 _LINE_FITS = 5.0
-_RUNOUT = 0.03  # logarithm of the gain by which the rotation must differ besides
-_TOLD_APART = 2 * math.log(1e3)  # of squares in standard errors: phases are a thousand times likelier so than otherwise
-_MOST_ACROSS = 0.15  # part of the other plane's motion that a sensor may show: more is another fault, or none of these
+_RUNOUT = 0.03  # least difference in log gain, too, for the 1x vectors to be rejected for it
+_TOLD_APART = 2 * math.log(1e3)  # least fall in chi-square by which one model of the phases is preferred: 1000:1
+_MOST_ACROSS = 0.15  # largest cross-axis sensitivity that is corrected for: more has another cause
 _PLANES, _RATES = str.maketrans("yz", "zy"), {"": 0, "dot": 1, "ddot": 2}
-_HANN_LOSS = 0.95  # part of the data's information that is left in half-overlapping Hann segments
+_HANN_LOSS = 0.95  # part of the data's information that half-overlapping Hann segments keep
 _FLOOR = 1e-10
 
 
 @dataclass(frozen=True, slots=True)
 class PairReading:
-    """What two sensors of one motion say of each other."""
+    """Gain and delay of the second sensor of a motion relative to the first."""
 
     pair: MotionPair
     # Logarithm of the second's gain over the first's, and its standard error.
     log_gain: float
     log_gain_error: float
-    polarity: int  # -1 where one of them is reversed
-    # By how much the second comes later.
+    polarity: int  # -1 if one of them is reversed
+    # Delay of the second, and its standard error.
     delay_s: float
     delay_error_s: float
-    # Phase by which the second runs ahead besides, times the angular frequency; 0 unless that explains the phases and
-    # a delay does not. Behind a high-pass of first order that is its corner.
+    # Additional phase lead of the second times the angular frequency; 0 unless that explains the phases and a delay
+    # does not. For a first-order high-pass this is the corner frequency.
     lead_rad_s: float
-    shared: float  # how much of the motion they share after gain and delay, 0 to 1, over the whole band
+    shared: float  # coherent part of the motion after matching gain and delay, 0 to 1, over the whole band
 
     def transfer(self, w: FloatArray) -> ComplexArray:
-        """What turns z into v at angular frequencies."""
+        """Transfer function from z to v at angular frequencies `w`."""
         phase = self.lead_rad_s / w - w * self.delay_s
         return np.asarray(self.polarity * np.exp(self.log_gain + 1j * phase), dtype=np.complex128)
 
@@ -60,17 +61,17 @@ class PairReading:
 class Banded:
     """Cross-spectra of z = (jω)ᵒʳᵈᵉʳ x, of v and of the other places, in bands; index 0 is z, 1 is v."""
 
-    # (n_bands, 2 + n_others, 2 + n_others): ``spectra[b, i, j]`` = E{a_i a_j*}, without the rotation
+    # (n_bands, 2 + n_others, 2 + n_others): ``spectra[b, i, j]`` = E{a_i a_j*}, without the synchronous part
     spectra: ComplexArray
-    total: ComplexArray  # (n_bands, 2, 2), the same of z and v with the rotation
-    w: FloatArray  # (n_bands,), angular frequency around which each band's power lies
-    averages: FloatArray  # (n_bands,), effectively independent samples
-    # Mean speed, and the rotation's z and v in every hop where it is known, shape (n_hops, 2); None if in none
+    total: ComplexArray  # (n_bands, 2, 2), the same for z and v, including the synchronous part
+    w: FloatArray  # (n_bands,), angular frequency at the centroid of each band's power
+    averages: FloatArray  # (n_bands,), number of effectively independent samples
+    # Mean speed, and the 1x vectors of z and v in each hop of known speed, shape (n_hops, 2); None without 1x vectors
     rotation: tuple[float, ComplexArray] | None
 
 
 def banded(window: WindowStatistics, pair: MotionPair) -> Banded:
-    """Average the window's spectra over bands, with the first channel turned into what the second measures."""
+    """Average the window's spectra over bands, with the first channel differentiated to the second's quantity."""
     w = 2 * np.pi * window.frequencies_hz
     columns = np.array([pair.first, pair.second, *_others(window.states, pair)])
     edges = pair_bands(w.size)
@@ -99,7 +100,7 @@ def banded(window: WindowStatistics, pair: MotionPair) -> Banded:
 
 
 def _rotation(window: WindowStatistics, pair: MotionPair) -> tuple[float, ComplexArray] | None:
-    """Mean speed, and the rotation's z and v in every hop where it is known, shape (n_hops, 2)."""
+    """Mean speed, and the 1x vectors of z and v in each hop of known speed, shape (n_hops, 2)."""
     vectors = window.rotation_vectors
     if vectors is None:
         return None
@@ -111,7 +112,7 @@ def _rotation(window: WindowStatistics, pair: MotionPair) -> tuple[float, Comple
 
 
 def _others(states: tuple[str, ...], pair: MotionPair) -> list[int]:
-    """One column of every other place."""
+    """First column of each place other than the pair's."""
     own = states[pair.first].partition("_")[0]
     first: dict[str, int] = {}
     for column, name in enumerate(states):
@@ -120,26 +121,26 @@ def _others(states: tuple[str, ...], pair: MotionPair) -> list[int]:
 
 
 def same(bands: Banded) -> float:
-    """How much of the motion two sensors show alike: same time, same size, same sense; 1 if all, below 0 if opposed."""
+    """Part of the motion that two sensors show with equal timing, size and sense; 1 if all, negative if opposed."""
     z, v, cross = _even(bands)
     return float(2 * cross.sum().real / (z + v)) if z > 0 and v > 0 else 0.0
 
 
 def _even(bands: Banded) -> tuple[float, float, ComplexArray]:
-    """Powers halfway between displacement and velocity: neither's noise is blown up at one end of the band."""
+    """Powers of z and v, and cross-powers per band, over ω: amplifies neither's noise at an end of the band."""
     z, v = bands.total[:, 0, 0].real / bands.w, bands.total[:, 1, 1].real / bands.w
     return float(z.sum()), float(v.sum()), np.asarray(bands.total[:, 1, 0] / bands.w, dtype=np.complex128)
 
 
 def _turned(w: FloatArray, cross: ComplexArray) -> tuple[float, float]:
-    """Delay that brings the cross-powers into line, and their sum then; it is negative where one is reversed."""
+    """Delay that brings the cross-powers into phase, and their sum then; negative if one sensor is reversed."""
     reach = round(LONGEST_DELAY_S / _DELAY_STEP_S)
     delays = _DELAY_STEP_S * np.arange(-reach, reach + 1)
     turns = np.cumprod(np.broadcast_to(np.exp(1j * _DELAY_STEP_S * w), (reach, w.size)), axis=0)
     sums = np.real(np.concatenate([turns[::-1].conj() @ cross, [cross.sum()], turns @ cross]))
     good = np.flatnonzero(np.abs(sums) >= _AS_GOOD * np.abs(sums).max())
     best = int(good[np.argmin(np.abs(delays[good]))])
-    # Climb from there: the first one that is as good lies on the slope of its peak.
+    # Climb to the peak from there: the shortest delay that fits well enough lies on its slope.
     while 0 < best < delays.size - 1 and np.abs(sums[best - 1 : best + 2]).argmax() != 1:
         best += int(np.abs(sums[best - 1 : best + 2]).argmax()) - 1
     return float(delays[best]), float(sums[best])
@@ -148,9 +149,9 @@ def _turned(w: FloatArray, cross: ComplexArray) -> tuple[float, float]:
 def read_pair(
     window: WindowStatistics, pair: MotionPair, bands: Banded | None = None, lead_rad_s: float | None = None
 ) -> PairReading | None:
-    """Compare two sensors of one motion, `banded` already or not; None if one of them shows no fluctuation.
+    """Compare two sensors of one motion, from given `banded` spectra or new ones; None if either does not fluctuate.
 
-    The lead is that of the healthy pair; without it, what these data say of it.
+    `lead_rad_s` is the lead of the healthy pair; if None, it is estimated from the window.
     """
     bands = banded(window, pair) if bands is None else bands
     z, v = bands.spectra[:, 0, 0].real, bands.spectra[:, 1, 1].real
@@ -186,7 +187,7 @@ def read_pair(
 
 
 def _fitted(start: PairReading, w: FloatArray, h: ComplexArray, variance: FloatArray, bias: FloatArray) -> PairReading:
-    """Gain and delay that fit the transfer of all bands best, from a first guess."""
+    """Weighted least-squares fit of gain and delay to the transfer functions of all bands, from a first guess."""
     log_gain, delay_s, weight = start.log_gain, start.delay_s, 1 / variance
     y, jw, total, by_delay = h * start.polarity, 1j * w, float(weight.sum()), weight * w
     moment, right_way = float(by_delay @ w), y
@@ -203,7 +204,7 @@ def _fitted(start: PairReading, w: FloatArray, h: ComplexArray, variance: FloatA
 
 
 def _other_plane(window: WindowStatistics, pair: MotionPair, bands: Banded) -> ComplexArray | None:
-    """What the same place does in the other plane, over z, shape (n_bands,); None where it is not measured."""
+    """Transfer function from z to the same place's motion in the other plane, (n_bands,); None if not measured."""
     others = _others(window.states, pair)
     own, _, order = window.states[pair.second].partition("_")
     for at, column in enumerate(others, 2):
@@ -218,12 +219,13 @@ def _other_plane(window: WindowStatistics, pair: MotionPair, bands: Banded) -> C
 def _across(
     alone: PairReading, other: ComplexArray | None, w: FloatArray, h: ComplexArray, variance: FloatArray
 ) -> ComplexArray | None:
-    """What one of the two shows of the other plane, in the transfer; None unless that and nothing else explains it.
+    """Contribution of the other plane to the transfer function; None unless it fits beyond gain, delay and lead.
 
-    One that is turned, or sensitive across its axis, shows a small part: where one force moves both planes, that is in
-    the transfer, large where its own plane hardly moves, and passes for a gain or a delay.
+    A sensor that is mounted at an angle or sensitive across its axis shows a small part of the other plane's motion. If
+    one force moves both planes, that part distorts the transfer, most at frequencies where the sensor's own plane
+    hardly moves, and would be mistaken for a gain or a delay.
     """
-    if other is None or not other.any():  # nor does a sensor that is stuck show anything of it
+    if other is None or not other.any():  # a stuck sensor of the other plane gives zeros
         return None
     expected = alone.transfer(w)
     aim, seen = h / expected - 1, other / expected
@@ -242,7 +244,7 @@ def _across(
 
 
 def _lead(alone: PairReading, w: FloatArray, h: ComplexArray, variance: FloatArray) -> float:
-    """Phase by which the second runs ahead, times w, where that explains the phases of all bands and no delay does."""
+    """Phase lead of the second times w; 0 unless it explains the phases of all bands better than a delay."""
     weight, ahead = 2 / variance, np.angle(alone.polarity * h)
     lead_rad_s = float(weight @ (ahead / w) / (weight @ w**-2.0))
     late = np.angle(h / alone.transfer(w))
@@ -254,7 +256,7 @@ def _lead(alone: PairReading, w: FloatArray, h: ComplexArray, variance: FloatArr
 def _line(
     rotation: tuple[float, ComplexArray], window: WindowStatistics, bands: Banded, incoherent: FloatArray
 ) -> tuple[float, complex, float] | None:
-    """Speed, transfer and its relative variance at the rotation, where the vectors hold little but sensor noise."""
+    """Speed, and transfer at 1x with its relative variance, from the 1x vectors; None if z has no 1x power."""
     speed, vectors = rotation
     power = float(np.sum(np.abs(vectors[:, 0]) ** 2))
     if not (power > 0 and np.isfinite(power)):
@@ -266,7 +268,7 @@ def _line(
 
 
 def _transfer(bands: Banded, incoherent: FloatArray) -> tuple[ComplexArray, FloatArray, FloatArray]:
-    """Transfer from z to v in each band, its relative variance, and how far noise may have biased it."""
+    """Transfer from z to v in each band, its relative variance, and the largest bias of its logarithm by noise."""
     S = bands.spectra
     z, v, cross = S[:, 0, 0].real, S[:, 1, 1].real, S[:, 1, 0]
     bracketed = np.sqrt(v / z) * cross / np.maximum(np.abs(cross), _FLOOR * np.sqrt(z * v))
@@ -277,10 +279,10 @@ def _transfer(bands: Banded, incoherent: FloatArray) -> tuple[ComplexArray, Floa
     scale = 1 / np.sqrt(np.maximum(np.einsum("bii->bi", S).real, np.finfo(float).tiny))
     unit = S * scale[:, :, None] * scale[:, None, :]
     others = unit[:, 2:, 2:] + 1e-9 * np.eye(S.shape[1] - 2)
-    a = np.linalg.solve(others, unit[:, 2:, :1])[:, :, 0]  # how the other places say z moves, z = aᴴ w
+    a = np.linalg.solve(others, unit[:, 2:, :1])[:, :, 0]  # prediction of z from the other places: z = aᴴ w
     seen = np.einsum("bi,bi->b", a.conj(), unit[:, 2:, 0]).real
     own = np.einsum("bi,bi->b", a.conj(), unit[:, 2:, 1])
-    overfit = (S.shape[1] - 2) / bands.averages  # of pure noise, the others would explain as much
+    overfit = (S.shape[1] - 2) / bands.averages  # part that the others would explain of pure noise
     explained = np.clip((seen - overfit) / (1 - np.minimum(overfit, 0.9)), 1e-6, 1.0)
     h = (own.conj() / np.maximum(seen, _FLOOR)) * scale[:, 0] / scale[:, 1]
     left = np.minimum(half * overfit / np.maximum(seen, _FLOOR), half)
@@ -290,14 +292,14 @@ def _transfer(bands: Banded, incoherent: FloatArray) -> tuple[ComplexArray, Floa
 def gain_courses(
     window: WindowStatistics, reading: PairReading, bands: Banded
 ) -> tuple[tuple[FloatArray, FloatArray], ...]:
-    """Relative deviation of the pair's gain from its mean, hop by hop, and each hop's standard error, in two ways.
+    """Relative deviation of the pair's gain from its median, hop by hop, and each hop's standard error, in two ways.
 
-    The noise of the sensors stays as it is while the motion comes and goes: where a machine runs down it is more and
-    more of what they show, and where a line of its own begins it is less. The ratio of a hop follows, and is less
-    certain. A band in which the usual hop shows nothing but noise does not say what has become of the gain.
+    Sensor noise is constant while the motion varies: its share of the signal grows as a machine runs down and shrinks
+    when a line appears. The ratio of such a hop is biased accordingly, so its standard error is increased. Bands that
+    show only noise in the usual hop carry hardly any weight.
 
-    The first way takes what the sensors share over the power of the first, which more noise of the first makes smaller,
-    the second over that of the second: a change of the gain is in both, and one of a sensor's noise in one of them.
+    The first way divides the cross-power by the power of the first sensor, so noise of the first lowers it; the second
+    way divides by the power of the second. A change of gain shows in both, a change of one sensor's noise in one.
     """
     number = motion_pairs(window.states).index(reading.pair)
     z, v = bands.total[:, 0, 0].real, bands.total[:, 1, 1].real
@@ -314,10 +316,10 @@ def gain_courses(
 def _course(
     common: FloatArray, power: FloatArray, incoherent: FloatArray, averages: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Relative deviation of a ratio of powers, shape (n_hops, n_bands), over all bands; standard error of each hop."""
+    """Relative deviation of a ratio of powers, each (n_hops, n_bands), averaged over the bands; its standard error."""
     own = np.maximum(power, np.finfo(float).tiny)
     ratio = common / own
-    # Each band about its own mean: what noise takes from the ratio is the same in all hops that are as loud.
+    # Each band about its own median: noise lowers the ratio equally in all hops of equal level.
     course = ratio / np.median(ratio, axis=0) - 1
     noise = np.minimum(incoherent * own.mean(axis=0) / own, 1.0)
     kept = np.maximum(1 - noise, 1e-6)
@@ -330,12 +332,12 @@ def _course(
 
 
 def delay_course(window: WindowStatistics, reading: PairReading, bands: Banded) -> tuple[FloatArray, FloatArray]:
-    """By how much the second comes later than the reading says, hop by hop, and the standard error of each hop, s."""
+    """Delay of the second beyond that of the reading, hop by hop, and the standard error of each hop, s."""
     number = motion_pairs(window.states).index(reading.pair)
     powers = np.stack([hop[number] for hop in window.pair_powers])
     common = powers[:, :, 1] * reading.transfer(bands.w).conj()
     coherent = np.abs(common) ** 2 / np.maximum(powers[:, :, 0].real * powers[:, :, 2].real, np.finfo(float).tiny)
     weight = coherent / np.maximum(1 - coherent, _FLOOR) * bands.w**2 * bands.averages / len(powers)
-    total = np.maximum(weight.sum(axis=1), np.finfo(float).tiny)  # a hop in which one of them is dead says nothing
+    total = np.maximum(weight.sum(axis=1), np.finfo(float).tiny)  # avoid 0 / 0 in a hop with a dead sensor
     course = -np.sum(weight * np.angle(common) / bands.w, axis=1) / total
     return np.asarray(course, dtype=np.float64), np.asarray(np.sqrt(1 / (2 * total)), dtype=np.float64)

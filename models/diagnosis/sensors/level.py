@@ -1,9 +1,9 @@
-"""What single channels say: standing still, cut off, at another level than before, or at another gain at once.
+"""Faults that single channels show: stuck, clipped, peaks, an offset, or a sudden change of gain.
 
-**Gain.** Between neighbouring hops the excitation may become louder and the machine may change, but that shows in every
-channel. What only a sensor can do is to multiply one channel by a factor: its rotation-synchronous vector keeps its
-angle and changes its length, its fluctuation changes by the same factor, and all other channels stay. Anything slower,
-or with the other channels moving too, cannot be told from the machine and is left to the misfit of its model.
+**Gain.** From one hop to the next the excitation may rise or the machine may change, but either shows in every channel.
+Only a sensor can multiply one channel by a factor: its rotation-synchronous vector then keeps its angle and changes its
+length, its fluctuation changes by the same factor, and all other channels stay as they were. A slower change, or one
+that other channels share, cannot be distinguished from a change of the machine and is left to the misfit of its model.
 """
 
 import re
@@ -21,29 +21,30 @@ from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
 STILL_S = 0.25  # longest time for which equal samples are put down to quantisation
-# Part of a hop's samples at its own limit that is put down to chance, beside what a quantised sine has there.
+# Part of a hop's samples at its extreme that is put down to chance, in addition to those of a quantised sine.
 FLAT_PART = 0.005
-# Part of the hops, and how many at least, whose tops end at one and the same value where the range ends there; what is
-# coarse, or as regular as a sine, ends at one value without it (in rms: step of the converter, distance of the value).
+# The range ends at a value if at least this part of the hops, and this number, have several samples exactly there and
+# none beyond. Coarsely quantised or sine-like signals do so without a limit: hence the largest converter step and the
+# least distance of the value from the mean, both as multiples of the channel's rms.
 _LIMITED_PART, _FEWEST_LIMITED, _FINE, _BEYOND_SINE = 0.25, 4, 0.05, 2.0
-# Rms of a displacement that peaks reach, of which a sensor of the same motion shows no more than so many, and part of
-# the hops with such peaks: to get there and back the shaft is fast, and normal noise hardly reaches five. Rarer ones do
-# not matter to what is read of the machine.
+# Least crest factor of a displacement with false peaks, largest one of the second sensor of the same motion, and least
+# part of hops with such peaks. A real peak needs a high velocity, too; Gaussian noise hardly reaches 5. Rarer peaks do
+# not affect the readings of the machine.
 _PEAKS, _NO_PEAKS, _PEAKED_PART = 10.0, 6.0, 0.5
-STEP_SPREADS = 8.0  # healthy standard deviations of a hop's mean that a step of it must exceed
-STEP_PART = 0.3  # part of the channel's rms that it must exceed besides
+STEP_SPREADS = 8.0  # standard deviations of a hop's mean that a step of the mean must exceed
+STEP_PART = 0.3  # part of the channel's rms that it must exceed, too
 # A slow drift of the mean over a window, as of a gap voltage, is allowed up to this many rms of the channel.
 DRIFT_PART = 3.0
 # The mean may differ from the reference by this many rms of the channel: temperature and load move gap voltages.
 MOVED_PART = 3.0
-_FEWEST_DROPPED = 3  # hops of a window in which a channel drops out; rarer ones do not matter to what is read
-_TOGETHER = 0.3  # where another displacement moves by at least this part of a displacement's step, the shaft has moved
+_FEWEST_DROPPED = 3  # least number of hops with drop-outs for a finding; fewer do not affect the readings
+_TOGETHER = 0.3  # if another displacement moves by more than this part of a displacement's step, the shaft has moved
 
 
 def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]) -> list[SensorFault]:
-    """Channels that hold a value, show nothing but their quantisation, or an angle that does not turn.
+    """Channels that hold a value or show nothing but their quantisation, and a shaft angle that does not turn.
 
-    No angle turns in hops, shape (n_hops,), where the machine stood or was about to.
+    The angle need not turn in the hops of `stood`, shape (n_hops,), in which the machine stood or was running down.
     """
     hops, findings = window.hop_waveform, []
     rate_hz = hops.n_samples * len(window.waveforms) / window.duration_s
@@ -69,7 +70,7 @@ def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]
                 "the machine has not run since the monitor started"
             )
         else:
-            still = int(runs.argmax())  # the mean of a hop is the value that was repeated, if all of the hop was
+            still = int(runs.argmax())  # the hop's mean is the repeated value only if the run fills the hop
             known = runs[still] >= hops.n_samples
             what = f"the value {naming.value(state, float(hops.mean[still, column]))}" if known else "one value"
             text = (
@@ -81,7 +82,7 @@ def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]
 
 
 def dropped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
-    """Channels that jump to a constant and back again and again: a coarse converter steps into what it holds."""
+    """Channels that jump to a constant and back in several hops, beyond the steps of a coarse converter."""
     hops, findings = window.hop_waveform, []
     rate_hz = hops.n_samples * len(window.waveforms) / window.duration_s
     for column, state in enumerate(window.sensors):
@@ -97,7 +98,7 @@ def dropped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
 
 
 def clipped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
-    """Channels whose tops are flat: more samples exactly at a hop's extreme than even a quantised sine would leave."""
+    """Clipped channels: more samples lie exactly at a hop's extreme than even in a quantised sine."""
     hops, findings = window.hop_waveform, []
     swing = (hops.maximum - hops.minimum) / 2
     step = np.where(np.isnan(hops.step), 0.0, hops.step)
@@ -127,9 +128,9 @@ def clipped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
 
 
 def at_range_end(windows: Sequence[WindowStatistics], naming: Naming, faulty: Collection[str] = ()) -> list[str]:
-    """Say which channels reach the end of their range again and again, but for too few samples for `clipped`.
+    """Say which channels often reach the end of their range, but with too few samples for `clipped`.
 
-    Of those at fault that is said already: one that is stuck is at a value in every hop.
+    Channels in `faulty` are left out: a stuck one, for example, is at one value in every hop.
     """
     hops, found = stacked_waveform([each for window in windows for each in window.waveforms]), []
     least = max(_FEWEST_LIMITED, _LIMITED_PART * len(hops.rms))
@@ -148,7 +149,7 @@ def at_range_end(windows: Sequence[WindowStatistics], naming: Naming, faulty: Co
 
 
 def spiked(window: WindowStatistics, naming: Naming, _: SensorReference | None) -> list[SensorFault]:
-    """Displacements with peaks that are no motion: velocity or acceleration of the same motion do not show them."""
+    """Displacements with peaks that the velocity or acceleration of the same motion does not show: no real motion."""
     hops, found = window.hop_waveform, []
     reach = np.maximum(hops.maximum - hops.mean, hops.mean - hops.minimum)
     crest = reach / np.where(hops.rms > 0, hops.rms, np.inf)
@@ -167,7 +168,7 @@ def spiked(window: WindowStatistics, naming: Naming, _: SensorReference | None) 
 
 
 def offset(window: WindowStatistics, naming: Naming, reference: SensorReference | None) -> list[SensorFault]:
-    """Channels whose mean steps or runs away within the window, or stands elsewhere than in the reference."""
+    """Channels whose mean steps or drifts within the window, or differs from that in the reference."""
     means = window.hop_waveform.mean[:, : len(window.states)]
     rms, spread = _scale(window), _spread(window)
     steps, drifts = _largest_step(means), means[-1] - means[0]
@@ -182,7 +183,7 @@ def offset(window: WindowStatistics, naming: Naming, reference: SensorReference 
     findings = []
     for column, state in enumerate(window.states):
         name, own = naming.name(state), float(rms[column])
-        if not own > 0:  # stuck, and reported as that
+        if not own > 0:  # `stuck` reports it
             continue
         step_z = float(abs(steps[column]) / spread[column]) if spread[column] > 0 else np.inf
         z: float | None = step_z
@@ -214,16 +215,16 @@ def offset(window: WindowStatistics, naming: Naming, reference: SensorReference 
 
 
 CHECKS = (offset, spiked)
-"""What is checked of channels that are neither missing, stuck nor clipped, one after the other."""
+"""Checks of channels that are neither missing, stuck nor clipped, in their order."""
 
 
 def _scale(window: WindowStatistics) -> FloatArray:
-    """The channels' rms, as it is in the middle of the hops: a step within one hop must not become the yardstick."""
+    """Median over the hops of each channel's rms, so that a step within one hop does not raise the limit."""
     return np.asarray(np.median(window.hop_waveform.rms[:, : len(window.states)], axis=0), dtype=np.float64)
 
 
 def _spread(window: WindowStatistics) -> FloatArray:
-    """Standard deviation of a hop's mean: from hop to hop (robust), and at least what the lowest frequencies expect."""
+    """Robust standard deviation of a hop's mean from hop to hop, at least that which the lowest bins predict."""
     hops = window.hop_waveform
     n, count = len(window.states), len(window.waveforms)
     means = hops.mean[:, :n]
@@ -236,7 +237,7 @@ def _spread(window: WindowStatistics) -> FloatArray:
 
 
 def _largest_step(means: FloatArray) -> FloatArray:
-    """Largest change of the mean across one hop beyond its usual drift; across, because a step may fall into a hop."""
+    """Largest change of the mean beyond its usual drift, from the hop before to the hop after: a step may be in one."""
     if means.shape[0] < 4:
         return np.asarray(means[-1] - means[0], dtype=np.float64)
     across = means[2:] - means[:-2]
@@ -245,7 +246,7 @@ def _largest_step(means: FloatArray) -> FloatArray:
 
 
 def _shaft(states: tuple[str, ...], column: int, changes: FloatArray) -> bool:
-    """Whether a displacement's level changed together with another one's."""
+    """Whether a displacement's mean changed together with another displacement's, as when the shaft moves."""
     places = [
         i for i, name in enumerate(states) if name in ("y1", "y2", "z1", "z2") or re.fullmatch(r"\w+@[\d.]+", name)
     ]
@@ -254,8 +255,8 @@ def _shaft(states: tuple[str, ...], column: int, changes: FloatArray) -> bool:
     return any(abs(changes[i]) > _TOGETHER * abs(changes[column]) for i in places if i != column)
 
 
-MOST_ERRORS = 6.0  # standard errors beyond which levels jump; the most probable of all moments is tested
-_STAY = 3.0  # standard errors within which everything else must stay
+MOST_ERRORS = 6.0  # standard errors that a jump must exceed, tested at the most probable of all moments
+_STAY = 3.0  # standard errors within which all else must be unchanged
 LEAST_JUMP = 0.08
 _FEWEST_SIDE = 3
 
@@ -287,7 +288,7 @@ def gain_jump(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
         if z > MOST_ERRORS and abs(value) > LEAST_JUMP and alone and quiet and straight and along:
             state = window.states[column]
             why = "expected a change of the machine to show in more than one channel: its gain jumped"
-            if state.startswith(("y1", "z1", "bearing")):  # others hardly feel a bearing well below its resonance
+            if state.startswith(("y1", "z1", "bearing")):  # below resonance its stiffness hardly moves others
                 why = "so either its gain jumped or the stiffness of that bearing did"
             text = (
                 f"{naming.name(state)}: everything it measures changed by {value:+.0%} at once (± "

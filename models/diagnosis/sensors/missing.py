@@ -1,7 +1,7 @@
 """Channels without numbers: their sensors are not connected, and the data acquisition sends NaN for them.
 
-The other channels are as good as before. What stands in for such a channel only keeps computations going: it is a
-finding in every window that has some of it, and nothing is read of it there.
+The other channels remain usable. Zeros replace the NaN so that computations can go on; every window that contains some
+of them reports the channel as a finding, and its data are not used there.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,13 +18,13 @@ from rotorwatch.records.windows import SensorFault
 
 
 def completed(block: SampleBlock) -> SampleBlock:
-    """A block that was accepted, with 0 in channels without numbers; recalled, it gives the same window."""
-    there = np.isfinite(block.samples[0])  # of a channel, all samples are or none is
+    """Replace the channels without numbers in an accepted block by 0; when recalled, it gives the same window."""
+    there = np.isfinite(block.samples[0])  # in an accepted block, a channel has all of its samples or none
     return block if there.all() else replace(block, samples=np.where(there, block.samples, block.samples.dtype.type(0)))
 
 
 def no_data(names: Sequence[str]) -> str:
-    """What is said of channels that have no numbers; empty without any.
+    """Text that names the channels without numbers; empty if there are none.
 
     Examples
     --------
@@ -40,25 +40,25 @@ class MissingNumbers:
     Parameters
     ----------
     channels : sequence of Channel
-        Of the machine, in the order of a block's columns.
+        The machine's channels in the order of a block's columns.
     """
 
     def __init__(self, channels: Sequence[Channel]) -> None:
         self._states, self._naming = [state_name(channel) for channel in channels], Naming(channels)
-        # Of each channel the newest time without numbers, from where to where.
+        # (2, n_channels), start and end of each channel's newest stretch without numbers; -1 if there is none.
         self._times_ns = np.full((2, len(self._states)), -1, dtype=np.int64)
-        self._newest_ns = -1  # of all of them
+        self._newest_ns = -1  # newest end of them all
 
     def take(self, block: SampleBlock) -> SampleBlock:
-        """Take note of what a block lacks, and return it `completed`."""
-        if self._newest_ns > block.end_ns:  # before the clock was set back
+        """Record which channels of a block have no numbers, and return it `completed`."""
+        if self._newest_ns > block.end_ns:  # the clock was set back: forget what is later
             self._times_ns[:, self._times_ns[1] > block.end_ns] = -1
             self._newest_ns = int(self._times_ns.max())
         there = np.isfinite(block.samples[0])
         if there.all():
             return block
         lost = ~there
-        apart_ns = np.abs(self._times_ns[1] - block.start_ns)  # not exactly 0 where a device counts its own time
+        apart_ns = np.abs(self._times_ns[1] - block.start_ns)  # not exactly 0 if a device counts its own time
         begun = lost & (apart_ns > (block.end_ns - block.start_ns) // 2)
         self._times_ns[0, begun], self._times_ns[1, lost] = block.start_ns, block.end_ns
         self._newest_ns = block.end_ns

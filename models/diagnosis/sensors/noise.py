@@ -1,9 +1,9 @@
 """A sensor whose noise has risen: a bad cable, mains hum, a failing amplifier.
 
-Noise differs from machine to machine and from day to day: some of it goes with the range and some with the vibration,
-and temperature or an amplifier's supply moves it in all channels. So a rise counts by which both the noise and its part
-of the channel's vibration grew, and only as far as the other channels' did not. It must also be large enough to matter:
-the diagnosis allows for noise, and would be given up for nothing.
+Noise differs from machine to machine and from day to day: some is proportional to the range, some to the vibration, and
+temperature or an amplifier's supply changes it in all channels. The rise is therefore the smaller of those of the noise
+and of its share of the vibration, less the median rise of the other channels. The noise must also be large enough to
+matter: the diagnosis allows for noise, and a finding would stop it needlessly.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,35 +30,35 @@ from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
 PAIR_RISE = 10.0
-"""Power of the difference of two sensors of one motion over the healthy one, beyond what the others' rose by.
+"""Least rise, over the healthy power and beyond the other pairs' rise, of the difference of two sensors of a motion.
 
 Calibrated on 384 healthy windows, each under another excitation than its reference: the largest rise was 3.5, and an
-exponential tail through the uppermost tenth reaches 10 in one of a million windows with four pairs of sensors, in ten
+exponential tail fitted to the uppermost tenth reaches 10 in one of a million windows with four pairs of sensors, in ten
 of a million with two.
 """
-ALONE_RISE = 40.0  # the same where no other pair says what all sensors do
+ALONE_RISE = 40.0  # the same if there is no other pair to compare with
 FLOOR_RISE, FLOOR_ALONE = 80.0, 5.0
-"""Where a motion has one sensor: floor of what the others do not explain over the healthy one, and beyond theirs.
+"""For motions with one sensor: least rise of the conditional power's floor over the healthy one, and beyond the others.
 
-The machine itself may do that under another excitation, though hardly with a flat floor: one of a thousand windows by
-the same reckoning.
+Another excitation of the machine may cause such a rise, though hardly with a flat floor: in one of a thousand windows
+by the same calculation.
 """
 FLOOR_FLAT = 0.5  # part of the bands that must lie on the floor: a machine's own spectrum has resonances
 LINE_RISE = 4.0
-# Parts of the channel's rms that noise in the band must reach: seen by a pair, as a floor, and as a line.
+# Least rms of the noise over that of the channel to be reported: as seen by a pair, as a floor, and as a line.
 LEAST_PART, LEAST_FLOOR, LEAST_LINE = 0.02, 0.1, 0.03
 _MAINS_HZ = (50.0, 60.0)
-_MAINS_OFF_HZ = 0.2  # by how much the mains may be off (EN 50160 allows 1 % in 99.5 % of a year)
-_FEWEST = 4  # channels that are needed to tell which of them rose alone
-# Standard deviation of the logarithm of a healthy pair's rise, and of a healthy channel's floor, calibrated.
+_MAINS_OFF_HZ = 0.2  # largest deviation of the mains frequency (EN 50160 allows 1 % in 99.5 % of a year)
+_FEWEST = 4  # least number of channels needed to see that one of them rose alone
+# Calibrated standard deviations of the logarithm of a healthy pair's rise, and of that of a healthy channel's floor.
 _PAIR_SCATTER, _FLOOR_SCATTER = 0.2, 1.0
 _CLEAR = 0.5  # one of two sensors is the noisy one if its noise exceeds the other's by more than this part of both
 _SURE = 0.15
-_COUNTS = 2.0  # bands in which the noise rose by less do not count for its size
+_COUNTS = 2.0  # bands in which the noise rose by a smaller factor do not contribute to its rms
 
 
 def _alone(rise: FloatArray) -> FloatArray:
-    """Rise beyond the median of the others, where that is a rise."""
+    """Rise (in logarithms) beyond the median of the others' rises; a fall of the others is not added."""
     n = rise.shape[0]
     if n < 2:
         return rise
@@ -74,9 +74,9 @@ def noisy(
     reference: SensorReference | None,
     sound: Callable[..., bool],
 ) -> list[SensorFault]:
-    """Channels whose noise is above what it was on the healthy machine; none if no reference says how that was.
+    """Findings on channels with more noise than on the healthy machine; none without a reference.
 
-    The readings are of pairs that see the same motion; `sound` says whether nothing else is wrong with columns.
+    The readings are those of pairs that see the same motion; `sound` returns whether columns have no other fault.
     """
     if reference is None:
         return []
@@ -117,7 +117,7 @@ def _of_pairs(
         guilty = _guilty(own, reading, risen)
         width_hz = (window.frequencies_hz[-1] - window.frequencies_hz[0]) / own.w.size
         excess = 2 * width_hz * now.density * -np.expm1(-rise[row]) * (rise[row] > np.log(_COUNTS))
-        # What is seen as the second shows it, as the first would.
+        # rms of the noise if all of it came from the first sensor, in the first sensor's quantity
         first = float(np.sqrt(np.sum(excess / own.w ** (2 * pair.order)))) * float(np.exp(-reading.log_gain))
         sizes = {pair.first: first, pair.second: float(np.sqrt(excess.sum()))}
         columns = [pair.first, pair.second] if guilty is None else [guilty]
@@ -142,7 +142,7 @@ def _of_pairs(
 
 
 def _guilty(bands: Banded, reading: PairReading, risen: npt.NDArray[np.bool_]) -> int | None:
-    """Which of two sensors is noisy, from their powers beyond what the other places say of the motion."""
+    """Column of the noisy one of two sensors, from powers that the other places do not explain; None if unclear."""
     spectra = matched(bands, reading)[risen]
     power, n = np.maximum(np.einsum("bii->bi", spectra).real, np.finfo(float).tiny), spectra.shape[1]
     own = spectra[:, :2, :2]
@@ -164,9 +164,9 @@ def _guilty(bands: Banded, reading: PairReading, risen: npt.NDArray[np.bool_]) -
 
 
 def is_hum(line_hz: float, speed_rad_s: float, resolution_hz: float) -> bool:
-    """Whether a line can be the mains': at 50 or 60 Hz or a harmonic, and at no order of the shaft.
+    """Whether a line can be mains hum: at 50 or 60 Hz or a harmonic, and not at an order of the shaft.
 
-    Any other line of one channel is the machine's: a bearing, a gear or a blade that one sensor sees.
+    Any other line in one channel is put down to a bearing, gear or blade of the machine that only one sensor sees.
 
     Examples
     --------

@@ -1,10 +1,10 @@
 """The phase reference: a shaft angle that loses pulses, jumps, slips, jitters, or turns at another speed.
 
-What turns with the shaft stands still when seen from the shaft. If the rotation-synchronous vectors of all channels
-turn together and keep their lengths, it is the angle that moved, or the heavy spot: a machine that changes, changes
-them each in its own way, and an unbalance that grows keeps its place. Where the angle went on as before, it is the
-heavy spot, and no fault of the angle; an angle that jumps does so within a turn, faster than any shaft. If only some
-sensors turn, evenly and in both planes, they are sampled by another clock.
+The rotation-synchronous vectors are constant relative to the shaft. If those of all channels turn together and keep
+their lengths, either the measured angle or the heavy spot has moved: any other change of the machine alters each vector
+differently, and a growing unbalance keeps its angle. An angle that jumps does so within a turn, faster than any shaft;
+if the angle went on steadily, the heavy spot has moved, and the angle is not at fault. If the vectors of only some
+sensors turn, evenly and in both planes, those sensors are sampled by another clock.
 """
 
 from collections.abc import Sequence
@@ -18,42 +18,42 @@ from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
-MOST_ERRORS = 8.0  # standard errors beyond which the angle jumped or slips; the most probable of all moments is tested
-SEEN_ERRORS = 4.0  # the same where the angle itself jumps by as much at that moment
-LEAST_JUMP_RAD = 0.35  # a smaller jump costs little and may be the machine's
-LEAST_SLIP_RAD = 0.2  # slip from hop to hop; thermal bending turns vectors, too, but by less
-LEAST_JITTER = 0.05  # power of the line left at the speed over that of the line taken out: jitter of 0.47 rad
-LEAST_WILD_JITTER = 0.1  # the same where jitter makes the speed jump about, and the line is taken out hop by hop
-_ERRATIC = 2.5  # ups and downs of the speed over its range: 1 for a run-up, 2 there and back
-# Range in which the shaft's true speed is looked for then, relative to the slowest and fastest hop.
+MOST_ERRORS = 8.0  # standard errors that a jump or slip must exceed; jumps are tested at the most probable moment
+SEEN_ERRORS = 4.0  # the same if the angle itself jumps by as much at that moment
+LEAST_JUMP_RAD = 0.35  # a smaller jump does little harm and may come from the machine
+LEAST_SLIP_RAD = 0.2  # least slip from hop to hop; thermal bending turns vectors, too, but by less
+LEAST_JITTER = 0.05  # least power of the line left at 1x over that of the line removed: a jitter of 0.47 rad
+LEAST_WILD_JITTER = 0.1  # the same if jitter makes the speed erratic, and the line is removed hop by hop
+_ERRATIC = 2.5  # least total variation of the hops' speed over its range: 1 for a run-up, 2 for up and down again
+# Range in which an erratic shaft's true speed is searched for, relative to the slowest and fastest hop.
 _WILD_SPEEDS = (0.7, 1.5)
 _JITTER_ERRORS = 6.0
-# Least part of the power at a line that keeps its phase: to the angle, or from segment to segment. Of the noise of a
-# damping of 0.05 % that was at most 0.02, and 0.83.
+# Least part of a line's power that keeps its phase: to the angle, or from segment to segment. For a resonance with
+# 0.05 % damping driven by noise, it was at most 0.02 and 0.83.
 _SHAFTS_PHASE, _LINES_PHASE = 0.5, 0.9
-# Turns of a hop by which a steady shaft's may differ, and by which a loss may differ from a whole number.
+# Largest scatter of the turns per hop of a steady shaft, and largest distance of a loss from a whole number of turns.
 _STEADY_TURNS, _WHOLE_TURNS = 0.02, 0.05
-# An angle that runs within the same bounds in every hop, by this part of them and at least so far, is none in radians
-# where the bounds are so many turns from whole ones.
+# A shaft angle is not in radians if every hop covers this part of the same range and at least so many radians, and the
+# range is off a whole number of turns by so much.
 _BOUNDED, _LEAST_RANGE_RAD, _OFF_TURNS = 0.95, 0.5, 0.2
 _FEWEST_HOPS, _FEWEST_SIDE = 6, 3
-_CLOCK_HOPS = 8  # newest ones, in which a clock is told that has just begun to run at another rate
-LEAST_CLOCK_RAD = 0.1  # turn from hop to hop of the sensors on another clock than the others: 130 ppm at 24 Hz and 5 s
+_CLOCK_HOPS = 8  # number of newest hops in which a clock is found that has only just begun to run at another rate
+LEAST_CLOCK_RAD = 0.1  # least turn from hop to hop of sensors on a clock of their own: 130 ppm at 24 Hz and 5 s
 _ALIKE = 0.25
 _STAY, _SURE = 3.0, 4.0
-_LENGTH = 0.15  # relative change of the vectors' common length that still counts as none
+_LENGTH = 0.15  # largest relative change of the vectors' common length that counts as unchanged
 _LINE_BINS, _AROUND_BINS, _FEWEST_AROUND, _AROUND_HZ = 1, 12, 4, 6.0
-_LINE_STRENGTH = 15.0  # a line is one where the channels' mean power stands out by this factor
-# The rotation is gone below this part of its healthy amplitude, and is elsewhere within this factor of it.
+_LINE_STRENGTH = 15.0  # least factor by which the power of a line exceeds its surroundings, mean over the channels
+# The 1x is missing below this part of its healthy amplitude; a line elsewhere is the 1x within this factor of it.
 _GONE, _THERE = 1 / 3, 3.0
 
 
 def phase_faults(
     window: WindowStatistics, columns: Sequence[int], naming: Naming, reference: SensorReference | None
 ) -> list[SensorFault]:
-    """At most one finding on the shaft angle, or on the clocks of sensors, from channels that nothing is wrong with.
+    """At most one finding on the shaft angle or on the clocks of sensors, from channels without other faults.
 
-    Without a reference a speed that contradicts the vibration is not found.
+    A speed that contradicts the vibration is only found with a reference.
     """
     vectors, speed = window.hop_synchronous, window.speed_rad_s
     if window.speed_source != "phase reference" or vectors is None or not columns or not abs(speed) > 0:
@@ -70,13 +70,13 @@ def phase_faults(
 
 
 def no_angle(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
-    """Whether the shaft angle runs to and fro within other bounds than whole turns of 2π in every hop."""
+    """Finding on a shaft angle that runs through the same range in every hop, other than a whole number of turns."""
     if "theta" not in window.sensors:
         return []
     hops, column = window.hop_waveform, window.sensors.index("theta")
     low, high = hops.minimum[:, column], hops.maximum[:, column]
     turns, least = np.ptp([low, high]) / (2 * np.pi), (high - low).min()
-    if least < max(_LEAST_RANGE_RAD, _BOUNDED * 2 * np.pi * turns):  # it stands still, or counts on
+    if least < max(_LEAST_RANGE_RAD, _BOUNDED * 2 * np.pi * turns):  # it stands still, or keeps counting up
         return []
     rate_hz = hops.n_samples * len(low) / window.duration_s
     step = abs(window.speed_rad_s) / (2 * np.pi * rate_hz) if np.isfinite(window.speed_rad_s) else 0.0
@@ -94,7 +94,7 @@ def _theta(kind: FaultKind, text: str, value: float, z: float | None = None) -> 
 
 
 def _lost(window: WindowStatistics, name: str) -> SensorFault | None:
-    """Whole turns that are missing from, or too many in, single hops of a shaft that is steady otherwise."""
+    """Finding on whole turns missing from or added to single hops of an otherwise steady shaft."""
     hops = len(window.waveforms)
     if hops < _FEWEST_HOPS:
         return None
@@ -122,10 +122,10 @@ def _lost(window: WindowStatistics, name: str) -> SensorFault | None:
 
 
 def _surroundings(window: WindowStatistics, columns: Sequence[int], at: int) -> tuple[FloatArray, FloatArray]:
-    """Power of a line's bins beyond their surroundings, mean square; and the surroundings' density."""
+    """Mean square of a line beyond its surroundings, and the spectral density of the surroundings."""
     power = np.einsum("fii->fi", window.spectrum).real[:, list(columns)]
     step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
-    # Where bins are wide, as many would reach over a resonance, whose flank is no line.
+    # If bins are wide, as many would reach beyond a resonance, whose flank is not a line.
     around = min(_AROUND_BINS, max(_FEWEST_AROUND, round(_AROUND_HZ / step_hz)))
     near = np.arange(max(0, at - around), min(power.shape[0], at + around + 1))
     beside = np.maximum(np.median(power[near[np.abs(near - at) > _LINE_BINS + 1]], axis=0), np.finfo(float).tiny)
@@ -134,7 +134,7 @@ def _surroundings(window: WindowStatistics, columns: Sequence[int], at: int) -> 
 
 
 def _bin(window: WindowStatistics, speed_rad_s: float) -> int | None:
-    """Bin of a speed, if it lies inside the band."""
+    """Index of the bin of a speed, or None if it is not well inside the band."""
     f = window.frequencies_hz
     at = round((abs(speed_rad_s) / (2 * np.pi) - f[0]) / (f[1] - f[0]))
     return at if 2 * _LINE_BINS < at < f.size - 2 * _LINE_BINS else None
@@ -143,7 +143,7 @@ def _bin(window: WindowStatistics, speed_rad_s: float) -> int | None:
 def _elsewhere(
     window: WindowStatistics, columns: Sequence[int], name: str, reference: SensorReference | None
 ) -> SensorFault | None:
-    """The rotation that every channel used to show is gone from the angle's speed and stands at another one."""
+    """Finding on a healthy 1x that is missing at the angle's speed and appears at another one."""
     vectors = window.hop_synchronous
     if reference is None or vectors is None or window.frequencies_hz.size <= 4 * _AROUND_BINS:
         return None
@@ -152,7 +152,7 @@ def _elsewhere(
     if len(usual) < min(2, len(columns)):
         return None
     there, amplitude = list(usual), np.array(list(usual.values()))
-    # Hop by hop: vectors that pass through zero, as where a bow grows, have a small mean and are not gone.
+    # Mean length, not length of the mean: vectors that pass through zero, as when a bow grows, are not missing.
     if np.median(np.abs(vectors[:, there]).mean(axis=0) / amplitude) > _GONE:
         return None
     power = np.einsum("fii->fi", window.spectrum).real[:, there]
@@ -176,7 +176,7 @@ def _elsewhere(
 
 
 def _common(columns: Sequence[int], vectors: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Vectors of all hops, each channel in units of its own noise, and what they have in common."""
+    """Vectors of all hops, each channel in units of its own noise, and their first singular course, (n_hops,)."""
     own = vectors[:, list(columns)]
     size = np.sqrt((np.abs(own) ** 2).mean(axis=0))
     noise = np.abs(np.diff(np.abs(own), axis=0)).mean(axis=0)
@@ -186,7 +186,7 @@ def _common(columns: Sequence[int], vectors: ComplexArray) -> tuple[ComplexArray
 
 
 def _slip(window: WindowStatistics, course: ComplexArray, name: str) -> SensorFault | None:
-    """The vectors keep their length and turn evenly, hop by hop."""
+    """Finding on vectors that keep their length and turn evenly from hop to hop."""
     length = np.abs(course)
     if length.std() > _ALIKE * length.mean():
         return None
@@ -207,9 +207,10 @@ def _slip(window: WindowStatistics, course: ComplexArray, name: str) -> SensorFa
 def _clock(
     window: WindowStatistics, columns: Sequence[int], vectors: ComplexArray, naming: Naming
 ) -> SensorFault | None:
-    """Sensors of both planes turn evenly and keep their lengths, while others of either plane stand.
+    """Finding on sensors of both planes whose vectors turn evenly at constant length, while others in both do not.
 
-    A machine turns what it changes in a plane, or everything with the heavy spot, and mostly by a bounded angle.
+    A change of the machine turns the vectors of one plane, or all of them with the heavy spot, and mostly by a bounded
+    angle.
     """
     states = [window.states[column] for column in columns]
     planes = np.array([state[0] for state in states])
@@ -233,7 +234,7 @@ def _clock(
         if set(planes[turning]) != set("yz") or set(planes[~turning]) != set("yz"):
             continue
         found = tuple(state for state, one in zip(states, turning, strict=True) if one)
-        ahead_s = rate / window.speed_rad_s  # of the others, more in every hop
+        ahead_s = rate / window.speed_rad_s  # lead over the others that each hop adds
         part = ahead_s * len(vectors) / window.duration_s
         text = (
             f"{naming.names(found)} turn by {np.degrees(rate):+.0f}° from hop to hop against the shaft angle and the "
@@ -245,9 +246,9 @@ def _clock(
 
 
 def _jump(window: WindowStatistics, vectors: ComplexArray, course: ComplexArray, name: str) -> SensorFault | None:
-    """The vectors of all channels turned by one angle between two hops and kept their lengths, and the angle jumped.
+    """Finding if all vectors turned by one angle between two hops at constant length, and the shaft angle jumped.
 
-    Where data are missing between the hops, whether it jumped is not known, and the vectors alone decide.
+    If data are missing between the hops, a jump of the angle cannot be seen, and the vectors alone decide.
     """
     n = len(course)
     best, at = 0.0, 0
@@ -282,7 +283,7 @@ def _jump(window: WindowStatistics, vectors: ComplexArray, course: ComplexArray,
 
 
 def _turn(vectors: ComplexArray, k: int) -> tuple[FloatArray, FloatArray]:
-    """Angle of each column after hop k against before, hops next to it left out; and its standard error."""
+    """Angle by which each column turned at hop k, without the hops next to it, and its standard error."""
     before, after = vectors[: k - 1], vectors[k + 1 :]
     first, second = before.mean(axis=0), after.mean(axis=0)
     scatter = np.concatenate([np.angle(before * first.conj()), np.angle(after * second.conj())])
@@ -293,7 +294,7 @@ def _turn(vectors: ComplexArray, k: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _jitter(window: WindowStatistics, columns: Sequence[int], vectors: ComplexArray, name: str) -> SensorFault | None:
-    """A line stays in the spectrum at the speed although what is steady with the angle was taken out."""
+    """Finding on a line that remains in the spectrum at 1x although the synchronous part was removed."""
     speeds = np.abs(window.hop_speed_rad_s)
     edges = [window.speed_rad_s, window.speed_rad_s]
     if window.removed_by_hop:
@@ -307,9 +308,9 @@ def _jitter(window: WindowStatistics, columns: Sequence[int], vectors: ComplexAr
     if first is None or last is None or kept is None or not np.all(out > 0):
         return None
     step_hz, hop_s = window.frequencies_hz[1] - window.frequencies_hz[0], window.duration_s / len(own)
-    # A jitter of more than half a radian miscounts turns at random: then the line is somewhere near the hops' speeds.
+    # Jitter of more than half a radian miscounts turns at random: the line is then only near the speeds of the hops.
     power = np.einsum("fii->fi", window.spectrum[first : last + 1]).real[:, list(columns)]
-    # A resonance stands out as a line does, but its noise keeps no phase.
+    # A resonance also stands out of the spectrum, but its noise does not keep its phase.
     least = _LINES_PHASE if window.removed_by_hop else _SHAFTS_PHASE
     lines = np.median(kept[first : last + 1, list(columns)], axis=1) >= least
     if not lines.any():
@@ -318,7 +319,7 @@ def _jitter(window: WindowStatistics, columns: Sequence[int], vectors: ComplexAr
     middle = first + int(np.where(lines, strength, -1.0).argmax())
     left, beside = _surroundings(window, columns, middle)
     if not window.removed_by_hop:
-        # Amplitudes that really changed leave a line, too; their scatter by the vibration around it does not.
+        # Real changes of amplitude also leave a line; scatter of the amplitudes due to the surrounding noise does not.
         moved = (np.abs(own - own.mean(axis=0)) ** 2).mean(axis=0) / 2 - 2 * beside / hop_s
         left = left - 2 * np.maximum(moved, 0.0)
     error = 2 * step_hz * beside * np.sqrt((2 * _LINE_BINS + 1) * 2.0 / window.n_segments)

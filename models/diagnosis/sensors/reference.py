@@ -1,9 +1,9 @@
-"""How the sensors of a machine were when it was healthy: levels, how pairs compare, and the noise that is their own.
+"""Reference of the sensors of a healthy machine: their levels, how pairs compare, and the sensors' own noise.
 
-Two sensors of one motion differ by their noise alone, whatever moves the machine: |v - hjωx|². Where a motion has one
-sensor, what the other channels do not explain of it holds the noise and a part of the machine. That part has the
-machine's resonances in it; noise lies under it like a floor. A line that stands in one channel alone is none of the
-machine's.
+Two sensors of one motion differ by their noise alone, whatever moves the machine: |v - hjωx|². If a motion has only one
+sensor, the part of its power that the other channels do not explain contains its noise and some motion of the machine.
+The motion shows the machine's resonances, the noise is the floor below them. A line in one channel alone does not come
+from the machine.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,14 +24,14 @@ from rotorwatch.records.windows import SensorFault
 
 
 def implicated(findings: Iterable[SensorFault]) -> set[str]:
-    """Channels whose data must not be used, by what they measure (``theta`` is the shaft angle)."""
+    """States whose channels must not be used (``theta`` is the shaft angle)."""
     return {state for finding in findings for state in finding.states}
 
 
 class Naming:
-    """Names of channels and values in their units, for sentences.
+    """Names of channels, and values in their units, for texts.
 
-    What is not among the channels of the machine is called by its state and given in SI units.
+    A state that none of the machine's channels measures is called by its own name, with values in SI units.
     """
 
     def __init__(self, channels: Iterable[Channel] = ()) -> None:
@@ -56,13 +56,14 @@ class Naming:
 
 _FLAT = 2.0  # bands within this factor of the lowest lie on the floor
 _LINE_BINS, _BLOCK = 3, 24  # bins that hold a line in Hann segments, and bins of its surroundings
-_STANDS_OUT = 6.0  # a bin this far above the median of its surroundings may hold a line
-_OWN = 4.0  # so far it must stand out still where the other channels have explained what they can
-# Relative distance from a multiple of half the speed within which a line is the shaft's, beside its range.
+_STANDS_OUT = 6.0  # a bin with this many times the median power of its surroundings may hold a line
+_OWN = 4.0  # the same factor for the conditional power, given the other channels
+# Relative distance from a multiple of half the speed, in addition to the range of speed, within which a line is put
+# down to the shaft.
 _HARMONIC = 0.002
 _RIDGE = 1e-9
 _LEAKAGE = 1.0
-_LEFT = 0.1  # least part of a difference that is still called noise after leakage was taken out
+_LEFT = 0.1  # least part of the difference's power that counts as noise after leakage was subtracted
 _SMOOTHED = 3
 
 
@@ -70,7 +71,7 @@ _SMOOTHED = 3
 class PairNoise:
     """Noise of two sensors of one motion, in bands."""
 
-    density: FloatArray  # (n_bands,), power of their difference as the second shows it, two-sided, SI²/Hz
+    density: FloatArray  # (n_bands,), power of their difference in the second's quantity, two-sided, SI²/Hz
     leakage: FloatArray  # (n_bands,), the part of it that two perfect sensors would show in segments of this length
     # (n_bands,): power of the difference, times 1 Hz, if each sensor had white noise of its own rms in 1 Hz, SI²
     scale: FloatArray
@@ -88,31 +89,31 @@ class PairNoise:
 
 @dataclass(frozen=True, slots=True)
 class ChannelNoise:
-    """What one channel does not share with the others."""
+    """Power of one channel that the others do not explain."""
 
     column: int
-    density: FloatArray  # (n_bands,), what is left of it, two-sided, SI²/Hz
+    density: FloatArray  # (n_bands,), conditional power, two-sided, SI²/Hz
     share: FloatArray  # (n_bands,), the same over the channel's mean square, 1/Hz
     flat: float  # part of the bands that lie on the floor, 0 to 1
-    # Strongest line that it alone shows, SI, and where; 0 without one.
+    # Strongest line that only this channel shows: its rms in SI units, and its frequency; 0 without one.
     line_rms: float
     line_hz: float
 
 
 def channel_rms(window: WindowStatistics) -> FloatArray:
-    """Root mean square of each channel about its hops' means, rotation included; shape (n,)."""
+    """Root mean square of each channel about the means of the hops, synchronous part included; shape (n,)."""
     rms = np.stack([hop.rms[: len(window.states)] for hop in window.waveforms])
     return np.asarray(np.sqrt((rms**2).mean(axis=0)), dtype=np.float64)
 
 
 def single(states: tuple[str, ...]) -> list[int]:
-    """Columns without a second sensor of their motion."""
+    """Columns of motions that only one sensor measures."""
     paired = {column for pair in motion_pairs(states) for column in (pair.first, pair.second)}
     return [column for column in range(len(states)) if column not in paired]
 
 
 def matched(bands: Banded, reading: PairReading) -> ComplexArray:
-    """Spectra in bands with the first sensor brought to gain, sense and time of the second."""
+    """Banded spectra with the first sensor corrected to the gain, polarity and delay of the second."""
     h = reading.transfer(bands.w)
     spectra = bands.spectra.copy()
     spectra[:, 0] *= h[:, None]
@@ -136,7 +137,7 @@ def pair_noise(window: WindowStatistics, bands: Banded, reading: PairReading) ->
 
 
 def channel_noise(window: WindowStatistics, columns: Sequence[int]) -> list[ChannelNoise]:
-    """What the other channels do not explain of some; nothing where there is too little data to tell."""
+    """Power of the given columns that the other channels do not explain; empty if there are too few data."""
     rms = channel_rms(window)
     n_bins, n = window.frequencies_hz.size, len(window.states)
     if not columns or n < 2 or window.n_segments < 2 * n or not np.all(rms > 0):
@@ -157,13 +158,13 @@ def channel_noise(window: WindowStatistics, columns: Sequence[int]) -> list[Chan
 
 
 def floor(log_density: FloatArray) -> FloatArray:
-    """Lowest mean of three neighbouring bands of log densities; shape (n_bands, ...) becomes (...)."""
+    """Lowest mean of the log densities of three neighbouring bands; shape (n_bands, ...) becomes (...)."""
     log_density = np.asarray(log_density, dtype=np.float64)
     return np.asarray(((log_density[:-2] + log_density[1:-1] + log_density[2:]) / _SMOOTHED).min(axis=0))
 
 
 def _conditional(spectra: ComplexArray) -> FloatArray:
-    """Power of each channel that the others do not explain; shape (..., n)."""
+    """Conditional power of each channel given all others; shape (..., n)."""
     power = np.maximum(np.einsum("...ii->...i", spectra).real, np.finfo(float).tiny)
     scale = 1 / np.sqrt(power)
     unit = spectra * scale[..., :, None] * scale[..., None, :] + _RIDGE * np.eye(spectra.shape[-1])
@@ -172,7 +173,7 @@ def _conditional(spectra: ComplexArray) -> FloatArray:
 
 
 def _lines(window: WindowStatistics, columns: Sequence[int]) -> dict[int, tuple[float, float]]:
-    """Strongest line of its own of each channel that has one: its rms and frequency."""
+    """Rms and frequency of the strongest line that a column alone shows, by column, for columns that have one."""
     f, count = window.frequencies_hz, window.frequencies_hz.size // _BLOCK
     if not count:
         return {}
@@ -214,7 +215,7 @@ class NoiseReference(BaseModel, extra="forbid", frozen=True, strict=True, allow_
 
 
 class _WithNoise(BaseModel, extra="forbid", frozen=True, strict=True, allow_inf_nan=False):
-    """A reference that may be older than the check of noise; then it is written as it was read."""
+    """A reference with noise, or one from before noise was learned, which is written back unchanged."""
 
     noise: NoiseReference | None = Field(
         default=None, exclude_if=lambda noise: noise is None, description="None where it was not learned"
@@ -252,9 +253,9 @@ class PairReference(_WithNoise):
 
 
 class SensorReference(BaseModel, extra="forbid", frozen=True, strict=True, allow_inf_nan=False):
-    """What healthy windows say of the sensors; as JSON it comes back bit for bit."""
+    """Reference of all sensors, learned from healthy windows; reading it back from JSON gives the same bits."""
 
-    # Healthy windows it was learned from, and the hops in them.
+    # Numbers of healthy windows that it was learned from, and of hops in them.
     n_windows: int = Field(ge=1)
     n_hops: int = Field(ge=1)
     speed_rad_s: float | None = None  # mean speed in them
@@ -271,16 +272,16 @@ class SensorReference(BaseModel, extra="forbid", frozen=True, strict=True, allow
         return self
 
     def channel(self, state: str) -> ChannelReference | None:
-        """One channel, or None if it was not there."""
+        """Reference of one channel, or None if it has none."""
         return next((channel for channel in self.channels if channel.state == state), None)
 
     def pair(self, first: str, second: str) -> PairReference | None:
-        """Two sensors of one motion, or None if they were not there."""
+        """Reference of two sensors of one motion, or None if they have none."""
         return next((pair for pair in self.pairs if (pair.first, pair.second) == (first, second)), None)
 
 
 def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReference:
-    """Learn from healthy windows that do not overlap.
+    """Learn the sensors' reference from healthy windows that do not overlap.
 
     Raises
     ------
@@ -358,7 +359,7 @@ def _channel(windows: Sequence[WindowStatistics], column: int, noise: NoiseRefer
 def _pair(
     states: tuple[str, ...], readings: list[PairReading], least_same: float, noise: NoiseReference | None
 ) -> PairReference:
-    """Mean of the windows' readings; the spread is their scatter beyond their own errors, and the mean's error."""
+    """Mean of the windows' readings; the spread combines their scatter beyond their own errors and the mean's error."""
     figures = [(one.log_gain, one.log_gain_error, one.delay_s, one.delay_error_s) for one in readings]
     gains, gain_errors, delays, delay_errors = np.array(figures).T.copy()
     pair = readings[0].pair

@@ -1,7 +1,7 @@
-"""A machine that stands: it does not turn, and no channel shows much of the vibration that it has when it runs.
+"""A machine at a standstill: it does not turn, and every channel has much less vibration than when it runs.
 
-Channels have no motion in common then, so none says anything of another one, and an angle that does not change is no
-fault. A phase reference that is lost leaves the vibration as it was.
+The channels then share no motion, so they cannot be compared, and a shaft angle that does not change is no fault. When
+only the phase reference is lost, the vibration stays as it was.
 """
 
 from collections.abc import Mapping
@@ -17,16 +17,17 @@ from models.levels.reference import QUIET
 from models.signals.block import FloatArray
 
 _SLOW = 0.5
-"""Part of the window's highest speed."""
+"""Part of the window's highest speed from which on a hop counts as running, however quiet it is."""
 _STEADY = 0.15
-"""Range of speed in a window, relative, up to which it shows how the machine runs: not while it slows down."""
+"""Largest relative range of speed in a window that is taken as steady running: it excludes slowing down."""
 
 
 def runs_down(window: WindowStatistics) -> npt.NDArray[np.bool_]:
-    """Which hops have little or nothing of a running machine, shape (n_hops,), beside others that do: a slow end, say.
+    """Which hops are quiet in all channels and slow (or of unknown speed) beside the others, shape (n_hops,).
 
-    None where no speed is known: hops may be quiet beside one that a blow or a disturbance has made loud. A channel
-    that shows nothing in any hop says nothing. The window is that of its sensors as they are mounted.
+    Hops at the end of a run-down are an example. There are none if no speed is known: the others may only seem quiet
+    beside a hop with a blow or a disturbance. A channel that is zero in all hops excludes none. The window must be that
+    of the sensors as mounted.
     """
     hops, speeds = window.hop_waveform, np.abs(window.hop_speed_rad_s)
     vibrations = [column for column, state in enumerate(window.sensors) if state != "theta"]
@@ -36,21 +37,21 @@ def runs_down(window: WindowStatistics) -> npt.NDArray[np.bool_]:
 
 
 class Standstill:
-    """Tells windows in which the machine stood from those in which its phase reference is lost.
+    """Distinguishes windows in which the machine stood from those in which its phase reference is lost.
 
-    The reference says how the healthy machine runs; otherwise, and for channels that are not in it, it is the newest
-    window in which it ran steadily.
+    The rms of the running machine comes from the reference or, without one and for channels that are not in it, from
+    the newest window of steady running.
     """
 
     def __init__(self, reference: SensorReference | None) -> None:
         self._reference = reference
-        self._running = np.empty(0)  # (n_sensors,), rms of a hop, SI units; the shaft angle among them
+        self._running = np.empty(0)  # (n_sensors,), median rms of a hop, SI units, including the shaft angle
 
     def found(self, window: WindowStatistics) -> str:
-        """How long the machine stood in the window, in a sentence; empty if it did not, or if that cannot be told."""
+        """Sentence that says how long the machine stood in the window; empty if it did not, or if that is not known."""
         window = window.as_mounted
         hops, speeds = window.hop_waveform, np.abs(window.hop_speed_rad_s)
-        still = ~(speeds > STANDS_RAD_S)  # or not known
+        still = ~(speeds > STANDS_RAD_S)  # or the speed is not known
         if not still.any():
             if speeds.max() - speeds.min() <= _STEADY * speeds.mean():
                 self._running = np.median(hops.rms, axis=0)
@@ -75,7 +76,7 @@ class Standstill:
         )
 
     def _running_rms(self, window: WindowStatistics) -> FloatArray:
-        """By column; nan where it is not known."""
+        """Rms of the running machine by column; NaN where it is not known."""
         running = self._running if self._running.size else np.full(len(window.sensors), np.nan)
         if self._reference is None or self._reference.speed_rad_s is None:
             return running
