@@ -1,7 +1,7 @@
-"""How far a window lies from all that the model can explain: things outside the model, each tried on it, and the rest.
+"""How far a window is from all that the model can explain: tests of single causes outside the model, and the total.
 
-Masses and shaft of a machine file are never quite the machine's, so the healthy machine may lie off its theory, too. It
-does so in the same way in every window: each thing that was tried is compared with its mean in the healthy windows.
+Masses and shaft of a machine file are never exact, so even the healthy machine deviates from its theory. It does so
+equally in every window: the score of each cause is compared with its mean in the healthy windows.
 """
 
 import math
@@ -16,50 +16,50 @@ from scipy.special import chdtri, log_ndtr, ndtri
 from models.physics.rotor import impossible
 from models.signals.block import FloatArray
 
-ACROSS = "share"  # first word of what a sensor shows of its place's motion in the other plane
-DELAY = "delay"  # first word of how late a channel comes, relative to the others
+ACROSS = "share"  # first word of the name of a sensor's cross-axis part, from the motion in the other plane
+DELAY = "delay"  # first word of the name of a channel's delay relative to the others
 EACH_LATE = f"{DELAY} of each channel after the one before"
 UNEQUAL = "shaft stiffer in y than in z"
 _LEAST_SUSPECT_Z = 5.0
-_LEAST_SUSPECT = 5e-3  # no sensor and no machine file is truer than that, and with one source a tenth of it stands out
-_SCATTER = 1e-4  # probability that a score scatters so much among healthy windows by chance
-_LINEAR = 0.5  # largest one-step estimate that is worth telling: farther out it only says that the thing is not small
-_LEAST_DELAY_S, _LONGEST_DELAY_S = 2e-6, 1e-3  # the same of delays
-# Part of the excess that a thing accounts for by itself, from which it is told: of a window that is unexplained, and of
-# any other. The right one of delays, gains and masses accounted for a third at least mostly, and for a sixth always
-# where the window was not unexplained; where another rotor or force was at work, such as a whirl, nothing for a
-# twentieth.
+# Smallest change that is named: no sensor or machine file is more accurate, but with one source a tenth is significant.
+_LEAST_SUSPECT = 5e-3
+_SCATTER = 1e-4  # significance level at which the scatter of a score among healthy windows is more than chance
+_LINEAR = 0.5  # largest one-step estimate whose size is stated: beyond it, only "not small" is certain
+_LEAST_DELAY_S, _LONGEST_DELAY_S = 2e-6, 1e-3  # the same two limits for delays
+# Least part of the excess that a single cause must account for to be named: in an unexplained window, and in any other.
+# Among delays, gains and masses, the right cause mostly accounted for at least a third, and always for a sixth if the
+# window was not unexplained; with another rotor or force, such as a whirl, no cause accounted for a twentieth.
 _ACCOUNTS, _ACCOUNTS_LITTLE = 1 / 3, 1 / 10
 
 
 @dataclass(frozen=True, slots=True)
 class AlternativeTest:
-    """One thing outside the model, tried on a window."""
+    """Score test of one cause outside the model on a window."""
 
     name: str
     z: float  # its score in standard errors
     change: float  # one-step estimate of its relative size; of a delay, s
-    pair: tuple[str, ...] = ()  # two sensors whose disagreement it is, put down to the one that `name` says
+    pair: tuple[str, ...] = ()  # two sensors that disagree, if that is the cause; `name` blames one of them
 
     @property
     def quantity(self) -> str:
-        """What kind of quantity it is."""
+        """Kind of quantity: the first word of the name."""
         return self.name.split()[0]
 
     @property
     def tried(self) -> str:
-        """What it is known by from window to window."""
+        """Key that identifies the cause from window to window."""
         return " and ".join(self.pair) or self.name
 
     @property
     def told(self) -> str:
-        """The thing and its size in words; empty where that is too little to matter, or impossible."""
+        """The cause and its size in words; empty if it is too small to matter, or impossible."""
         change, quantity = self.change, self.quantity
         if quantity == DELAY:
             least, most, size = _LEAST_DELAY_S, _LONGEST_DELAY_S, f"{1e6 * change:+.0f} µs"
         else:
             least, most, size = _LEAST_SUSPECT, _LINEAR, f"{change:+.1%}"
-        # What y gains by an unequal shaft z loses.
+        # An unequal shaft that gains in y loses as much in z.
         if abs(change) < least or impossible(-abs(change) if self.name == UNEQUAL else change, quantity):
             return ""
         return f"{self.name} ({size})" if abs(change) <= most else self.name
@@ -70,13 +70,13 @@ class Goodness:
     """How well the theory explains a window."""
 
     excess_z: float  # total squared excess of the whitened spectra over its expectation, in standard deviations
-    alternatives: tuple[AlternativeTest, ...]  # everything tried
-    tests: int  # how many of them, and the total, say something of their own
+    alternatives: tuple[AlternativeTest, ...]  # all causes tried
+    tests: int  # number of independent tests among them and the total
     excess: float = 0.0  # total squared excess beyond its expectation, in squared standard errors of a score
 
     @property
     def misfit_z(self) -> float:
-        """All tests in one number, standard normal (one-sided) where the model holds: the worst, Šidák-corrected."""
+        """The most significant test, Šidák-corrected: standard normal (one-sided) if the model holds."""
         worst = max([-log_ndtr(-self.excess_z), *(-_two_sided(one.z) for one in self.alternatives)])
         tests = self.tests
         log_p = np.log(-np.expm1(tests * np.log1p(-np.exp(-worst)))) if worst < 30 else np.log(tests) - worst
@@ -86,8 +86,8 @@ class Goodness:
     def suspect(self) -> str:
         """The alternative with the largest score, if that is beyond 5 standard errors and possible; else empty.
 
-        A one-step estimate that physics does not allow says that this is not what happened: no suspect is named then,
-        for a score that is only second best explains less still.
+        A one-step estimate that is physically impossible rules the cause out. No suspect is named then, because the
+        second-best score explains even less.
         """
         if not self.alternatives:
             return ""
@@ -95,7 +95,7 @@ class Goodness:
         return best.told if abs(best.z) > _LEAST_SUSPECT_Z else ""
 
     def suspected(self, *, unexplained: bool) -> str:
-        """`suspect`, if it alone accounts for some of the excess; of a window that is unexplained, for much of it."""
+        """`suspect`, if it alone accounts for some of the excess, or much of it if the window is unexplained."""
         accounted = max([one.z**2 for one in self.alternatives], default=0.0)
         return "" if accounted < (_ACCOUNTS if unexplained else _ACCOUNTS_LITTLE) * self.excess else self.suspect
 
@@ -129,10 +129,9 @@ class HealthyMisfit(BaseModel, extra="forbid", frozen=True):
     def of(cls, windows: Sequence[Goodness], parts: Sequence[float]) -> "HealthyMisfit | None":
         """Average over healthy windows; None without any.
 
-        A deviation of one size stands out by the root of the data's length in a score, and by the length in the total
-        excess. How much it stands out depends on what shakes the machine, too: where one force does, a wrong gain of a
-        hundredth is many standard errors, where several do it is hardly one. The data of each are given in parts of a
-        window of the monitor.
+        For a given deviation, scores grow with the root of the data's length, and the total excess with the length.
+        They also depend on the excitation: with one force a gain error of 1 % is many standard errors, with several
+        hardly one. `parts` are the lengths of the windows' data over that of a window of the monitor.
         """
         if not windows:
             return None
@@ -156,15 +155,15 @@ class HealthyMisfit(BaseModel, extra="forbid", frozen=True):
         )
 
     def beyond(self, window: Goodness, part: float) -> Goodness:
-        """What is left of a later window: as of a machine that the theory explains, as long as this one is as it was.
+        """A later window's scores and excess beyond the healthy ones: as if the theory explained the healthy machine.
 
-        Its data are such a part of a window of the monitor.
+        `part` is the length of its data over that of a window of the monitor.
         """
         root = math.sqrt(part)
         alternatives = []
         for one in window.alternatives:
             if one.quantity == DELAY and one.tried not in self.scores:
-                continue  # of an earlier version, which did not try them: what healthy windows had of it is not known
+                continue  # an earlier version did not test delays, so their healthy scores are unknown
             left = one.z - root * self.scores.get(one.tried, 0.0)
             change = one.change * left / one.z if one.z else 0.0
             error = root * math.hypot(self.error, self.spreads.get(one.tried, 0.0))
@@ -179,7 +178,7 @@ class HealthyMisfit(BaseModel, extra="forbid", frozen=True):
 
 
 def _spread(values: FloatArray, variances: FloatArray) -> float:
-    """Standard deviation of one more value about the mean beyond its own variance; 0 where chance may have made it."""
+    """Standard deviation of a new value about the mean beyond its own variance; 0 if that may be chance."""
     count = len(values)
     if count < 2 or np.sum((values - values.mean()) ** 2 / variances) < chdtri(count - 1, _SCATTER):
         return 0.0

@@ -1,4 +1,4 @@
-"""What a diagnostician says about a window: readings of parameters and of equations, or why there are none."""
+"""Diagnosis of a window by one diagnostician: readings of parameters and equations, or why there are none."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,11 +17,11 @@ from rotorwatch.records.windows import Equation, Parameter
 from rotorwatch.records.windows import UnbalanceVector as VectorRecord
 
 _DIGITS, _MOST_DIGITS = 3, 15
-_MOST_LOSS = -0.95  # of which the logarithm is taken
+_MOST_LOSS = -0.95  # changes are limited to this before taking the logarithm
 
 
 def beyond(value: float, limit: float) -> tuple[str, str]:
-    """Print a value and the limit it is beyond with so many digits that it is beyond the limit as printed, too.
+    """Print a value and its limit, with enough digits that the printed value is on the right side of the limit.
 
     Examples
     --------
@@ -37,15 +37,15 @@ def beyond(value: float, limit: float) -> tuple[str, str]:
     return text, f"{limit:g}"
 
 
-_GAIN = 0.15  # relative error of every vector: what sensors, and a rotor that is not quite that of the model, make
-_RATE = 1e-6  # probability that vectors of an unbalance are taken for those of something else
+_GAIN = 0.15  # relative error of every vector due to the sensors and the model's approximation of the rotor
+_RATE = 1e-6  # probability that the vectors of an unbalance are taken for foreign
 
 
 def foreign_rotation(observed: FloatArray, explained: FloatArray, spread: FloatArray) -> str:
-    """By how much what turns with the shaft is not what an unbalance makes; empty if it is.
+    """Sentence on how badly an unbalance explains the 1x vectors; empty if it explains them.
 
-    Observed are real parts of the vectors, then imaginary ones, shape (2n,), with their covariance, `spread`; explained
-    are those of the unbalance that is nearest.
+    `observed`, shape (2n,), holds the real parts of the vectors, then the imaginary ones, with their covariance,
+    `spread`; `explained` those of the best-fitting unbalance.
     """
     n = observed.size // 2
     if n < 2:
@@ -61,10 +61,10 @@ def foreign_rotation(observed: FloatArray, explained: FloatArray, spread: FloatA
 
 
 _SEEN = 3.0  # standard errors from which a vector has a direction
-# Standard errors, and part of the unbalance, by which the heavy spot must have moved to count as turned: angle sensors
-# and probes are not mounted better than to a few degrees.
+# Least movement of the heavy spot that counts as turned, in standard errors and as part of the unbalance: angle sensors
+# and probes are not mounted more accurately than to a few degrees.
 _TURNED, _LEAST_TURN = 6.0, 0.05
-_SAME_SIZE = 0.1  # a heavy spot seldom moves without a change of its size; a sensor does
+_SAME_SIZE = 0.1  # with a smaller change of size, a turn may come from the sensor: real ones mostly change the size
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,27 +74,26 @@ class UnbalanceVector:
     Angles count from the nominal heavy spot in the direction of rotation.
     """
 
-    # Of ρ.
+    # Parts of ρ.
     real: float
     imaginary: float
-    # Of these two.
+    # Covariance of these parts.
     variance_real: float
     covariance: float
     variance_imaginary: float
-    # Why what turns with the shaft is not what an unbalance makes, so that none of this should be believed; empty if it
-    # is.
+    # Why the 1x vectors are not those of an unbalance, so that no value here should be believed; empty if they are.
     foreign: str = ""
-    directed: bool = True  # whether its direction says something
+    directed: bool = True  # whether its direction is meaningful
 
     def widened(self, variance: float) -> "UnbalanceVector":
-        """Return the same with an error added to both parts."""
+        """Return the same vector with a variance added to both parts."""
         real, imaginary = self.variance_real + variance, self.variance_imaginary + variance
         return replace(self, variance_real=real, variance_imaginary=imaginary)
 
     def read_as(self, change: float, own: float) -> "UnbalanceVector":
-        """Return the same as large as e is read: a window that is astride a change shows a part of it.
+        """Return the vector scaled to the reading of e, as a window that straddles a change shows only part of it.
 
-        The relative change of e is `change` as read, `own` as the window by itself says; see `parameter_reading`.
+        `change` is the relative change of e as read, `own` that of the window by itself; see `parameter_reading`.
         """
         if self.moved:
             part = change / own if own else 1.0
@@ -114,7 +113,7 @@ class UnbalanceVector:
 
     @property
     def turned_deg(self) -> float | None:
-        """Angle of the heavy spot from where it was, -180 to 180; None where so little is left that it has none."""
+        """Angle by which the heavy spot has turned, -180 to 180; None if too little unbalance is left to have one."""
         return self._angle(self.real, self.imaginary)
 
     @property
@@ -126,8 +125,8 @@ class UnbalanceVector:
 
     @property
     def turned(self) -> bool:
-        """Whether the heavy spot is elsewhere."""
-        if self.turned_error_deg is None:  # so little is left that it has no direction
+        """Whether the heavy spot has moved significantly."""
+        if self.turned_error_deg is None:  # too little unbalance is left to have a direction
             return False
         size = math.hypot(self.real, self.imaginary)
         turn = math.hypot(self.real - size, self.imaginary)
@@ -135,7 +134,7 @@ class UnbalanceVector:
 
     @property
     def moved(self) -> bool:
-        """Whether most of the change is the turn, so that what is read as e is the size of the vector of change."""
+        """Whether most of the change is the turn, so that the reading of e is the size of the vector of change."""
         size = math.hypot(self.real, self.imaginary)
         return self.directed and self.turned and math.hypot(self.real - size, self.imaginary) > abs(size - 1)
 
@@ -151,7 +150,7 @@ class UnbalanceVector:
 
     @property
     def change_angle_deg(self) -> float | None:
-        """Direction of that vector, from the nominal heavy spot; None where the change is within its errors."""
+        """Direction of the vector of change, from the nominal heavy spot; None if the change is within its errors."""
         return self._angle(self.real - 1, self.imaginary)
 
     @property
@@ -167,7 +166,7 @@ class UnbalanceVector:
         return f"a vector of {100 * self.change:.0f} % of the nominal unbalance at {where} ({size}{turned})"
 
     def _error(self, x: float, y: float) -> float:
-        """Standard error along a direction."""
+        """Standard error in the direction (x, y)."""
         length = math.hypot(x, y)
         x, y = (x / length, y / length) if length > 0 else (1.0, 0.0)
         along = x**2 * self.variance_real + 2 * x * y * self.covariance + y**2 * self.variance_imaginary
@@ -179,11 +178,11 @@ class UnbalanceVector:
 
 
 Z95 = 1.959964  # standard errors on either side of a 95 % interval
-_ROUNDED_TO_NOTHING = 0.0005  # one digit would leave 0.0 % of half an interval below it
+_ROUNDED_TO_NOTHING = 0.0005  # a smaller half interval would print as 0.0 % with one digit
 
 
 def percent_digits(half: float) -> int:
-    """Digits after the point of a change in percent: one, or two of the half of its interval where that is smaller.
+    """Decimal places of a change in percent: one, or more so that a small half interval shows two digits.
 
     Examples
     --------
@@ -202,10 +201,10 @@ def interval_95(value: float, standard_error: float, least: float = -math.inf) -
 def parameter_reading(
     name: str, by: str, change: float, standard_error: float, vector: UnbalanceVector | None = None
 ) -> Parameter:
-    """One parameter as one diagnostician reads it.
+    """One diagnostician's reading of a parameter.
 
-    Of e there is a vector where there is a phase reference. The change is then that of its size as long as the heavy
-    spot stays where it is, and the size of the vector of change once it has turned.
+    For e, there is a vector if there is a phase reference. The change is then that of its size while the heavy spot
+    stays in place, and the size of the vector of change once it has turned.
 
     Raises
     ------
@@ -228,14 +227,14 @@ def parameter_reading(
 
 
 def no_reading(name: str, by: str, reason: str) -> Parameter:
-    """Why one diagnostician cannot read a parameter."""
+    """A parameter without a number, with the reason why a diagnostician cannot read it."""
     return Parameter(name=name, text=PARAMETER_TEXT[name], by=by, reason=reason)
 
 
 def possible_reading(
     name: str, by: str, change: float, standard_error: float, vector: UnbalanceVector | None = None
 ) -> Parameter:
-    """A reading, or the reason why the number is none: physics does not allow it."""
+    """A reading, or no reading if the change is not finite or physically impossible."""
     reason = impossible(change, QUANTITY[name]) if math.isfinite(change) else f"reads as {change}"
     return no_reading(name, by, reason) if reason else parameter_reading(name, by, change, standard_error, vector)
 
@@ -255,48 +254,48 @@ def _stated(vector: UnbalanceVector) -> VectorRecord:
 
 
 class Left(NamedTuple):
-    """What simpler explanations leave of several parameters' changes, in squared standard errors."""
+    """Residual χ² of several parameters' changes under simpler explanations."""
 
-    single: float  # the best of them alone
-    common: float  # one factor on all of them, as of a wrong gain
-    factor: float  # its logarithm
-    z: float  # that in standard errors
+    single: float  # only the best of the parameters changed
+    common: float  # one factor on all of them, as from a wrong gain
+    factor: float  # logarithm of that factor
+    z: float  # the logarithm in standard errors
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """One diagnostician's opinion of one window."""
+    """One diagnostician's diagnosis of one window."""
 
-    by: str  # who: ``likelihood``, ``network``, ``relation`` or ``paper``
-    parameters: tuple[Parameter, ...] = ()  # the parameters it speaks of, evaluable or with the reason why not
+    by: str  # diagnostician: ``likelihood``, ``network``, ``relation`` or ``paper``
+    parameters: tuple[Parameter, ...] = ()  # the parameters that it covers, with a reading or a reason why not
     equations: tuple[Equation, ...] = ()  # the equations it evaluated; empty for the likelihood
-    # (m, m): covariance of the m evaluable `parameters`' changes, in their order; None where a diagnostician knows only
-    # single standard errors
+    # (m, m): covariance of the m evaluable `parameters`' changes, in their order; None if the diagnostician only knows
+    # individual standard errors
     covariance: FloatArray | None = None
-    # Of e, where it is evaluable and there is a phase reference: size and direction.
+    # Size and direction of e, if it is evaluable and there is a phase reference.
     unbalance: UnbalanceVector | None = None
-    # (m, m): part of `covariance` that every window shares, as the error of a commissioning does: further windows do
-    # not remove it. None where there is no such part.
+    # (m, m): part of `covariance` that all windows share, such as the error of a commissioning: further windows do not
+    # reduce it. None if there is no such part.
     common: FloatArray | None = None
-    # Part of the variances in `common`, by parameter, that longer healthy recordings do not remove either: what a
-    # relation is off in conditions that it was not learned in.
+    # Part of the variances in `common`, by parameter, that longer healthy recordings do not reduce either: the error of
+    # a relation in conditions that it was not learned in.
     elsewhere: Mapping[str, float] = field(default_factory=dict)
-    # Degrees of freedom of the standard errors (Student's t), by parameter: far from zero a reading with few of them is
-    # less unlikely than a normal one. What is not in it is normal.
+    # Degrees of freedom of the standard errors (Student's t), by parameter: with few, large deviations are less
+    # unlikely than under a normal distribution. Parameters that are not in it are normal.
     freedom: Mapping[str, float] = field(default_factory=dict)
-    # Of a parameter, what the reading takes for a change of it when another one changes by 1, which it takes as
-    # unchanged.
+    # By parameter, and by another parameter that the reading assumes unchanged: the apparent change of the first if the
+    # other one changes by 1.
     taken_for: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    # Over-identification: how far the window is from anything the model can explain, standard normal where the model
-    # holds; None where the diagnostician has no such test.
+    # Over-identification: how far the window is from anything the model can explain, standard normal if the model
+    # holds; None if the diagnostician has no such test.
     misfit_z: float | None = None
-    goodness: Goodness | None = None  # what that is made of, where it is made of tests of single things
-    # What explains the misfit best, if one thing does: a sensor's gain, a mass, a shaft unequal in y and z; empty if
-    # nothing stands out or there is no such test.
+    goodness: Goodness | None = None  # the tests that make up the misfit, if it is made of tests of single causes
+    # Cause that best explains the misfit: a sensor's gain, a mass, a shaft unequal in y and z; empty if none stands out
+    # or there is no such test.
     suspect: str = ""
-    # Why nothing that is read here should be believed: the window is so far from all the model can explain that
-    # parameters fitted to it mean nothing, or another force moves the machine than the one that a single condition
-    # was learned under, and the relations do not hold. Empty otherwise, however significant a misfit is.
+    # Why no reading here should be believed: the window is so far from all the model can explain that parameters fitted
+    # to it mean nothing, or the relations, learned in a single condition, fail under another force. Empty otherwise,
+    # however significant the misfit is.
     unexplained: str = ""
     steps: int = 0  # search steps it took (0 where there is no search)
 
@@ -307,14 +306,14 @@ class Diagnosis:
 
     @property
     def full_covariance(self) -> FloatArray:
-        """`covariance`, or the diagonal of the squared standard errors where there is none."""
+        """`covariance`, or without one a diagonal matrix of the squared standard errors."""
         if self.covariance is not None:
             return self.covariance
         errors = [one.standard_error for one in self.evaluable]
         return np.diag(np.square(np.array(errors, dtype=np.float64)))
 
     def left_by(self, names: Sequence[str]) -> "Left | None":
-        """What simpler explanations leave of some parameters' changes; None where one of them was not read."""
+        """Residuals of some parameters' changes under simpler explanations; None if one of them was not read."""
         known = [one.name for one in self.evaluable]
         if not names or not set(names) <= set(known):
             return None
@@ -330,7 +329,7 @@ class Diagnosis:
 
 
 class Diagnostician(Protocol):
-    """Looks at one window after the other and says which parameter changed, by how much, and how sure."""
+    """Reads in one window after the other which parameters changed, by how much, and with which standard errors."""
 
     @property
     def by(self) -> str:

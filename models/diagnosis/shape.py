@@ -1,16 +1,16 @@
-"""The shape of each channel's own correlation function against its healthy shape: changed or not, never what or where.
+"""Comparison of each channel's autocorrelation function with its healthy shape: whether it changed, not why or where.
 
-A channel's autocorrelation over its own variance, ρ(τ), depends on the machine and on the colour of what drives it, not
-on the level. Its deviation from the healthy mean is looked at in the few directions in which it scatters most, found
-from the scatter of the hops within the windows and scaled to it, so that they are independent of how the windows
-scatter among each other. That scatter is what decides: it holds both sampling and what the excitation did from window
-to window. With n windows and a new one, d their distance,
+A channel's autocorrelation over its own variance, ρ(τ), depends on the machine and on the colour of the excitation, not
+on its level. Its deviation from the healthy mean is projected on the few directions in which it scatters most. These
+are found and scaled from the scatter of the hops within windows, so they are independent of the scatter between
+windows, which decides: it includes both sampling and changes of the excitation from window to window. For n healthy
+windows and a new one at a distance d,
 
     |d|² / ((1 + 1/n) tr S)  ~  F(f, f (n - 1)),   f = (tr S)² / tr S²
 
-with the windows' covariance S in these directions: Brunner's ANOVA-type statistic, as a prediction. It needs no inverse
-of S, which few windows do not give, and with few windows its tail is as heavy as it has to be. If the scatter is alike
-in all directions, fewer false alarms than declared come out (a third with six windows, half with twelve); if one
+with the windows' covariance S in these directions: Brunner's ANOVA-type statistic, used for prediction. It needs no
+inverse of S, which few windows do not determine, and has the heavier tail that few windows require. If the scatter is
+equal in all directions, there are fewer false alarms than declared (a third with six windows, half with twelve); if one
 direction has nearly all of it, up to 1.3 times as many at 1 %.
 
 References
@@ -34,7 +34,7 @@ from models.signals.block import FloatArray
 from rotorwatch.records.windows import Shape
 
 SEEN_GROWTH = 8.0
-"""Noise that makes a channel so many times as loud and is not seen: then its shape says nothing."""
+"""A channel's shape is not evaluable if noise that makes it so many times as loud would not be detected."""
 _POWER_Z = float(ndtri(0.95))
 _MOST_WINDOWS = 100
 FEWEST_WINDOWS = 4  # healthy windows without which nothing is learned; six or more are advised, from several recordings
@@ -50,7 +50,7 @@ class ShapeSpread(BaseModel, extra="forbid", frozen=True, strict=True):
 
     channel: str = Field(min_length=1)
     mean: tuple[_Finite, ...] = Field(min_length=2)  # ρ at the lags
-    # Each turns a deviation of ρ into a coordinate with unit variance from sampling alone.
+    # Each maps a deviation of ρ to a coordinate that has unit variance from sampling alone.
     directions: tuple[tuple[_Finite, ...], ...] = Field(min_length=1)
     variance: float = Field(gt=0, allow_inf_nan=False)  # tr S of the healthy windows in these coordinates
     freedom: float = Field(ge=1, allow_inf_nan=False)  # f, between 1 and the number of directions
@@ -64,7 +64,7 @@ class ShapeSpread(BaseModel, extra="forbid", frozen=True, strict=True):
 
 
 class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
-    """What the correlation functions of a healthy machine look like."""
+    """Healthy shapes of all channels."""
 
     windows: int = Field(ge=FEWEST_WINDOWS)  # healthy windows it was learned from
     window_s: float = Field(gt=0, allow_inf_nan=False)  # length of the shortest of them
@@ -80,9 +80,9 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
         return self
 
     def powers(self, rate: float) -> dict[str, "ShapePower"]:
-        """What would be called a change of each channel's shape, at the rate of `judge`: noise of another colour.
+        """White noise that would be called a change of each channel's shape, at the rate of `judge`.
 
-        White noise that makes a channel g times as loud takes its shape by 1 - 1/g² of the way to that of white noise.
+        Noise that makes a channel g times as loud moves its shape 1 - 1/g² of the way to the shape of white noise.
         """
         own_rate = self._own_rate(rate)
         return {one.channel: _power(one, self.windows, np.array(self.lags_s), own_rate) for one in self.channels}
@@ -91,7 +91,7 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
         return -math.expm1(math.log1p(-rate) / len(self.channels))
 
     def judge(self, window: WindowStatistics, rate: float = 0.01) -> tuple[Shape, ...]:
-        """Compare every channel of a window with its healthy shape; what cannot be compared says why.
+        """Compare every channel of a window with its healthy shape, or say why it cannot be compared.
 
         The rate is the declared probability that any channel of an unchanged machine is called changed in one window.
 
@@ -134,7 +134,7 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
             reason = reason or "it does not move, or its correlation is not finite"
             return stated(verdict="not evaluable", z=None, text=f"{one.channel}: not evaluable, {reason}")
         d = np.array(one.directions) @ (rho - np.array(one.mean))
-        # a shorter window scatters more; that a longer one scatters less is not relied on
+        # a shorter window scatters more; a longer one is not assumed to scatter less
         wider = (1 + 1 / self.windows) * max(1.0, self.window_s / window.duration_s)
         statistic = float(d @ d) / (wider * one.variance)
         p = float(fdtrc(one.freedom, one.freedom * (self.windows - 1), statistic))
@@ -158,11 +158,12 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
 
 @dataclass(frozen=True, slots=True)
 class ShapePower:
-    """What is seen of one channel's shape."""
+    """How small a change of one channel's shape is detected."""
 
-    # So many times as loud noise must make it to be called a change with 95 % probability; infinite where none is.
+    # Factor on the rms of the channel at which white noise is called a change with 95 % probability; infinite if no
+    # noise is.
     growth: float
-    # Healthy windows with which `SEEN_GROWTH` suffices, if they scatter as these do; None where none do.
+    # Healthy windows with which `SEEN_GROWTH` is detected, if all scatter as these do; None if 99 are too few.
     windows: int | None
 
 
@@ -171,7 +172,7 @@ def _power(one: ShapeSpread, windows: int, lags_s: FloatArray, rate: float) -> S
     distance = float(np.linalg.norm(np.array(one.directions) @ (white - np.array(one.mean)))) / math.sqrt(one.variance)
 
     def part(count: int) -> float:
-        """Of the way to white noise."""
+        """Part of the way to the shape of white noise at which a change is detected."""
         wider = math.sqrt(1 + 1 / count)
         limit = math.sqrt(float(fdtri(one.freedom, one.freedom * (count - 1), 1 - rate)))
         return wider * (limit + _POWER_Z) / distance if distance > 0 else math.inf
@@ -184,8 +185,8 @@ def _power(one: ShapeSpread, windows: int, lags_s: FloatArray, rate: float) -> S
 def learn_shape(windows: Sequence[WindowStatistics]) -> HealthyShape:
     """Learn the shape of every channel from healthy windows that do not overlap.
 
-    They are of all conditions that are to count as healthy: a colour of excitation that is in none of them will be
-    called a change.
+    They must include all conditions that count as healthy: a colour of excitation that is in none of them is called a
+    change.
 
     Raises
     ------
@@ -223,7 +224,7 @@ def learn_shape(windows: Sequence[WindowStatistics]) -> HealthyShape:
 
 
 def _shape(window: WindowStatistics, channel: str) -> FloatArray | None:
-    """ρ at the lags; None where there is no motion or no finite one."""
+    """ρ at the lags; None if the channel does not move or its correlation is not finite."""
     column = window.states.index(channel)
     R = window.correlation[:, column, column]
     if not np.all(np.isfinite(R)) or R[0] <= 0:
@@ -239,12 +240,12 @@ def _spread(windows: Sequence[WindowStatistics], channel: str) -> ShapeSpread | 
             return None
         column = window.states.index(channel)
         R = window.hop_correlation[:, :, column, column]
-        # first order in the hop's deviation: their mean over the window is zero
+        # to first order in the hop's deviation; the mean over the window is zero
         deviations.append((R - R[:, :1] * rho) / np.mean(R[:, 0]) / len(R))
         shapes.append(rho)
         hops += len(R)
     scatter = np.concatenate(deviations)
-    # each hop contributes 1/n of the window's shape: n of them, less the mean of each window
+    # each of a window's n hops contributes 1/n of its shape; one degree of freedom goes to the mean of each window
     per_window = hops / len(windows)
     within = scatter.T @ scatter * per_window / (hops - len(windows))
     values, vectors = np.linalg.eigh(within)

@@ -1,8 +1,8 @@
-"""The diagnosis of a window against a baseline, and where a bearing's change is a sensor's gain.
+"""Diagnosis of a window against a baseline, including wrong gains that look like a change of the bearing.
 
-In a row that balances the bearing's forces against the disc's inertia, a gain error at the bearing or at the disc
-scales every one of the row's own parameters alike. One sensor of several at a place gives itself away; of a single one,
-or of all that share a transducer, nothing else would show it.
+A row balances the bearing's forces against the disc's inertia, so a gain error of all sensors at the bearing or at the
+disc scales all of the row's own parameters by one factor. If one of several sensors at a place is wrong, they disagree;
+with a single sensor, or several on one transducer, the common factor is the only evidence.
 """
 
 import itertools
@@ -34,7 +34,7 @@ from models.errors import EstimationError
 from models.signals.block import FloatArray
 
 _SINGLE = 2.326  # standard errors beyond which no single parameter explains a window (one per cent, one-sided)
-_COMMON = 2.576  # within which the common factor does (one per cent, two-sided)
+_COMMON = 2.576  # standard errors within which a common factor explains it (one per cent, two-sided)
 _MOST_LOSS = -0.95
 
 
@@ -44,7 +44,7 @@ class GainSuspicion:
 
     sentence: str  # ``gain of y1 or of y2``
     factor: float  # relative change of all of the row's own parameters
-    # The factor in standard errors, as a one-sided normal variable that knows of how many rows it is the largest.
+    # The factor in standard errors, as a one-sided normal variable that allows for the number of rows tested.
     z: float
 
 
@@ -53,7 +53,7 @@ def gain_suspicion(
 ) -> GainSuspicion | None:
     """Find the row whose changes look most like a gain error of all sensors of a place.
 
-    None where single parameters explain the window, or a common factor does not.
+    None if single parameters explain the changes of every row, or a common factor does not.
     """
     tested = [
         (row, relation)
@@ -79,10 +79,10 @@ def _row_suspicion(diagnosis: Diagnosis, row: Row, relation: Relation, tested: i
 
 _WORST_ERROR = 0.2
 _RPM = 30 / math.pi
-_GONE = -0.95  # a loss beyond this is no loss of a bearing
+_GONE = -0.95  # a loss beyond this is not a real change of a bearing
 _SURELY_OUTSIDE = 8.0
-# Factor on standard errors of the bearing in windows of another force, of a relation learned in one condition: its
-# error is not normal (decision 0012).
+# Factor on the standard errors of the bearing's parameters in windows with another force, for a relation learned in one
+# condition: its error is not normal (decision 0012).
 _OTHER_FORCE = 1.2
 
 
@@ -98,14 +98,14 @@ class _Bearing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Unbalance:
-    """Change of the unbalance, its covariance with the others, its variance, and the commissioning's part of both."""
+    """Change of the unbalance, its variance, its covariance with the bearing's changes, and what commissioning adds."""
 
     value: float
     covariance: FloatArray
     variance: float
     common_covariance: FloatArray
     common_variance: float
-    slope: FloatArray  # (n_own,), to the bearing's changes
+    slope: FloatArray  # (n_own,), derivative with respect to the bearing's changes
 
 
 class BaselineDiagnostician:
@@ -139,7 +139,7 @@ class BaselineDiagnostician:
                 self._coefficients[at] = relation.coefficients
 
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
-        """Judge one window; never raises: what cannot be read carries its reason."""
+        """Judge one window; never raises: a parameter that cannot be read carries the reason."""
         reason = unsuitable(window)
         if reason:
             return Diagnosis(self.by, tuple(no_reading(n, self.by, reason) for n in self._parameters))
@@ -152,7 +152,7 @@ class BaselineDiagnostician:
         bearing = self._bearing(changes)
         names = list(self._names)
         values, total, common = bearing.values, bearing.noise + bearing.common, bearing.common
-        through = np.eye(values.size)  # from the bearing's changes to all
+        through = np.eye(values.size)  # Jacobian of all changes with respect to the bearing's
         foreign = ""
         if "e" in self._parameters:
             names.append("e")
@@ -175,8 +175,8 @@ class BaselineDiagnostician:
             wider = np.array([max(least if one.terms else 1.0, one.one_source if alone else 1.0) for one in own])
             total, common = total * np.outer(wider, wider), common * np.outer(wider, wider)
         elsewhere = through @ np.diag(self._elsewhere(bearing.values, same=same)) @ through.T
-        # A stiffness that grew with the motion has changed, and the unbalance is rightly read with it. Where the force
-        # is the commissioned one, motions differ by what has changed, and what was not seen to grow has not grown.
+        # A stiffness that grew with the motion has really changed, so the unbalance is read with it and gets no part of
+        # this variance. Under the commissioned force, growth that commissioning did not show is not assumed.
         seen, unseen = self._grown(changes)
         elsewhere[range(seen.size), range(seen.size)] += seen if same else seen + unseen
         total, common = total + elsewhere, common + elsewhere
@@ -194,10 +194,10 @@ class BaselineDiagnostician:
             parameters=parameters,
             covariance=covariance if known else None,
             common=positive(common[np.ix_(known, known)]) if known else None,
-            elsewhere=dict(zip(names, np.diag(elsewhere).tolist(), strict=False)),  # none of an e that was not read
+            elsewhere=dict(zip(names, np.diag(elsewhere).tolist(), strict=False)),  # without e if it was not read
             misfit_z=_misfit(changes),
         )
-        # What is carried for another force makes no reading impossible.
+        # The variance that allows for another force is left out here: it must not make a reading impossible.
         impossible = foreign or _impossible(
             diagnosis, dict(zip(self._names, np.diag(bearing.noise + bearing.common), strict=True))
         )
@@ -212,11 +212,11 @@ class BaselineDiagnostician:
 
     @property
     def _alone(self) -> bool:
-        """Whether nothing but one condition says how far the relations hold; older records read as they did."""
+        """Whether the relations were tested in one condition only; False for records from before growth was learned."""
         return self._conditions == 1 and bool(self._baseline.growth)
 
     def _as_commissioned(self, changes: Sequence[RowChange | None]) -> bool:
-        """Whether the force that moves the machine, its changes taken into account, is the commissioned one."""
+        """Whether the force, computed with the changes of the window, is the commissioned one."""
         seen = [change for change in changes if change is not None]
         if not self._baseline.force.size or len(seen) < len(changes):
             return False
@@ -224,13 +224,13 @@ class BaselineDiagnostician:
         return alike(self._baseline.force, now)
 
     def _elsewhere(self, changes: FloatArray, *, same: bool) -> FloatArray:
-        """Variances of what a relation is off in other conditions; each that it holds in is a witness against it."""
+        """Variances from the relations' errors in other conditions, over the number of conditions learned from."""
         own = [self._own_of[name] for name in self._names]
         errors = np.array([0.0 if same and not one.always else one.elsewhere for one in own])
         return (errors * np.maximum(1 + changes, 1 + _MOST_LOSS)) ** 2 / self._conditions
 
     def _grown(self, changes: Sequence[RowChange | None]) -> tuple[FloatArray, FloatArray]:
-        """Variances of stiffnesses whose motion has another power, from growth that was seen and that was not."""
+        """Variances of stiffnesses at another power of motion: from growth that was seen, and from growth unseen."""
         found = np.zeros((2, len(self._names)))
         known = zip(self._rows, self._own, self._baseline.relations, self._baseline.growth, changes, strict=False)
         for row, at, relation, growth, change in known:
@@ -287,7 +287,7 @@ class BaselineDiagnostician:
         cov = self._baseline.covariance
         force = relative_force(rows, self._coefficients, bearing.values, now, healthy)
         to_d, to_now, to_healthy = force.to_change, force.to_now, force.to_healthy
-        # the error of the coefficients comes in directly and through the bearing's changes
+        # errors of the coefficients act directly and through the bearing's changes
         through = to_d @ bearing.sensitivity + force.to_coefficients
         extra = bearing.common - bearing.sensitivity @ cov @ bearing.sensitivity.T
         shared = through @ cov @ through.T + to_d @ extra @ to_d.T + to_healthy @ healthy.covariance @ to_healthy.T
@@ -346,7 +346,7 @@ class BaselineDiagnostician:
 
 
 def _unexplained(misfit_z: float | None) -> str:
-    """Why nothing is named in a window of another force that the relations do not hold in; empty where they may."""
+    """Why no parameter is named if the relations fail under another force; empty if the misfit is small enough."""
     if misfit_z is None or misfit_z <= _SURELY_OUTSIDE:
         return ""
     text, limit = beyond(misfit_z, _SURELY_OUTSIDE)
@@ -358,9 +358,9 @@ def _unexplained(misfit_z: float | None) -> str:
 
 
 def _impossible(diagnosis: Diagnosis, variances: Mapping[str, float]) -> str:
-    """What no bearing does: a stiffness or damping that is gone or has changed its sign, or cannot be told at all.
+    """Sentence on a stiffness or damping that has vanished or changed sign, or a stiffness of unknown size, else "".
 
-    The variances are those of the readings by themselves, without what they carry for another force.
+    The variances are those of the readings without the allowance for another force.
     """
     for reading in diagnosis.evaluable:
         if reading.name == "e" or reading.relative_change is None or reading.standard_error is None:
@@ -393,7 +393,7 @@ def _read(row: Row, relation: Relation | None, window: WindowStatistics, why: st
 
 
 def _misfit(changes: list[RowChange | None]) -> float | None:
-    """What the worst of the rows leaves, as a standard normal variable that knows it is the worst of several."""
+    """Misfit of the worst row as a standard normal variable, corrected for the number of rows."""
     used = [change for change in changes if change is not None]
     if not used:
         return None

@@ -1,8 +1,8 @@
 """Whether the force that moves the machine is the one that its relations were learned under.
 
-What a relation leaves out of the machine biases its coefficients, and by the same amount for as long as the same force
-moves the machine: in a change the bias cancels. The residual of each row is that force, as far as the sensors show it.
-Its cross-spectra by bands say how strong it is, of what colour, and how it is directed.
+Parts of the machine that a relation omits bias its coefficients. As long as the same force moves the machine the bias
+is constant and cancels in a change. The residual of each row is that force, as far as the sensors show it. Its
+cross-spectra in bands describe its level, colour and direction.
 """
 
 from collections.abc import Sequence
@@ -14,17 +14,17 @@ from models.diagnosis.window.moments import ComplexArray
 from models.signals.block import FloatArray
 
 _BAND_HZ = 8.0
-# Distance up to which two forces count as one. On finite-element rotors (overhung, between bearings; seeds 100 to 105,
-# windows of 30 s) the same force is 0.0005 to 0.019 off itself with changes of up to c -40 %, up to 0.038 with k -25 %;
-# forces of the same colour and level in other directions 0.044 to 0.97, one window in ten below 0.09.
+# Largest distance at which two forces count as the same. On finite-element rotors (overhung, between bearings; seeds
+# 100 to 105, windows of 30 s) the same force is 0.0005 to 0.019 from itself with changes of up to c -40 %, up to 0.038
+# with k -25 %; forces of the same colour and level in other directions 0.044 to 0.97, one window in ten below 0.09.
 _ALIKE = 0.03
 
 
 def force_spectrum(windows: Sequence[RowWindow], combinations: Sequence[FloatArray]) -> FloatArray:
-    """Cross-spectra of what the rows of one window leave over, mean of every band, shape (n_bands, n_rows, n_rows).
+    """Mean cross-spectra of the residuals of all rows in one window, by bands, shape (n_bands, n_rows, n_rows).
 
-    The force of each row is a combination of its terms. Real parts stand on and above the diagonal, imaginary parts
-    below.
+    The residual of each row is a combination of its terms. Real parts are stored on and above the diagonal, imaginary
+    parts below.
     """
     window = windows[0].window
     forces = np.stack([one.terms @ combination for one, combination in zip(windows, combinations, strict=True)], axis=1)
@@ -38,7 +38,7 @@ def force_spectrum(windows: Sequence[RowWindow], combinations: Sequence[FloatArr
 def alike(healthy: FloatArray, now: FloatArray) -> bool:
     """Whether two forces (`force_spectrum`) agree in level, colour and direction.
 
-    Every row counts in units of its own healthy power in a band.
+    In each band, every row is normalised with its own healthy power.
     """
     if healthy.size == 0 or healthy.shape != now.shape:
         return False

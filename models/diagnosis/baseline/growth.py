@@ -1,7 +1,7 @@
 """How a bearing's stiffness grows with its displacement, as far as the hops of the healthy recording show it.
 
-A relation is linear, and reads the stiffness that the motion of its own window meets. Where that grows with the motion,
-a force of another direction or level meets another one, which is no fault: errors of the stiffness know it.
+A relation is linear and reads the stiffness at the amplitude of its own window. If the stiffness grows with the motion,
+a force of another direction or level changes it without a fault; the standard errors of the stiffness allow for that.
 """
 
 import math
@@ -18,9 +18,9 @@ from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 
-_CHANCE = 4.0  # square of the growth over its error up to which it is taken for chance
-# Growth that a bearing may have all the same, of motions up to e times as strong or as weak; where it is known better
-# than that, its error. A stiffness carries half a per cent in any case (`rows.py`).
+_CHANCE = 4.0  # squared ratio of growth to its standard error up to which growth is taken for chance
+# Largest hidden growth assumed, for motions up to e times as strong or as weak; if smaller, the standard error of the
+# growth is used. Every stiffness carries half a per cent in any case (`rows.py`).
 _UNSEEN, _CARRIED = 0.02, 0.005
 
 
@@ -33,7 +33,7 @@ class Growth:
     standard_error: NotNegative  # of the slope
 
     def seen_variance(self, power: float) -> float:
-        """Variance of the scale's relative change where the motion has another power, from a growth beyond chance.
+        """Variance of the scale's relative change at another power of the motion, from growth beyond chance.
 
         A stiffness that falls as the motion grows is taken for chance.
         """
@@ -41,16 +41,16 @@ class Growth:
         return seen * (power / self.power - 1) ** 2
 
     def unseen_variance(self, power: float) -> float:
-        """The same of a growth that chance may have hidden, beyond what every stiffness carries."""
+        """The same from growth that scatter may have hidden, beyond the error that every stiffness carries."""
         hidden = max(0.0, min(_UNSEEN, self.standard_error) ** 2 - _CARRIED**2)
         return hidden * min(1.0, abs(math.log(power / self.power))) ** 2
 
 
 def growth_of(row: Row, relation: Relation, parts: Sequence[LagMoments]) -> Growth | None:
-    """Regress what the hops of healthy windows read of a row's scale on the power of its motion.
+    """Regress the scale of a row, read in each hop of the healthy windows, on the power of its motion.
 
-    Every window counts against its own mean, and as sharply as it reads: one that hardly determines the scale reads
-    large numbers by chance. None where the row reads no scale, or the hops do not tell.
+    Each window is centred on its own mean and weighted by its standard error, because a window that hardly determines
+    the scale reads large changes by chance. None if the row reads no scale, or the hops do not determine the growth.
     """
     at = next((number for number, own in enumerate(row.own) if 0 in own.terms), None)
     powers = [one for part in parts if (one := motion_power(row, relation, part.of.window)) is not None]
@@ -79,9 +79,9 @@ def growth_of(row: Row, relation: Relation, parts: Sequence[LagMoments]) -> Grow
 
 
 def motion_power(row: Row, relation: Relation, window: WindowStatistics) -> FloatArray | None:
-    """Power of the random motion that a row's scale resists, in every hop, shape (n_hops,); None if it is not measured.
+    """Power of the stochastic motion that a row's scale resists, in each hop, shape (n_hops,); None if not measured.
 
-    What is at running speed is not in it: an unbalance that grows takes a stiffening bearing elsewhere unseen.
+    Motion at running speed is not included, so a stiffening due to growing unbalance is not seen.
     """
     coordinate = row.terms[0].motions[0].coordinate
     at = [window.states.index(name) for name in relation.references if name in window.states and name[:2] == coordinate]

@@ -1,13 +1,12 @@
 """Moments of one row in one window: every term, correlated with past motions.
 
-Correlated with any motion that lies further back than the force remembers, a row of motion is zero. Sensor noise of
-shorter memory is gone as well. Nothing is differentiated: each moment is a correlation function under a smooth kernel
-over lags, and derivatives stand on the kernel.
+The correlation of a row of motion with any motion further back than the memory of the force is zero. So is that of
+sensor noise with a shorter memory. No signal is differentiated: each moment is the integral of a correlation function
+times a smooth kernel over lags, and derivatives are taken of the kernel.
 
-What the moments scatter by follows from the window's spectra (Bartlett's formula), without assuming a model of the
-machine. As the kernels are shifted copies of one another, every covariance is made of blocks that depend on the
-distance of two kernels alone; they are summed over frequency once, for all combinations of terms. The kernels'
-derivatives are the differentiator behind every row.
+The covariance of the moments follows from the window's spectra (Bartlett's formula), without a model of the machine.
+As the kernels are shifted copies of one another, every covariance consists of blocks that depend only on the distance
+between two kernels; they are summed over frequency once, for all combinations of terms.
 """
 
 from dataclasses import dataclass, replace
@@ -23,23 +22,23 @@ from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 
-# Times of a machine that the usual window suits; of another one each is multiplied by its time scale.
+# Times for a machine that suits the usual window; for another one, each is multiplied by its time scale.
 LONGEST_LAG_STEP_S = 0.00126  # spacing of the lags beyond which a kernel has too few points
 _SPACING_S = 0.004
 _FALLEN_TO = 0.1
-_FALLEN_AT = 3.0  # width times the band's end for cos⁸: a tenth is left there, and a seventieth a third further up
+_FALLEN_AT = 3.0  # kernel width times the band's upper end for cos⁸: gain 1/10 there, 1/70 a third further up
 _LEAD = 0.375
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """cosᵖ over a width: a sum of cosines of multiples of the width's frequency."""
+    """Kernel cosᵖ of a given width: a sum of cosines at multiples of 1/width."""
 
     power: int
     width_s: float
-    # From the shortest lag to the first kernel's centre; what lies before it weighs less than a thousandth.
+    # Shortest lag to the first kernel's centre; less than a thousandth of the kernel lies below the shortest lag.
     lead_s: float
-    spacing_s: float  # of neighbours, as near as the lags allow
+    spacing_s: float  # of neighbouring kernels, rounded to the spacing of the lags
 
     @property
     def cosines(self) -> FloatArray:
@@ -51,16 +50,16 @@ class Shape:
 
 
 def shape_for(deepest: int, band_to_hz: float, time_scale: float) -> Shape:
-    """Shape of the kernels that bear some derivatives.
+    """Shape of kernels that can be differentiated a given number of times.
 
-    One derivative is borne by a narrow kernel. Every further one lifts the sensors' noise by another power of the
-    frequency: kernels are then so wide that they pass nothing beyond the band of the spectra, or the spectra would not
-    know what the moments scatter by.
+    For one derivative a narrow kernel is enough. Each further one amplifies the sensors' noise by another power of the
+    frequency. Kernels must then be wide enough to pass hardly anything beyond the band of the spectra, as the scatter
+    of the moments is computed from the spectra.
 
     Parameters
     ----------
     deepest : int
-        Most derivatives on a kernel (`Formation.deepest`), at most 4.
+        Largest number of derivatives of a kernel (`Formation.deepest`), at most 4.
     band_to_hz : float
         Highest frequency of the window's spectra.
     """
@@ -75,14 +74,14 @@ def shape_for(deepest: int, band_to_hz: float, time_scale: float) -> Shape:
 class Kernels:
     """Kernels over the lags of a window."""
 
-    # (n_kernels, n_lags): kernels and their derivatives with alternating sign, (-1)ⁿ κ⁽ⁿ⁾, times the lags' spacing
+    # By order n of the derivative, (n_kernels, n_lags): (-1)ⁿ κ⁽ⁿ⁾ times the spacing of the lags
     values: tuple[FloatArray, ...]
     centres_s: FloatArray  # (n_kernels,)
 
 
 @lru_cache(maxsize=256)
 def kernels(lags: bytes, lag_from_s: float, shape: Shape, deepest: int) -> Kernels:
-    """Kernels from a shortest lag on, with up to `deepest` derivatives, at most 4; the lags are equally spaced."""
+    """Kernels from a shortest lag on, and up to `deepest` derivatives, at most 4; the lags are equally spaced."""
     lags_s = np.frombuffer(lags)
     step_s = float(lags_s[1] - lags_s[0])
     spacing_s = max(1, round(shape.spacing_s / step_s)) * step_s
@@ -94,7 +93,7 @@ def kernels(lags: bytes, lag_from_s: float, shape: Shape, deepest: int) -> Kerne
     for order in range(deepest + 1):
         value = np.zeros_like(u)
         for m, weight in enumerate(shape.cosines):
-            # d/dτ of cos(2π m u) turns its phase by a quarter
+            # d/dτ advances the phase of cos(2π m u) by π/2
             value += weight * (2 * np.pi * m / width_s) ** order * np.cos(2 * np.pi * m * u + order * np.pi / 2)
         values.append(np.where(inside, (-1) ** order * value, 0.0) * (step_s / width_s))
     return Kernels(tuple(values), centres)
@@ -110,14 +109,14 @@ def gain(frequencies_hz: FloatArray, shape: Shape) -> FloatArray:
 
 
 def passband_hz(deepest: int, band_to_hz: float, time_scale: float) -> float:
-    """Frequency, Hz, up to which kernels let through at least a tenth: the end of the differentiator's valid band."""
+    """Frequency, Hz, up to which kernels pass at least a tenth: the end of the differentiator's valid band."""
     f = np.linspace(0.0, 2000.0, 8001) / time_scale
     through = gain(f, shape_for(deepest, band_to_hz, time_scale))
     return float(min(band_to_hz, f[np.argmax(through < _FALLEN_TO * through[0])]))
 
 
-LAG_FROM_S = 0.036  # shortest lag where the memory of the excitation is not known yet: enough for a cutoff of 25 Hz
-SHORTEST_LAG_FROM_S, LONGEST_LAG_FROM_S = 0.014, 0.045  # what the shortest lag may be once the memory is known
+LAG_FROM_S = 0.036  # shortest lag while the memory of the excitation is not known yet: enough for a cutoff of 25 Hz
+SHORTEST_LAG_FROM_S, LONGEST_LAG_FROM_S = 0.014, 0.045  # limits of the shortest lag once the memory is known
 _RANK, _OWN = 1e-4, 1e-2
 
 
@@ -128,24 +127,24 @@ class LagMoments:
     of: "RowWindow"
     kernels: Kernels
     values: FloatArray  # (n_moments, n_terms), one row per reference and kernel, SI units
-    hop_values: FloatArray  # (n_hops, n_moments, n_terms), the same of every hop
-    index: npt.NDArray[np.intp]  # (n_moments, n_moments), where the elements of a covariance stand in `of.blocks`
+    hop_values: FloatArray  # (n_hops, n_moments, n_terms), the same for every hop
+    index: npt.NDArray[np.intp]  # (n_moments, n_moments), positions of a covariance's elements in `of.blocks`
 
     def only(self, kept: npt.NDArray[np.intp]) -> "LagMoments":
-        """Some of them."""
+        """Select some of the moments by index."""
         return replace(
             self, values=self.values[kept], hop_values=self.hop_values[:, kept], index=self.index[np.ix_(kept, kept)]
         )
 
     def covariance(self, combination: FloatArray) -> FloatArray:
-        """Covariance of the combination's moments where it is unrelated to the past, shape (n_moments, n_moments)."""
+        """Covariance of the combination's moments if it is uncorrelated with the past, shape (n_moments, n_moments)."""
         pairs = self.of.pairs
         weights = combination[pairs[0]] * combination[pairs[1]] * np.where(pairs[0] == pairs[1], 1.0, 2.0)
         blocks = np.tensordot(weights, self.of.blocks, axes=1)
         return np.asarray(blocks.reshape(-1)[self.index], dtype=np.float64)
 
     def noise(self, weight: npt.NDArray[np.floating]) -> FloatArray:
-        """Mean of values' W values that scatter alone would give, shape (n_terms, n_terms): errors in the variables."""
+        """Expectation of valuesᵀ W values due to scatter alone, shape (n_terms, n_terms): the errors in variables."""
         blocks = self.of.blocks
         summed = np.bincount(self.index.reshape(-1), weight.reshape(-1), blocks[0].size)
         found = blocks.reshape(blocks.shape[0], -1) @ summed
@@ -156,7 +155,7 @@ class LagMoments:
         return matrix
 
     def scatter(self, combination: FloatArray, weight: npt.NDArray[np.floating], rank: int) -> float:
-        """Scatter of the combination from hop to hop in units of what `weight` (the inverse covariance) expects."""
+        """Variance of the combination from hop to hop over that expected from `weight`, the inverse covariance."""
         hops = self.hop_values @ combination
         hops = hops - hops.mean(axis=0)
         count = hops.shape[0]
@@ -167,22 +166,22 @@ class LagMoments:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowWindow:
-    """One row in one window: what does not depend on the shortest lag."""
+    """The part of one row in one window that does not depend on the shortest lag."""
 
     window: WindowStatistics
     formation: Formation
     references: tuple[str, ...]  # states that serve as references
     terms: ComplexArray  # (n_bins, n_states, n_terms), the terms as combinations of the measured states
     spectra: ComplexArray  # (n_bins, n_terms, n_terms), cross-spectra of the terms
-    # (n_pairs, n_references, n_references, 2 n_distances - 1): covariance of moments of a pair of terms by references
-    # and by distance of the kernels
+    # (n_pairs, n_references, n_references, 2 n_distances - 1): covariance of the moments of each pair of terms, by
+    # their references and by the distance of their kernels
     blocks: FloatArray
     pairs: npt.NDArray[np.intp]  # (2, n_pairs), the pairs of terms
     factors: FloatArray  # (n_terms,), the speed for terms whose coefficient is proportional to it, else one
 
     @property
     def shape(self) -> Shape:
-        """Of the kernels."""
+        """Shape of the kernels."""
         window = self.window
         return shape_for(self.formation.deepest, float(window.frequencies_hz[-1]), window.time_scale)
 
@@ -217,7 +216,7 @@ class RowWindow:
 
 
 def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], references: tuple[str, ...]) -> RowWindow:
-    """Prepare a row in a window, whose correlations reach up to 0.1 s or more."""
+    """Prepare a row in a window, whose correlations must reach to lags of 0.1 s times the time scale or more."""
     formation = formation_of([term.motions for term in row.terms], states)
     index = {name: position for position, name in enumerate(window.states)}
     f = window.frequencies_hz
@@ -238,7 +237,7 @@ def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], refe
     centres_s = kernels(window.lags_s.tobytes(), shortest_s, shape, formation.deepest).centres_s
     cosine, sine = _waves(f.tobytes(), float(centres_s[1] - centres_s[0]), centres_s.size)
     flat = between.reshape(f.size, -1)
-    # one product for each reference pair: what the distance does to it, weighted by the pairs of terms
+    # one product for all reference pairs and distances, weighted with the cross-spectra of the pairs of terms
     even = own.T @ (flat.real[:, :, None] * cosine[:, None, :]).reshape(f.size, -1)
     odd = own.T @ (flat.imag[:, :, None] * sine[:, None, :]).reshape(f.size, -1)
     earlier, later = (each.reshape(pairs.shape[1], len(columns), len(columns), -1) for each in (even + odd, even - odd))
@@ -247,7 +246,7 @@ def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], refe
 
 
 def _reference_spectra(window: WindowStatistics, columns: list[int], shape: Shape) -> ComplexArray:
-    """Cross-spectra of the references seen through the kernels, by frequency, per resolution of the window."""
+    """Cross-spectra of the references times the kernels' squared gain and each bin's weight in Bartlett's formula."""
     weight = _bin_weights(window) * gain(window.frequencies_hz, shape) ** 2
     return np.asarray(window.spectrum[:, columns][:, :, columns].conj() * weight[:, None, None], dtype=np.complex128)
 
@@ -256,7 +255,7 @@ def _bin_weights(window: WindowStatistics) -> FloatArray:
     f = window.frequencies_hz
     step_hz = f[1] - f[0]
     bins_hz = np.full(f.size, step_hz)
-    bins_hz[0] += f[0] - step_hz / 2  # below the band the spectra are taken as level
+    bins_hz[0] += f[0] - step_hz / 2  # below the band the spectra are taken as flat
     return np.asarray(2 * bins_hz / window.duration_s, dtype=np.float64)
 
 
@@ -269,7 +268,7 @@ def _waves(frequencies: bytes, spacing_s: float, count: int) -> tuple[FloatArray
 
 @lru_cache(maxsize=64)
 def _block_index(n_references: int, n_kernels: int, n_distances: int) -> npt.NDArray[np.intp]:
-    """Where a covariance's elements stand in its blocks, which are flat: shape (n_moments, n_moments)."""
+    """Positions of a covariance's elements in its flattened blocks, shape (n_moments, n_moments)."""
     middle = n_distances // 2
     k = np.arange(n_kernels)
     distance = middle + k[:, None] - k[None, :]
@@ -298,18 +297,18 @@ def shared_covariance(a: LagMoments, of_a: FloatArray, b: LagMoments, of_b: Floa
 
 
 def telling(covariance: FloatArray) -> npt.NDArray[np.intp]:
-    """Moments that say something of their own, shape (n_kept,), by what they add to those before them.
+    """Indices of moments with variance of their own, shape (n_kept,).
 
-    Neighbouring kernels overlap. A moment whose variance the others account for to within a hundredth holds what the
-    spectra do not know, as in `inverse`; a Cholesky decomposition with pivoting finds those that are left in a
-    twentieth of the time that the eigenvectors take.
+    Neighbouring kernels overlap. If the others account for a moment's variance to within a hundredth, the rest is not
+    described by the spectra, as in `inverse`. A pivoted Cholesky decomposition finds the remaining moments in a
+    twentieth of the time that eigenvectors take.
 
     Raises
     ------
     LinAlgError
         If a moment does not scatter.
     """
-    # A little less of each following moment, so that rounding does not choose between two that say equally much.
+    # Scale each moment slightly smaller than the one before, so that rounding does not decide between equal ones.
     with np.errstate(invalid="ignore", divide="ignore"):
         scale = np.sqrt(np.diag(covariance) * (1 + np.linspace(0, _OWN, covariance.shape[0])))
         scaled = covariance / np.outer(scale, scale)
@@ -320,10 +319,10 @@ def telling(covariance: FloatArray) -> npt.NDArray[np.intp]:
 
 
 def inverse(covariance: FloatArray) -> tuple[FloatArray, int]:
-    """Inverse on the directions that the covariance resolves, and how many they are.
+    """Inverse on the directions that the covariance resolves, and their number.
 
-    Neighbouring kernels overlap. Directions with less than 1e-4 of the largest variance hold what the spectra do not
-    know (sampling of the lags, frequencies above their band), not information.
+    Neighbouring kernels overlap. Directions with less than 1e-4 of the largest variance contain no information, only
+    errors not described by the spectra (sampling of the lags, frequencies above the band).
     """
     scale = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))

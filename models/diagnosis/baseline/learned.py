@@ -1,4 +1,4 @@
-"""The baseline of a machine without parameters: what healthy windows teach, and how well they agree."""
+"""The baseline of a machine without parameters: learning it from healthy windows, and how well they agree."""
 
 import itertools
 from collections.abc import Hashable, Sequence
@@ -28,15 +28,15 @@ from models.signals.block import FloatArray
 
 _FOLDS = 6
 _FEWEST_OTHERS = 2
-_BEYOND = 2.0  # standard deviations of a mean beyond which it is taken for more than scatter
+_BEYOND = 2.0  # standard deviations beyond which a mean is taken for more than scatter
 
 
 @dataclass(frozen=True, slots=True)
 class HeldOutReading:
-    """One parameter of one healthy window, read against the relation that the other conditions teach."""
+    """One parameter of one healthy window, read against the relation learned in the other conditions."""
 
     parameter: str
-    # Relative change and its standard error, the relation's included.
+    # Relative change and its standard error, including the relation's error.
     change: Number
     standard_error: Positive
 
@@ -48,20 +48,21 @@ class HeldOutReading:
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """One healthy window of one row against what the windows of other conditions teach."""
+    """One healthy window of one row, read against the relation learned in the other conditions."""
 
     row: str  # name of the row
     window: Annotated[int, Field(ge=0)]  # number of the window, from 0
-    condition: str  # what it belongs to
+    condition: str  # condition of the window
     agreements: tuple[HeldOutReading, ...]  # one for each of the row's own parameters
-    misfit: NotNegative  # χ² of what is left per degree of freedom
+    misfit: NotNegative  # χ² of the residual per degree of freedom
     degrees_of_freedom: Annotated[int, Field(ge=1)]
 
 
 def left_out(row: Row, parts: Sequence[LagMoments], conditions: Sequence[Hashable]) -> tuple[LeftOut, ...]:
-    """Read every healthy window against the relation learned without its condition, where the others determine one.
+    """Read every healthy window against the relation learned without its condition, if the others determine one.
 
-    Where there is one condition, windows are left out one by one, or in up to six runs of neighbours.
+    With a single condition, up to six runs of neighbouring windows (single windows, if there are six or fewer) are left
+    out in turn.
     """
     groups = list(dict.fromkeys(conditions))
     if len(groups) > 1:
@@ -88,10 +89,10 @@ def left_out(row: Row, parts: Sequence[LagMoments], conditions: Sequence[Hashabl
 
 
 def allowance_of(found: Sequence[LeftOut]) -> float:
-    """Factor on variances that makes what windows of other conditions leave over as large as expected, at least 1.
+    """Factor on variances, at least 1, with which the residuals in held-out conditions are as large as expected.
 
-    A relation that is not quite the machine leaves over more in a condition that it was not learned in. The condition
-    that it fits worst counts.
+    A relation that only approximates the machine leaves a larger residual in a condition that it was not learned in.
+    The factor is that of the condition with the worst fit.
     """
     worst = 1.0
     for condition in {one.condition for one in found}:
@@ -109,7 +110,8 @@ def allowance_of(found: Sequence[LeftOut]) -> float:
 
 
 _SHORTEST_LAG_RANGE_S = 0.1
-# Planes are coupled where the stiffness across is more of that along, and more standard errors, in one of them.
+# Planes are coupled if in one of them the cross stiffness exceeds this part of the direct one, and so many standard
+# errors.
 _COUPLED, _SHOWN = 0.03, 4.0
 _FEWEST_HOPS = 2
 NO_FORCE: FloatArray = np.zeros((0, 0, 0))
@@ -117,47 +119,47 @@ NO_FORCE: FloatArray = np.zeros((0, 0, 0))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Baseline:
-    """What was learned on a healthy machine."""
+    """Everything learned on a healthy machine."""
 
-    relations: tuple[Relation | None, ...]  # one for each learned row of the table; None where there is none
-    reasons: tuple[str, ...]  # why there is no relation; empty where there is one
-    # (n, n): of the coefficients of all rows one after the other; zero where there is no relation
+    relations: tuple[Relation | None, ...]  # one for each learned row of the table; None if it has no relation
+    reasons: tuple[str, ...]  # why a row has no relation; empty if it has one
+    # (n, n): of the coefficients of all rows one after the other; zero for rows without a relation
     covariance: FloatArray
     # Synchronous vectors of the healthy machine, one for each distinct speed, slowest first.
     rotations: tuple[SynchronousVectors, ...]
-    duration_s: float  # healthy data
-    # Every healthy window of every row against what the windows of other conditions teach.
+    duration_s: float  # length of the healthy data
+    # Every healthy window of every row, read against the relation learned in the other conditions.
     consistency: tuple[LeftOut, ...] = ()
-    # (n_bands, n_rows, n_rows): force that it was learned under (`force_spectrum`); empty where it was not one, or is
-    # not seen in all rows
+    # (n_bands, n_rows, n_rows): force that the relations were learned under (`force_spectrum`); empty with several
+    # conditions, or if a row has no relation
     force: FloatArray = field(default_factory=NO_FORCE.copy)
-    # How the stiffness of each learned row grows with the motion; None where that is not known, empty in older records.
+    # Growth of the stiffness of each learned row with the motion; None if unknown, empty in older records.
     growth: tuple[Growth | None, ...] = ()
 
     @property
     def without_force(self) -> "Baseline":
-        """The same without the force: what it reads has the errors of other conditions, whatever moves the machine."""
+        """The same without the force: readings get the errors of other conditions, whatever moves the machine."""
         return replace(self, force=NO_FORCE)
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Measured states that it was learned with and that later windows must have."""
+        """Measured states used by the relations, which later windows must have."""
         return tuple(sorted({name for one in self.relations if one is not None for name in one.states}))
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """The shipped table that it was learned with."""
+        """The shipped table of rows that the baseline was learned with."""
         n_coupled = coefficient_slices(learned_rows(COUPLED_ROWS))[-1].stop
         return COUPLED_ROWS if len(self.covariance) == n_coupled else ROWS
 
 
 def learned_rows(rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Rows that are learned on the stochastic part."""
+    """Rows that are learned on the stochastic part of the signals."""
     return tuple(row for row in rows if not row.synchronous)
 
 
 def coefficient_slices(rows: Sequence[Row]) -> tuple[slice, ...]:
-    """Where the coefficients of each row stand among those of all."""
+    """Slice of each row's coefficients in the vector of all coefficients."""
     ends = np.cumsum([0, *(row.n_coefficients for row in rows)]).tolist()
     return tuple(slice(a, b) for a, b in itertools.pairwise(ends))
 
@@ -170,15 +172,15 @@ def learn_baseline(
     Parameters
     ----------
     windows : sequence of WindowStatistics
-        They must not overlap; a long recording is best cut into windows of about a minute. Each window weighs by its
-        own spectra, so that they may differ in speed, load, and level, colour and layout of the excitation.
+        They must not overlap; a long recording is best cut into windows of about a minute. Each window is weighted by
+        its own spectra, so windows may differ in speed, load, and level, colour and layout of the excitation.
     conditions : sequence, optional
-        What each window belongs to, for example the recording it was cut from; one condition without it.
+        Condition of each window, for example the recording it was cut from; by default all are of one condition.
 
     Raises
     ------
     EstimationError
-        If there is nothing to learn from, or if no row has a relation.
+        If there is no window, if one is unsuitable, or if no row has a relation.
     """
     if not windows:
         raise EstimationError("no healthy window to learn from")
@@ -206,7 +208,7 @@ def learn_baseline(
         parts.append(contributions)
     if all(relation is None for relation in relations):
         raise EstimationError("; ".join(dict.fromkeys(reasons)))
-    # Synchronous vectors are kept of all rows that the unbalance can be read by.
+    # Keep the synchronous vectors of all rows from which the unbalance can be read.
     there = {relation.row for relation in relations if relation is not None}
     used = [row for row in rows if row.synchronous and row.rests_on in there]
     coordinates = tuple(sorted({motion.coordinate for row in used for motion in row.motions}))
@@ -254,10 +256,10 @@ def _learn(
 
 
 def planes_coupled(windows: Sequence[WindowStatistics]) -> bool:
-    """Whether the bearing answers a motion in one plane with a force in the other, as far as healthy windows tell.
+    """Whether healthy windows show that the bearing answers a motion in one plane with a force in the other.
 
-    A relation of one plane alone is then none: what the other plane adds depends on how the force is directed. Where
-    one plane shows it, both are coupled; one source hides it in one plane at times, not in both.
+    Relations of single planes are then invalid: the contribution of the other plane depends on the direction of the
+    force. Planes count as coupled if one of them shows it; a single source may hide it in one plane, but not in both.
     """
     if not windows or any(unsuitable(window) for window in windows):
         return False
@@ -313,7 +315,7 @@ def unsuitable(window: WindowStatistics) -> str:
 
 
 def positive(covariance: FloatArray) -> FloatArray:
-    """The same covariance without negative eigenvalues (of correlations just beyond one)."""
+    """The covariance with negative eigenvalues (from correlations just beyond one) raised to almost zero."""
     if covariance.size == 0:
         return covariance
     variances = np.diag(covariance)
@@ -324,10 +326,10 @@ def positive(covariance: FloatArray) -> FloatArray:
     return np.asarray((vectors * np.maximum(values, 1e-9)) @ vectors.T * np.outer(scale, scale), dtype=np.float64)
 
 
-_FAR = 3.0  # spreads from what is expected
+_FAR = 3.0  # largest distance of a coefficient from its expected value, in expected spreads
 _VAGUE = 0.33  # relative standard error beyond which a coefficient is not known
-_LEFT_OVER = 5.0  # times what chance leaves; where there are several conditions, they are compared with each other
-_DISAGREE = 4.0  # standard errors between conditions
+_LEFT_OVER = 5.0  # largest χ² per degree of freedom with one condition; several are compared with each other instead
+_DISAGREE = 4.0  # standard errors beyond which conditions disagree
 _RECORD = (
     "make sure that the sensors of bearing and disc are not exchanged, that none has the wrong sign, and that all are "
     "sampled at once and AC-coupled alike (or state delay_us and high_pass_hz), or record a second condition: another "
@@ -336,11 +338,11 @@ _RECORD = (
 
 
 def undetermined(baseline: Baseline) -> tuple[str, ...]:
-    """Say of every learned row why the healthy windows do not determine it; empty where they do.
+    """For every learned row a sentence on why the healthy windows do not determine it; empty if they do.
 
-    One source of excitation leaves combinations of coefficients weakly determined. The estimate then wanders to where
-    damping or inertia is not physical, and no interval around it is honest. Each sentence says what to record instead;
-    it is empty, too, where there is no relation (``baseline.reasons`` says why).
+    With one source of excitation, combinations of coefficients are weakly determined. The estimate may then end where
+    damping or inertia is not physical, and no interval around it is valid. Each sentence says what to record instead.
+    It is also empty for a row without a relation (``baseline.reasons`` says why).
     """
     found, alone = [], len({one.condition for one in baseline.consistency}) < 2
     for row, relation in zip(learned_rows(baseline.rows), baseline.relations, strict=True):
@@ -370,11 +372,11 @@ def _reason(row: Row, relation: Relation, *, alone: bool) -> str:
 
 
 def disagreements(baseline: Baseline) -> tuple[str, ...]:
-    """Sentences on conditions in which a parameter reads otherwise than in all others.
+    """Sentences on conditions in which a parameter reads differently than in all others.
 
-    Readings of one condition share the error of the relation: their mean is compared with a standard error that does
-    not fall with their number. Where there are such conditions, keep a baseline for each, or widen (which later windows
-    do by `Relation.allowance` in any case).
+    Readings of one condition share the error of the relation, so the mean of their z is tested as a single one. If
+    there are such conditions, keep a baseline for each; otherwise `Relation.allowance` widens the errors of later
+    windows.
     """
     found = []
     for condition in dict.fromkeys(one.condition for one in baseline.consistency):

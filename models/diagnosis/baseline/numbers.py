@@ -1,4 +1,4 @@
-"""Numbers and arrays as a stored baseline has them: finite, and of possible sign and shape."""
+"""Types of the numbers and arrays in a stored baseline: finite, with their sign and shape validated."""
 
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -34,7 +34,7 @@ def _cube(bands: tuple[_Rows, ...]) -> FloatArray:
 
 
 def _stored(kind: object, made: Callable[[Any], FloatArray] = _array) -> GetPydanticSchema:
-    """Say that an array is stored as nested numbers."""
+    """Store an array as nested numbers."""
     as_numbers = Annotated[kind, AfterValidator(made), PlainSerializer(np.ndarray.tolist)]  # type: ignore[valid-type]
     return GetPydanticSchema(lambda _, handler: handler(as_numbers))
 

@@ -1,12 +1,12 @@
-"""The relation of one row: learned on healthy windows, and what a later window adds to it.
+"""The relation of one row: learning it on healthy windows, and reading the changes of later windows against it.
 
-Both are least squares in which every variable has errors: the moments of the terms scatter with the same force as the
-residual. Left alone that pulls the coefficients towards zero (many weak instruments), so the known part of the scatter
-is taken out of the normal equations (k-class estimator, k the smallest root and at most one).
+Both are least-squares problems with errors in all variables: the moments of the terms scatter with the same force as
+the residual. Uncorrected, that biases the coefficients towards zero (many weak instruments), so the known part of the
+scatter is subtracted from the normal equations (k-class estimator, k being the smallest root and at most one).
 
-A covariance describes the bottom of the criterion by a parabola. Where windows determine a direction weakly the
-criterion is flatter than that: the estimate moves to where the noise of the terms hides the misfit, and the parabola is
-drawn there. The interval is then taken from the criterion itself, which is right however weak the instruments are.
+A covariance approximates the criterion near its minimum by a parabola. In directions that the windows determine weakly
+the criterion is flatter: the estimate moves to where the noise of the terms hides the misfit, and so does the parabola.
+The interval is then taken from the criterion itself, which is valid however weak the instruments are.
 
 References
 ----------
@@ -37,15 +37,15 @@ from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 
-_RISE = 4.0  # what the criterion gains at two standard errors if the covariance is right
-# Distances that are tried, standard errors: to about twenty times what the covariance says.
+_RISE = 4.0  # rise of the criterion at two standard errors if the covariance is right
+# Distances tried, standard errors: the last one stretches the errors about twentyfold.
 _STEPS = 2.0 * 1.4 ** np.arange(10)
 
 
 def stretching(criterion: Callable[[FloatArray], float], b: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Matrix A that stretches errors e with the given covariance to A e, whose covariance is what the criterion says.
+    """Matrix A that stretches errors e with the given covariance to errors A e that agree with the criterion.
 
-    The criterion is χ² at an estimate; `b`, shape (n,), is the one whose covariance, shape (n, n), is given.
+    The criterion is χ² as a function of the estimate; `covariance`, shape (n, n), is that of the estimate `b`, (n,).
     """
     spread = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
@@ -62,9 +62,9 @@ def stretching(criterion: Callable[[FloatArray], float], b: FloatArray, covarian
 
 
 def relation_criterion(parts: Sequence[LagMoments], prior: FloatArray, b: FloatArray) -> float:
-    """Left-over moments of healthy windows, weighted as at these coefficients, less what scatter explains.
+    """χ² of the residual moments of healthy windows, weighted as at these coefficients, less its expectation.
 
-    The prior, shape (n, n), is the precision of what was expected of the coefficients.
+    The prior, shape (n, n), is the prior precision of the coefficients.
     """
     combination = np.concatenate([[1.0], -b])
     total = float(b @ prior @ b)
@@ -79,19 +79,19 @@ _MEMORY = 1.1
 _CUTOFFS_HZ = np.geomspace(10.0, 300.0, 40)
 _NOISES = np.concatenate([[0.0], np.geomspace(1e-6, 10.0, 25)])
 _LOWEST_RAISED_HZ = 8.0
-_COHERENT = 0.9  # share of the coherence that one source explains: 0.97 to 1 with one, 0.6 to 0.85 with several
+_COHERENT = 0.9  # least share of the coherence that one source explains: 0.97 to 1 with one, 0.6 to 0.85 with several
 
 
 def lag_beyond_memory(row: RowWindow, combination: FloatArray) -> float:
-    """Shortest lag, s, at which a force of this residual's colour has forgotten all but a few per cent.
+    """Lag, s, beyond which the autocorrelation of a force with this residual's spectrum is at most a few per cent.
 
-    The residual is the force, and the noise of the accelerations on top. A second-order roll-off and a noise that
-    rises with f⁴ are fitted by Whittle's likelihood on a grid. A wrong guess costs sharpness or shows in the misfit.
-    Where the row was differentiated, that is undone first; the sensors' noise at the lowest frequencies is left out.
+    The residual is the force plus the noise of the accelerations. A second-order roll-off and a noise that rises with
+    f⁴ are fitted by Whittle's likelihood on a grid. Too long a lag costs precision, too short a lag shows as misfit. If
+    the row was differentiated, that is undone first, and the lowest frequencies, with most sensor noise, are left out.
     """
     raised = row.formation.raised
     scale = row.window.time_scale
-    f = row.window.frequencies_hz * scale  # as if the machine were one that the usual window suits
+    f = row.window.frequencies_hz * scale  # scaled to a machine that suits the usual window
     used = f >= _LOWEST_RAISED_HZ if raised else np.ones(f.size, dtype=bool)
     f = f[used]
     density = row.residual_spectrum(combination)[used] / f ** (2 * raised)
@@ -104,8 +104,8 @@ def lag_beyond_memory(row: RowWindow, combination: FloatArray) -> float:
 def one_source(window: WindowStatistics) -> bool:
     """Whether one source moves all channels: their coherence matrices have one large eigenvalue.
 
-    Frequencies count by their power. Rates of one motion are coherent whatever moves it, so one channel of each
-    coordinate is looked at.
+    Frequencies are weighted with their power. Channels of one coordinate are coherent whatever moves it, so one channel
+    of each coordinate is used.
     """
     columns = list({name.split("_")[0]: number for number, name in enumerate(window.states)}.values())
     if len(columns) < 2:
@@ -136,7 +136,7 @@ _FITS = 3.0  # standard deviations of χ² within which a relation is taken to f
 _LAG_ROUNDS = 2
 _LONGER_LAGS_S = (0.02, 0.028, 0.036, LONGEST_LAG_FROM_S)
 _CONVERGED = 1e-4  # standard errors
-LOST = 0.5  # standard error of a stiffness beyond which a window says nothing of it
+LOST = 0.5  # standard error of a stiffness beyond which a window does not determine it
 
 
 _Names = Annotated[tuple[str, ...], Field(min_length=1)]
@@ -144,32 +144,32 @@ _Names = Annotated[tuple[str, ...], Field(min_length=1)]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Relation:
-    """What holds between the correlation functions of one row on the healthy machine."""
+    """Linear relation between the correlation functions of one row on the healthy machine."""
 
     row: str  # name in the table of rows
     states: _Names  # measured states the terms are formed from
     references: _Names  # measured states they were correlated with
-    # (n,): of every term but the first in term₀ = Σ b term; for the bearing's row -c/k, -m2/k, -m1/k and -s
+    # (n,): b of every term but the first in term₀ = Σ b term; for the bearing's row -c/k, -m2/k, -m1/k and -s
     coefficients: Annotated[Vector, Field(min_length=1)]
-    covariance: Covariance  # (n, n), theirs, widened where the relation did not fit
+    covariance: Covariance  # (n, n), of the coefficients, widened if the relation did not fit
     misfit: NotNegative  # χ² of the fit per degree of freedom
     degrees_of_freedom: Annotated[int, Field(ge=1)]
     # Factor on the variances of every later window, from how well the relation holds in conditions that it was not
     # learned in; at least 1.
     allowance: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 1.0
-    # Where it does not fit below this lag, no window is read below it either. What older records lack is left out where
-    # it says nothing: their commissionings keep their identity.
+    # Shortest lag at which the relation fits: later windows are not read below it. Zero is not stored, as older records
+    # lack the field, so that their commissionings keep their identity.
     lag_from_s: Annotated[NotNegative, Field(exclude_if=lambda lag_s: lag_s == 0)] = 0.0
 
     @property
     def combination(self) -> FloatArray:
-        """Combination of the terms that is the force."""
+        """Weights of the terms whose sum is the force."""
         return np.concatenate([[1.0], -self.coefficients])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contribution:
-    """What one healthy window adds to the coefficients of a row."""
+    """Contribution of one healthy window to the coefficients of a row."""
 
     moments: LagMoments
     projection: FloatArray  # (n_coefficients, n_moments), from its moments to the coefficients
@@ -177,29 +177,29 @@ class Contribution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowChange:
-    """What one window says of one row."""
+    """Changes of one row's own parameters as read in one window."""
 
     change: FloatArray  # (n_own,), relative change of the row's own parameters
-    # (n_own, n_moments): from the window's moments to the change, stretched to what the window objects to, and wider
-    # where more is left over than chance leaves
+    # (n_own, n_moments): from the window's moments to the change, stretched to agree with the criterion (`stretching`),
+    # and further if the residual exceeds its scatter
     projection: FloatArray
     sensitivity: FloatArray  # (n_own, n_coefficients), of the change to the relation's coefficients
     moments: LagMoments
-    combination: FloatArray  # (n_terms,), the window's own force
-    widening: float  # scatter from hop to hop over what the spectra expect, at least 1, times the relation's allowance
-    chi2: float  # what the change leaves, in units of all its errors
+    combination: FloatArray  # (n_terms,), weights of the terms whose sum is the window's own force
+    widening: float  # scatter from hop to hop over that predicted from the spectra, at least 1, times the allowance
+    chi2: float  # residual moments after the change, in units of all their errors
     degrees_of_freedom: int
-    # Whether no change at all leaves no more than chance does, of a row whose parts add up to less than they are: where
-    # a sensor is reversed or late the force that is left is so large that chance leaves anything.
+    # Whether no change at all fits as well, in a row whose terms partly cancel. If a sensor is reversed or late they do
+    # not: the residual force is then so large that anything is within its scatter.
     unchanged: bool
 
     @property
     def fits(self) -> bool:
-        """Whether what is left is within what scatter explains."""
+        """Whether the residual is within its scatter."""
         return _by_chance(self.chi2, self.degrees_of_freedom)
 
     def error(self, relation: Relation) -> FloatArray:
-        """Standard errors of the change, shape (n_own,), from the window and from its own row's coefficients."""
+        """Standard errors of the change, shape (n_own,), from the window and from the row's coefficients."""
         noise = self.projection @ self.moments.covariance(self.combination) @ self.projection.T * self.widening
         uncertain = self.sensitivity @ relation.covariance @ self.sensitivity.T
         return np.asarray(np.sqrt(np.diag(noise + uncertain)), dtype=np.float64)
@@ -207,7 +207,7 @@ class RowChange:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """Least squares over windows."""
+    """Result of least squares over healthy windows."""
 
     coefficients: FloatArray  # (n,)
     covariance: FloatArray  # (n, n)
@@ -216,7 +216,7 @@ class Fit:
 
     @property
     def fits(self) -> bool:
-        """Whether what is left is within what scatter explains."""
+        """Whether the residual is within its scatter."""
         return _by_chance(self.chi2, self.degrees_of_freedom)
 
 
@@ -225,7 +225,7 @@ def _by_chance(chi2: float, freedom: int) -> bool:
 
 
 def prior_of(row: Row, start: FloatArray, *, minimal: bool) -> FloatArray:
-    """Precision of what is expected of the coefficients, shape (n, n); `minimal` leaves out what can be left out."""
+    """Prior precision of the coefficients, shape (n, n); `minimal` all but excludes the optional terms."""
     precision = np.zeros((row.n_coefficients, row.n_coefficients))
     for number, term in enumerate(row.terms[1:]):
         spread = term.without if minimal and term.without is not None else term.spread
@@ -241,7 +241,7 @@ def prior_of(row: Row, start: FloatArray, *, minimal: bool) -> FloatArray:
 
 
 def _start(row: Row, parts: Sequence[LagMoments]) -> FloatArray:
-    """First coefficients, from the terms of which nothing is expected beforehand."""
+    """First coefficients: least squares with the terms that have no prior, zero for the others."""
     target = np.eye(len(row.terms))[0]
     stacked = np.concatenate([part.values / np.sqrt(np.diag(part.covariance(target)))[:, None] for part in parts])
     free = [number for number, term in enumerate(row.terms) if number and term.spread is None]
@@ -251,13 +251,13 @@ def _start(row: Row, parts: Sequence[LagMoments]) -> FloatArray:
 
 
 def beyond_memory(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMoments], tuple[Fit, Fit], float]:
-    """Moments of every window beyond its excitation's memory, from first fits; and what `fit_row` makes of them.
+    """Moments of every window beyond the memory of its excitation, their `fit_row`, and a longer shortest lag, s.
 
-    The colour of the force is known as well as the relation is. Of the fits without and with the optional terms the one
-    that remembers longer is believed, twice.
+    The force's spectrum, and so its memory, depends on the fitted relation. It is estimated from the fits without and
+    with the optional terms, and the longer lag is used; this is done twice.
 
-    What the row leaves out of the machine may be felt for longer than the force remembers. Where no relation fits,
-    longer lags are tried; the last value is the one at which one does, 0 if none had to be.
+    Parts of the machine that the row omits may act for longer than the memory of the force. If no relation fits, longer
+    lags are tried; the last value is the one from which a relation fits, 0 if none was needed or none helped.
     """
     parts, fits, lags = _beyond_force(row, windows)
     if any(fit.fits for fit in fits):
@@ -287,7 +287,7 @@ def _beyond_force(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMomen
 
 
 def fit_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Fit, Fit]:
-    """Fit a row without its optional terms and with them."""
+    """Fit a row without its optional terms, and with them."""
     start = _start(row, parts)
     full = _fit(parts, start, prior_of(row, start, minimal=False))
     return _fit(parts, full.coefficients, prior_of(row, start, minimal=True)), full
@@ -306,20 +306,20 @@ def learn_row(
     Parameters
     ----------
     fits : tuple of Fit, optional
-        What `fit_row` makes of them, where that is known.
+        Result of `fit_row` for these moments, if already known.
     lag_from_s : float
-        Lag that later windows are not to be read below.
+        Shortest lag at which later windows are to be read.
     widened : bool
-        Whether the covariance is widened to what the windows object to (`stretching`), which takes most of the time.
+        Whether the covariance is widened to agree with the criterion (`stretching`), which takes most of the time.
 
     Raises
     ------
     EstimationError
         If the windows do not determine the row's own parameters.
     """
-    # Without the optional terms where that fits; their uncertainty counts in either case. With one source, y2 - y1 and
-    # the disc's acceleration can take each other's place, and the estimate wanders along that direction further than
-    # its covariance says, to where the terms' own noise hides the misfit.
+    # Leave out the optional terms if that fits, but always include their uncertainty. With one source, y2 - y1 and the
+    # disc's acceleration are interchangeable, and the estimate moves along that direction by more than its covariance
+    # indicates, to where the terms' own noise hides the misfit.
     minimal, full = fit_row(row, parts) if fits is None else fits
     chosen, covariance = full, full.covariance
     prior = prior_of(row, _start(row, parts), minimal=False)
@@ -379,7 +379,7 @@ def _fit(parts: Sequence[LagMoments], b: FloatArray, prior: FloatArray, iteratio
 
 
 def _least_squares(Q: FloatArray, C: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Regress the first variable on the others, given products Q and the part C of them that is scatter."""
+    """Regress the first variable on the others, given the matrix of products Q and its part C due to scatter."""
     scale = 1 / np.sqrt(np.diag(Q))
     root = float(eigh(Q * np.outer(scale, scale), C * np.outer(scale, scale), eigvals_only=True)[0])
     k = min(1.0, root)
@@ -392,22 +392,22 @@ def _least_squares(Q: FloatArray, C: FloatArray, prior: FloatArray) -> tuple[Flo
 def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
     """Read the change of a row's own parameters in one window.
 
-    Moments are weighted by all that is uncertain, the relation included: where the healthy recording did not determine
-    the relation, a window is not asked.
+    Moments are weighted by all uncertainties including the relation's: directions in which the healthy recording did
+    not determine the relation carry little weight.
 
-    A guess of the force's memory that is too short leaves more than chance does. Where so much is left, and not beyond
-    the longer lag of the first reading, that one is believed, as it was when the relation was learned.
+    Too short an estimate of the force's memory leaves a residual beyond its scatter. If so, and the longer lag of the
+    first reading leaves none, that reading is used, as when the relation was learned.
 
     Raises
     ------
     EstimationError
-        If the window does not determine them: it is explained as it is, and by nearly any change as well.
+        If the window does not determine them: no change at all fits, and so does nearly any change.
     """
     usual_s = LAG_FROM_S * window.window.time_scale
     first = change_of(row, relation, window.beyond(max(usual_s, relation.lag_from_s)), stretched=False)
     lag_s = max(relation.lag_from_s, lag_beyond_memory(window, first.combination))
     believed = change = change_of(row, relation, window.beyond(lag_s))
-    # An estimate that the window does not determine wanders, to where the misfit is anything: no change counts as well.
+    # The misfit of an undetermined estimate can be anything, so the fit of no change at all is tested, too.
     unchanged = change.unchanged
     if lag_s < usual_s:
         unchanged |= first.unchanged
@@ -422,7 +422,7 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
 def change_of(row: Row, relation: Relation, moments: LagMoments, *, stretched: bool = True) -> RowChange:
     """Read the change from given moments.
 
-    To stretch errors to what the window objects to (`stretching`) takes most of the time.
+    Widening the errors to agree with the criterion (`stretching`) takes most of the time.
 
     Raises
     ------
@@ -465,7 +465,7 @@ def change_of(row: Row, relation: Relation, moments: LagMoments, *, stretched: b
         return float(rest @ np.linalg.solve(used.covariance(force) * widening + uncertain[grid], rest))
 
     chi2, freedom = float(left @ W @ left), max(1, kept.size - d.size)
-    # What is left beyond chance was not expected by any of these errors: it is in the change as well.
+    # A residual beyond its scatter comes from an error that is not modelled, which affects the change, too.
     beyond = 1.0 if _by_chance(chi2, freedom) else chi2 / freedom
     stretch = stretching(criterion, d, covariance) if stretched else np.eye(d.size)
     return RowChange(
@@ -482,6 +482,6 @@ def change_of(row: Row, relation: Relation, moments: LagMoments, *, stretched: b
 
 
 def _cancels_nothing(relation: Relation, moments: LagMoments) -> bool:
-    """Whether more is left of the row as it was learned than its parts hold, as if one of them had another sign."""
+    """Whether the residual of the learned relation exceeds the sum of its terms' powers, as if a sign were wrong."""
     parts = [np.trace(moments.covariance(part)) for part in np.diag(relation.combination)]
     return bool(np.trace(moments.covariance(relation.combination)) > sum(parts))

@@ -1,17 +1,17 @@
-"""The rows of motion that a machine without parameters is read by, as a table.
+"""Table of the rows of motion by which a machine without parameters is read.
 
-Everything else in this room is driven by it: a row that is added here is learned, read, stored and reported without a
-change elsewhere. The sum of the rows of bearing and disc holds no shaft force and no tilt. Divided by the bearing's
-stiffness to ground,
+The table drives the rest of this package: a row added here is learned, read, stored and reported without a change
+elsewhere. The sum of the equations of motion of bearing and disc contains no shaft force and no tilt. Divided by the
+bearing's stiffness to ground k,
 
     y1 + (c/k) ẏ1 + (m2/k) ÿ2 + (m1/k) ÿ1 + s (y2 - y1) = f / k,
 
-where s is zero on the six-degree-of-freedom machine and takes up a shaft that is held elsewhere too.
+where s is zero on the six-degree-of-freedom machine and allows for a shaft that is also held elsewhere.
 
-Displacement, velocity and acceleration of a place are one motion. Correlated under a smooth kernel over lags, a
-derivative is moved to the kernel, so that one of the three suffices. It cannot be integrated that way: where a place
-has a velocity or an acceleration alone, the whole row is differentiated, once or twice, which leaves it as true as it
-was.
+Displacement, velocity and acceleration of a place are one motion. When a correlation is smoothed with a kernel over
+lags, derivatives can be moved to the kernel, so one of the three suffices. Integration is not possible that way: if
+only a velocity or an acceleration is measured at a place, the whole row is differentiated once or twice and still
+holds.
 """
 
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A measured state and the derivative of it that stands on the kernel."""
+    """A measured state, and the number of its derivatives that are moved to the kernel."""
 
     state: str
     derivatives: int
@@ -54,7 +54,7 @@ class Formation:
     """How the terms of a row are formed."""
 
     raised: int  # how often the whole row is differentiated
-    terms: tuple[tuple[Source, ...], ...]  # what each term is the sum of
+    terms: tuple[tuple[Source, ...], ...]  # the summands of each term
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -63,7 +63,7 @@ class Formation:
 
     @property
     def deepest(self) -> int:
-        """Most derivatives on a kernel."""
+        """Largest number of derivatives of a kernel."""
         return max(source.derivatives for term in self.terms for source in term)
 
 
@@ -83,7 +83,7 @@ def lowest(coordinate: str, states: Sequence[str]) -> int | None:
 
 
 def not_measured(motions: Sequence[Motion], states: Sequence[str]) -> str:
-    """Sentence that says what is missing for some motions; empty if nothing is."""
+    """Sentence on the coordinates of these motions that are not measured; empty if all are."""
     coordinates = dict.fromkeys(motion.coordinate for motion in motions)
     missing = [_described(coordinate) for coordinate in coordinates if not _measured(coordinate, states)]
     return f"not measured: {'; '.join(missing)}" if missing else ""
@@ -97,8 +97,8 @@ def _described(coordinate: str) -> str:
 def formation_of(terms: Sequence[Sequence[Motion]], states: Sequence[str]) -> Formation:
     """Choose how to form the terms of a row, each the sum of motions whose coordinates are measured (`not_measured`).
 
-    The row is differentiated as rarely as possible. Then every motion is taken from the highest measured derivative
-    that does not exceed it: what needs not be differentiated is not made noisier.
+    The row is differentiated as few times as possible. Then every motion is formed from the highest measured derivative
+    that does not exceed it, because each differentiation amplifies noise.
     """
     motions = [motion for term in terms for motion in term]
     raised = max(max(0, _measured(motion.coordinate, states)[0] - motion.order) for motion in motions)
@@ -121,11 +121,11 @@ class Term:
     """One term of a row: motions that share a coefficient."""
 
     motions: tuple[Motion, ...]  # their weighted sum
-    # Standard deviation expected beforehand of the coefficient; None where nothing is expected.
+    # Prior standard deviation of the coefficient; None without a prior.
     spread: float | None = None
-    in_units_of: int | None = None  # term whose coefficient `spread` and `about` are multiples of
-    about: float = 0.0  # value expected beforehand
-    without: float | None = None  # expected spread of a term that is left out wherever the relation holds without it
+    in_units_of: int | None = None  # term whose coefficient is the unit of `spread` and `about`
+    about: float = 0.0  # prior mean of the coefficient
+    without: float | None = None  # for an optional term: prior standard deviation if the relation holds without it
     times_speed: bool = False  # whether the coefficient is proportional to the speed (gyroscopic terms)
 
 
@@ -135,18 +135,18 @@ class Own:
 
     parameter: str  # one of ``models.physics.rotor.PARAMETERS``
     terms: tuple[int, ...] = ()  # terms whose coefficients are proportional to it
-    # Whether these terms have the sign of the first one, as a stiffness and a damping do; a fit of the other sign has
-    # not determined them.
+    # Whether these terms must have the sign of the first one, as a stiffness and a damping do; a fit with the other
+    # sign has not determined them.
     resists: bool = True
-    # Factor on the standard error where one source moves everything: all channels are then coherent, what the row
-    # leaves out of the machine is driven by the same force as what it holds, and is not averaged away. Measured on
-    # finite-element rotors (decision 0012).
+    # Factor on the standard error if one source moves everything: all channels are then coherent, and as the same force
+    # drives the omitted parts of the machine, their effect does not average out. Measured on finite-element rotors
+    # (decision 0012).
     one_source: float = 1.0
-    # Standard error of a relative change, from what the row leaves out of the machine, which pulls otherwise where
-    # another force moves it; of a relation learned in one condition (decision 0012). Neither it nor `one_source` is
-    # taken where the force is still the commissioned one, but for a stiffness: a bearing is never quite linear.
+    # Standard error of a relative change due to omitted parts of the machine, whose effect differs under another force;
+    # for a relation learned in one condition (decision 0012). Under the commissioned force, `one_source` is not applied
+    # and `elsewhere` only to a stiffness, as a bearing is never quite linear.
     elsewhere: float = 0.0
-    always: bool = False  # whether `elsewhere` is taken there, too
+    always: bool = False  # whether `elsewhere` is applied under the commissioned force, too
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,26 +155,26 @@ class Row:
 
     name: str  # unique in the table
     number: str  # the paper's equations
-    title: str  # what it is about
+    title: str  # short description for texts
     terms: tuple[Term, ...]  # the first is the target: its coefficient is one
-    own: tuple[Own, ...]  # what it reads. A change of the first is relative to the scale of the row
-    # Name of the row whose coefficients it uses, for a row that is evaluated on the rotation-synchronous vectors; empty
-    # for one that is learned on the stochastic part.
+    own: tuple[Own, ...]  # parameters that it reads; a change of the first is relative to the scale of the row
+    # For a row evaluated on the rotation-synchronous vectors, name of the row whose coefficients it uses; empty for a
+    # row learned on the stochastic part.
     rests_on: str = ""
 
     @property
     def synchronous(self) -> bool:
-        """Whether it is evaluated on the rotation-synchronous vectors."""
+        """Whether the row is evaluated on the rotation-synchronous vectors."""
         return bool(self.rests_on)
 
     @property
     def n_coefficients(self) -> int:
-        """Coefficients to learn."""
+        """Number of coefficients to learn."""
         return len(self.terms) - 1
 
     @property
     def needs_speed(self) -> bool:
-        """Whether it cannot be evaluated without a phase reference."""
+        """Whether the row cannot be evaluated without the speed."""
         return self.synchronous or any(term.times_speed for term in self.terms)
 
     @property
@@ -189,7 +189,7 @@ def _bearing_and_disc(plane: str) -> tuple[Term, ...]:
         Term((Motion(one, 0),)),
         Term((Motion(one, 1),)),
         Term((Motion(two, 2),)),
-        # what moves with the bearing, from next to nothing to as much as the disc
+        # mass that moves with the bearing, from next to nothing to that of the disc
         Term((Motion(one, 2),), spread=0.4, in_units_of=2, about=0.4),
         Term((Motion(two, 0), Motion(one, 0, -1.0)), spread=0.5, without=0.02),
     )
@@ -224,7 +224,7 @@ def _coupled(row: Row) -> Row:
 
 
 COUPLED_ROWS = tuple(_coupled(row) for row in ROWS)
-"""The same for a bearing whose force has a part across its motion, as that of an oil film or of a mesh has."""
+"""The same rows for a bearing whose force has a component across its motion, as with an oil film or a gear mesh."""
 
 
 def parameters_of(rows: Sequence[Row] = ROWS) -> tuple[str, ...]:
@@ -236,7 +236,7 @@ def parameters_of(rows: Sequence[Row] = ROWS) -> tuple[str, ...]:
 def evaluable_rows(states: Sequence[str], has_phase_reference: bool) -> list[tuple[Row, str]]:
     """Every row with the reason why it cannot be evaluated with these sensors; empty if it can.
 
-    A speed that the vibration's own line is looked for at serves as phase reference, too.
+    `has_phase_reference` is also true if the speed is estimated from the 1x line in the vibration.
     """
     found = []
     for row in ROWS:

@@ -1,7 +1,7 @@
-"""A baseline as JSON: some hundred numbers and no code, restored to the last bit.
+"""A baseline as JSON: some hundred numbers and no code.
 
-Numbers are written with as many digits as it takes to read the same number back, so that a restored baseline gives the
-same diagnoses as the one that was stored.
+Numbers are written with as many digits as needed to read back the same bits, so that a restored baseline gives the same
+diagnoses as the one that was stored.
 """
 
 import json
@@ -19,18 +19,18 @@ from models.diagnosis.baseline.unbalance import SynchronousVectors
 
 
 class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
-    """What was learned on a healthy machine, as plain numbers."""
+    """A `Baseline`, as plain numbers."""
 
     format: Literal[1] = 1
     relations: tuple[Relation | None, ...]  # one for each learned row, or null
-    reasons: tuple[str, ...]  # why there is none
+    reasons: tuple[str, ...]  # why a row has no relation
     covariance: Covariance  # of the coefficients of all rows
     rotations: tuple[SynchronousVectors, ...]  # synchronous vectors by speed
     duration_s: Positive
     consistency: tuple[LeftOut, ...] = ()  # healthy windows against each other
-    # Cross-spectra of what the rows leave over, by bands; empty where the healthy recordings had several forces.
+    # Cross-spectra of the rows' residuals by bands; empty if the healthy recordings had several conditions.
     force: Spectra = Field(default_factory=NO_FORCE.copy, exclude_if=lambda bands: not len(bands))
-    # Of each learned row, or null; empty in older records.
+    # One for each learned row, or null; empty in older records.
     growth: tuple[Growth | None, ...] = Field(default=(), exclude_if=lambda rows: not rows)
 
     @model_validator(mode="after")
@@ -67,7 +67,7 @@ class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
 
     @classmethod
     def of(cls, baseline: Baseline) -> Self:
-        """Record of a baseline.
+        """Make the record of a baseline.
 
         Raises
         ------
@@ -77,7 +77,7 @@ class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
         return cls.model_validate_json(json.dumps(asdict(baseline), default=lambda numbers: numbers.tolist()))
 
     def diagnostician(self) -> BaselineDiagnostician:
-        """What reads windows against it."""
+        """Diagnostician that reads windows against the baseline."""
         return BaselineDiagnostician(self.baseline())
 
     def baseline(self) -> Baseline:

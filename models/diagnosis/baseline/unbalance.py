@@ -1,8 +1,8 @@
-"""The unbalance from the rotation-synchronous vectors, through the relation that the stochastic part taught.
+"""The unbalance from the rotation-synchronous vectors, by means of the relation learned on the stochastic part.
 
-With the phase reference as reference channel the stochastic force drops out of the relation, and what is left of the
-synchronous vectors is the unbalance force over the stiffness to ground, F = Y1 + jΩ(c/k) Y1 - Ω²(m2/k) Y2 - …, in both
-planes. A bearing that changed enters with its own reading, so that its effect on the 1x amplitude is not taken for
+With the phase reference as reference channel the stochastic force averages out of the relation. Its residual for the
+synchronous vectors is the unbalance force over the stiffness to ground, F = Y1 + jΩ(c/k) Y1 - Ω²(m2/k) Y2 - …, in each
+plane. Changes of the bearing enter with their own readings, so that their effect on the 1x amplitude is not taken for
 unbalance. Velocities and accelerations are displacements times jΩ and -Ω².
 """
 
@@ -28,15 +28,15 @@ _NEIGHBOURS = (2, 8)
 class SynchronousVectors:
     """Synchronous vectors of one window, or of a baseline at one speed."""
 
-    coordinates: Annotated[tuple[str, ...], Field(min_length=1)]  # whose they are, for example y1, y2, z1, z2
+    coordinates: Annotated[tuple[str, ...], Field(min_length=1)]  # for example y1, y2, z1, z2
     vectors: Vector  # (2 n,), real parts of the displacements, then their imaginary parts, m
     covariance: Covariance  # (2 n, 2 n), from the stochastic part near the speed
     speed_rad_s: Number
-    # Whether angles are those to the phase reference; otherwise only angles between coordinates hold.
+    # Whether angles are relative to the phase reference; otherwise only angles between coordinates are meaningful.
     absolute: bool = True
 
     def of(self, coordinates: tuple[str, ...]) -> "SynchronousVectors":
-        """The same of some of the coordinates."""
+        """The vectors of some of the coordinates."""
         n = len(self.coordinates)
         keep = [self.coordinates.index(name) for name in coordinates]
         keep = [*keep, *(n + number for number in keep)]
@@ -50,7 +50,7 @@ class SynchronousVectors:
         return self.coordinates[int(np.argmax(np.hypot(self.vectors[:n], self.vectors[n:])))]
 
     def turned(self, coordinate: str) -> "SynchronousVectors":
-        """The same from the angle at which a coordinate is largest."""
+        """The vectors with angles relative to that of a coordinate."""
         n, at = len(self.coordinates), self.coordinates.index(coordinate)
         angle = np.arctan2(self.vectors[n + at], self.vectors[at])
         c, s = np.cos(angle) * np.eye(n), np.sin(angle) * np.eye(n)
@@ -61,7 +61,7 @@ class SynchronousVectors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForceRow:
-    """A row that the unbalance is read by, and where its numbers stand among those of all rows."""
+    """A row from which the unbalance is read, and the slices of its numbers among those of all rows."""
 
     row: Row  # learned on the stochastic part
     coefficients: slice  # of its relation among all coefficients
@@ -70,12 +70,12 @@ class ForceRow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativeForce:
-    """Unbalance force over the healthy one, less one: real parts row by row, then imaginary parts; and its slopes."""
+    """Unbalance force over the healthy one, less one, and its derivatives; real parts of all rows, then imaginary."""
 
     value: FloatArray  # (2 n_rows,)
-    to_coefficients: FloatArray  # (2 n_rows, n_coefficients), of all relations
-    to_change: FloatArray  # (2 n_rows, n_own), of all their own parameters
-    # (2 n_rows, 2 n_coordinates): to real parts of the synchronous vectors, then to their imaginary parts
+    to_coefficients: FloatArray  # (2 n_rows, n_coefficients), with respect to all relations' coefficients
+    to_change: FloatArray  # (2 n_rows, n_own), with respect to the changes of all own parameters
+    # (2 n_rows, 2 n_coordinates): with respect to the real parts of the synchronous vectors, then the imaginary parts
     to_now: FloatArray
     to_healthy: FloatArray
 
@@ -83,7 +83,7 @@ class RelativeForce:
 def rotation_of(window: WindowStatistics, coordinates: tuple[str, ...]) -> SynchronousVectors | None:
     """Synchronous vectors of a window with their covariance; None without a coordinate or a steady speed.
 
-    Where the speed was estimated from the vibration, angles to the shaft are not known.
+    If the speed was estimated from the vibration, angles relative to the shaft are not known.
     """
     measured = _synchronous(window)
     if measured is None or not coordinates or not np.isfinite(window.speed_rad_s) or window.speed_rad_s == 0:
@@ -97,20 +97,20 @@ def rotation_of(window: WindowStatistics, coordinates: tuple[str, ...]) -> Synch
     q = measured[columns] * to_displacement
     step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
     distance = np.abs(np.round((window.frequencies_hz - window.speed_rad_s / (2 * np.pi)) / step_hz))
-    # the regression has emptied the bin of the line itself
+    # removing the synchronous part has emptied the bin of the line itself
     near = (distance >= _NEIGHBOURS[0]) & (distance <= _NEIGHBOURS[1])
     if not np.any(near):
         return None
     density = window.spectrum[near][:, columns][:, :, columns].mean(axis=0) * (2 / window.duration_s)
     density = density * np.outer(to_displacement, to_displacement.conj())
-    # q = a - jb with the phase of cos θ: the density of q is that of the transform
+    # q = a - jb with the phase of cos θ, so its density is that of the Fourier transform
     covariance = np.block([[density.real, -density.imag], [density.imag, density.real]])
     absolute = window.synchronous is not None
     return SynchronousVectors(coordinates, np.concatenate([q.real, q.imag]), covariance, window.speed_rad_s, absolute)
 
 
 def _synchronous(window: WindowStatistics) -> ComplexArray | None:
-    """Synchronous part of the states; its angles are relative where the speed is estimated."""
+    """Synchronous part of the states; its angles are relative if the speed is estimated."""
     if window.synchronous is not None or window.relative_synchronous is None:
         return window.synchronous
     seen = window.relative_synchronous[np.any(window.relative_synchronous != 0, axis=1)]
@@ -118,7 +118,7 @@ def _synchronous(window: WindowStatistics) -> ComplexArray | None:
 
 
 def rotations_by_speed(found: Sequence[SynchronousVectors]) -> tuple[SynchronousVectors, ...]:
-    """One rotation for each distinct speed, slowest first: the mean of those within 3 % of the slowest among them."""
+    """Mean vectors for each distinct speed, slowest first; speeds within 3 % of a group's slowest are one group."""
     if not all(one.absolute for one in found):
         reference = found[0].largest
         found = [one.turned(reference) for one in found]
@@ -148,10 +148,10 @@ def relative_force(
     now: SynchronousVectors,
     healthy: SynchronousVectors,
 ) -> RelativeForce:
-    """Compare what the rows leave of synchronous vectors with what they leave of the healthy ones.
+    """Ratio of the rows' residuals for the present synchronous vectors to those for the healthy ones.
 
-    Coefficients, shape (n_coefficients,), are those of all relations; the relative change, shape (n_own,), that of all
-    their own parameters, of which the healthy machine has none.
+    `coefficients`, shape (n_coefficients,), are those of all relations; `change`, shape (n_own,), is the relative
+    change of all their own parameters since the machine was healthy.
     """
     n, n_coordinates = len(rows), len(now.coordinates)
     ratio = np.zeros(n, dtype=np.complex128)
@@ -198,18 +198,18 @@ def _terms(row: Row, vectors: SynchronousVectors) -> ComplexArray:
 
 
 class ForeignRotationError(EstimationError):
-    """What turns with the shaft is not what an unbalance makes."""
+    """The 1x vectors are not those that an unbalance causes."""
 
 
 def combination(design: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Weights with which the rows' forces make the vector of the unbalance, shape (2, n_rows).
+    """Generalised least-squares weights that combine the rows' forces to the vector of the unbalance, (2, n_rows).
 
     The design is of shape (n_rows, 2), the covariance of the rows' errors of shape (n_rows, n_rows).
 
     Raises
     ------
     EstimationError
-        If it has no inverse: of what is no rotor, errors may be all that there is.
+        If it has no inverse, as when signals that do not come from a rotor contain nothing but errors.
     """
     try:
         weight = np.linalg.inv(covariance)
