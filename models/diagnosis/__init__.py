@@ -1,1 +1,1 @@
-"""Sliding correlations, the equation table and its networks, the likelihood, and the trained bundle."""
+"""Diagnosis of windows: their statistics, the diagnosticians, the checks of the sensors, and the verdict."""

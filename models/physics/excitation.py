@@ -1,8 +1,8 @@
 """Coloured stochastic excitation: white noise through a linear filter (Eqs. 7-12).
 
-The paper's filter is a second-order low-pass. Machines are not all like that, so the order may be one to four
-(Butterworth) and a broad hump may stand on the low-pass floor: Eqs. (7)-(8) with other matrices R and S*, and A* and B*
-that grow with them. Every source has unit variance before `force_rms_N`, whatever its shape.
+The paper's filter is a second-order low-pass. As not all machines are like that, the order may be one to four
+(Butterworth) and a broad hump may be added to the low-pass floor: Eqs. (7)-(8) with other matrices R and S*, and A* and
+B* enlarged accordingly. Every source has unit variance before `force_rms_N` is applied, whatever its shape.
 """
 
 import math
@@ -29,8 +29,8 @@ class Source(BaseModel, extra="forbid", frozen=True):
     # Part of the force's variance in a broad hump, 0 to 1; the rest is the low-pass floor. Hump and floor are driven by
     # independent white noise, so that their spectra add.
     hump_share: float = Field(default=0.0, ge=0, le=1)
-    # Centre and damping ratio of the hump, white noise through a second-order band-pass; its half-power width is 2 ·
-    # damping · centre.
+    # Centre and damping ratio of the hump, which is white noise through a second-order band-pass with a half-power
+    # width of 2 · damping · centre.
     hump_hz: float = Field(default=80.0, gt=0, le=1e5)
     hump_damping: float = Field(default=0.4, gt=0, le=1)
 
@@ -48,7 +48,7 @@ def colouring_filter(source: Source) -> ColouringFilter:
     """Filter of one source.
 
     A low-pass of order n has the states (u, u̇/ω_c, …), all of one unit, and the normalised Butterworth polynomial in
-    its last row; a hump adds two states (v, v̇/ω_h) of which the second is the band-pass' output.
+    its last row; a hump adds two states (v, v̇/ω_h), the second of which is the output of the band-pass.
     """
     floor = _butterworth(source.cutoff_hz, source.order)
     if source.hump_share == 0:
@@ -84,9 +84,9 @@ def _butterworth(cutoff_hz: float, order: int) -> ColouringFilter:
 
 
 def _floor_density(cutoff_hz: float, order: int) -> float:
-    """Two-sided density at zero frequency of unit variance through a Butterworth low-pass, 1/Hz.
+    """Two-sided density at zero frequency of Butterworth low-pass noise with unit variance, 1/Hz.
 
-    Its noise bandwidth, both sides, is 2 f_c (π/2n) / sin(π/2n).
+    The filter's two-sided noise bandwidth is 2 f_c (π/2n) / sin(π/2n).
     """
     return math.sin(math.pi / (2 * order)) * order / (math.pi * cutoff_hz)
 
@@ -109,7 +109,7 @@ def filter_R(cutoff_hz: float) -> FloatArray:
 
 
 def filter_gain(cutoff_hz: float) -> float:
-    """S* of Eq. (7): gain for unit-intensity white noise that makes u(t) of unit variance.
+    """S* of Eq. (7): gain for white noise of unit intensity with which u(t) has unit variance.
 
     The stationary variance of u for ü + 2ζω u̇ + ω² u = g ω w is g²/(4ζω); with states scaled by ω the gain is 2√(ζω).
     """
@@ -125,7 +125,7 @@ def low_pass(frequency_hz: FloatArray, cutoff_hz: float, order: float = 2.0) -> 
 
 
 def low_pass_slopes(frequency_hz: FloatArray, cutoff_hz: float, order: float = 2.0) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of log `low_pass` by the logarithms of cutoff and order; each of the shape of `frequency_hz`."""
+    """Derivatives of log `low_pass` with respect to the logarithms of cutoff and order; shaped like `frequency_hz`."""
     ratio = np.abs(frequency_hz / cutoff_hz)
     stopped = 2 * order * (1 - low_pass(frequency_hz, cutoff_hz, order))
     return stopped, -stopped * np.log(np.maximum(ratio, 1e-12))

@@ -1,4 +1,4 @@
-"""What the rotor does: correlation functions from theory (Eqs. 17-25), and exact discretisation, never Euler.
+"""Response of the rotor: correlation functions from theory (Eqs. 17-25), and exact discretisation (no Euler steps).
 
 References
 ----------
@@ -19,9 +19,9 @@ from models.signals.block import FloatArray
 def stationary_covariance(A: FloatArray, B: FloatArray) -> FloatArray:
     """Solve A R(0) + R(0) Aᵀ = -B Bᵀ for the covariance of a stable system under unit white noise.
 
-    The states are balanced first: they differ by many orders of magnitude, and the solver's error is relative to the
-    largest. A, shape (n, n), is the system matrix, B, shape (n, p), the input matrix of independent white noise of unit
-    intensity.
+    The states are balanced first, because they differ by many orders of magnitude and the solver's error is relative to
+    the largest. A, shape (n, n), is the system matrix; B, shape (n, p), is the input matrix for independent white noise
+    of unit intensity.
 
     Raises
     ------
@@ -36,7 +36,7 @@ def stationary_covariance(A: FloatArray, B: FloatArray) -> FloatArray:
     _, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
     inputs = B / scale[:, None]
     rough = scipy.linalg.solve_continuous_lyapunov(A * (scale / scale[:, None]), -inputs @ inputs.T)
-    # One refinement in units of the states' own standard deviations.
+    # Solve once more in units of the states' standard deviations.
     deviation = np.sqrt(np.maximum(np.diag(rough), np.finfo(float).tiny)) * scale
     if not np.any(B):
         return np.zeros_like(A)
@@ -81,8 +81,8 @@ def discretise(A: FloatArray, B: FloatArray, step_s: float) -> DiscreteSystem:
     """Discretise ẋ = A x + B w exactly for one sample of `step_s` seconds.
 
     Displacement, velocity and filter states differ by many orders of magnitude. They are scaled to unit standard
-    deviation before the covariance is factored; without that the displacement-velocity pair comes out inconsistent and
-    damping is off by tens of percent. The result is in the original states. A and B are as in `stationary_covariance`.
+    deviation before the covariance is factored; otherwise displacement and velocity become inconsistent and damping is
+    wrong by tens of percent. The result is for the original states. A and B are as in `stationary_covariance`.
     """
     n = A.shape[0]
     deviation = np.sqrt(np.diag(stationary_covariance(A, B)))
@@ -97,7 +97,7 @@ def discretise(A: FloatArray, B: FloatArray, step_s: float) -> DiscreteSystem:
     F = exponential[n:, n:].T
     covariance = F @ exponential[:n, n:]
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    G = vectors * np.sqrt(np.maximum(values, 0.0))  # the noise has full rank in theory only; rounding goes below zero
+    G = vectors * np.sqrt(np.maximum(values, 0.0))  # full rank in theory only: rounding gives values below 0
     return DiscreteSystem(F * (scale[:, None] / scale), G * scale[:, None])
 
 
@@ -105,8 +105,8 @@ def advance(system: DiscreteSystem, state: FloatArray, noise: FloatArray) -> Flo
     """States after each of many steps, shape (n_samples, n), from the state before the first one, shape (n,).
 
     Equals the recursion ``x = F @ x + G @ w`` row by row, with standard normal noise, shape (n_samples, n). The samples
-    are cut into pieces that advance side by side from rest; the pieces' starting states follow and are carried through
-    each piece, which costs √n array operations instead of n. The last row is where to go on from.
+    are cut into pieces that advance in parallel from zero states; the response to each piece's starting state is added
+    afterwards. That costs √n_samples array operations instead of n_samples. The last row is the state to continue from.
     """
     n_samples, n = noise.shape
     length = max(1, int(np.sqrt(n_samples)))
@@ -114,7 +114,7 @@ def advance(system: DiscreteSystem, state: FloatArray, noise: FloatArray) -> Flo
     driven = np.zeros((pieces * length, n))
     driven[:n_samples] = noise @ system.G.T
     x = np.ascontiguousarray(driven.reshape(pieces, length, n).transpose(1, 0, 2))
-    powers = system.F.T[np.newaxis]  # of the transposed matrix, from the first on
+    powers = system.F.T[np.newaxis]  # powers 1, 2, … of the transposed matrix
     while len(powers) < length:
         powers = np.concatenate([powers, powers @ powers[-1]])
     for k in range(1, length):

@@ -1,4 +1,4 @@
-"""The six-degree-of-freedom rotor: parameters, what may become of them, and matrices (Eqs. 1-6, 13-16, 26, 27)."""
+"""The six-degree-of-freedom rotor: parameters, their possible changes, and matrices (Eqs. 1-6, 13-16, 26, 27)."""
 
 import math
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from models.signals.block import FloatArray
 
 
 class KnownRotor(BaseModel, extra="forbid", frozen=True):
-    """What is known of a rotor's parameters; see `RotorParameters` for the meaning of each."""
+    """Parameters of a rotor as far as they are known; see `RotorParameters` for the meaning of each."""
 
     m1_kg: float | None = Field(default=None, gt=0, le=1e5)
     m2_kg: float | None = Field(default=None, gt=0, le=1e5)
@@ -34,12 +34,12 @@ class KnownRotor(BaseModel, extra="forbid", frozen=True):
 
     @property
     def modes_hz(self) -> tuple[float, ...]:
-        """Natural frequencies at rest and without damping, ascending, Hz; none where parameters are missing.
+        """Natural frequencies at rest and without damping, ascending, Hz; empty if parameters are missing.
 
         Raises
         ------
         ValueError
-            If parameters are so small or large that there are none.
+            If parameters are so small or large that no natural frequencies can be computed.
 
         Examples
         --------
@@ -107,7 +107,7 @@ PARAMETERS: tuple[str, ...] = tuple(_TABLE)  # the diagnosed parameters, in the 
 FAULT_FIELDS: Mapping[str, str] = MappingProxyType({name: row.field for name, row in _TABLE.items()})
 # Each parameter in a vibration engineer's words.
 PARAMETER_TEXT: Mapping[str, str] = MappingProxyType({name: row.text for name, row in _TABLE.items()})
-# What kind of quantity each parameter is.
+# The kind of quantity that each parameter is.
 QUANTITY: Mapping[str, str] = MappingProxyType({name: row.quantity for name, row in _TABLE.items()})
 
 
@@ -151,8 +151,8 @@ def M_matrix(rotor: RotorParameters) -> FloatArray:
 def Q_shaft(rotor: RotorParameters) -> FloatArray:
     """Stiffness of the shaft alone, shape (6, 6), N/m, N and N m; linear in EI.
 
-    The cantilever from bearing (which keeps its slope) to disc: a = 12EI/L³, b = 6EI/L², c = 4EI/L. It has the zero
-    pattern and the signs of Eq. (26).
+    The shaft is a cantilever from the bearing, which keeps its slope, to the disc: a = 12EI/L³, b = 6EI/L², c = 4EI/L.
+    The matrix has the zero pattern and the signs of Eq. (26).
     """
     L = rotor.shaft_length_m
     a, b, c = 12 * rotor.EI_N_m2 / L**3, 6 * rotor.EI_N_m2 / L**2, 4 * rotor.EI_N_m2 / L
@@ -175,7 +175,7 @@ def Q_matrix(rotor: RotorParameters) -> FloatArray:
 def P_matrix(rotor: RotorParameters, speed_rad_s: float) -> FloatArray:
     """Damping at the bearing and gyroscopic coupling of the tilts, shape (6, 6).
 
-    Eq. (27) with the entry c44 that its printed form lost.
+    This is Eq. (27) with the entry c44, which is missing in print.
     """
     P = np.zeros((6, 6))
     P[0, 0] = rotor.c_by_N_s_per_m
@@ -203,11 +203,11 @@ def system_A(rotor: RotorParameters, speed_rad_s: float) -> FloatArray:
     return A
 
 
-_LEAST = -1.0  # nothing that is positive by nature can lose all it has and still be there to be read
+_LEAST = -1.0  # a quantity that is positive by nature cannot lose all of its value
 
 
 def impossible(change: float, quantity: str) -> str:
-    """Why a relative change of what is positive by nature (a mass, a gain, a length) cannot be; empty if it can.
+    """Why a relative change of a positive quantity (a mass, a gain, a length) is impossible; empty if it is possible.
 
     Examples
     --------

@@ -1,1 +1,1 @@
-"""The equations (28)-(31) and their networks: as printed, as relations, amortised; training and bundle."""
+"""The equations (28)-(31) and their networks (relation and amortised), their training, and the trained bundle."""

@@ -1,9 +1,9 @@
-"""Amortised networks: one per equation, from a window's features to its own parameters and their uncertainty.
+"""Amortised networks: one per equation, from a window's features to the equation's own parameters and their errors.
 
-The heirs of the paper's per-equation networks: estimated correlations in, but instead of a residual each network gives
-the relative change of its equation's own parameters, as the mean and covariance of a normal distribution of the
-logarithmic ratio to nominal. It has learned the inverse of the theory, Eqs. (1)-(18), once, over random machines and
-conditions, and answers in microseconds; its standard errors are calibrated on windows simulated in time.
+Like the paper's per-equation networks they start from estimated correlations, but instead of a residual each network
+returns the mean and covariance of a normal distribution of the logarithmic ratio to nominal of its equation's own
+parameters. It is trained once to invert the theory, Eqs. (1)-(18), over random machines and conditions, and evaluates
+in microseconds; its standard errors are calibrated on windows simulated in the time domain.
 """
 
 from dataclasses import dataclass, field
@@ -22,19 +22,19 @@ from models.signals.block import FloatArray
 from rotorwatch.records.windows import Parameter
 
 OWN = {"28": ("k_by", "c_by"), "29": ("e",), "30": ("EI",), "31": ("k_bz", "c_bz")}  # own parameters of each equation
-# Largest remainders, in logarithms, that the second reading is trained for: five times what the first leaves or more.
+# Largest remainders, as logarithms, that the second reading is trained for: at least five times those after the first.
 NEAR = {"k_by": 0.12, "c_by": 0.25, "k_bz": 0.12, "c_bz": 0.25, "EI": 0.08, "e": 0.25}
 LAYERS = (256, 128, 64)  # neurons of the hidden layers
-LIMIT = 8.0  # inputs are clipped here, in units of their usual deviation
-# Displacement and rate of one place may differ by this in the band where they agree best: one gain is wrong beyond it.
-# Of 1400 simulated windows with 1 to 5 % sensor noise 99 % stay below 0.2 %; the largest is 3.2 %.
+LIMIT = 8.0  # inputs are clipped at this multiple of their usual deviation
+# Largest relative difference of displacement and rate at one place, in the band where they agree best; beyond it one
+# gain is wrong. In 99 % of 1400 simulated windows with 1 to 5 % sensor noise it is below 0.2 %; the largest is 3.2 %.
 _MOST_APART = 0.05
-_VAGUE = 0.25  # a parameter less certain than this is not determined by the sensors or the window
+_VAGUE = 0.25  # largest standard error of a reading: beyond it, sensors or window do not determine the parameter
 
 
 @dataclass(frozen=True, slots=True)
 class AmortisedNetwork:
-    """Hidden layers with y = x / (1 + e⁻ˣ), and a linear path beside them to the means."""
+    """Hidden layers with y = x / (1 + e⁻ˣ), and a parallel linear path to the means."""
 
     equation: str  # the paper's number
     weights: tuple[Float32Array, ...]  # of the hidden layers and the output
@@ -58,14 +58,14 @@ class AmortisedNetwork:
 
 
 class Calibration(BaseModel, extra="forbid", frozen=True):
-    """What windows simulated in time say about one network's parameter."""
+    """Calibration of one parameter of a network, from windows simulated in the time domain."""
 
-    bias: float = Field(allow_inf_nan=False)  # median error of the logarithmic ratio; it is taken off
-    # Logarithms of stated standard errors, ascending: knots. At each, what the standard error has to be multiplied by
-    # for its 95 % interval to hold 95 %.
+    bias: float = Field(allow_inf_nan=False)  # median error of the logarithmic ratio, to be subtracted
+    # Logarithms of stated standard errors in ascending order (knots), and at each the factor on the standard error with
+    # which its 95 % interval contains 95 %.
     log_deviation: tuple[Annotated[float, Field(allow_inf_nan=False)], ...] = Field(min_length=1)
     z_scale: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(min_length=1)
-    # Degrees of freedom of the scaled errors (Student's t); None: normal.
+    # Degrees of freedom of the scaled errors (Student's t); None for a normal distribution.
     freedom: float | None = Field(default=None, gt=0, allow_inf_nan=False)
 
     def scale(self, deviation: FloatArray) -> FloatArray:
@@ -75,9 +75,9 @@ class Calibration(BaseModel, extra="forbid", frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class NearNetworks:
-    """The second reading: spectra are taken through the machine as read first, and the small remainder is read."""
+    """Networks of the second reading: forces are computed with the machine as read first, and the remainder is read."""
 
-    basis: FeatureBasis  # does not judge novelty: the first reading's has
+    basis: FeatureBasis  # without novelty, which the first reading's basis judges
     networks: tuple[AmortisedNetwork, ...]
 
 
@@ -91,18 +91,18 @@ class AmortisedNetworks:
     calibration: dict[str, Calibration]  # for every parameter; empty before calibration
     novelty_limit: float  # largest `FeatureBasis.novelty` that is evaluated
     log_range: float  # parameters were drawn up to this logarithmic ratio, either sign
-    # In windows whose forces are as coherent as those of one source; empty: as in all others.
+    # Calibration for windows whose forces are as coherent as those of one source; empty if the same as for others.
     coherent: dict[str, Calibration] = field(default_factory=dict)
-    coherence_limit: float = 1.0  # mean squared coherence of the forces beyond which a window is one of these
+    coherence_limit: float = 1.0  # mean squared coherence of the forces beyond which `coherent` applies
     near: NearNetworks | None = None
 
     def calibration_at(self, coherence: float) -> dict[str, Calibration]:
-        """Calibration of a window."""
+        """Calibration for a window with this mean squared coherence of the forces."""
         return self.coherent if self.coherent and coherence > self.coherence_limit else self.calibration
 
 
 def around(machine: Machine, log_ratio: FloatArray) -> Machine:
-    """The machine with its parameters at these logarithmic ratios to nominal, in the order of `PARAMETERS`."""
+    """The machine with its parameters changed by these logarithmic ratios, in the order of `PARAMETERS`."""
     changes = dict(zip(PARAMETERS, np.expm1(log_ratio).tolist(), strict=True))
     return machine.model_copy(update={"rotor": changed(machine.rotor, changes)})
 
@@ -117,10 +117,11 @@ class NetworkDiagnostician:
         self._features = ForceFeatures(machine, amortised.states)
 
     def inputs(self, window: WindowStatistics) -> tuple[Float32Array, float] | None:
-        """What the first reading looks at; None if a state the networks were trained with is not in the window.
+        """Inputs of the first reading; None if the window lacks a state that the networks were trained with.
 
-        Standardised inputs, shape (1, n_inputs), those of equation 29 only with a phase reference, and the mean squared
-        coherence of the forces on the nominal machine, over all pairs and frequencies, 0 to 1.
+        These are the standardised inputs, shape (1, n_inputs), with those of equation 29 only if there is a phase
+        reference, and the mean squared coherence of the forces on the nominal machine, over all pairs and frequencies,
+        0 to 1.
         """
         if any(name not in window.states for name in self._amortised.states):
             return None
@@ -132,7 +133,7 @@ class NetworkDiagnostician:
     def _standardised(
         self, window: WindowStatistics, basis: FeatureBasis, features: ForceFeatures, centre: Float32Array
     ) -> tuple[Float32Array, Float32Array]:
-        """Standardised inputs, and the functions of frequency that they condense."""
+        """Standardised inputs, and the functions of frequency from which they are condensed."""
         spectrum, synchronous = window.spectrum_without_lines[None], window.synchronous
         if window.states != self._amortised.states:
             columns = [window.states.index(name) for name in self._amortised.states]
@@ -146,9 +147,10 @@ class NetworkDiagnostician:
         return basis.standardised(np.concatenate(parts, axis=1)), series
 
     def stated(self, window: WindowStatistics, inputs: Float32Array) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Mean and Cholesky factor of the logarithmic ratios, not calibrated, of every equation that has its inputs.
+        """Uncalibrated mean and Cholesky factor of the logarithmic ratios, for every equation that has its inputs.
 
-        Those of the second reading, unless a parameter is too vague in the first, or out of range in either.
+        They are those of the second reading, unless a parameter is too uncertain in the first or out of range in
+        either; then those of the first.
         """
         first, near = _stated(self._amortised.networks, inputs), self._amortised.near
         if near is None:
@@ -157,7 +159,7 @@ class NetworkDiagnostician:
         trained = np.array([NEAR[name] for name in PARAMETERS])
         for equation, (mean, factor) in first.items():
             sharp = np.all(np.linalg.norm(factor, axis=1) <= trained[own[equation]])
-            if not (sharp and np.all(np.abs(mean) <= self._amortised.log_range)):  # nor what is not a number
+            if not (sharp and np.all(np.abs(mean) <= self._amortised.log_range)):  # false for NaN, too
                 return first
             centre[own[equation]] = mean
         features = self._features.around(around(self._machine, centre))
@@ -168,7 +170,7 @@ class NetworkDiagnostician:
         return {name: (centre[own[name]] + mean, factor) for name, (mean, factor) in remainder.items()}
 
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
-        """Judge one window; never raises: what cannot be read carries its reason."""
+        """Judge one window; never raises: a parameter that cannot be read carries the reason."""
         amortised = self._amortised
         seen = self.inputs(window)
         if seen is None:
@@ -199,7 +201,7 @@ class NetworkDiagnostician:
         return Diagnosis(self.by, tuple(readings), covariance=block_diag(*blocks), freedom=freedom)
 
     def _disagreement(self, inputs: Float32Array) -> str:
-        """Degrees of freedom of which two sensors tell different things; empty if none."""
+        """Displacements that differ too much from their rates, and by how much; empty if none does."""
         basis, n = self._amortised.basis, self._features.n_consistency
         own = slice(basis.n_common - n, basis.n_common)
         raw = inputs[:, own] * basis.scale[own] + basis.centre[own]
@@ -213,7 +215,7 @@ class NetworkDiagnostician:
     def _read(
         self, equation: str, mean: FloatArray, factor: FloatArray, calibrations: dict[str, Calibration]
     ) -> tuple[list[Parameter], FloatArray]:
-        """Readings of one equation and the covariance of those that could be made."""
+        """Readings of one equation's parameters, and the covariance of those with a number."""
         amortised = self._amortised
         covariance = factor @ factor.T
         readings, kept, scales = [], [], []

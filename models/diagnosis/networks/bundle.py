@@ -1,4 +1,4 @@
-"""The trained bundle: a manifest (JSON) and weights (safetensors) in one directory. No code in it, no pickle.
+"""The trained bundle: a manifest (JSON) and weights (safetensors) in one directory, without code or pickle.
 
 ::
 
@@ -6,7 +6,7 @@
     ├── manifest.json        machine, equations, units, seeds, versions, healthy spread, hash of the weights
     └── weights.safetensors  relation networks, float64: 28.input_scale, 28.W1, …
                              amortised networks, float32: basis.mean, …, amortised.28.W1, …;
-                             those of the second reading: near.basis.mean, …
+                             amortised networks of the second reading: near.basis.mean, …
 
 Loading refuses a bundle that is damaged or was trained for another machine, and says what differs.
 """
@@ -47,7 +47,7 @@ _FORMAT = 2
 _PHYSICS = ("rotor", "operation", "condition", "rate_hz", "window")
 _BASIS = ("mean", "directions", "centre", "scale", "precision_factor")
 _ARRAYS = ("input_scale", "W1", "b1", "W2", "b2")
-# By hash of the file and name: machines of one kind hold the weights of their bundle once, for as long as one has them.
+# By hash of the file and name of the array: machines with the same bundle share its weights while any of them uses it.
 _shared: WeakValueDictionary[tuple[str, str], _Array] = WeakValueDictionary()
 
 
@@ -76,7 +76,7 @@ class AmortisedEntry(BaseModel, extra="forbid", frozen=True):
     calibration_windows: int = Field(ge=1)
     novelty_limit: float = Field(gt=0, allow_inf_nan=False)
     log_range: float = Field(gt=0, allow_inf_nan=False)
-    # Left out where there is none: bundles of one reading keep their identity.
+    # Not stored if None, so that bundles with one reading keep their identity.
     near: dict[str, float] | None = Field(
         default=None,
         exclude_if=lambda value: value is None,
@@ -85,7 +85,7 @@ class AmortisedEntry(BaseModel, extra="forbid", frozen=True):
 
 
 class Training(BaseModel, extra="forbid", frozen=True):
-    """How the bundle was made: enough to make it again."""
+    """Everything needed to train the bundle again."""
 
     seed: int
     training_windows: int
@@ -98,7 +98,7 @@ class Training(BaseModel, extra="forbid", frozen=True):
 
 
 class Manifest(BaseModel, extra="forbid", frozen=True):
-    """What a bundle says about itself."""
+    """Description of a bundle."""
 
     format: int
     machine: str
@@ -314,7 +314,7 @@ def _amortised_entry(amortised: AmortisedNetworks, training: Training) -> Amorti
 
 
 def _amortised(directory: Path, entry: AmortisedEntry, arrays: _Arrays) -> AmortisedNetworks:
-    """The amortised networks, every array checked against what the others say its shape must be."""
+    """The amortised networks, with the shape of every array checked against the others."""
     where = f"{directory}: amortised networks"
     if entry.layers != LAYERS:
         raise BundleError(f"{where}: layers are {entry.layers}, this program expects {LAYERS}")
@@ -356,7 +356,7 @@ def _stage(
         "basis.directions": (n_series, n_bins, n_kept),
         "basis.centre": (n_inputs,),
         "basis.scale": (n_inputs,),
-        # What is unlike the training is refused once, before the first reading.
+        # Novelty is judged once, before the first reading, so the second basis has no factor.
         "basis.precision_factor": (n_common, 0 if stage else n_common),
     }
     for number in entry.equations:

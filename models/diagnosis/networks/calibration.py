@@ -1,9 +1,9 @@
-"""Calibration of the networks on simulated windows of their own: what they read beside what is true, and how far off.
+"""Calibration of the networks on simulated windows: bias, gain and true size of the errors of their readings.
 
-Readings are compared with the truth in windows in which everything is changed, own parameters too: a network that has
-learned to explain a part of its own parameter's change reads the rest of it, and an error that all hops of a window
-share does not show in their scatter. Errors are those of Student's t where their tails ask for it: a standard error
-that is right for 95 % of the windows says little of the one in a thousand.
+Readings are compared with the truth in windows in which everything changes, including own parameters: a network that
+has learned to explain part of its own parameter's change reads only the rest, and an error that all hops of a window
+share does not show in their scatter. Errors with heavy tails follow Student's t: a standard error that is right for
+95 % of the windows says little about one in a thousand.
 """
 
 from collections.abc import Iterable, Sequence
@@ -22,11 +22,11 @@ from models.machine import Machine
 from models.signals.block import FloatArray
 
 Held = tuple[WindowStatistics, dict[str, float]]
-"""A window and the true relative changes in it; what is not named is nominal."""
-_MAD = 1.4826  # median absolute deviation to standard deviation
+"""A window and its true relative changes by parameter; parameters not in it are nominal."""
+_MAD = 1.4826  # ratio of standard deviation to median absolute deviation
 _FREEDOMS = (3.0, 5.0, 8.0, 12.0, 20.0, 40.0, 100.0)
-# A hundred windows of a layout hardly tell five degrees of freedom from eleven, which the scatter of twelve hops has;
-# 300 with one source of `lab` show three to five in the stiffness.
+# A hundred windows per layout of the sources hardly distinguish 5 degrees of freedom from the 11 of the scatter of
+# twelve hops; 300 windows of `lab` with one source show 3 to 5 for the stiffness.
 _RELATION_FREEDOMS = (3.0, 4.0, 5.0)
 _LEAST_GAIN = 0.02
 
@@ -34,11 +34,11 @@ _LEAST_GAIN = 0.02
 def calibrate(
     trained: EquationNetwork, healthy: Iterable[WindowStatistics], changed: Sequence[Iterable[Held]], machine: Machine
 ) -> EquationNetwork:
-    """Measure how a relation network reads windows that training did not see, from seeds of their own.
+    """Measure how a relation network reads windows with seeds other than those of the training.
 
-    The healthy ones are so in the equation's own parameters. In the others own parameters are changed, too; those that
-    the equation takes as unchanged beside them are nominal. They are in one group for every layout of the sources: the
-    one with the heaviest tails decides on the degrees of freedom.
+    In `healthy` windows the equation's own parameters are nominal. In `changed` ones they are changed, too, while other
+    parameters that the equation assumes unchanged are nominal. `changed` has one group for each layout of the sources;
+    the group with the heaviest tails determines the degrees of freedom.
     """
     raw = EquationNetwork(trained.equation, trained.network, None)
     names = trained.equation.parameters
@@ -76,9 +76,9 @@ def calibrate(
 
 
 def _relation_errors(groups: Sequence[FloatArray]) -> tuple[float, float, float, float]:
-    """Scale, floor, gain and degrees of freedom by maximum likelihood: change = gain · true + error.
+    """Scale, floor, gain and degrees of freedom by maximum likelihood for change = gain · true + error.
 
-    A group, shape (3, n), holds the change as projected, its scatter over the hops, and the true one.
+    Each group, shape (3, n), holds the projected change, its scatter over the hops, and the true change.
     """
     freedom = min(min((_fitted(group, one)[0], one) for one in _RELATION_FREEDOMS)[1] for group in groups)
     _, scale, floor, gain = _fitted(np.concatenate(groups, axis=1), freedom)
@@ -87,7 +87,7 @@ def _relation_errors(groups: Sequence[FloatArray]) -> tuple[float, float, float,
 
 
 def _fitted(figures: FloatArray, freedom: float) -> tuple[float, float, float, float]:
-    """What is left of the likelihood (negative logarithm), scale, floor and gain."""
+    """Smallest negative log-likelihood, with its scale, floor and gain."""
     change, scatter, true = figures
     usual = float(np.median(scatter))
 
@@ -104,28 +104,28 @@ def _fitted(figures: FloatArray, freedom: float) -> tuple[float, float, float, f
 
 
 def _t_logpdf(x: FloatArray, freedom: float) -> FloatArray:
-    """As `scipy.stats.t.logpdf`, which takes ten times as long to look at its arguments as to compute."""
+    """Like `scipy.stats.t.logpdf`, which spends ten times as long on checking its arguments as on computing."""
     constant = np.log(poch(0.5 * freedom, 0.5)) - 0.5 * (np.log(freedom) + np.log(np.pi))
     return np.asarray(constant - (freedom + 1) / 2 * np.log1p(x * x / freedom), dtype=np.float64)
 
 
 def _wider(freedom: float) -> float:
-    """What the scale of a t distribution is multiplied by so that 1.96 of it hold 95 %."""
+    """Factor on the scale of a t distribution with which ±1.96 scales contain 95 %."""
     return float(stdtrit(freedom, 0.975)) / Z95
 
 
 _KNOTS = 3
 _QUANTILES = (0.9, 0.95, 0.98)
-_FEWEST_OF_KNOT = 40  # windows from which a quantile is believed
+_FEWEST_OF_KNOT = 40  # least number of windows for the quantiles of a knot
 
 
 def calibrate_networks(
     machine: Machine, trained: AmortisedNetworks, coherent: Iterable[Held], independent: Iterable[Held]
 ) -> AmortisedNetworks:
-    """Measure bias and true size of the amortised networks' standard errors.
+    """Measure the bias of the amortised networks and the true size of their standard errors.
 
-    One source leaves the forces coherent and independent sources do not: a window shows of which kind it is, and each
-    kind has a calibration of its own, from windows of seeds of their own.
+    With one source the forces are coherent, with independent sources they are not. Both cases are calibrated
+    separately, on windows with seeds of their own; the coherence of a window tells which calibration applies.
     """
     reader = NetworkDiagnostician(machine, trained)
     calibrated, coherences = [], []
@@ -144,15 +144,15 @@ def calibrate_networks(
                     errors.setdefault(name, []).append((error, float(deviation)))
         calibrated.append({name: _calibration(np.array(pairs)) for name, pairs in errors.items()})
         coherences.append(seen)
-    # Midway between nearly all of either kind.
+    # Midway between the 1 % quantile of coherent windows and the 99 % quantile of the others.
     limit = (float(np.quantile(coherences[0], 0.01)) + float(np.quantile(coherences[1], 0.99))) / 2
     return replace(trained, calibration=calibrated[1], coherent=calibrated[0], coherence_limit=limit)
 
 
 def _calibration(pairs: FloatArray) -> Calibration:
-    """Bias, and scale of z in thirds of the stated standard error: what is easy to see and what is hard differ."""
+    """Bias, and scale of z by thirds of the stated standard error, as precise and imprecise readings differ."""
     error, deviation = pairs[:, 0], pairs[:, 1]
-    # Weighted median: windows that see the parameter well decide.
+    # Weighted median: windows that determine the parameter well count more.
     order, weight = np.argsort(error), 1 / deviation**2
     cumulated = np.cumsum(weight[order])
     bias = float(error[order][np.searchsorted(cumulated, cumulated[-1] / 2)])
@@ -162,9 +162,9 @@ def _calibration(pairs: FloatArray) -> Calibration:
     for low, high in pairwise(np.quantile(deviation, np.linspace(0, 1, n_knots + 1))):
         own = (deviation >= low) & (deviation <= high)
         knots.append(float(np.median(np.log(deviation[own]))))
-        # Several quantiles scatter less than one, and see the tail.
+        # The mean of several quantiles scatters less than one quantile, and includes the tail.
         scales.append(float(np.mean(np.quantile(z[own], _QUANTILES) / ndtri((1 + np.array(_QUANTILES)) / 2))))
     scaled = z / np.interp(np.log(deviation), knots, scales)
-    # Whatever its tails are, 1.96 errors hold 95 %: only the shape is free.
+    # Only the shape is fitted: for any degrees of freedom, ±1.96 standard errors contain 95 %.
     freedom = max(_FREEDOMS, key=lambda n: float(np.sum(_t_logpdf(scaled * _wider(n), n) + np.log(_wider(n)))))
     return Calibration(bias=bias, log_deviation=tuple(knots), z_scale=tuple(scales), freedom=freedom)

@@ -2,10 +2,10 @@
 
 Each is one row of the equation of motion, correlated with a measured reference. For every lag beyond the excitation's
 memory its target correlation is a fixed combination of its inputs, and only the equation's *own* parameters can change
-that combination: this is what locates a fault. Two additions to the printed equations make that exact without tilt
-sensors: all measured displacements serve as reference, and the correlation of the disc's acceleration eliminates the
-tilt through row 2 (`docs/method.md`). Equation 29 uses the phase reference itself as reference, so that the stochastic
-excitation drops out at every lag.
+that combination: this locates a fault. Two additions to the printed equations make that exact without tilt sensors: all
+measured displacements serve as references, and the correlation of the disc's acceleration eliminates the tilt through
+row 2 (`docs/method.md`). Equation 29 uses the phase reference itself as reference, so that the stochastic excitation
+drops out at every lag.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,7 +27,7 @@ _ANGLES = np.arange(16) * (2 * np.pi / 16)
 
 @dataclass(frozen=True, slots=True)
 class StatisticsView:
-    """The statistics an equation looks at: of a whole window, or of each hop in it along one axis more."""
+    """The statistics that an equation needs, of a whole window or, with one more axis, of each hop in it."""
 
     states: tuple[str, ...]  # measured states, naming rows and columns of the correlations
     correlation: FloatArray  # (…, n_lags, n, n), stochastic part at the lags that the networks use
@@ -37,16 +37,16 @@ class StatisticsView:
 
 @dataclass(frozen=True, slots=True)
 class EquationRows:
-    """Training or evaluation rows of one equation: one per lag and reference, with axes before them as in the view."""
+    """Training or evaluation rows of one equation, one per lag and reference, after the leading axes of the view."""
 
     inputs: FloatArray  # (…, n_rows, n_inputs)
     target: FloatArray  # (…, n_rows)
-    # (…, n_rows, n_parameters): what a relative change of one of the own parameters adds to the target
+    # (…, n_rows, n_parameters): derivative of the target with respect to the relative change of each own parameter
     signatures: FloatArray
 
     @property
     def norm(self) -> float:
-        """Root mean square of the target: the relation is homogeneous, levels are divided out."""
+        """Root mean square of the target; the relation is homogeneous, so dividing by it removes the level."""
         return float(np.sqrt(np.mean(self.target**2)))
 
 
@@ -57,11 +57,11 @@ class Term:
     response: str  # state j
     # Whether the reference is the rate ẏ instead of the displacement y of the reference channel.
     rate_reference: bool = False
-    times_speed: bool = False  # whether the term stands with Ω (gyroscopic)
+    times_speed: bool = False  # whether the term is multiplied by Ω (gyroscopic)
 
     @property
     def name(self) -> str:
-        """As in the paper, with i for the reference: ``R[i,y1]``, ``R[i',y1']``."""
+        """Name as in the paper, with i for the reference: ``R[i,y1]``, ``R[i',y1']``."""
         response = self.response.replace("_dot", "'")
         factor = "Ω·" if self.times_speed else ""
         return f"{factor}R[{'i' + chr(39) if self.rate_reference else 'i'},{response}]"
@@ -71,12 +71,12 @@ class Term:
 class Equation:
     """An equation between correlations of the stochastic part (28, 30, 31)."""
 
-    # The paper's number, and what it is about.
+    # The paper's number, and a short description.
     number: str
     title: str
     target: Term
     inputs: tuple[Term, ...]
-    # Own parameter to the coefficients of the inputs that it scales, a function of the rotor.
+    # For each own parameter, a function from the rotor to the coefficients of the inputs that the parameter scales.
     signatures: Mapping[str, Callable[[RotorParameters], tuple[float, ...]]]
 
     @property
@@ -96,7 +96,7 @@ class Equation:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Measured states it needs: references and their rates first, then what its terms need besides."""
+        """Measured states that it needs: references and their rates first, then other states of its terms."""
         needed = [name for reference in _REFERENCES for name in (reference, f"{reference}_dot")]
         needed += [term.response for term in (self.target, *self.inputs)]
         return tuple(dict.fromkeys(needed))
@@ -127,14 +127,14 @@ class SynchronousEquation:
     network follow the coefficients through the speed range. Both planes and all shaft angles Ωτ serve as rows; the
     bearings' stiffness and damping do not occur.
 
-    The printed equation takes the disc's acceleration as target and its displacement as input. In the synchronous part
-    one is -Ω² times the other, and a network that may use both predicts the target without e: it reads -2 % for -20 %.
+    The printed equation has the disc's acceleration as target and its displacement as input. In the synchronous part
+    one is -Ω² times the other, so a network with both predicts the target without e: it reads -2 % for -20 %.
     """
 
     number: str
     title: str
     parameters: tuple[str, ...] = ("e",)
-    # The shaft stands in this row too (k22, k23).
+    # The shaft occurs in this row, too (k22, k23).
     kept_nominal: tuple[str, ...] = ("e", "EI")
     input_names: tuple[str, ...] = (
         "R[n,y1]", "Ω²R[n,y1]", "Ω⁴R[n,y1]", "Ω²R[n,z1]", "Ω²R[n,n]", "Ω⁴R[n,n]", "Ω⁶R[n,n]"
@@ -171,7 +171,7 @@ class SynchronousEquation:
         return EquationRows(inputs, target, np.broadcast_to(signatures, (*target.shape, 1)))
 
     def taken_for(self, machine: Machine) -> Mapping[str, float]:
-        """Relative change of e that is read where another parameter changes by a relative 1, as the shaft may."""
+        """Relative change of e that is read per relative change of another parameter, here the shaft's EI."""
         rotor, speed = machine.rotor, machine.operation.speed_rad_s
         q1, q2 = synchronous_response(changed(rotor, {"EI": _STEP}), speed)
         moved = (q1 - 1j * q2)[: len(q1) // 2]
@@ -192,13 +192,13 @@ def _balance(rotor: RotorParameters, speed_rad_s: float) -> tuple[ComplexArray, 
 
 
 def _disc_response_to_e(rotor: RotorParameters, speed_rad_s: float) -> float:
-    """Change of Y2 with the relative change of e while the bearing's motion is given, m (real by symmetry)."""
+    """Derivative of Y2 with respect to the relative change of e for given bearing motion, m (real by symmetry)."""
     dynamic, force = _balance(rotor, speed_rad_s)
     return float(np.linalg.solve(dynamic[np.ix_(_DISC, _DISC)], force[_DISC])[0].real)
 
 
 def _over_mass(place: int, name: str, rotor: RotorParameters) -> tuple[float, ...]:
-    """A parameter of a bearing over the mass m1, at one of four inputs; no lambda, so that networks can be pickled."""
+    """A bearing parameter over the mass m1 at one of four inputs; not a lambda, so that networks can be pickled."""
     share = float(getattr(rotor, name)) / rotor.m1_kg
     return tuple(share if at == place else 0.0 for at in range(4))
 
@@ -238,5 +238,5 @@ EQUATIONS: tuple[Equation | SynchronousEquation, ...] = (
 
 
 def missing(equation: Equation | SynchronousEquation, measured: tuple[str, ...]) -> tuple[str, ...]:
-    """What would have to be measured besides, to evaluate an equation, with ``theta`` for the phase reference."""
+    """Channels that an equation needs and that are not measured, with ``theta`` for the phase reference."""
     return tuple(name for name in equation.channels if name not in measured)

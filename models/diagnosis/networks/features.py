@@ -1,15 +1,15 @@
-"""What the amortised networks look at: a window's cross-spectra, brought into a form in which faults stand out.
+"""Inputs of the amortised networks: a window's cross-spectra, transformed so that faults stand out.
 
-The cross-spectra are the Fourier transforms of the correlation functions (Eq. 18): the same information. They are taken
-through the *nominal* machine backwards: the motion of the measured degrees of freedom times the nominal dynamic
-stiffness is the force that the nominal machine would have needed. Where the machine is nominal these force spectra are
-those of the excitation: smooth, with one constant coherence. A changed parameter leaves its own trace, the measured
-motion times the change. And every frequency gets the weight it has in the likelihood: logarithms of the force spectra,
-and coherences instead of cross-spectra, have the same sampling error at all frequencies, loud or quiet. Levels drop
-out.
+The cross-spectra are the Fourier transforms of the correlation functions (Eq. 18), with the same information. They are
+transformed to forces with the *nominal* machine: the motion of the measured degrees of freedom times the nominal
+dynamic stiffness is the force that the nominal machine would have needed. If the machine is nominal, these force
+spectra are those of the excitation: smooth, with one constant coherence. A changed parameter adds a component of its
+own, the measured motion times the change. Every frequency has the same weight as in the likelihood: logarithms of the
+force spectra, and coherences instead of cross-spectra, have the same sampling error at all frequencies, loud or quiet.
+Levels drop out.
 
-Frequencies are then condensed by principal components of *expected* features over random machines and conditions:
-directions in which nothing but sampling error varies are left out.
+Frequencies are then condensed to principal components of *expected* features over random machines and conditions, which
+leaves out directions with nothing but sampling error.
 """
 
 from copy import copy
@@ -32,11 +32,11 @@ _LEAST_VARIANCE = 1e-3
 
 
 class ForceFeatures:
-    """Features of one machine's windows, of all states that it measures or of some, before they are condensed.
+    """Features of one machine's windows before they are condensed, from all its measured states or from some.
 
-    `near` is for machines that are nearly nominal. With one source, all forces at a frequency share their sampling
-    error, and it drops out of contrasts of their levels; the imaginary part of a squared coherence shows whether forces
-    lag behind each other, whichever sign they have to each other.
+    `near` adds features for machines that are nearly nominal. With one source, all forces at a frequency share their
+    sampling error, so it cancels in differences of their levels; the imaginary part of the squared coherence shows
+    whether forces lag behind each other, independently of their relative sign.
     """
 
     def __init__(self, machine: Machine, states: tuple[str, ...] | None = None, near: bool = False) -> None:
@@ -57,7 +57,7 @@ class ForceFeatures:
         self._take(machine)
 
     def around(self, machine: Machine) -> "ForceFeatures":
-        """The same features near another machine with the same sensors, which the cross-spectra are taken through."""
+        """The `near` features with forces computed for another machine with the same sensors."""
         found = copy(self)
         found._near = True
         found._take(machine)
@@ -69,7 +69,7 @@ class ForceFeatures:
         rows = [self._dofs.index(STATE_INDEX[name] % 6) for name in self.states]
         self._rows, self._rates = np.array(rows), np.array([STATE_INDEX[name] >= 6 for name in self.states])
         self._corners_rad_s = self._corners()[self._rows]
-        # What stands with 1, ω², jω and jωΩ (gyroscopic); measured degrees of freedom first.
+        # Matrices multiplied by 1, ω², jω and jωΩ (gyroscopic); measured degrees of freedom first.
         still = P_matrix(rotor, 0.0)
         order = [*self._dofs, *(dof for dof in range(6) if dof not in self._dofs)]
         terms = np.array([Q_matrix(rotor), -M_matrix(rotor), still, P_matrix(rotor, 1.0) - still])
@@ -79,19 +79,19 @@ class ForceFeatures:
 
     @property
     def n_series(self) -> int:
-        """Number of functions of frequency: force spectra, and real and imaginary parts of their coherences."""
+        """Number of functions of frequency: force spectra, parts of their coherences, and more with `near`."""
         return len(self._dofs) + 2 * len(self._pairs) + (1 + len(self._pairs) if self._near else 0)
 
     @property
     def n_consistency(self) -> int:
-        """Number of features that `consistency` gives."""
+        """Number of features from `consistency`."""
         return 1 + 2 * _BANDS * len(self._twice)
 
     def _corners(self) -> FloatArray:
-        """Corner ω where rates take over from displacements, for each measured degree of freedom, rad/s.
+        """Corner ω above which rates replace displacements, for each measured degree of freedom, rad/s.
 
-        Their noise is proportional to their own rms, so that ω is the ratio of the two, here of the nominal machine
-        under equal forces. 0 where only the rate is measured, infinite where only the displacement is.
+        Sensor noise is proportional to a channel's rms, so ω is the ratio of the rms of rate and displacement, here of
+        the nominal machine under equal forces. It is 0 if only the rate is measured, infinite if only the displacement.
         """
         machine = self._machine
         cutoff = float(np.sqrt(machine.condition.cutoff_hz[0] * machine.condition.cutoff_hz[1]))
@@ -106,13 +106,13 @@ class ForceFeatures:
         )
 
     def _to_force(self, w: FloatArray, speed_rad_s: FloatArray) -> ComplexArray:
-        """Matrices that turn measured states into equivalent forces, shape (n_frequencies, n_dofs, n).
+        """Matrices that transform measured states to equivalent forces, shape (n_frequencies, n_dofs, n).
 
-        At angular frequencies w, rad/s, with the speed Ω at each of them.
+        They are for angular frequencies w, rad/s, with the speed Ω at each of them.
         """
         m, jw = len(self._dofs), 1j * w
         dynamic = (np.stack([np.ones_like(jw), w**2, jw, jw * speed_rad_s], axis=1) @ self._terms).reshape(-1, 6, 6)
-        # No force acts where nothing is measured: those degrees of freedom follow the others (Schur complement).
+        # Unmeasured degrees of freedom carry no force and follow the others (Schur complement).
         stiffness = dynamic[:, :m, :m]
         if m < 6:
             stiffness = stiffness - dynamic[:, :m, m:] @ np.linalg.solve(dynamic[:, m:, m:], dynamic[:, m:, :m])
@@ -123,7 +123,7 @@ class ForceFeatures:
     def force(self, spectrum: npt.NDArray[np.complexfloating]) -> ComplexArray:
         """Cross-spectra of the equivalent forces, shape (n_windows, n_bins, n_dofs, n_dofs).
 
-        From those of the measured states, SI²/Hz, shape (n_windows, n_bins, n, n).
+        `spectrum` holds those of the measured states, SI²/Hz, shape (n_windows, n_bins, n, n).
         """
         return np.asarray(self._force @ spectrum @ self._force.conj().swapaxes(1, 2), dtype=np.complex128)
 
@@ -144,9 +144,9 @@ class ForceFeatures:
         return np.concatenate([level, out[:m] - level, out[m:], 2 * out[m::2] * out[m + 1 :: 2]])
 
     def coherence(self, series: Float32Array) -> float:
-        """Mean squared coherence over all windows, frequencies and pairs of forces; 0 where there is no pair.
+        """Mean squared coherence over all windows, frequencies and pairs of forces; 0 without a pair.
 
-        From the `series` of the nominal machine.
+        `series` must be that of the nominal machine.
         """
         parts = series[len(self._dofs) :]
         return 2 * float(np.mean(parts**2)) if self._pairs else 0.0
@@ -155,7 +155,7 @@ class ForceFeatures:
         """Speed, and agreement of displacement and rate, shape (n_windows, n).
 
         For every degree of freedom measured twice, in eight bands: the logarithm of the ratio of the two powers, which
-        shows a sensor at fault, and of what is not coherent between them, which shows the sensor noise.
+        shows a faulty sensor, and that of their incoherent part, which shows the sensor noise.
         """
         n_windows = spectrum.shape[0]
         speed = np.where(np.isfinite(speed_rad_s), speed_rad_s / self._machine.operation.speed_rad_s - 1, 0.0)
@@ -171,10 +171,10 @@ class ForceFeatures:
         return np.asarray(np.concatenate(parts, axis=1).reshape(n_windows, -1), dtype=np.float32)
 
     def disagreement(self, consistency: Float32Array) -> dict[str, FloatArray]:
-        """Relative disagreement in amplitude of displacement and rate, each of shape (n_windows,), by displacement.
+        """Relative difference in amplitude of displacement and rate, each of shape (n_windows,), by displacement.
 
-        From `consistency`, of the band in which they agree best: sensor noise sets them apart in some bands, a wrong
-        gain in all of them.
+        It is taken from `consistency` in the band in which they agree best: sensor noise makes them differ in some
+        bands, a wrong gain in all of them.
         """
         n = len(self._twice)
         ratio = consistency[:, 1 : 1 + _BANDS * n].reshape(-1, _BANDS, n)
@@ -187,20 +187,20 @@ class ForceFeatures:
         synchronous: npt.NDArray[np.complexfloating],
         speed_rad_s: FloatArray,
     ) -> Float32Array:
-        """What equation 29 looks at besides, shape (n_windows, 3 n_dofs).
+        """Additional features for equation 29, shape (n_windows, 3 n_dofs).
 
-        The rotation-synchronous vectors as forces, in units of the nominal unbalance force (real parts, imaginary
-        parts), and the logarithm of the sampling variance that the stochastic forces beside them give them. Spectra are
-        of shape (n_windows, n_bins, n, n), vectors of shape (n_windows, n), speeds of shape (n_windows,).
+        These are the rotation-synchronous vectors as forces, in units of the nominal unbalance force (real parts,
+        imaginary parts), and the logarithm of their sampling variance due to the stochastic forces near 1x. `spectrum`
+        is of shape (n_windows, n_bins, n, n), `synchronous` (n_windows, n), `speed_rad_s` (n_windows,).
         """
         machine = self._machine
         unbalance = machine.rotor.m2_kg * machine.rotor.e_m * speed_rad_s**2
-        transfer = self._to_force(speed_rad_s, speed_rad_s)  # each window's vectors stand at its own speed
+        transfer = self._to_force(speed_rad_s, speed_rad_s)  # at each window's own speed
         force = (transfer @ synchronous[:, :, None])[:, :, 0]
         force = force * np.exp(-1j * machine.operation.unbalance_phase_rad) / unbalance[:, None]
         nearest = np.argmin(np.abs(self.frequencies_hz - speed_rad_s[:, None] / (2 * np.pi)), axis=1)
         nearest = np.clip(nearest, 6, self.frequencies_hz.size - 7)
-        beside = np.concatenate([np.arange(-6, -2), np.arange(3, 7)])  # the rotation's own bins lack its part
+        beside = np.concatenate([np.arange(-6, -2), np.arange(3, 7)])  # bins at 1x lack the synchronous part
         around = spectrum[np.arange(nearest.size)[:, None], nearest[:, None] + beside].mean(axis=1)
         power = np.einsum("bij,bjk,bik->bi", transfer, around, transfer.conj()).real
         error = np.log(np.maximum(power, np.finfo(np.float64).tiny) * 4 / self._duration_s / unbalance[:, None] ** 2)
@@ -209,33 +209,34 @@ class ForceFeatures:
 
 @dataclass(frozen=True, slots=True)
 class FeatureBasis:
-    """How raw features become the inputs of the networks, float32."""
+    """Transformation of raw features to the inputs of the networks, float32."""
 
     mean: Float32Array  # (n_series, 1, n_bins)
     directions: Float32Array  # (n_series, n_bins, n_kept), principal components of every function of frequency
-    # (n_inputs,): of all inputs over random machines and conditions; those of equation 29 alone stand last
+    # (n_inputs,): mean and standard deviation of all inputs over random machines and conditions; those for equation 29
+    # alone come last
     centre: Float32Array
     scale: Float32Array
-    # (n_common, n_common): factor F of their inverse covariance F Fᵀ, without those of equation 29
+    # (n_common, n_common): factor F of the inverse covariance F Fᵀ of the common inputs
     precision_factor: Float32Array
 
     @property
     def n_common(self) -> int:
-        """Inputs that all networks share."""
+        """Number of inputs that all networks share."""
         return int(self.precision_factor.shape[0])
 
     def condensed(self, series: Float32Array) -> Float32Array:
-        """Scores of the functions of frequency, shape (n_windows, n_series · n_kept)."""
+        """Principal-component scores of the functions of frequency, shape (n_windows, n_series · n_kept)."""
         scores = (series - self.mean) @ self.directions
         return np.asarray(scores.transpose(1, 0, 2).reshape(series.shape[1], -1), dtype=np.float32)
 
     def standardised(self, raw: Float32Array) -> Float32Array:
-        """Inputs in units of their usual deviation; `raw` may lack those of equation 29."""
+        """Inputs less their mean, in units of their standard deviation; `raw` may lack those for equation 29."""
         n = raw.shape[1]
         return np.asarray((raw - self.centre[:n]) / self.scale[:n], dtype=np.float32)
 
     def novelty(self, inputs: Float32Array) -> FloatArray:
-        """Squared Mahalanobis distance per input from the windows trained on, shape (n_windows,): one is usual."""
+        """Squared Mahalanobis distance from the training windows, per input, shape (n_windows,); usually about 1."""
         n = self.n_common
         return np.asarray(np.mean((inputs[:, :n] @ self.precision_factor) ** 2, axis=1), dtype=np.float64)
 
@@ -243,7 +244,7 @@ class FeatureBasis:
 def principal_directions(series: Float32Array, n_kept: int) -> tuple[Float32Array, Float32Array]:
     """Mean, shape (n_series, 1, n_bins), and first principal components, shape (n_series, n_bins, n_kept).
 
-    The series, shape (n_series, n_windows, n_bins), are those of expected spectra, without sampling error.
+    `series`, shape (n_series, n_windows, n_bins), must be from expected spectra, without sampling error.
     """
     mean = series.mean(axis=1, keepdims=True)
     deviation = (series - mean).astype(np.float64)
@@ -255,12 +256,13 @@ def principal_directions(series: Float32Array, n_kept: int) -> tuple[Float32Arra
 def fit_basis(mean: Float32Array, directions: Float32Array, raw: Float32Array, n_common: int) -> FeatureBasis:
     """Standardise condensed features and measure their covariance.
 
-    They are raw, shape (n_windows, n_inputs), of windows with sampling error; all networks share so many of them.
+    `raw`, shape (n_windows, n_inputs), holds those of windows with sampling error; all networks share the first
+    `n_common`.
     """
     centre = raw.mean(axis=0)
     scale = raw.std(axis=0) + np.float32(1e-6)
     common = ((raw - centre) / scale)[:, :n_common].astype(np.float64)
     values, vectors = np.linalg.eigh(common.T @ common / common.shape[0])
-    # What hardly varies in training would make every real window a stranger: it counts with a little variance.
+    # Some variance is added to directions that hardly vary in training; otherwise every real window would be novel.
     factor = vectors / np.sqrt(values + _LEAST_VARIANCE)
     return FeatureBasis(mean, directions, centre, scale, np.ascontiguousarray(factor, dtype=np.float32))

@@ -1,4 +1,4 @@
-"""The per-equation network: one hidden layer of fifteen (Eq. 32), evaluated in numpy.
+"""The per-equation network: one hidden layer of fifteen neurons (Eq. 32), evaluated in numpy.
 
 Training needs torch, evaluation does not: the monitor starts without it and gives the same numbers everywhere.
 """
@@ -33,7 +33,7 @@ _NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 class Network:
     """A multi-layer perceptron with one hidden layer and one output."""
 
-    input_scale: FloatArray  # (n_inputs,), inputs are divided by it
+    input_scale: FloatArray  # (n_inputs,), divisors of the inputs
     W1: FloatArray
     b1: FloatArray
     W2: FloatArray  # (15,)
@@ -50,28 +50,28 @@ class Network:
 
 
 class Healthy(BaseModel, extra="forbid", frozen=True):
-    """How an equation reads on healthy windows that training did not see."""
+    """Calibration of an equation on windows that training did not see, by own parameter."""
 
     windows: int = Field(ge=1)
     msd: float = Field(ge=0)  # mean of the mean squared deviation
-    # What the scatter over the hops is multiplied by, so that with `floor` 95 % intervals hold 95 %.
+    # Factor on the scatter over the hops with which, together with `floor`, 95 % intervals contain 95 %.
     z_scale: tuple[_Positive, ...]
     spread: tuple[_NotNegative, ...]  # robust standard deviation of each own parameter's reading
-    # Relative error that all hops of a window share and their scatter does not show; empty: none.
+    # Error of the relative change that all hops of a window share, so that their scatter misses it; empty for none.
     floor: tuple[_NotNegative, ...] = ()
-    # How much of a change is read; the rest the network explains by itself. Empty: all of it.
+    # Part of a change that is read, as the network explains the rest by itself; empty if all is read.
     gain: tuple[_Positive, ...] = ()
-    freedom: tuple[_Positive, ...] = ()  # degrees of freedom of the errors (Student's t); empty: normal
+    freedom: tuple[_Positive, ...] = ()  # degrees of freedom of the errors (Student's t); empty if normal
 
     def stated(self, change: FloatArray, scatter: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Changes and their standard errors, of what the signatures see of the residual and its scatter."""
+        """Calibrated changes and standard errors, from the projected residual and its scatter."""
         error = np.hypot(np.multiply(self.z_scale, scatter), self.floor or 0.0)
         return change / (self.gain or 1.0), error
 
 
 @dataclass(frozen=True, slots=True)
 class EquationNetwork:
-    """A trained network with the equation it stands for."""
+    """A trained network with its equation and, once calibrated, its calibration."""
 
     equation: Equation | SynchronousEquation
     network: Network
@@ -79,9 +79,9 @@ class EquationNetwork:
 
 
 def window_view(window: WindowStatistics, machine: Machine, *, by_hop: bool = False) -> StatisticsView:
-    """The window, or each of its hops alone, along the first axis, as equations look at it.
+    """Statistics of the window that equations need, or those of each hop, along the first axis.
 
-    Lags are those from ``lag_from_s``: shorter ones see the excitation itself.
+    Lags start at ``lag_from_s``, because shorter ones contain the excitation itself.
     """
     first = int(np.searchsorted(window.lags_s, machine.window.lag_from_s - 1e-9))
     speed = window.speed_rad_s if np.isfinite(window.speed_rad_s) else machine.operation.speed_rad_s
@@ -93,9 +93,9 @@ def window_view(window: WindowStatistics, machine: Machine, *, by_hop: bool = Fa
 def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: Machine) -> EquationReading:
     """Evaluate one equation on one window.
 
-    The residual is projected on the signatures of the equation's own parameters: detection, location inside the
-    equation, and size in one step. The scatter over the window's hops gives the standard error, with what calibration
-    found that all hops share.
+    The residual is projected on the signatures of the equation's own parameters: this detects a change, assigns it to a
+    parameter and sizes it in one step. The standard error comes from the scatter over the window's hops and, from the
+    calibration, the error that all hops share.
     """
     equation = trained.equation
     absent = missing(equation, window.states if window.synchronous is None else (*window.states, "theta"))
@@ -133,12 +133,12 @@ def _residual(network: Network, rows: EquationRows, norm: float) -> FloatArray:
 
 
 def equation_by_number(number: str) -> Equation | SynchronousEquation:
-    """Look an equation up; KeyError for a number that is not in the table."""
+    """Look up an equation; KeyError if its number is not in the table."""
     return {equation.number: equation for equation in EQUATIONS}[number]
 
 
 def not_read(equation: Equation | SynchronousEquation, reason: str) -> EquationReading:
-    """What is said of an equation that cannot be evaluated."""
+    """Reading of an equation that cannot be evaluated, with the reason."""
     return EquationReading(equation=equation.number, title=equation.title, evaluable=False, reason=reason)
 
 

@@ -1,12 +1,12 @@
-"""Training of the networks, of one equation each and amortised.
+"""Training of the relation networks, of one equation each, and of the amortised networks.
 
-For one equation, the training windows keep the equation's own parameters nominal and draw everything else at random:
-the residual becomes blind to other faults and to the operating condition by construction.
+In the training windows of an equation, its own parameters are nominal and everything else is drawn at random, so that
+the residual is insensitive to other faults and to the operating condition.
 
-For the amortised networks, each step sees windows drawn at random from a buffer that is being renewed all the time. A
-fixed set of training windows would be learned by heart: the networks' variances shrink to the errors on that set. The
-negative logarithm of the normal density diverges at high learning rates; gradients are clipped and the rate falls along
-a half cosine.
+For the amortised networks, each step uses windows drawn at random from a buffer that is renewed continually. A fixed
+set of training windows would be overfitted, and the networks' variances would shrink to the errors on that set. As the
+negative log-density of a normal distribution diverges at high learning rates, gradients are clipped and the rate falls
+along a half cosine.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -36,7 +36,7 @@ def train_network(
     seed: int,
     progress: Callable[[float], None] = lambda _: None,
 ) -> EquationNetwork:
-    """Fit the network of one equation, which is not calibrated yet.
+    """Fit the network of one equation, without calibrating it.
 
     Parameters
     ----------
@@ -46,9 +46,9 @@ def train_network(
     Raises
     ------
     EstimationError
-        If the fit does not come out finite.
+        If the fitted weights are not finite.
     """
-    torch.set_num_threads(1)  # sums keep their order, whatever ran before in this process
+    torch.set_num_threads(1)  # so that sums keep their order, whatever ran before in this process
     rows = [equation.rows(window_view(window, machine), machine) for window in windows]
     inputs = np.concatenate([row.inputs / row.norm for row in rows])
     target = np.concatenate([row.target / row.norm for row in rows])
@@ -56,7 +56,7 @@ def train_network(
     x, t = torch.from_numpy(inputs / scale), torch.from_numpy(target)
     generator = torch.Generator().manual_seed(seed)
     n_inputs = inputs.shape[1]
-    # Small first-layer weights: the relation is nearly linear, and tanh is too near zero.
+    # Small first-layer weights: the relation is nearly linear, and so is tanh near zero.
     W1 = torch.randn(n_inputs, HIDDEN, generator=generator, dtype=torch.float64) * 0.1 / n_inputs**0.5
     W2 = torch.randn(HIDDEN, generator=generator, dtype=torch.float64) / HIDDEN**0.5
     weights = [W1, torch.zeros(HIDDEN, dtype=torch.float64), W2, torch.zeros(1, dtype=torch.float64)]
@@ -89,16 +89,16 @@ def train_network(
 
 
 _BATCH = 512
-_PASSES = 3.0  # how often a window is seen on average
+_PASSES = 3.0  # average number of times that a window is used
 _BUFFER = 160_000
-_WARM_UP = 24_000  # windows in the buffer before the first step: they standardise the inputs
+_WARM_UP = 24_000  # windows in the buffer before the first step; the inputs are standardised with them
 _RATE, _RATE_RISES_OVER = 2e-3, 100
 _WEIGHT_DECAY = 2e-2
 _NOVELTY_QUANTILE, _NOVELTY_MARGIN = 0.999, 1.25
 
 
 class _Learner:
-    """One equation's network while it learns."""
+    """One equation's amortised network during training."""
 
     def __init__(self, equation: str, n_inputs: int, usual: Float32Array, generator: torch.Generator) -> None:
         self.equation = equation
@@ -128,7 +128,7 @@ class _Learner:
         self.optimiser.step()
 
     def _loss(self, inputs: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """Negative logarithm of the normal density."""
+        """Mean negative log-density of the normal distribution, without its constant."""
         hidden = inputs
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = torch.nn.functional.silu(hidden @ weight + bias)
@@ -142,7 +142,7 @@ class _Learner:
         return torch.mean(torch.sum(white**2 / 2 + log_deviation, dim=1))
 
     def finished(self) -> AmortisedNetwork:
-        """Return the network in units of the logarithmic ratio."""
+        """Return the network, with outputs scaled to logarithmic ratios."""
         p = len(self.targets)
         weights = [_array(weight) for weight in self.weights]
         biases = [_array(bias) for bias in self.biases]
@@ -170,17 +170,17 @@ def train_networks(
     states : tuple of str
         Measured states that the features were made of.
     principal : tuple of ndarray
-        Mean and directions that condensed them.
+        Mean and directions with which they were condensed.
     n_common : int
-        Features that all networks share; the rest are equation 29's.
+        Number of features that all networks share; the rest are for equation 29.
     batches : iterable of (features, logarithmic ratios)
         Condensed features, shape (n_windows, n_features), and targets, shape (n_windows, 6).
     expected_windows : int
-        Windows in all batches together: it sets the course of the learning rate.
+        Number of windows in all batches together, for the schedule of the learning rate.
     log_range : float or ndarray, shape (6,)
         Largest drawn logarithmic ratio of each of `PARAMETERS`.
     seed : int
-        Of initial weights and of the choice from the buffer.
+        For the initial weights and the choice from the buffer.
     progress : callable
         Called with the number of windows of each batch.
 
@@ -189,14 +189,14 @@ def train_networks(
     EstimationError
         If the batches hold too few windows to start, or the training diverges.
     """
-    torch.set_num_threads(1)  # the windows are made by processes beside it, and sums keep their order
+    torch.set_num_threads(1)  # other processes make the windows, and sums keep their order
     generator = torch.Generator().manual_seed(seed)
     warm_up = min(_WARM_UP, expected_windows // 2)
     buffer = _Buffer(min(_BUFFER, expected_windows))
     total_steps = max(1, int(_PASSES * (expected_windows - warm_up) / _BATCH))
     basis: FeatureBasis | None = None
     learners: list[_Learner] = []
-    # Standard deviation of what is drawn: the networks work in units of it.
+    # Standard deviation of the drawn ratios, the unit of the networks' outputs.
     usual = np.broadcast_to(np.float32(log_range) / np.float32(3**0.5), len(PARAMETERS))
     step = 0
     for features, log_ratio in batches:
@@ -230,7 +230,7 @@ def train_networks(
 
 
 class _Buffer:
-    """The latest windows of the stream."""
+    """Ring buffer of the latest windows of the stream."""
 
     def __init__(self, size: int) -> None:
         self._size = size
@@ -240,11 +240,11 @@ class _Buffer:
 
     @property
     def filled(self) -> int:
-        """Windows in it."""
+        """Number of windows in the buffer."""
         return min(self.seen, self._size)
 
     def add(self, features: Float32Array, log_ratio: Float32Array) -> None:
-        """Put windows in the place of the oldest ones."""
+        """Replace the oldest windows by new ones."""
         if not self.seen:
             self.features = np.empty((self._size, features.shape[1]), dtype=np.float32)
         places = (self.seen + np.arange(features.shape[0])) % self._size
