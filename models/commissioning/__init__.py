@@ -1,5 +1,5 @@
-"""From healthy recordings of a machine to what its monitor compares later data with.
+"""From healthy recordings of a machine to the references with which its monitor compares later data.
 
-`healthy` turns recordings into hops, `checks` says whether they are fit, `identified` and the baselines of
-`models.diagnosis` are what is learned, `commissioned` is the file that holds it.
+`healthy` cuts recordings into hops, `checks` decides whether they are suitable, `levels` learns at each knowledge level
+(with `identified`, or the baselines of `models.diagnosis`), and `commissioned` is the file with the result.
 """

@@ -1,4 +1,4 @@
-"""Whether healthy recordings are fit to commission a machine from, and what to record instead where they are not."""
+"""Checks whether healthy recordings are suitable for commissioning a machine, with advice on what to record if not."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -31,12 +31,12 @@ _MUCH_REFUSED, _TOO_MUCH_REFUSED = 0.01, 0.2
 _STEADY_SPEED = 0.05
 _STEADY_LEVEL = 2.0  # ratio of the rms between the halves of a recording; chance alone reaches 1.3 in half a minute
 SAME_SPEED = 0.03  # relative difference within which speeds count as one
-# Part of the other plane's motion in a sensor, as of one that is mounted to two degrees, that is no other machine.
+# Largest part of the other plane's motion in a sensor (as when mounted two degrees off) that is not another machine's.
 _LITTLE = 0.035
 _MOST_OUTSIDE = 0.8  # share of healthy windows outside a theory beyond which it is not the machine's
 _RATE = 1e-3  # probability that a healthy machine fails a comparison of its own windows
-# Part of the limit from which a parameter's alarm is raised, within which a difference is none that matters. Sensors
-# are calibrated to some per cent, and where one force moves everything, standard errors are less than a thousandth.
+# Differences matter above this part of the limit of the parameter's alarm. Sensors are calibrated to some per cent, but
+# with one force standard errors are less than a thousandth, so smaller differences can be significant.
 _MATTERS = 1 / 3
 _LOUD_LINE, _DOMINANT_LINE = 0.05, 0.5  # share of a foreign line in the power of a channel's random part
 
@@ -51,7 +51,7 @@ class Check(BaseModel, extra="forbid", frozen=True):
 
 
 def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> Check:
-    """Whether there is enough data, and how much was lost."""
+    """Check whether there are enough data, and how much was lost."""
     told = partial(Check, name="enough data")
     hops = sum(len(one.hops) for one in recordings)
     used_s = sum(one.duration_s for one in recordings)
@@ -82,7 +82,7 @@ def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> 
     if share > _TOO_MUCH_REFUSED:
         advice = f"find out why {share:.0%} of the data are missing, and {advice}"
         return told(verdict="refused", text=f"too many gaps: {found}", advice=advice)
-    # Before its first hop, each recording fills the lags, which costs a hop: six windows are not too few for that.
+    # Each recording first fills the lags, which costs one hop; six windows less those hops are enough.
     lead_s = sum(one.plan.fresh / one.plan.rate_hz for one in recordings)
     if used_s + lead_s < wanted_s or share > _MUCH_REFUSED or refused:
         return told(verdict="limited", text=found, advice=advice)
@@ -94,7 +94,7 @@ def check_sensors_of(
     findings: Mapping[str, Sequence[SensorFault]],
     windows: Mapping[str, Sequence[WindowStatistics]],
 ) -> Check:
-    """Whether a sensor was at fault while the recordings were made, or at the end of its range."""
+    """Check whether a sensor was faulty during the recordings, or reached the end of its range."""
     told = partial(Check, name="sensors")
     faults: dict[tuple[str, str, tuple[str, ...]], list[str]] = {}
     for recording, found in findings.items():
@@ -118,9 +118,9 @@ def check_sensors_of(
 
 
 def check_speed_given(machine: MachineFile, windows: Sequence[WindowStatistics]) -> Check | None:
-    """Refusal of a machine that turns so fast that other windows suit it, where its file does not say so."""
+    """Refusal if the shaft is so fast that other windows suit it and the file does not state the speed; else None."""
     speeds = [window.speed_rad_s / (2 * np.pi) for window in windows if np.isfinite(window.speed_rad_s)]
-    fastest_hz = max(map(abs, speeds), default=0.0)  # an angle that falls is a matter of its own
+    fastest_hz = max(map(abs, speeds), default=0.0)  # a falling angle is `check_steady`'s
     modes_hz = () if machine.rotor is None else machine.rotor.modes_hz
     stated_hz, tolerance = 0.0, 0.0
     if machine.operation is not None:
@@ -140,7 +140,7 @@ def check_speed_given(machine: MachineFile, windows: Sequence[WindowStatistics])
 def check_steady(
     machine: MachineFile, recordings: Sequence[HealthyRecording], windows: Mapping[str, Sequence[WindowStatistics]]
 ) -> Check:
-    """Whether speed and level held still within each recording, of a shaft whose angle grows."""
+    """Check whether the shaft angle grows, and whether speed and level are steady within each recording."""
     told = partial(Check, name="stationary")
     falling = [one.name for one in recordings if any(window.speed_rad_s < 0 for window in windows[one.name])]
     if falling:
@@ -162,7 +162,7 @@ def check_steady(
                 )
                 break
         powers = np.array([np.diag(w.as_mounted.correlation[0]) for w in windows[recording.name]])
-        powers = np.maximum(powers, 0.0)  # of a channel that does not move rounding may leave less than nothing
+        powers = np.maximum(powers, 0.0)  # rounding may be below 0 in a channel that does not move
         half = len(powers) // 2
         if half:
             ratio = np.sqrt(powers[half:].mean(axis=0) / np.maximum(powers[:half].mean(axis=0), np.finfo(float).tiny))
@@ -183,7 +183,7 @@ def check_steady(
 
 
 def check_lines(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> Check:
-    """Whether something else than noise and the rotation drives the machine."""
+    """Check whether anything other than noise and the rotation excites the machine."""
     told = partial(Check, name="second excitation")
     found = [(one.name, line) for one in recordings for line in foreign_lines(one)]
     loud = [(recording, line) for recording, line in found if line.share > _LOUD_LINE]
@@ -209,10 +209,10 @@ def check_lines(machine: MachineFile, recordings: Sequence[HealthyRecording]) ->
 
 
 def check_recordings(differences: Sequence[str], speeds_rad_s: Mapping[str, float]) -> Check | None:
-    """Whether the recordings tell of one machine, each read against what the others teach; None for a single one.
+    """Check whether recordings agree, each read against the relations learned from the others; None for a single one.
 
-    Where they do not but ran at different speeds, the machine may be one whose bearings depend on the speed: that
-    limits what can be said between the speeds.
+    If they disagree but were made at different speeds, the bearings may depend on the speed, which limits the diagnosis
+    between the speeds.
     """
     told = partial(Check, name="recordings agree")
     if len(speeds_rad_s) < 2:
@@ -236,9 +236,9 @@ def check_recordings(differences: Sequence[str], speeds_rad_s: Mapping[str, floa
 
 
 def check_sources(windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
-    """Whether the recordings were excited in more than one way, at level none.
+    """Check whether the recordings were excited in more than one way, at level none.
 
-    With one source every channel is a filtered copy of every other, and relations that differ by far fit the same
+    With one source every channel is a filtered copy of every other, and very different relations fit the same
     recording.
     """
     told = partial(Check, name="ways of excitation")
@@ -259,24 +259,24 @@ def check_sources(windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
 
 
 def _alike(recordings: Sequence[Sequence[WindowStatistics]]) -> bool:
-    """Whether recordings with one source each have it in common: at one speed, all their windows look like one."""
+    """Whether recordings with one source each share it: they have one speed, and their mean spectra show one source."""
     speeds = [window.speed_rad_s for own in recordings for window in own if np.isfinite(window.speed_rad_s)]
     if speeds and max(speeds) > (1 + SAME_SPEED) * min(speeds):
         return False
-    # As loud as each other, so that none decides alone.
+    # Normalised, so that no window dominates the mean.
     spectra = [window.spectrum / np.einsum("fii->", window.spectrum).real for own in recordings for window in own]
     return one_source(replace(recordings[0][0], spectrum=np.mean(spectra, axis=0)))
 
 
 def check_determined(reasons: Sequence[str], *, only_shapes: bool = False) -> Check:
-    """Whether the recordings determine every relation that the sensors allow.
+    """Check whether the recordings determine every relation that the sensors allow.
 
     Parameters
     ----------
     reasons : sequence of str
-        Why there is none, with what to record instead.
+        Why relations are missing, with what to record instead.
     only_shapes : bool
-        There is none at all, and each channel is only compared with its own healthy form.
+        Whether there is no relation at all, so that each channel is only compared with its own healthy shape.
     """
     told = partial(Check, name="relations determined")
     if not reasons:
@@ -290,7 +290,7 @@ def check_determined(reasons: Sequence[str], *, only_shapes: bool = False) -> Ch
 
 
 def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows: int) -> Check:
-    """Whether a change of a shape learned from so many windows would be called one, where nothing else is compared."""
+    """Check whether changes of shape can be detected with so many healthy windows, if only shapes are compared."""
     told = partial(Check, name="changes would be seen")
     names = {state: with_channel_names(state, machine.sensors) for state in powers}
     seen = {names[state]: one.growth for state, one in powers.items() if one.growth <= SEEN_GROWTH}
@@ -325,12 +325,12 @@ def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows
 
 
 def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: str | None = None) -> Check:
-    """Whether healthy windows agree with what they are compared with.
+    """Check whether healthy windows agree with the reference that they were read against.
 
     Parameters
     ----------
     what : str, optional
-        In words: "the parameters in the machine file". Without it, what was learned on the other half of the data.
+        The reference in words, such as "the parameters in the machine file"; by default the other half of the data.
     """
     name, between = "halves agree", "between the halves of the healthy data"
     if what is not None:
@@ -387,9 +387,9 @@ def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: 
 
 
 def _is_little(diagnosis: Diagnosis) -> bool:
-    """Whether a sensor that shows a little of the other plane, or comes a little late, is best: it is taken off later.
+    """Whether the best explanation is a small cross-axis part or delay of a sensor, for which later windows allow.
 
-    What a delay does to the readings is looked at before.
+    The effect of a delay on the readings is checked before.
     """
     tried = () if diagnosis.goodness is None or diagnosis.unexplained else diagnosis.goodness.alternatives
     best = max(tried, key=lambda one: abs(one.z), default=None)

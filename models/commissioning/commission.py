@@ -1,4 +1,4 @@
-"""Commission a machine from healthy recordings, with as much physics as its file gives, and report what came of it."""
+"""Commission a machine from healthy recordings, with as much physics as its file gives, and report the result."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -47,11 +47,11 @@ from models.machine import Machine, MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETER_TEXT, PARAMETERS
 
 _POWER = 0.95
-_NO_CHANCE = 3.0  # standard errors
+_NO_CHANCE = 3.0  # standard errors beyond which the healthy misfit is more than chance
 
 
 class EquationRow(BaseModel, extra="forbid", frozen=True):
-    """One row of the equation table, and whether these sensors allow it."""
+    """One row of the equation table, and whether it is used with these sensors."""
 
     number: str
     title: str
@@ -61,7 +61,7 @@ class EquationRow(BaseModel, extra="forbid", frozen=True):
 
 
 class HealthyReading(BaseModel, extra="forbid", frozen=True):
-    """One parameter in one healthy window, read against what was learned on other data where there is enough of it."""
+    """One parameter in one healthy window; at level none, read against the other half of the healthy data."""
 
     recording: str
     end_ns: int
@@ -70,7 +70,7 @@ class HealthyReading(BaseModel, extra="forbid", frozen=True):
 
 
 class ParameterSummary(BaseModel, extra="forbid", frozen=True):
-    """What is known of one parameter."""
+    """Results of the commissioning for one parameter."""
 
     name: str
     text: str
@@ -91,7 +91,7 @@ class ParameterSummary(BaseModel, extra="forbid", frozen=True):
 
 
 class CommissioningReport(BaseModel, extra="forbid", frozen=True):
-    """The whole report."""
+    """The report of a commissioning."""
 
     site: str
     machine: str
@@ -122,7 +122,7 @@ def parameter_summaries(
     wished: float,
     identified: Mapping[str, float],
 ) -> tuple[ParameterSummary, ...]:
-    """Sum up what healthy windows say of each parameter.
+    """Summarise the readings of each parameter in healthy windows.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def parameter_summaries(
     compared : sequence of (recording, end_ns, Diagnosis)
         The same windows read against what was learned without them.
     healthy_s, window_s : float
-        Data learned from; length of each window in `diagnoses`.
+        Length of the data learned from, and of the windows in `diagnoses`.
     identified : mapping of str to float
         Identified values, SI.
     """
@@ -176,22 +176,23 @@ def parameter_summaries(
 def _needed(
     name: str, wished: float, threshold: float, errors: tuple[float, float, float], healthy_s: float, window_s: float
 ) -> dict[str, float]:
-    """Healthy data and window length for a wished change: two errors fall as one over the root of the length.
+    """Healthy data and window length needed to find a wished change.
 
-    Nothing where no length is enough, because of what the relation is off in other conditions.
+    The window's error and the shared error fall as one over the root of the length. The result is empty if no length is
+    enough because of the relation's error in other conditions.
     """
     own, shared, elsewhere = errors
     allowed = math.sqrt(max(0.0, (to_scale(name, wished) / threshold) ** 2 - elsewhere**2))
     if not allowed:
         return {}
-    # At most half of what is allowed to the window: a commissioning that leaves nothing to chance takes for ever.
+    # The window gets at most half of the allowed variance; with none left, commissioning would take infinitely long.
     window = window_s * max(1.0, 2 * (own / allowed) ** 2)
     left = allowed**2 - own**2 * window_s / window
     return {"healthy_s_for_wished": healthy_s * shared**2 / left, "window_s_for_wished": window}
 
 
 def _errors(name: str, diagnosis: Diagnosis) -> tuple[float, float, float] | None:
-    """A window's own, its shared standard error, and that of other conditions, in the scale of the errors."""
+    """A window's own standard error, the shared one, and that from other conditions, in the scale of the errors."""
     names = [reading.name for reading in diagnosis.evaluable]
     if name not in names:
         return None
@@ -224,11 +225,11 @@ def _readings(name: str, compared: Sequence[tuple[str, int, Diagnosis]]) -> tupl
 
 @dataclass(frozen=True, slots=True)
 class Commissioning:
-    """What came of it."""
+    """Result of a commissioning."""
 
     report: CommissioningReport
     commissioned: Commissioned | None  # None if it was refused
-    machine: Machine | None  # with all parameters, where they are given or identified: networks can be trained for it
+    machine: Machine | None  # with all parameters, if they are given or identified: networks can be trained for it
 
 
 def commission(
@@ -246,9 +247,9 @@ def commission(
     Parameters
     ----------
     recordings : sequence of HealthyRecording
-        One for each file; of one steady condition each.
+        One for each file, each of one steady condition.
     wished : float, optional
-        Relative change that shall be found; the alarm limit without it.
+        Relative change that is to be found; by default the alarm limit.
     """
     knowledge = knowledge_of(machine)
     checks = [check_data(machine, recordings)]
@@ -271,7 +272,7 @@ def commission(
             ]
             for name, windows in by_recording.items()
         }
-        if not states:  # levels of a machine that stands are levels, too
+        if not states:  # levels can also be learned at standstill
             findings = {name: [f for f in found if f.states != ("theta",)] for name, found in findings.items()}
         checks.append(check_sensors_of(machine, findings, by_recording))
         if not states:
@@ -321,7 +322,7 @@ def commission(
 
 
 def _excluded(windows: Sequence[WindowStatistics], *, everywhere: bool) -> tuple[KnownLine, ...]:
-    """Lines that were left out and are from now on; of correlations, which relations are learned on, not all can be."""
+    """Lines that were excluded and will be; without `everywhere`, only those that can be taken out of correlations."""
     lines = [(line, window) for window in windows for line in window.lines if everywhere or line.power is not None]
     return tuple(sorted({line.known(window.speed_rad_s) for line, window in lines}))
 
@@ -396,7 +397,7 @@ def _report(
 
 
 def _healthy_misfit(machine: MachineFile, learned: Learned, pieces: Sequence[HealthyPiece]) -> HealthyMisfit | None:
-    """How far the healthy windows lie from the theory, where there is one."""
+    """How far the healthy windows lie from the theory; None if there is no theory."""
     if learned.machine is None:
         return None
     found = [
@@ -408,7 +409,7 @@ def _healthy_misfit(machine: MachineFile, learned: Learned, pieces: Sequence[Hea
 
 
 def _misfit_notes(commissioned: Commissioned | None) -> tuple[str, ...]:
-    """That the theory is a little off from the start, where that is no chance."""
+    """Note that even the healthy windows deviate from the theory by more than chance; empty otherwise."""
     misfit = None if commissioned is None else commissioned.misfit
     if misfit is None or misfit.mean < _NO_CHANCE * misfit.error:
         return ()
@@ -420,7 +421,7 @@ def _misfit_notes(commissioned: Commissioned | None) -> tuple[str, ...]:
 
 
 def _growths(machine: MachineFile, commissioned: Commissioned | None) -> tuple[GrowthToAlert, ...]:
-    """What growth of each level raises an alert; none where limits refer to the first windows instead."""
+    """Growth of each level that raises an alert; empty if limits refer to the first windows instead."""
     if commissioned is None or commissioned.levels is None or machine.levels.reference == "first windows":
         return ()
     return tuple(alerts_of(commissioned.levels, machine.sensors, machine.levels, machine.window.hops))
@@ -443,7 +444,7 @@ def _summary(verdict: str, checks: Sequence[Check], read: str) -> str:
 
 
 def _equations(machine: MachineFile, learned: Learned, pieces: Sequence[HealthyPiece]) -> tuple[EquationRow, ...]:
-    """The whole table: what is compared with theory where the rotor is known, and what is learned where it is not."""
+    """All equations, compared with theory if the rotor is known, and all rows, learned if it is not."""
     states = machine.descriptor.states
     known = learned.machine is not None
     has_speed = "theta" in states or any(np.isfinite(piece.window.speed_rad_s) for piece in pieces)

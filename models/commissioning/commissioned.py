@@ -1,15 +1,15 @@
-"""What a machine is monitored with: what its file tells, and the bundle that was learned on it when healthy, as JSON.
+"""The knowledge a machine is monitored with: its machine file, and the bundle learned on the healthy machine, as JSON.
 
 ::
 
     my-machine/
     ├── commissioned.json     this file: level, conditions, baseline or identified rotor, references of the sensors
-    ├── manifest.json         networks trained for the machine, where its parameters are known (optional)
+    ├── manifest.json         networks trained for the machine, if its parameters are known (optional)
     ├── weights.safetensors
     ├── report.html           for people
     └── report.json           the same figures for programs
 
-A commissioning is frozen: another one is another version, which names what it replaces and why.
+A commissioning never changes: a new one is a new version, which names the one that it replaces, and why.
 """
 
 import hashlib
@@ -39,12 +39,12 @@ from models.mistakes import mistakes
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 
-# What cannot be identified beside stiffness and damping: masses and shaft.
+# Fields of masses and shaft, which cannot be identified together with stiffness and damping.
 _GEOMETRY = ("m1_kg", "m2_kg", "I2_kg_m2", "I2p_kg_m2", "shaft_length_m", "shaft_diameter_m", "shaft_E_Pa")
 
 
 class KnowledgeLevel(StrEnum):
-    """How much is known."""
+    """How much of a machine's physics its machine file gives."""
 
     FULL = "full"
     PARTIAL = "partial"
@@ -53,14 +53,14 @@ class KnowledgeLevel(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Knowledge:
-    """Level of knowledge of a machine."""
+    """Knowledge level of a machine, and the reason for it."""
 
     level: KnowledgeLevel
-    text: str  # why, in a sentence
+    text: str  # reason, in a sentence
 
 
 def knowledge_of(machine: MachineFile) -> Knowledge:
-    """Level of knowledge that a machine file gives.
+    """Determine the knowledge level that a machine file allows.
 
     Examples
     --------
@@ -104,9 +104,9 @@ def knowledge_of(machine: MachineFile) -> Knowledge:
 
 
 _RPM = 30 / np.pi
-SPEED_MARGIN = 0.05  # the relations hold no speed; a bearing's film and the unbalance response do
-# Random vibration this many times below or above what was seen is another regime: a stopped drive, a mounting come
-# loose, a bearing lifted through its clearance.
+SPEED_MARGIN = 0.05  # relations do not depend on the speed, but a bearing's oil film and the unbalance response do
+# Random vibration this many times below or above the commissioned range is another regime: a stopped drive, a loose
+# mounting, a bearing lifted through its clearance.
 LEVEL_MARGIN = 10.0
 _Positive = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
@@ -142,7 +142,7 @@ class OperatingRange(BaseModel, extra="forbid", frozen=True):
         )
 
     def outside(self, window: WindowStatistics, naming: Naming) -> str:
-        """Why a window lies outside the commissioned conditions; empty if it does not."""
+        """Why a window is outside the commissioned conditions; empty if it is inside."""
         if self.speed_rpm is not None and np.isfinite(window.speed_rad_s):
             low, high = self.speed_rpm
             rpm = window.speed_rad_s * _RPM
@@ -215,7 +215,7 @@ class ConditionBaseline(BaseModel, extra="forbid", frozen=True):
 
 
 class Commissioned(BaseModel, extra="forbid", frozen=True):
-    """What a machine's monitor compares later data with."""
+    """Everything that a machine's monitor compares later data with."""
 
     format: Literal[1] = 1
     site: str
@@ -230,7 +230,7 @@ class Commissioned(BaseModel, extra="forbid", frozen=True):
     identified: IdentifiedRecord | None = Field(
         default=None, description="level partial; level full without a shaft angle, of the unbalance alone"
     )
-    # Left out where there is none: bundles that were made without it keep their identity.
+    # Not stored if None, so that bundles made without it keep their identity.
     misfit: HealthyMisfit | None = Field(
         default=None,
         exclude_if=lambda found: found is None,
@@ -264,11 +264,11 @@ class Commissioned(BaseModel, extra="forbid", frozen=True):
 
     @property
     def identity(self) -> str:
-        """Twelve hexadecimal digits that change with anything in it."""
+        """Twelve hexadecimal digits that change with any content."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:12]
 
     def completed(self, machine: MachineFile) -> Machine | None:
-        """The machine with its identified parameters filled in; None where nothing but a baseline is known."""
+        """The machine with its identified parameters filled in; None at level none."""
         if self.identified is None:
             return machine if isinstance(machine, Machine) and self.level is KnowledgeLevel.FULL else None
         return Machine.model_validate(machine.model_dump(mode="json") | self.identified.machine)
@@ -277,8 +277,8 @@ class Commissioned(BaseModel, extra="forbid", frozen=True):
 def in_sense(machine: Machine, sense: Gyroscopic) -> Machine:
     """The machine with gyroscopic moments of this sense: the opposite one is a negative polar moment of inertia.
 
-    In the sense of Eq. (27), as it is read here, natural frequencies of forward whirl fall with the speed, and those of
-    a real rotor rise; see ``docs/decisions/0049-the-sense-of-the-gyroscopic-moments.md``.
+    In the sense of Eq. (27), as interpreted here, natural frequencies of forward whirl fall with the speed, whereas
+    those of a real rotor rise; see ``docs/decisions/0049-the-sense-of-the-gyroscopic-moments.md``.
     """
     if sense == "Eq. 27":
         return machine
@@ -287,22 +287,22 @@ def in_sense(machine: Machine, sense: Gyroscopic) -> Machine:
 
 
 def described(machine: MachineFile) -> dict[str, Any]:
-    """The parts of a machine file that a commissioning holds for, as plain JSON."""
+    """The parts of a machine file that must not change after commissioning, as plain JSON."""
     return json.loads(json.dumps(machine.model_dump(mode="json", include=_DESCRIBED)))  # type: ignore[no-any-return]
 
 
 def load_commissioned(directory: Path, machine: MachineFile, *, same_description: bool = True) -> Commissioned:
-    """Load what was commissioned and check that it belongs to a machine.
+    """Load a commissioned bundle and check that it belongs to a machine.
 
     Parameters
     ----------
     same_description : bool
-        Whether channels, window and physics must be as they were.
+        Whether channels, window and physics must be the same as when it was commissioned.
 
     Raises
     ------
     BundleError
-        Naming what is missing, damaged or different.
+        If it is missing, damaged, or of another machine; the message names the difference.
     """
     path = directory / FILE
     try:
@@ -327,15 +327,15 @@ def load_commissioned(directory: Path, machine: MachineFile, *, same_description
 
 @dataclass(frozen=True, slots=True)
 class Installed:
-    """One machine and all that its monitor knows of it."""
+    """A machine file with all that was trained or commissioned for the machine."""
 
     machine: MachineFile
     bundle: Bundle | None = None  # trained networks
-    commissioned: Commissioned | None = None  # what was learned on the healthy machine
+    commissioned: Commissioned | None = None  # references learned on the healthy machine
 
     @property
     def known(self) -> Machine | None:
-        """The machine with all its parameters, given or identified; None where only a baseline is known."""
+        """The machine with all its parameters, given or identified; None without some of them or without states."""
         if not states_of(self.machine):
             return None
         if self.commissioned is not None:
@@ -345,12 +345,12 @@ class Installed:
 
     @property
     def watching(self) -> bool:
-        """Whether nothing but levels can be watched: the machine is neither known nor commissioned."""
+        """Whether only levels can be watched, because the machine is neither known nor commissioned."""
         return self.commissioned is None and self.known is None
 
     @property
     def thorough(self) -> bool:
-        """Whether what the healthy machine has of a contact, or of lines, is known: one can be told then."""
+        """Whether the healthy machine's signs of contact, or its lines, are known, so that new ones can be detected."""
         if self.commissioned is None:
             return self.known is not None  # by theory
         levels = self.commissioned.levels
@@ -363,7 +363,7 @@ class Installed:
 
     @property
     def identity(self) -> str | None:
-        """Changes with anything that was trained or commissioned; None where there is neither."""
+        """Digits that change with anything trained or commissioned; None if there is neither."""
         parts = [part.identity for part in (self.bundle, self.commissioned) if part is not None]
         if len(parts) < 2:
             return parts[0] if parts else None
@@ -371,7 +371,7 @@ class Installed:
 
 
 def install(machine: MachineFile, bundle: str | Path | None) -> Installed:
-    """Load what a machine is monitored with; of one that is neither known nor commissioned, levels are watched.
+    """Load what a machine is monitored with; if it is neither known nor commissioned, only its levels are watched.
 
     Parameters
     ----------

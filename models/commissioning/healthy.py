@@ -1,4 +1,4 @@
-"""Healthy recordings, cut into hops as the monitor would cut them live, and lines in them that are not the rotation."""
+"""Healthy recordings, cut into hops as the monitor does live, and the lines in them that are not the rotation's."""
 
 import math
 from collections import Counter
@@ -22,37 +22,37 @@ from models.signals.recording import read_recording, summarize_recording
 from models.signals.wire import decode_block
 
 _RUN_UP = 0.03
-"""Part of the usual speed that is missing while a machine still runs up, or runs down already."""
+"""Part of the usual speed by which a hop may be slower; a slower one belongs to a run-up or run-down."""
 
 
 @dataclass(frozen=True, slots=True)
 class HealthyRecording:
-    """What a recording gave."""
+    """The usable hops of one recording, and what could not be used."""
 
     name: str  # of the file
     plan: Plan  # sizes of its hops
-    stretches: tuple[tuple[HopMoments, ...], ...]  # hops without an interruption between them
-    gaps: int = 0  # interruptions
-    missing_s: float = 0.0  # data that they cost
-    refused: tuple[tuple[str, int], ...] = ()  # blocks that could not be used, by reason
-    last_refusal: str = ""  # the latest such reason in a sentence
-    stopped_s: float = 0.0  # data left out in which the machine stood, ran up or ran down
+    stretches: tuple[tuple[HopMoments, ...], ...]  # runs of hops without an interruption
+    gaps: int = 0  # number of interruptions
+    missing_s: float = 0.0  # length of the data missing in them
+    refused: tuple[tuple[str, int], ...] = ()  # number of blocks that could not be used, by reason
+    last_refusal: str = ""  # reason for the latest refused block, in a sentence
+    stopped_s: float = 0.0  # length of the data left out because the machine stood, ran up or ran down
 
     @property
     def hops(self) -> tuple[HopMoments, ...]:
-        """All of them, oldest first."""
+        """All hops, oldest first."""
         return tuple(hop for stretch in self.stretches for hop in stretch)
 
     @property
     def duration_s(self) -> float:
-        """Usable data, s."""
+        """Length of the usable data, s."""
         return len(self.hops) * self.plan.fresh / self.plan.rate_hz
 
 
 def healthy_from_blocks(
     name: str, machine: MachineFile, blocks: Iterable[tuple[SampleBlock, str]], until_s: float | None = None
 ) -> HealthyRecording:
-    """Cut a stream into hops, up to so long after its first sample.
+    """Cut a stream into hops, up to `until_s` after its first sample.
 
     Each block comes with the hash of the channel descriptor that its sender named, or "".
     """
@@ -95,10 +95,10 @@ def healthy_from_blocks(
 
 
 def _without_stops(plan: Plan, stretch: list[HopMoments]) -> list[list[HopMoments]]:
-    """The stretches between its stops, each up to where the machine has its usual speed.
+    """The parts of a stretch between stops in which the machine has its usual speed.
 
-    A machine that stands all the time is recorded so on purpose; of one of which levels alone are watched those at
-    standstill are levels, too.
+    The whole stretch is returned if the machine stands all the time, as that is intended, or if only levels are
+    watched, as levels at standstill are valid, too.
     """
     speeds = np.abs([hop.turned_rad for hop in stretch]) * plan.rate_hz / plan.hop
     turns = speeds > STANDS_RAD_S
@@ -110,19 +110,19 @@ def _without_stops(plan: Plan, stretch: list[HopMoments]) -> list[list[HopMoment
     for first, last in edges.tolist():
         at_speed = first + np.flatnonzero(usual[first:last])
         if at_speed.size:
-            # Of the hop after a run-up, and of the one before a run-down, a part may have been below the usual speed.
+            # Part of the hop after a run-up, and of the one before a run-down, may be below the usual speed.
             begin = at_speed[0] + (first > 0)
             parts.append(stretch[begin : at_speed[-1] + (last == len(stretch))])
     return parts
 
 
 def read_healthy(path: Path, machine: MachineFile, until_s: float | None = None) -> HealthyRecording:
-    """Read a recording (MCAP) of the machine, up to so long after its first sample; there may be others in it.
+    """Read a recording (MCAP) of the machine, up to `until_s` after its first sample; other streams are ignored.
 
     Raises
     ------
     RecordingError
-        If it cannot be read, or holds no stream of this machine; the message names what it holds.
+        If it cannot be read, or holds no stream of this machine; the message names the streams that it holds.
     """
     found = healthy_from_blocks(path.name, machine, _blocks(path, machine), until_s)
     if not found.hops and not found.refused:
@@ -143,13 +143,13 @@ def _blocks(path: Path, machine: MachineFile) -> Iterator[tuple[SampleBlock, str
 
 
 def foreign_lines(recording: HealthyRecording) -> tuple[Line, ...]:
-    """Lines that are neither noise nor a multiple of the speed, strongest first."""
+    """Steady lines that are not at a multiple of the speed, strongest first."""
     plan, hops = recording.plan, recording.hops
     return steady_lines(plan, hops, window_statistics(plan, hops, lagged=False)) if hops else ()
 
 
 def known_lines(recordings: Iterable[HealthyRecording]) -> tuple[KnownLine, ...] | None:
-    """Those of all recordings and of each window in them; None where the speed is not known."""
+    """Steady lines of all recordings as a whole and of each window in them; None if a speed is not known."""
     found = set[KnownLine]()
     for one in recordings:
         cuts = [one.hops[first : first + one.plan.hops] for first in range(0, len(one.hops), one.plan.hops)]

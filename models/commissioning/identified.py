@@ -1,10 +1,10 @@
 """Partial knowledge: stiffness, damping and unbalance of a rotor with known masses and shaft, from healthy windows.
 
-The likelihood reads changes relative to a nominal rotor. Started from a guess and moved to what it reads, again and
-again, it identifies the rotor itself; what is left uncertain is shared by every later reading relative to it.
+The likelihood reads changes relative to a nominal rotor. Starting from a guess, the nominal rotor is moved to the
+readings repeatedly until it is identified; all later readings relative to it share its remaining uncertainty.
 
-Without a shaft angle the unbalance is identified by its size, where all windows are of one: of a rotor that is known
-too, for its file tells no more of the unbalance than somebody has supposed.
+Without a shaft angle only the size of the unbalance is identified, if it is the same in all windows. This is done for a
+rotor that is known, too, as the unbalance in its file is only an assumption.
 """
 
 import math
@@ -26,12 +26,12 @@ from models.signals.block import FloatArray
 
 _ROUNDS = 8
 _SETTLED = 0.02  # largest relative move of a parameter in the last round
-_ONE_SIZE = 0.1  # relative difference of one unbalance from itself, at another speed or load
-_MOST_LESS = 0.9  # relative move of the unbalance in a round
+_ONE_SIZE = 0.1  # largest relative deviation of an unbalance's size that may come from another speed or load
+_MOST_LESS = 0.9  # largest relative reduction of the unbalance in a round
 _START_DAMPING = 0.05
 _LEAST_TOLERANCE = 0.05
 _CUTOFF_HZ = (20.0, 300.0)
-_NO_STIFFNESS = 1e5  # N/m, in a plane without any sensor: nothing will be read of it
+_NO_STIFFNESS = 1e5  # N/m, placeholder in a plane without any sensor, whose stiffness is never read
 _E = PARAMETERS.index("e")
 _SCALES = tuple(np.geomspace(0.1, 10.0, 9).tolist())
 
@@ -41,9 +41,9 @@ class Identified:
     """A rotor identified on healthy windows."""
 
     machine: Machine  # the machine file with every parameter filled in
-    names: tuple[str, ...]  # parameters that were identified; none, or e alone, of a rotor that is known
+    names: tuple[str, ...]  # parameters that were identified; for a known rotor none, or e alone
     # (6, 6): of the identified values, in the scale of the errors (`models.diagnosis.verdict.stretch`), in the order of
-    # `PARAMETERS`; zero where nothing was identified
+    # `PARAMETERS`; zero for parameters that were not identified
     covariance: FloatArray
     diagnoses: tuple[Diagnosis, ...]  # the healthy windows read against it, without its uncertainty
 
@@ -61,12 +61,12 @@ def identify(
     Parameters
     ----------
     sized : bool
-        Whether the unbalance is identified without a shaft angle, too.
+        Whether the size of the unbalance is identified if there is no shaft angle.
 
     Raises
     ------
     EstimationError
-        If no start leads to a rotor that explains the windows, or `sized` ones are not of one unbalance.
+        If the parameters do not settle, or with `sized` the windows do not have the same unbalance.
     MachineFileError
         If masses or shaft are missing.
     """
@@ -90,7 +90,7 @@ def identify(
     total[np.ix_(together.known, together.known)] = covariance
     if sized and not has_angle(windows):
         total[_E, _E] = max(total[_E, _E], _size(machine, diagnoses)[1])
-    as_described = in_sense(whole, sense)  # the opposite of the opposite
+    as_described = in_sense(whole, sense)  # the opposite sense applied twice is the original
     return Identified(as_described, together.names, total, tuple(diagnoses))
 
 
@@ -102,12 +102,12 @@ def compare(
     *,
     sized: bool = False,
 ) -> Identified:
-    """Read healthy windows, as for `identify`, of a rotor that is known; `sized`, identify its unbalance alone.
+    """Read healthy windows of a known rotor, as for `identify`; with `sized`, identify the size of its unbalance.
 
     Raises
     ------
     EstimationError
-        If windows without a shaft angle are not of one unbalance.
+        If, without a shaft angle, the windows do not have the same unbalance.
     """
     whole, covariance = in_sense(machine, sense), np.zeros((len(PARAMETERS), len(PARAMETERS)))
     read = _read(whole, windows, progress, sized=sized)
@@ -121,17 +121,17 @@ def compare(
 
 
 def has_angle(windows: Sequence[WindowStatistics]) -> bool:
-    """Whether a shaft angle was measured."""
+    """Whether a shaft angle was measured in any window."""
     return any(window.synchronous is not None for window in windows)
 
 
 def _size(machine: MachineFile, diagnoses: Sequence[Diagnosis]) -> tuple[float, float]:
-    """Size of the unbalance, over the one that it was read against, and the relative variance of a later one.
+    """Size of the unbalance over the nominal one, and the relative variance of the size in a later window.
 
     Raises
     ------
     EstimationError
-        If it is not read in all windows, or is another one in some.
+        If it is not read in all windows, or differs between them.
     """
     read = [reading for each in diagnoses for reading in each.evaluable if reading.name == "e"]
     sizes = np.array([1 + (reading.relative_change or 0.0) for reading in read])
@@ -167,10 +167,10 @@ def _read(
 def _moved(
     machine: Machine, moves: dict[str, float], windows: Sequence[WindowStatistics], *, sized: bool
 ) -> tuple[Machine, list[Diagnosis]]:
-    """The machine with its parameters where they were read, and what is read relative to it.
+    """The machine with its parameters moved to the readings, and the windows read relative to it.
 
-    Moves are in the scale of the errors; the unbalance is moved to the vectors that are read in the windows, or, where
-    there are none, to its size.
+    Moves are in the scale of the errors. The unbalance is moved to the mean of the vectors read in the windows or,
+    without vectors, to the size read.
     """
     steps = {name: math.expm1(min(1.5, max(-1.5, value))) for name, value in moves.items() if name != "e"}
     if "e" in moves and not has_angle(windows):
@@ -196,7 +196,7 @@ def _moved(
 
 
 def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics]) -> Machine:
-    """Every parameter from somewhere: the file, the sum of forces on bearing and disc, or the lowest peak."""
+    """First guess of every parameter: from the file, the relation of bearing and disc, or the strongest peak."""
     known = machine.rotor
     if known is None or known.m2_kg is None or known.m1_kg is None:
         raise MachineFileError(f"{machine.title}: [rotor] gives no masses")
@@ -228,13 +228,13 @@ def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics]) -> M
 
 
 def _first_e(windows: Sequence[WindowStatistics]) -> float:
-    """Of the order of the synchronous motion; never nothing, because e is read as a ratio."""
+    """First e, of the order of the synchronous motion; never 0, because e is read as a ratio."""
     sizes = [float(np.max(np.abs(window.synchronous))) for window in windows if window.synchronous is not None]
     return float(np.clip(np.median(sizes), 1e-7, 1e-3)) if sizes else 1e-6
 
 
 def _from_forces(m2_kg: float, windows: Sequence[WindowStatistics]) -> dict[str, float]:
-    """Stiffness and damping from the relation between bearing and disc: its coefficients are -c/k and -m2/k."""
+    """Stiffness and damping from the relation of bearing and disc, whose first coefficients are -c/k and -m2/k."""
     try:
         baseline = learn_baseline([window.without_lines for window in windows])
     except EstimationError:
@@ -249,7 +249,7 @@ def _from_forces(m2_kg: float, windows: Sequence[WindowStatistics]) -> dict[str,
 
 
 def _from_peak(fields: dict[str, float], windows: Sequence[WindowStatistics]) -> dict[str, float]:
-    """Stiffness for which the lowest mode lies at the strongest peak of its plane."""
+    """Stiffness for which the lowest mode is at the strongest peak of its plane."""
     found: dict[str, float] = {}
     window = windows[0]
     for axis in "yz":

@@ -1,4 +1,4 @@
-"""What each level of knowledge makes of healthy windows."""
+"""Learning from healthy windows at each knowledge level."""
 
 import cmath
 import math
@@ -52,20 +52,20 @@ from models.levels.measures import WindowLevels
 from models.machine import Machine, MachineFile
 from models.signals.channels import ACCELERATIONS
 
-Read = tuple[str, int, Diagnosis]  # recording, end of the window, and what was read in it
-Progress = Callable[[str, int, int], None]  # told what is being done, how much of it is done, and how much there is
+Read = tuple[str, int, Diagnosis]  # recording, end of the window in ns, and its diagnosis
+Progress = Callable[[str, int, int], None]  # called with the present step in words, the steps done, and their total
 _TABLES = ("rotor", "operation", "condition")
-_SIZE = 0.05  # relative difference of the unbalance up to which it is the file's, at another angle
+_SIZE = 0.05  # relative difference in size up to which the unbalance is that of the file, turned to another angle
 _OPPOSITE = (
     "gyroscopic moments have the sense in which natural frequencies of forward whirl rise with the speed; "
     "in the other one, which is tried first, the machine file does not explain the recordings"
 )
-_SHORTEST_HOPS = 4  # fewer say too little of how they scatter
+_SHORTEST_HOPS = 4  # with fewer hops, their scatter is too uncertain
 
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """What one level of knowledge made of the windows."""
+    """Results of learning at one knowledge level."""
 
     checks: tuple[Check, ...]
     diagnoses: tuple[Read, ...] = ()
@@ -80,7 +80,7 @@ class Learned:
 
 @dataclass(frozen=True, slots=True)
 class HealthyPiece:
-    """A healthy window and where it comes from."""
+    """A healthy window, its recording, and whether it is in the later half of its stretch."""
 
     recording: str
     late: bool
@@ -110,7 +110,7 @@ def pieces_of(recordings: Sequence[HealthyRecording]) -> list[HealthyPiece]:
 def _by_theory(
     machine: MachineFile, pieces: Sequence[HealthyPiece], identified: Callable[..., Identified]
 ) -> tuple[Identified, tuple[Read, ...], IdentifiedRecord | None]:
-    """What theory makes of the windows, with what was identified; with the unbalance unless they are not of one."""
+    """Read the windows with the theory; without a shaft angle, identify the unbalance's size if all windows agree."""
     try:
         found = identified(sized=True)
     except EstimationError:
@@ -151,7 +151,7 @@ def _learn_full(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
 
 
 def _elsewhere(machine: Machine, read: Sequence[Diagnosis]) -> str:
-    """Advice where the heavy spot is as large as in the file and at another angle; empty where it is not so."""
+    """Advice if the unbalance is as large as in the file but at another angle; empty otherwise."""
     vectors = [each.unbalance for each in read if each.unbalance is not None and not each.unbalance.foreign]
     turned = [complex(one.real, one.imaginary) for one in vectors if one.turned and abs(one.magnitude_change) < _SIZE]
     if 2 * len(turned) <= len(read):
@@ -224,7 +224,7 @@ _LINEAR = (
 
 
 def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
-    """Learn the relations, in one baseline or in one for each speed."""
+    """Learn the relations, in one baseline or, if the recordings disagree, in one for each speed."""
     pieces = [replace(piece, window=piece.window.without_lines) for piece in pieces]
     groups = [pieces]
     baselines = [_baseline(groups[0])]
@@ -235,7 +235,7 @@ def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progre
     read: list[Read] = []
     compared: list[Read] = []
     for group, baseline in zip(groups, baselines, strict=True):
-        diagnostician = BaselineDiagnostician(baseline.without_force)  # a report holds for other days, too
+        diagnostician = BaselineDiagnostician(baseline.without_force)  # the report must also hold under other forces
         for piece in group:
             stated = determined(diagnostician.diagnose(piece.window), piece.window, machine.window_data_s)
             read.append((piece.recording, piece.window.end_ns, stated))
@@ -263,17 +263,17 @@ def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progre
 
 
 def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[str]) -> Baseline:
-    """What healthy windows that do not overlap teach, without the rows that they do not determine well enough.
+    """Learn a baseline from healthy windows that do not overlap, without relations that they hardly determine.
 
     Parameters
     ----------
     conditions : sequence of str
-        What each belongs to, for example its recording.
+        Condition of each window, for example its recording.
 
     Raises
     ------
     EstimationError
-        If they determine none; in one condition, if they do not determine all whose motions are measured.
+        If no row is determined or, with a single condition, not every row whose motions are measured.
     """
     rows = COUPLED_ROWS if planes_coupled(windows) else ROWS
     baseline = learn_baseline(windows, conditions, rows)
@@ -283,14 +283,14 @@ def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[s
     states = windows[0].states
     measured = [not not_measured(row.motions, states) for row in learned_rows(baseline.rows)]
     lost = [relation is None for relation, there in zip(relations, measured, strict=True) if there]
-    # A single recording that does not determine one of two planes is no ground to believe the other one.
+    # If a single recording does not determine one of two planes, the other one is not trusted either.
     if all(lost) or (any(lost) and len(set(conditions)) < 2):
         raise EstimationError("; ".join(dict.fromkeys(reason for reason in reasons if reason)))
     return replace(baseline, relations=relations, reasons=reasons)
 
 
 def _differentiated(baseline: Baseline, machine: MachineFile) -> str:
-    """Up to which frequency the derivatives of what is measured hold, in a sentence."""
+    """Sentence on the frequency up to which derivatives of the measured motions are valid."""
     deepest = max(
         formation_of([term.motions for term in row.terms], relation.states).deepest
         for row, relation in zip(learned_rows(baseline.rows), baseline.relations, strict=True)
@@ -304,7 +304,7 @@ def _differentiated(baseline: Baseline, machine: MachineFile) -> str:
 
 
 def _integrated(pieces: Sequence[HealthyPiece], machine: Machine) -> tuple[str, ...]:
-    """How accelerations are used, in a sentence; none where none is measured."""
+    """Sentence on the use of accelerations; empty if none is measured."""
     if not any(name in ACCELERATIONS for name in pieces[0].window.states):
         return ()
     low, high = machine.window.band_hz
@@ -316,7 +316,7 @@ def _baseline(pieces: Sequence[HealthyPiece]) -> Baseline:
 
 
 def _speeds(pieces: Sequence[HealthyPiece]) -> dict[str, float]:
-    """Mean speed of each recording, rad/s; nan where it is not known."""
+    """Mean speed of each recording, rad/s; NaN if it is not known."""
     return {
         name: float(np.mean([piece.window.speed_rad_s for piece in pieces if piece.recording == name]))
         for name in dict.fromkeys(piece.recording for piece in pieces)
@@ -354,7 +354,7 @@ def _without_equations(
 
 
 def _halves(pieces: Sequence[HealthyPiece], rows: Sequence[Row]) -> tuple[Read, ...]:
-    """Every window read against what the other halves of the recordings teach."""
+    """Every window, read against a baseline learned on the other halves of the recordings."""
     found: list[Read] = []
     for late in (False, True):
         teaching = [piece for piece in pieces if piece.late is not late]
@@ -364,7 +364,7 @@ def _halves(pieces: Sequence[HealthyPiece], rows: Sequence[Row]) -> tuple[Read, 
         try:
             half = learn_baseline([p.window for p in teaching], [p.recording for p in teaching], rows)
         except EstimationError:
-            continue  # half of the data is too little for this machine; the whole may be enough
+            continue  # half of the data is not enough for this machine, but all may be
         diagnostician = BaselineDiagnostician(half.without_force)
         found += [(p.recording, p.window.end_ns, diagnostician.diagnose(p.window)) for p in asked]
     return tuple(sorted(found, key=lambda read: read[1]))
@@ -374,10 +374,9 @@ _OF_LEVEL = MappingProxyType({KnowledgeLevel.FULL: _learn_full, KnowledgeLevel.P
 
 
 def learn(level: KnowledgeLevel, machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
-    """What a level of knowledge makes of the windows.
+    """Learn from the windows at a knowledge level.
 
-    Where theory does not explain them, neither with gyroscopic moments of one sense nor with those of the other, what
-    is wrong is told of the first.
+    If the theory fails with gyroscopic moments of either sense, the reasons are those for the sense of Eq. (27).
     """
     if level is KnowledgeLevel.NONE:
         return _learn_none(machine, pieces, progress)
@@ -391,7 +390,7 @@ def learn(level: KnowledgeLevel, machine: MachineFile, pieces: Sequence[HealthyP
             continue
         if all(check.verdict == "passed" for check in found[-1].checks):
             break
-    best = min(found, key=_doubt, default=None)  # the first of those that are as good
+    best = min(found, key=_doubt, default=None)  # the first sense if both are equally good
     if best is None or (best.gyroscopic == "opposite" and _doubt(best) == _REFUSED):
         raise errors[0]
     return best if best.gyroscopic == "Eq. 27" else replace(best, notes=(*best.notes, _OPPOSITE))
