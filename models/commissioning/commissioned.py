@@ -1,4 +1,4 @@
-"""The knowledge a machine is monitored with: its machine file, and the bundle learned on the healthy machine, as JSON.
+"""What a machine is monitored with: its machine file, and the bundle learned on the healthy machine, as JSON.
 
 ::
 
@@ -335,7 +335,7 @@ class Installed:
 
     @property
     def known(self) -> Machine | None:
-        """The machine with all its parameters, given or identified; None without some of them or without states."""
+        """The machine with all its parameters, given or identified; None if it lacks some or has only levels."""
         if not states_of(self.machine):
             return None
         if self.commissioned is not None:
@@ -363,7 +363,7 @@ class Installed:
 
     @property
     def identity(self) -> str | None:
-        """Digits that change with anything trained or commissioned; None if there is neither."""
+        """Hexadecimal digits that change with anything trained or commissioned; None if there is neither."""
         parts = [part.identity for part in (self.bundle, self.commissioned) if part is not None]
         if len(parts) < 2:
             return parts[0] if parts else None

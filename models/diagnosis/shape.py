@@ -37,7 +37,7 @@ SEEN_GROWTH = 8.0
 """A channel's shape is not evaluable if noise that makes it so many times as loud would not be detected."""
 _POWER_Z = float(ndtri(0.95))
 _MOST_WINDOWS = 100
-FEWEST_WINDOWS = 4  # healthy windows without which nothing is learned; six or more are advised, from several recordings
+FEWEST_WINDOWS = 4  # least number of healthy windows; six or more are advised, from several recordings
 _DIRECTIONS = 3
 _SPEED_TOLERANCE = 0.03
 _LAG_TOLERANCE_S = 1e-9

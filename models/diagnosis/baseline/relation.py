@@ -132,10 +132,10 @@ def _models(frequencies: bytes) -> tuple[FloatArray, FloatArray]:
 
 
 _ITERATIONS = 8
-_FITS = 3.0  # standard deviations of χ² within which a relation is taken to fit
+_FITS = 3.0  # standard deviations by which χ² of a relation that fits may exceed its expectation
 _LAG_ROUNDS = 2
 _LONGER_LAGS_S = (0.02, 0.028, 0.036, LONGEST_LAG_FROM_S)
-_CONVERGED = 1e-4  # standard errors
+_CONVERGED = 1e-4  # largest change of a coefficient in the last iteration, standard errors
 LOST = 0.5  # standard error of a stiffness beyond which a window does not determine it
 
 

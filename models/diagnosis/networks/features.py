@@ -79,7 +79,7 @@ class ForceFeatures:
 
     @property
     def n_series(self) -> int:
-        """Number of functions of frequency: force spectra, parts of their coherences, and more with `near`."""
+        """Number of functions of frequency: force spectra, real and imaginary coherences, and more with `near`."""
         return len(self._dofs) + 2 * len(self._pairs) + (1 + len(self._pairs) if self._near else 0)
 
     @property
@@ -213,8 +213,7 @@ class FeatureBasis:
 
     mean: Float32Array  # (n_series, 1, n_bins)
     directions: Float32Array  # (n_series, n_bins, n_kept), principal components of every function of frequency
-    # (n_inputs,): mean and standard deviation of all inputs over random machines and conditions; those for equation 29
-    # alone come last
+    # (n_inputs,): of all inputs over random machines and conditions; those for equation 29 alone come last
     centre: Float32Array
     scale: Float32Array
     # (n_common, n_common): factor F of the inverse covariance F Fᵀ of the common inputs
@@ -256,8 +255,7 @@ def principal_directions(series: Float32Array, n_kept: int) -> tuple[Float32Arra
 def fit_basis(mean: Float32Array, directions: Float32Array, raw: Float32Array, n_common: int) -> FeatureBasis:
     """Standardise condensed features and measure their covariance.
 
-    `raw`, shape (n_windows, n_inputs), holds those of windows with sampling error; all networks share the first
-    `n_common`.
+    `raw`, (n_windows, n_inputs), is of windows with sampling error; all networks share its first `n_common` columns.
     """
     centre = raw.mean(axis=0)
     scale = raw.std(axis=0) + np.float32(1e-6)

@@ -18,8 +18,7 @@ MOST_ERRORS = 5.0  # standard errors beyond which two sensors disagree
 # Smaller relative differences of gain are put down to calibration: without a reference, and from the reference.
 LEAST_GAIN, LEAST_GAIN_CHANGE = 0.06, 0.015
 LEAST_COURSE = 0.02  # smaller relative changes of the gain within a window are not reported
-# Smaller delays are not reported, without and with a reference. A delay of 0.25 ms already shifts the estimate of a
-# bearing's damping by a quarter.
+# The same for delays. A delay of 0.25 ms already changes the reading of a bearing's damping by a quarter.
 LEAST_DELAY_S, LEAST_DELAY_CHANGE_S = 1e-4, 3e-5
 # Largest allowed phase lead of one sensor over the other, times angular frequency: that of a first-order high-pass at
 # 1.1 Hz. At 1 Hz no parameter of machines of 15 to 40 Hz was taken for changed, at 2 Hz damping read up to 16 % more.
@@ -33,7 +32,7 @@ _SURE = 0.2  # largest standard error of a channel's own change, as part of the 
 
 @dataclass(frozen=True, slots=True)
 class _Departure:
-    """A pair's reading less its reference, or less zero without one."""
+    """Differences of a pair's reading from its reference or, without one, from perfect agreement."""
 
     reading: PairReading
     log_gain: float
@@ -63,7 +62,7 @@ def gain_and_delay(
         least_delay = LEAST_DELAY_CHANGE_S if departure.known else LEAST_DELAY_S
         steady = departure.gain_z > MOST_ERRORS and abs(np.expm1(departure.log_gain)) > least_gain
         late = departure.delay_z > MOST_ERRORS and abs(departure.delay_s) > least_delay
-        if late:  # alternating delays partly cancel, which looks like a loss of gain
+        if late:  # two delays in turn partly cancel in the mean, like a loss of gain
             step_s, z = _largest_part(*delay_course(window, departure.reading, bands[departure.reading.pair]))
             steady &= not (z > MOST_ERRORS and abs(step_s) > least_delay)
         moving = departure.course_z > MOST_ERRORS and abs(departure.course_step) > LEAST_COURSE
@@ -282,8 +281,7 @@ BROKEN = 0.9  # two sensors of one motion that share less than this do not see t
 _SUSPECT = 0.985  # below this, channels may be swapped: two places of a stiff shaft move much alike
 _RESTORED = 0.97  # part that both pairs must share after the exchange, relative to the healthy one
 _CLEARLY = 5.0  # factor by which the exchange must reduce the part that the worse pair does not share
-# Two channels count as exchanged if their 1x amplitudes differ from each other's healthy ones by less than this part of
-# the difference from their own.
+# 1x amplitudes of exchanged channels: largest difference from each other's healthy ones over that from their own.
 _CROSSED = 0.25
 
 
@@ -369,11 +367,7 @@ def crossed_planes(window: WindowStatistics, naming: Naming) -> list[SensorFault
 def _guilty(
     window: WindowStatistics, sides: list[tuple[int, int]], broken: list[MotionPair], reference: SensorReference | None
 ) -> int | None:
-    """Which side was exchanged, 0 or 1; None if unclear.
-
-    It is the side whose channels break two pairs each in a chain of three sensors, or whose 1x amplitudes are each
-    other's healthy ones.
-    """
+    """Side that was exchanged: its channels break two pairs each, or have each other's healthy 1x amplitudes."""
     for number, side in enumerate(sides):
         if all(sum(column in (pair.first, pair.second) for pair in broken) > 1 for column in side):
             return number

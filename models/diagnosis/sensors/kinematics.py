@@ -23,11 +23,11 @@ LONGEST_DELAY_S = 0.02  # longest delay searched for
 _DELAY_STEP_S = 2.5e-4
 # The shortest delay with at least this part of the best fit is taken: narrow-band signals fit again a period later.
 _AS_GOOD = 0.98
-# The 1x vectors are used only if gain and delay with them agree with those without within so many standard errors:
-# run-out falsifies them, and so does cross-axis sensitivity, as the other plane's 1x comes a quarter turn later.
+# The 1x vectors are rejected if they move gain or delay by more than so many standard errors: run-out falsifies them,
+# and so does cross-axis sensitivity, as the other plane's 1x comes a quarter turn later.
 _LINE_FITS = 5.0
-_RUNOUT = 0.03  # least difference in log gain, too, for the 1x vectors to be rejected for it
-_TOLD_APART = 2 * math.log(1e3)  # least fall in chi-square by which one model of the phases is preferred: 1000:1
+_RUNOUT = 0.03  # least change of the log gain for that, and largest standard error of the log gain without them
+_TOLD_APART = 2 * math.log(1e3)  # least fall of χ² with which a model of the phases is preferred: 1000 times likelier
 _MOST_ACROSS = 0.15  # largest cross-axis sensitivity that is corrected for: more has another cause
 _PLANES, _RATES = str.maketrans("yz", "zy"), {"": 0, "dot": 1, "ddot": 2}
 _HANN_LOSS = 0.95  # part of the data's information that half-overlapping Hann segments keep

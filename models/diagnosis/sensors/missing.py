@@ -78,16 +78,16 @@ class MissingNumbers:
         return tuple(findings)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """Everything as named arrays."""
+        """The complete state as named arrays."""
         return {"times_ns": self._times_ns}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called.
+        """Restore the state that `checkpoint` returned.
 
         Raises
         ------
         CheckpointError
-            If the array is missing or of another form.
+            If the array is missing, or has another type or shape.
         """
         self._times_ns = checked(arrays, "times_ns", np.int64, self._times_ns.shape).copy()
         self._newest_ns = int(self._times_ns.max(initial=-1))

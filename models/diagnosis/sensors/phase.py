@@ -176,7 +176,7 @@ def _elsewhere(
 
 
 def _common(columns: Sequence[int], vectors: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Vectors of all hops, each channel in units of its own noise, and their first singular course, (n_hops,)."""
+    """Vectors of all hops, each channel in units of its own noise, and their common course (rank-1 SVD), (n_hops,)."""
     own = vectors[:, list(columns)]
     size = np.sqrt((np.abs(own) ** 2).mean(axis=0))
     noise = np.abs(np.diff(np.abs(own), axis=0)).mean(axis=0)
@@ -209,8 +209,7 @@ def _clock(
 ) -> SensorFault | None:
     """Finding on sensors of both planes whose vectors turn evenly at constant length, while others in both do not.
 
-    A change of the machine turns the vectors of one plane, or all of them with the heavy spot, and mostly by a bounded
-    angle.
+    A change of the machine turns the vectors of one plane, or all with the heavy spot, and mostly by a bounded angle.
     """
     states = [window.states[column] for column in columns]
     planes = np.array([state[0] for state in states])

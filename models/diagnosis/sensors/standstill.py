@@ -84,15 +84,15 @@ class Standstill:
         return np.array([own if one is None else one.rms for own, one in zip(running, known, strict=True)])
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """Everything as named arrays."""
+        """The complete state as named arrays."""
         return {"running": self._running}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called.
+        """Restore the state that `checkpoint` returned.
 
         Raises
         ------
         CheckpointError
-            If the array is missing or of another form.
+            If the array is missing, or has another type or shape.
         """
         self._running = checked(arrays, "running", np.float64, (None,))
