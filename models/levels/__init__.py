@@ -1,1 +1,1 @@
-"""Vibration levels: what is seen of a machine without any model of it."""
+"""Vibration levels: figures of a machine's vibration that need no model of it."""

@@ -1,9 +1,9 @@
-"""Levels in narrow bands, which are compared with the reference: what grows at any frequency, whatever the speed.
+"""Levels in narrow bands, compared with the reference: they show growth at any frequency, whatever the speed.
 
-Where the running speed is not known there are no orders, and a line that doubles is lost in the overall level;
-sidebands and subharmonics are at no order at all. In bands of a twelfth of an octave a line stands out of random
-vibration, and growth of any kind is growth of one of them. A line moves to a neighbouring band when the speed does:
-each band is compared with the loudest of its neighbourhood.
+If the running speed is not known there are no orders, and a line that doubles is lost in the overall level; sidebands
+and subharmonics are at no order at all. In 1/12-octave bands a line stands out of random vibration, and growth of any
+kind shows in one of them. A line moves to a neighbouring band when the speed changes, so each band is compared with the
+loudest of its neighbourhood.
 """
 
 from collections.abc import Sequence
@@ -19,22 +19,21 @@ from scipy.special import fdtri
 from models.signals.block import FloatArray
 
 BEYOND_RANGE, ERRORS = 1.25, 6.0
-"""No limit is nearer than so many times the largest healthy level, nor nearer than so many standard errors of a
-window."""
+"""No limit is nearer than this many times the largest healthy level, or this many standard errors of a window."""
 NYQUIST_PART = 0.8
-"""Part of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
+"""Fraction of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
 _PER_OCTAVE = 12
 _FIRST_BIN = 2
 """The taper spreads the mean over the bins before it."""
 _COUNTS = 0.01
-"""Part of a channel's rms below which a band is not looked at: what is there is mostly the noise of the sensor."""
+"""Fraction of a channel's rms below which a band is ignored: it is mostly sensor noise."""
 _CHANCE = 1e-9
 NEIGHBOURHOOD = 2.0 ** (1 / _PER_OCTAVE) - 1
-"""Relative change of the speed that moves a line by a band: out of its neighbourhood, if by more."""
+"""Relative change of the speed that moves a line by one band; a larger one moves it out of the neighbourhood."""
 LINE = 0.2
-"""Least part of the power of its band that the strongest bin of a line has."""
+"""Least share of its band's power that the strongest bin of a line has."""
 OF_BIN = 1.5
-"""Power of a line over that of its strongest bin, where it is in the middle of it."""
+"""Power of a line over that of its strongest bin, if the line is at the centre of the bin."""
 _Level = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
@@ -54,7 +53,7 @@ class BandLevels:
 
     edges_hz: FloatArray  # (n_bands + 1,)
     rms: FloatArray  # (n_bands, n), SI units
-    errors: FloatArray | None  # (n_bands, n), standard errors by the scatter of the hops, if asked for
+    errors: FloatArray | None  # (n_bands, n), standard errors from the scatter of the hops, if asked for
     freedom: FloatArray  # (n_bands,), degrees of freedom of a mean square of Gaussian noise
 
 
@@ -70,7 +69,7 @@ class BandReference(BaseModel, extra="forbid", frozen=True, strict=True):
 
 
 def learn_bands(windows: Sequence[BandLevels], column: int) -> BandReference:
-    """Learn a channel's from healthy windows."""
+    """Learn the reference of one channel from healthy windows."""
     rms = np.stack([one.rms[:, column] for one in windows])
     errors = np.stack([one.errors[:, column] for one in windows if one.errors is not None])
     return BandReference(
@@ -98,11 +97,11 @@ class Growth:
 
 @dataclass(frozen=True, slots=True)
 class BandLimits:
-    """What the bands of some channels are judged by in windows of one length; nothing where there is no reference."""
+    """Limits of the bands of all channels for windows of one length; zero where there is no reference."""
 
     # All (n_bands, n).
     own: FloatArray  # mean healthy level
-    mean: FloatArray  # that of the loudest of its neighbourhood
+    mean: FloatArray  # mean healthy level of the loudest band of the neighbourhood
     limit: FloatArray
 
 
@@ -117,13 +116,13 @@ def band_limits(
     Parameters
     ----------
     levels : BandLevels
-        Of a window of that length.
+        Of a window of the length in question.
     references : sequence of BandReference or None
         By column.
     ratio : float
-        Limit, times the mean of the reference.
+        Least limit over the mean of the reference.
     shorter : float
-        By how much a level scatters more than in the healthy windows, while the window fills.
+        Factor by which a level scatters more than in the healthy windows, while the window fills.
     """
     own, mean, limit = np.zeros((3, *levels.rms.shape))
     for column, reference in enumerate(references):
@@ -149,7 +148,7 @@ def growth(levels: BandLevels, limits: BandLimits) -> list[Growth | None]:
     ratios = np.divide(now, limits.own, out=np.full(now.shape, np.inf), where=looked_at)
     count = looked_at.sum(axis=0)
     ratios.sort(axis=0)
-    # What grows in all bands alike is growth of the excitation, which the overall level is judged by.
+    # Equal growth of all bands is growth of the excitation, which the limits of the overall level cover.
     median = (ratios[(count - 1) // 2, columns] + ratios[count // 2, columns]) / 2
     limit = limits.limit * np.maximum(1.0, np.where(count > 0, median, 1.0))
     at = np.divide(now, limit, out=np.zeros(now.shape), where=looked_at).argmax(axis=0)
@@ -165,13 +164,13 @@ def growth(levels: BandLevels, limits: BandLimits) -> list[Growth | None]:
 
 
 def widened(values: FloatArray) -> FloatArray:
-    """Largest of each band and its two neighbours, to which a line moves when the speed does."""
+    """Largest value of each band and its two neighbours, to which a line moves when the speed changes."""
     padded = np.concatenate([values[:1], values, values[-1:]])
     return np.asarray(np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:]))
 
 
 def band_in_words(band_hz: tuple[float, float]) -> str:
-    """From and to, without a power of ten.
+    """Edges of a band as text, without powers of ten.
 
     Examples
     --------

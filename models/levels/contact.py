@@ -1,12 +1,12 @@
 """Contact: whether a shaft is pushed back where it is farthest from its mean position, as by a casing that it rubs on.
 
-The next sample of a linear machine is what the latest ones predict and a remainder. Where what shakes the machine is
-Gaussian, the remainder is independent of the latest samples, and so of every function of them, whatever the machine and
-its lines at the first orders of running speed. A contact is a force towards the centre while the shaft is far out, and
-nothing otherwise: a remainder that goes with such a force is nothing that stiffness, damping, unbalance, a wrong gain
-or a louder source makes. Cubic stiffness, and other lines, are taken out with what grows with the cube of the distance.
-This is a score test of an autoregressive model against one with another regime beyond a threshold (H. Tong,
-"Non-linear Time Series", Oxford 1990, chapter 5).
+The next sample of a linear machine is a prediction from the latest samples plus a remainder. Under Gaussian excitation
+the remainder is independent of the latest samples, and so of every function of them, whatever the machine and its lines
+at the first orders of running speed. A contact is a force towards the centre while the shaft is far out, and zero
+otherwise: no stiffness, damping, unbalance, wrong gain or louder source makes the remainder correlate with such a
+force. The cube of the distance is among the predictors: it takes out cubic stiffness and other lines. This is a score
+test of an autoregressive model against one with another regime beyond a threshold (H. Tong, "Non-linear Time Series",
+Oxford 1990, chapter 5).
 """
 
 from collections import deque
@@ -20,38 +20,39 @@ from models.checkpoint import checked
 from models.signals.block import FloatArray
 
 _LAGS = (0, 2, 4, 8, 16, 64, 128)
-"""Samples back that the next one is predicted from: the longest tell running speed from a line beside it."""
+"""Samples back from which the next is predicted: the longest lags separate running speed from a line beside it."""
 _FAR_OUT = (0.02, 0.15)
-"""Parts of the samples: a light contact is seen best in the first, one that is there in every turn in the second."""
+"""Fractions of samples that count as far out: the first shows a light contact best, the second one in every turn."""
 _BEFORE = 2
-"""Samples back, one of these lags: in the second, far out is where the shaft was so then as well. A stiff contact is
-over by then, and the shaft is back later than was predicted: in the first it is seen without."""
+"""The second test counts the shaft as far out only if it was so this many samples earlier (one of the lags) as well. A
+stiff contact is over by then and the shaft returns later than predicted: the first test, without this, shows it."""
 _OFF = 8.0
-"""Times the average distance from what was predicted: a single sample that is off, by which nothing is far out unless
-the shaft was so before. Of a Gaussian's, none."""
+"""Mean absolute remainders from which on a sample is a spike, which is far out only if the shaft was so before as well.
+No sample of a Gaussian vibration is that far off its prediction."""
 _LEAST = 1000
-"""Samples: of less, hardly any are far out."""
+"""Fewest samples: of fewer, hardly any are far out."""
 _FITTED = 4
-"""One of so many samples is enough to fit what predicts the next one."""
+"""The predictor is fitted to one in so many samples, which is enough."""
 _STEPS = 20.0
-"""Steps of a converter in the rms: of fewer what is rounded goes with where the shaft is. On the rotor kit *heavy*
-steps of a twelfth to a seventh made 4.3 standard errors in an average hop, of half of that nothing."""
+"""Least rms in converter steps. With fewer, the rounding error correlates with the shaft position: on the rotor kit
+*heavy*, steps of rms/12 to rms/7 gave 4.3 standard errors in an average hop, steps half that size none."""
 _NOTHING = 1e-6
-"""Of the largest distance: less is what numbers are rounded to."""
+"""Fraction of the largest deviation below which a value is rounding error."""
 _Hop = npt.NDArray[np.float32]  # written with every hop
 _PER_TURN, _LEAST_HZ = 64, 1000.0
-"""Sampled faster than both, neighbours are averaged: between them a force hardly moves the shaft."""
+"""Samples per turn, and Hz: sampled faster than both, neighbours are averaged, as no force moves the shaft much
+between them."""
 
 
 def contact(
     pair: FloatArray, turning: FloatArray, revolutions: float, rate_hz: float, skew: float = 0.0, velocity: bool = False
 ) -> FloatArray:
-    """How much of a push towards the centre there is where a shaft is far out.
+    """Test statistics of a push towards the centre while a shaft is far out.
 
     Parameters
     ----------
     pair : ndarray, shape (2, n_samples)
-        Displacements or velocities in two directions, from their mean.
+        Displacements or velocities in two directions, less their mean.
     turning : ndarray, shape (2, n_samples)
         Cosine and sine of the shaft angle.
     skew : float
@@ -60,9 +61,9 @@ def contact(
     Returns
     -------
     ndarray, shape (2,)
-        Beyond the radius of fewer samples and of more: each standard normal on a linear machine that is shaken at
-        random, far above zero with a contact. Nan of too few samples, of coarse ones, and where a sensor shows
-        nothing of its own.
+        One for each radius (`_FAR_OUT`): standard normal on a linear machine under random excitation, far above zero
+        with a contact. NaN if there are too few samples, they are too coarsely quantised, or a sensor carries no
+        signal of its own.
     """
     size, steps = pair.shape[1], np.abs(np.diff(pair))
     step = np.min(steps, axis=1, where=steps > 0, initial=np.inf)
@@ -80,7 +81,7 @@ def contact(
     angle = (turning[0] + 1j * turning[1])[first : kept - 1]
     now, then = latest[0], latest[_LAGS.index(_BEFORE)]
     if velocity:
-        # Where the shaft is, by its velocities of about one turn: a function of the past as the samples themselves are.
+        # The position, by a leaky integral of the velocity over about one turn: a function of past samples as well.
         place = scipy.signal.lfilter([1.0], [1.0, -np.exp(-max(abs(revolutions), 1.0) / kept)], x, axis=1)
         place /= np.abs(place).max()
         now, then = place[:, first : kept - 1], place[:, first - _BEFORE : kept - 1 - _BEFORE]
@@ -104,12 +105,12 @@ def contact(
     for part, far in zip(_FAR_OUT, (square, both), strict=True):
         at = round((1 - part) * far.size)
         limits.append(np.partition(far, at)[at])
-        # Towards the centre, in parts of the distance from it.
+        # A force towards the centre, proportional to the distance beyond the radius.
         pushes.append((np.sqrt(limits[-1] / np.maximum(far, max(limits[-1], _NOTHING**2))) - 1) * now)
     left = unpredicted(np.concatenate(pushes))
     scale = np.sqrt(np.mean(remainder**2, axis=1))
     together = remainder[0] / max(scale[0], _NOTHING) * left[::2] + remainder[1] / max(scale[1], _NOTHING) * left[1::2]
-    # By their own squares: what shakes the machine may be louder while the shaft is far out.
+    # Standard errors by the products' own squares: the excitation may be louder while the shaft is far out.
     errors = np.sqrt(np.sum(together**2, axis=1))
     if min(scale.min(), *np.sqrt(limits)) < _NOTHING or errors.min() == 0:
         return np.full(len(_FAR_OUT), np.nan)
@@ -117,14 +118,14 @@ def contact(
 
 
 class LatestContact:
-    """What so many latest hops have of a contact, more than a window: a light one takes minutes to stand out."""
+    """Contact statistics of the latest hops, more than a window has: a light contact takes minutes to stand out."""
 
     def __init__(self, hops: int) -> None:
         self._hops: deque[_Hop] = deque(maxlen=hops)
         self._state = 0
 
     def take(self, hop: FloatArray, state: int) -> FloatArray:
-        """Go on with a hop, shape (n,); all of its operating state, shape (n_hops, n): others are forgotten."""
+        """Add a hop, shape (n,), and return all of its operating state, shape (n_hops, n); others are discarded."""
         if state != self._state:
             self._hops.clear()
         self._state = state

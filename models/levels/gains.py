@@ -1,10 +1,10 @@
-"""A wrong gain of all sensors of a place, told from a changed machine by what the places show side by side.
+"""A wrong gain of all sensors of a place, distinguished from a changed machine by comparing the places.
 
-A gain multiplies what its place shows by one factor, at every frequency alike, and no other place. Stiffness and
-damping move resonances, so they change some frequencies more than others; unbalance changes one frequency everywhere.
-What shakes the machine is shared: the logarithm of each place's level in third octaves is taken less the mean of the
-other places', and compared with that of each recording of the healthy machine. Where the excitation is like none of
-these, no factor fits, and nothing is said.
+A gain multiplies the levels of its own place, and of no other, by one factor at every frequency. Stiffness and damping
+move resonances, so they change some frequencies more than others; unbalance changes one frequency everywhere. All
+places share the excitation, so the contrast of each is used: the logarithm of its third-octave levels less the mean of
+the other places', compared with that in each recording of the healthy machine. If the excitation is like that of none
+of them, no factor fits, and no gain is reported.
 """
 
 import math
@@ -19,18 +19,19 @@ from models.signals.channels import Channel
 
 _BANDS = 4
 _COUNTS = 0.01
-"""Part of a channel's rms below which a third octave is not looked at: mostly the noise of the sensor."""
+"""Fraction of a channel's rms below which a third octave is ignored: it is mostly sensor noise."""
 _FEWEST_PLACES, _FEWEST_THIRDS = 3, 4
 _LEAST = 0.08
-"""Change of a gain that is told; smaller ones are what sensors differ by."""
+"""Least natural logarithm of a gain that is reported; sensors differ by smaller ones."""
 _SCATTER = 0.005
 _FITS, _EXPLAINED = 4.0, 0.25
-"""Mean square that a gain may leave, in variances of the healthy windows, and over what there is without it. Healthy
-windows leave up to 2.4; of changed stiffness and damping, what looks most like a gain of 6 % leaves 0.3 of it."""
+"""Mean square of the contrasts that a gain may leave, in variances of the healthy windows, and relative to that without
+the gain. Healthy windows leave up to 2.4 variances; the change of stiffness and damping that looks most like a gain of
+6 % leaves 0.3 of the mean square."""
 
 
 class GainReference(BaseModel, extra="forbid", frozen=True, strict=True):
-    """Levels of the places of a healthy machine side by side."""
+    """Third-octave levels of the places of a healthy machine."""
 
     places: tuple[str, ...] = Field(min_length=_FEWEST_PLACES)
     edges_hz: tuple[float, ...] = Field(min_length=_FEWEST_THIRDS)  # lower edges of the third octaves that are compared
@@ -38,11 +39,11 @@ class GainReference(BaseModel, extra="forbid", frozen=True, strict=True):
     levels: tuple[tuple[tuple[float, ...], ...], ...] = Field(min_length=1)
     # (n_thirds, n_places), standard deviation of one window's contrast within its recording.
     scatter: tuple[tuple[float, ...], ...]
-    windows: int = Field(ge=1)  # fewest of a recording
+    windows: int = Field(ge=1)  # number in the recording that has fewest
 
 
 def place_of(channel: Channel) -> str:
-    """Sensors of one place and direction may share a transducer or an amplifier."""
+    """Name of a place and direction, whose sensors may share a transducer or an amplifier."""
     angle = "" if channel.angle_deg is None else f" {channel.angle_deg:g}"
     return f"{channel.location} {channel.direction}{angle}"
 
@@ -72,7 +73,7 @@ def learn_gains(places: Sequence[str], recordings: Sequence[Sequence[BandLevels]
 
 
 def wrong_gain(levels: BandLevels, places: Sequence[str], reference: GainReference) -> tuple[str, float] | None:
-    """Place whose sensors show too much or too little, and by which factor; None where no gain explains the window."""
+    """Name the place with a wrong gain, and the factor; None if no gain explains the window."""
     low = _edges(levels)
     at = np.abs(low[:, None] - np.array(reference.edges_hz)).argmin(axis=0)
     if tuple(dict.fromkeys(places)) != reference.places or not np.allclose(low[at], reference.edges_hz, rtol=1e-3):
@@ -97,10 +98,10 @@ def wrong_gain(levels: BandLevels, places: Sequence[str], reference: GainReferen
 
 
 def left_of_1x(logs: FloatArray, errors: FloatArray, places: Sequence[str], place: str, factor: float) -> float:
-    """What a wrong gain of a place leaves of the change of 1x beyond what chance does, in squared standard errors.
+    """Change of 1x that a wrong gain of a place leaves unexplained: chi-square less its degrees of freedom, 0 at least.
 
-    A gain changes 1x of its own place by its factor and that of no other, but for what they all share: an unbalance. A
-    bearing that has changed moves the other places, too.
+    A gain changes 1x at its own place only, by its factor. A factor common to all places is an unbalance, and is not
+    counted. A changed bearing changes 1x at the other places too.
 
     Parameters
     ----------
@@ -117,7 +118,7 @@ def left_of_1x(logs: FloatArray, errors: FloatArray, places: Sequence[str], plac
 
 
 def _contrast(levels: FloatArray) -> FloatArray:
-    """Each place less the mean of the others."""
+    """Each place's level less the mean of the others'."""
     n = levels.shape[-1]
     return np.asarray((n * levels - levels.sum(axis=-1, keepdims=True)) / (n - 1), dtype=np.float64)
 
@@ -132,7 +133,7 @@ def _thirds(rms: FloatArray) -> FloatArray:
 
 
 def _levels(levels: BandLevels, places: Sequence[str]) -> FloatArray:
-    """Mean logarithm of the channels of each place, shape (n_thirds, n_places); a channel that is dead has none."""
+    """Mean log rms of the channels of each place, shape (n_thirds, n_places); not finite if one of them is dead."""
     with np.errstate(divide="ignore"):
         rms = np.log(_thirds(levels.rms))
     columns = [[one == place for one in places] for place in dict.fromkeys(places)]

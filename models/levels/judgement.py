@@ -37,15 +37,15 @@ from models.signals.channels import Channel, Quantity, unit_in_text
 from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth, LevelLimits
 
 _ERRORS_OF_CONTACT = 5.0
-"""A contact is on one side alone, and Gaussian in theory: five are seldom enough."""
+"""Standard errors of a contact, which is tested on one side and Gaussian in theory: chance seldom exceeds five."""
 _STILL = 0.3
-"""Part of what several windows show that the newest one has to show, or the contact is over."""
+"""Fraction of the effect in several windows that the newest one must show; otherwise the contact is over."""
 _SPREAD = 4.0
-"""Standard deviations from the smallest to the largest of the windows of a healthy machine."""
+"""Range of the windows of a healthy machine, in standard deviations."""
 _ERRORS_OF_DOUBT = 4.0
-"""Where it decides whether to believe what else has been found, not whether anything has happened."""
+"""Standard errors of a kurtosis that casts doubt on a parameter already named, instead of `ERRORS`."""
 _TURNED_OUT = "1x vector"
-_MOST_KEPT = 16  # sets of limits of a channel: of its zones, of operating states, of a window that fills
+_MOST_KEPT = 16  # sets of limits kept per channel: for its zones, operating states, lengths of a window that fills
 _DEADBAND = 0.9
 
 
@@ -53,18 +53,18 @@ _MEASURED = tuple(name for name in LEVEL_MEASURES if name != "growth")
 _SHOWN = (*_MEASURED, "growth", "x1_phase_lag_deg", "x2_phase_lag_deg")
 _ROW = {name: row for row, name in enumerate(_SHOWN)}
 _Standard = tuple[str, str, tuple[float, float, float]]
-"""Zones: their name, the measure, boundaries as shown."""
+"""Zones of a standard: their name, the measure, boundaries in the unit that is shown."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Nearest:
-    """The nearest of the limits of a level, and what is said of it while it is within all of them."""
+    """The nearest limits of a level, and the record of a level that is within all of them."""
 
     alert: Limit | None
     danger: Limit | None
     fall: Limit | None
     normal: LevelLimits
-    # Within them from the one to below the other.
+    # The level is within its limits from `low` to below `high`.
     low: float
     high: float
 
@@ -73,13 +73,13 @@ class Foreign(NamedTuple):
     """What the levels of a window show that no change of a parameter makes."""
 
     text: str = ""  # empty if there is nothing
-    hides: bool = False  # whether nothing that is read of parameters beside it can be believed
-    direction: str = ""  # of a wrong gain of all sensors of a place: theirs
-    unlike: float = 0.0  # what that leaves of the change of 1x, see `left_of_1x`
+    hides: bool = False  # whether readings of parameters cannot be believed beside it
+    direction: str = ""  # of the sensors of a place that all have a wrong gain
+    unlike: float = 0.0  # what that gain leaves of the change of 1x, see `left_of_1x`
 
 
 class LevelJudge:
-    """Says what the levels of a machine's windows are, and on which side of their limits; `channels` are the plan's."""
+    """Judges the levels of a machine's windows against their limits; `channels` are those of the plan."""
 
     def __init__(self, plan: LevelPlan, channels: Sequence[Channel], settings: LevelSettings) -> None:
         self._plan = plan
@@ -89,7 +89,7 @@ class LevelJudge:
         self._units = np.array([[unit_size(channel, name) for channel in channels] for name in _MEASURED])
         self._blank = [_blank(plan, channel) for channel in channels]
         self._reference: LevelReference | None = None
-        # What most windows have in common with the one before is made once.
+        # Caches of what most windows have in common with the one before.
         self._relatives: dict[tuple[int, bool, int], RelativeLimits] = {}
         self._limits: dict[tuple[object, ...], dict[str, _Nearest]] = {}
         self._growth = lru_cache(maxsize=16 * len(self._channels))(_growth_limit)
@@ -102,9 +102,9 @@ class LevelJudge:
         moved: bool = False,
         missing: Sequence[int] = (),
     ) -> tuple[ChannelLevels, ...]:
-        """Levels of one window, channel by channel, none in columns where samples are `missing`.
+        """Judge the levels of one window, channel by channel; columns with `missing` samples have none.
 
-        There is no growth where lines `moved` to other bands within it.
+        If lines `moved` to other bands within the window, there is no growth.
         """
         alike = None if reference is None else self._alike(levels, reference)
         relative = None if alike is None else self._relatives[alike]
@@ -137,21 +137,21 @@ class LevelJudge:
         named: bool,
         faulty: Sequence[int] = (),
     ) -> Foreign:
-        """What the levels of a window show that no change of a parameter makes.
+        """Find what the levels of a window show that no change of a parameter makes.
 
         A shaft that is pushed back where it is far out, a new line, a wrong gain of all sensors of a place, a 2x that
-        has grown, or a random part that is not Gaussian as it was on the healthy machine.
+        has grown, or a random part whose kurtosis departs from that of the healthy machine.
 
         Parameters
         ----------
         judged : sequence of ChannelLevels
-            What `judge` says of them.
+            What `judge` returned for the window.
         latest : LatestContact
-            Of the hops before the latest one, with which it goes on.
+            Of the hops before the latest one, which is added to it.
         named : bool
-            Whether a parameter has been found to have changed, which this would cast doubt on.
+            Whether a parameter has been found to have changed, which a finding would cast doubt on.
         faulty : sequence of int
-            Columns of sensors at fault: what they show is nothing of the machine, nor a gain.
+            Columns of sensors at fault, which show neither the machine nor a gain.
         """
         if reference is None:
             return Foreign()
@@ -172,7 +172,7 @@ class LevelJudge:
                 text = f"gain of {' and '.join(one.name for one in own)}: {more}"
                 unlike = left_of_1x(*self._turned_up(levels, state), places, *wrong) if seen else 0.0
                 return Foreign(text, hides=True, direction=own[0].direction, unlike=unlike)
-        if found or not seen:  # at another speed much is otherwise
+        if found or not seen:  # at another speed much differs in any case
             return Foreign(found)
         kurtosis, hidden = levels.random_kurtosis, levels.hidden_twice
         told = np.full(len(judged), True) if hidden is None else ~hidden
@@ -207,7 +207,7 @@ class LevelJudge:
             return np.log(levels.values["x1"] / mean), np.hypot(error, (high - low) / _SPREAD) / mean
 
     def _contact(self, levels: WindowLevels, state: OperatingState, latest: LatestContact, number: int) -> str:
-        """Where the shaft is pushed back far out, as it was not on the healthy machine; empty if nowhere."""
+        """Describe where the shaft is pushed back far out, unlike the healthy machine's; empty if nowhere."""
         columns = [(column, (y, z)) for y, z, _ in self._plan.contacts for column in (y, z)]
         if levels.contact is None or not columns:
             return ""
@@ -217,7 +217,7 @@ class LevelJudge:
             if (healthy := state.contact.get(self._channels[column].name)) is None:
                 continue
             now, lasting = (departure(hops[:, at], healthy, _ERRORS_OF_CONTACT) for hops in (window, several))
-            # Of no more than the window, it is what that shows, and may be one knock.
+            # If `several` is no longer than the window, it shows nothing more, and may be one impact.
             if len(several) > len(window) and window[:, at].mean() - healthy.mean > _STILL * lasting:
                 now = max(now, lasting)
             looked.append((now, healthy.mean, pair))
@@ -231,9 +231,9 @@ class LevelJudge:
         )
 
     def _departure(self, levels: WindowLevels, column: int, state: OperatingState, n_errors: float) -> float:
-        """By how much a channel's kurtosis is off, beyond what lines make of it that have grown or gone.
+        """Departure of a channel's kurtosis from the healthy one; 0 if lines that have grown or gone explain it.
 
-        What has risen to less than a Gaussian's 3 may have lost a line.
+        The loss of a line explains a kurtosis that has risen to no more than a Gaussian's 3.
         """
         name, kurtosis = self._channels[column].name, levels.random_kurtosis
         if kurtosis is None or levels.moments is None or levels.bands is None:
@@ -303,7 +303,7 @@ class LevelJudge:
         zone: str,
         edge: float | None,
     ) -> dict[str, _Nearest]:
-        """Limits of a channel, but for those of bands; `edge` is that of a 1x vector out of its acceptance region."""
+        """Limits of a channel except for its bands; `edge` is that for a 1x vector out of its acceptance region."""
         limits = defaultdict[str, list[Limit]](list)
         for own in self._settings.limits:
             if own.channel == self._channels[column].name:
@@ -332,7 +332,7 @@ class LevelJudge:
         return name, measure, (first, second, third)
 
     def _alike(self, levels: WindowLevels, reference: LevelReference) -> tuple[int, bool, int]:
-        """Which windows are judged by the same limits relative to the reference, which are made once."""
+        """Key of the relative limits that a window shares with others, which are made here if there are none yet."""
         if reference is not self._reference:
             self._reference, self._relatives = reference, {}
             self._limits.clear()
@@ -345,7 +345,7 @@ class LevelJudge:
     def _limited(
         self, channel: Channel, name: str, value: float, nearest: _Nearest, words: str, out: str
     ) -> LevelLimits:
-        """On which side of its limits a level is; `out` is said of a 1x vector out of its acceptance region."""
+        """On which side of its limits a level is; `out` is the text for a 1x vector out of its acceptance region."""
         danger, alert, fall = nearest.danger, nearest.alert, nearest.fall
         if danger is not None and value >= (danger.danger or math.inf):
             state, decided, what = "danger", danger, f"danger limit {danger.danger:.3g} ({danger.source})"
@@ -399,7 +399,7 @@ def _nearest_limits(name: str, limits: Sequence[Limit]) -> _Nearest:
         fall=None if fall is None else rounded(fall.fall or 0.0),
         source="" if decided is None else decided.source,
         state="normal",
-        bounds=tuple(one.bound() for one in limits if one.source != _TURNED_OUT) if several else (),  # that is no level
+        bounds=tuple(one.bound() for one in limits if one.source != _TURNED_OUT) if several else (),  # it is no level
     )
     high = min((alert and alert.alert) or math.inf, (danger and danger.danger) or math.inf)
     return _Nearest(alert, danger, fall, normal, (fall and fall.fall) or 0.0, high)
@@ -407,12 +407,12 @@ def _nearest_limits(name: str, limits: Sequence[Limit]) -> _Nearest:
 
 @dataclass(frozen=True, slots=True)
 class ChannelState:
-    """How a channel stands as a whole: its worst level, and whether all are well within their limits."""
+    """State of a channel as a whole: its worst level, and whether all are well within their limits."""
 
     beyond: bool
     danger: bool
     absolute: bool  # beyond a limit of the machine file or of a standard, not only of a reference
-    small: bool  # every level is back by a tenth of its limit: the deadband of ISA-18.2
+    small: bool  # every level is a tenth within its limit: the deadband of ISA-18.2
     text: str
 
 

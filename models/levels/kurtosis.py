@@ -1,10 +1,10 @@
-"""Kurtosis of what is not at running speed: 3 where a linear machine is shaken at random, and compared with healthy.
+"""Kurtosis of the vibration without the orders of running speed, compared with that of the healthy machine.
 
-No change of stiffness, damping or unbalance makes the random part of a vibration anything but Gaussian. A rub or a stop
-clips it, and its kurtosis falls; what knocks, like a loose part or a damaged raceway, lifts it (ISO 13373-3). Cumulants
-of independent parts add up: a line of amplitude a takes 3/8 a⁴ from the fourth one.
+It is 3 on a linear machine under random excitation: whatever the stiffness, damping and unbalance, the random part is
+Gaussian. A rub or a stop clips it and lowers the kurtosis; impacts, as of a loose part or a damaged raceway, raise it
+(ISO 13373-3). Cumulants of independent parts add up: a line of amplitude a takes 3/8 a⁴ from the fourth one.
 
-What is learned of healthy hops here, and how far later ones depart from it, serves `models.levels.contact` as well.
+`HopReference` and `departure` serve the statistic of `models.levels.contact` as well.
 """
 
 from collections.abc import Sequence
@@ -17,21 +17,21 @@ from models.levels.bands import BEYOND_RANGE, LINE, OF_BIN, BandLevels, BandRefe
 from models.signals.block import FloatArray
 
 _PIECES, _APART = 20, 2
-"""Pieces of a hop whose levels are compared, each with the next but one: in between, what a knock makes ring dies."""
+"""Pieces of a hop whose levels are compared, each with the next but one: in between, ringing after an impact dies."""
 
 
 def swell(rest: FloatArray) -> FloatArray:
-    """What a level that rises and falls within a hop, as with a load that cycles, adds to the fourth moment; (n,).
+    """Part of the fourth moment due to a level that varies within a hop, as under a cycling load, shape (n,).
 
-    Three times the variance of the level, by the covariance of pieces that are apart: unlike the variance of the
-    pieces it is next to nothing, in the mean, where their levels differ by chance or for single knocks. It may be
-    negative.
+    It is three times the variance of the level (a mean square), estimated by the covariance of pieces two apart. Unlike
+    the variance over the pieces, this is next to zero on average if levels differ by chance or by single impacts. It
+    may be negative.
 
     Parameters
     ----------
     rest : ndarray, shape (n, n_samples)
-        Deviations from the mean without the orders of running speed, with which a line beside them beats: that is no
-        level that swells.
+        Deviations from the mean, without the orders of running speed: an order that beats with a line beside it does
+        not count as a varying level.
     """
     n, size = rest.shape[0], rest.shape[1] // _PIECES
     if not size:
@@ -43,14 +43,14 @@ def swell(rest: FloatArray) -> FloatArray:
 
 
 def random_kurtosis(square: FloatArray, fourth: FloatArray, lines: npt.NDArray[np.complex128]) -> FloatArray:
-    """Kurtosis of each hop without what its lines take from it, shape (n_hops, n); nan where these are not known.
+    """Kurtosis of each hop, corrected for lines, shape (n_hops, n); NaN where their amplitudes are not known.
 
     Parameters
     ----------
     square, fourth : ndarray, shape (n_hops, n)
-        Second and fourth moment about the mean, the latter without `swell`.
+        Second and fourth moment about the mean, the latter less `swell`.
     lines : ndarray of complex, shape (n_hops, n_lines, n)
-        Their amplitudes.
+        Amplitudes of the lines.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         found = (fourth + 0.375 * (np.abs(lines) ** 4).sum(axis=1)) / square**2
@@ -58,7 +58,7 @@ def random_kurtosis(square: FloatArray, fourth: FloatArray, lines: npt.NDArray[n
 
 
 class HopReference(BaseModel, extra="forbid", frozen=True, strict=True):
-    """What a channel's hops have in the healthy windows: kurtosis, or contact (`models.levels.contact`)."""
+    """A statistic of a channel's hops in the healthy windows: kurtosis, or contact (`models.levels.contact`)."""
 
     mean: float = Field(allow_inf_nan=False)
     scatter: float = Field(ge=0, allow_inf_nan=False)  # standard deviation of one hop
@@ -67,7 +67,7 @@ class HopReference(BaseModel, extra="forbid", frozen=True, strict=True):
 
 
 def learn_hops(windows: Sequence[FloatArray]) -> HopReference | None:
-    """Learn a channel's from the hops of healthy windows; None where it is not known, or of a single hop."""
+    """Learn from a channel's hops in healthy windows; None if one has no value, or there are fewer than two."""
     values = np.concatenate(windows)
     if values.size < 2 or not np.all(np.isfinite(values)):
         return None
@@ -83,9 +83,9 @@ def learn_hops(windows: Sequence[FloatArray]) -> HopReference | None:
 
 GAUSSIAN = 3.0
 _STEADIER = 0.3
-"""Part of the scatter of noise from hop to hop below which what a band holds is a line: noise in one of a hundred."""
+"""A band holds a line if its power scatters by less than this part of what noise does; noise does so once in 100."""
 _STEPS = 2
-"""Differences that may be larger: a line that begins has a hop that holds both, and one before and one after."""
+"""Largest differences between hops that are ignored: a line that begins within a hop differs there from both sides."""
 
 
 def fallen_by_lines(
@@ -97,20 +97,20 @@ def fallen_by_lines(
     healthy_parts: Sequence[float] = (),
     strongest: FloatArray | None = None,
 ) -> FloatArray:
-    """What lines, such as a gear mesh, have taken from a channel's kurtosis since it was healthy; of each hop.
+    """How much lines that have begun or grown, such as a gear mesh, lower a channel's kurtosis, shape (n_hops,).
 
-    Of lines that are no orders but near one, such as mains hum beside 2x, it is what these leave in their bands.
+    The power of a line beside an order, such as mains hum beside 2x, is that of the order's bands less the order's own.
 
     Parameters
     ----------
     in_bands : ndarray, shape (n_hops, n_bands)
-        Mean squares.
+        Mean squares in the bands.
     orders : ndarray of complex, shape (n_hops, n_orders)
-        Amplitudes of the first multiples of running speed, which have been taken out.
+        Amplitudes of the first multiples of running speed, for which the kurtosis is already corrected.
     healthy_parts : sequence of float
-        Largest part of each band's power that the strongest bin had on the healthy machine.
+        Largest share of each band's power that the strongest bin had on the healthy machine.
     strongest : ndarray, shape (n_hops, n_bands), optional
-        Mean squares of the strongest bins: a line in a band of noise is known better by these.
+        Mean squares of each band's strongest bin, which measure a line in a band of noise better.
     """
     total = np.maximum(in_bands.sum(axis=1), np.finfo(float).tiny)
     freedom = bands.freedom / len(in_bands)
@@ -135,9 +135,9 @@ def fallen_by_lines(
 
 
 def _steady(power: FloatArray, freedom: FloatArray) -> npt.NDArray[np.bool_]:
-    """In which columns the power is that of a line: it is the same in every hop, but for where it begins or ends.
+    """Which columns hold the power of a line: the same in every hop, except where it begins or ends.
 
-    That of noise, of so many degrees of freedom in a hop, differs from hop to hop by √(2/freedom) of itself.
+    The power of noise with `freedom` degrees of freedom in a hop has a relative scatter of √(2/freedom).
     """
     differences = np.diff(power, axis=0) ** 2
     by_noise = 2 / np.maximum(freedom, 1.0) * (power[1:] ** 2 + power[:-1] ** 2)
@@ -148,17 +148,17 @@ def _steady(power: FloatArray, freedom: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def without_lines(healthy: HopReference) -> HopReference:
-    """The same if it is below that of noise because of a line, and this has gone: noise alone scatters more."""
+    """Reference of the noise alone, once a line that lowered the healthy kurtosis has gone: it scatters more."""
     share = min(1.0, np.sqrt(max(0.0, (GAUSSIAN - healthy.mean) / 1.5)))  # of the power
     scatter = healthy.scatter / max(1 - share, 0.1) ** 2
     return healthy.model_copy(update={"mean": GAUSSIAN, "scatter": float(scatter)})
 
 
 def departure(hops: FloatArray, reference: HopReference, n_errors: float) -> float:
-    """Difference from the healthy mean of the newest half of a window, or all of it; 0 within so many standard errors.
+    """Difference of the newest half of a window, or all of it, from the healthy mean; 0 within `n_errors`.
 
-    It has to hold without the hop that departs most: one in which the level steps, or the machine stops, holds two
-    vibrations and has a large kurtosis of its own, and one knock is no state of a machine.
+    It must persist without the hop that departs most: a hop in which the level steps, or the machine stops, mixes two
+    vibrations and has a large kurtosis of its own, and a single impact is no state of a machine.
     """
 
     def beyond(kept: FloatArray) -> float:

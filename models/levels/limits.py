@@ -1,9 +1,9 @@
-"""The limits of levels: one of them, and those relative to a reference.
+"""The limits of levels: single ones, and those relative to a reference.
 
-A limit relative to a reference is never nearer than the reference itself has been: not within a quarter of its largest
-healthy level, nor within six standard errors of one window. So excitation that varies as it did in the healthy windows
-raises nothing, and a line that was nothing but noise has to stand out of it. While a window fills it scatters more,
-about the loudest and the quietest healthy level as well as about their mean.
+A limit relative to a reference is never nearer than a quarter above the largest healthy level, nor than six standard
+errors of one window above the mean. So excitation that varies as it did in the healthy windows raises nothing, and a
+line where there was only noise has to stand out of it. While a window fills, its levels scatter more: the limits allow
+for that about the loudest and the quietest healthy level as well as about the mean.
 """
 
 import math
@@ -22,7 +22,7 @@ from models.signals.channels import Channel, Quantity
 from rotorwatch.records.levels import LevelBound
 
 _TURNED = 0.6
-_LEAST_DANGER = 0.25  # of the overall level, for a line that was nothing but noise: it has no level to be a multiple of
+_LEAST_DANGER = 0.25  # of the overall level, for a line that was only noise: it has no healthy level to multiply
 PEAK_TO_PEAK = (Quantity.DISPLACEMENT, Quantity.TILT)
 
 
@@ -38,7 +38,7 @@ class Limit:
     zones: tuple[float, float, float] | None = field(default=None, kw_only=True)
 
     def bound(self) -> LevelBound:
-        """The limit as it is told."""
+        """The limit as a record, rounded."""
         alert, danger, fall = (None if edge is None else rounded(edge) for edge in (self.alert, self.danger, self.fall))
         if self.zones is None:
             return LevelBound(source=self.source, alert=alert, danger=danger, fall=fall)
@@ -53,7 +53,7 @@ class Region:
 
     centre: complex
     radius: float
-    # Limit of the level, and what it was, SI units.
+    # Alert limit of the level, and its healthy mean, SI units.
     alert: float
     mean: float
 
@@ -72,7 +72,7 @@ class RelativeLimits:
 def relative_limits(
     levels: WindowLevels, reference: LevelReference, channels: Sequence[Channel], given: LevelSettings
 ) -> RelativeLimits:
-    """What a window is judged by, and all others of as many hops in the same operating state."""
+    """Relative limits of a window, and of all others with as many hops in the same operating state."""
     state, seen = reference.at(levels.speed_rad_s)
     source = reference.source if seen else f"{reference.source} at another speed"
     shorter = _shorter(state, levels.hops)
@@ -82,13 +82,13 @@ def relative_limits(
         for name, one in state.levels.get(channel.name, {}).items():
             spread = ERRORS * one.error * shorter
             alert = _alert_from(one, given, shorter)
-            danger = None  # what levels are at another speed says too little
+            danger = None  # levels at another speed say too little
             if seen:
                 danger = max(given.danger_ratio * one.mean, alert * given.danger_ratio / given.alert_ratio)
                 overall = state.levels[channel.name].get("overall")
                 if name in {"x1", "x2"} and one.mean < ERRORS * one.error and overall is not None:
                     danger = max(danger, _LEAST_DANGER * overall.mean)
-            fall = None  # nor is it a fault to be quieter there, as while it runs down
+            fall = None  # nor is a machine at fault that is quieter there, as while it runs down
             if seen and name in {"overall", "velocity"} and given.fall_ratio:
                 quietest = one.low * min(1 / BEYOND_RANGE, 1 - _filling(one, shorter))
                 fall = min(given.fall_ratio * one.mean, quietest, one.mean - spread)
@@ -113,12 +113,12 @@ def _region(channel: Channel, one: ReferenceLevel, centre: complex, alert: float
 
 
 def _shorter(state: OperatingState, hops: int) -> float:
-    """By how much a level scatters more than in the healthy windows while the window fills."""
+    """Factor by which a level scatters more than in the healthy windows while the window fills."""
     return math.sqrt(max(1.0, state.hops / hops))
 
 
 def _filling(one: ReferenceLevel, shorter: float) -> float:
-    """By how much, relative, a level may scatter about that of a full window; nothing once the window is full."""
+    """Relative margin for the scatter of a level about that of a full window; zero once the window is full."""
     return ERRORS * one.error / one.mean * math.sqrt(shorter**2 - 1) if one.mean else 0.0
 
 
@@ -143,7 +143,7 @@ class GrowthToAlert(BaseModel, extra="forbid", frozen=True):
 def alerts_of(
     reference: LevelReference, channels: Sequence[Channel], settings: LevelSettings, hops: int
 ) -> Iterator[GrowthToAlert]:
-    """Alert limits relative to a reference, for windows of so many hops, state by state."""
+    """Alert limits relative to a reference, for windows of `hops` hops, state by state."""
     for state in reference.states:
         slowest, fastest = sorted(abs(speed) * 30 / math.pi for speed in state.speed_rad_s or (0.0, 0.0))
         for channel in channels:
@@ -168,7 +168,7 @@ def shown_level(channel: Channel, name: str, value: float) -> float:
 
 
 def unit_size(channel: Channel, name: str) -> float:
-    """Size of that unit, SI."""
+    """Size of the unit in which a measure is shown, SI."""
     if name in {"crest", "kurtosis"}:
         return 1.0
     return 1e-3 if name == "velocity" else channel.to_si
@@ -196,7 +196,7 @@ def unit_of(unit: str, name: str, peak_to_peak: bool) -> str:
 
 
 def rounded(value: float) -> float:
-    """Five digits: no sensor has more."""
+    """Round to five digits: no sensor has more."""
     return float(f"{value:.5g}")
 
 
@@ -204,7 +204,7 @@ _POWERS_OF_TEN = np.array([float(f"1e{exponent}") for exponent in range(309)])
 
 
 def all_rounded(values: FloatArray) -> list[list[float | None]]:
-    """The same of an array of two dimensions, in rows; None where a value is not finite."""
+    """Rows of a two-dimensional array, `rounded`; None where a value is not finite."""
     with np.errstate(divide="ignore", invalid="ignore"):
         digits = 4 - np.floor(np.log10(np.abs(values)))
         power = _POWERS_OF_TEN[np.where(np.isfinite(digits), np.minimum(np.abs(digits), 308), 0).astype(np.intp)]

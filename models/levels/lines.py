@@ -1,8 +1,8 @@
-"""Lines in narrow bands that the healthy machine did not have: of gears, blades, bearings, whatever turns.
+"""Lines in narrow bands that the healthy machine did not have, as from gears, blades or bearings.
 
-The level of a band says little where the healthy machine was loud in it in one condition and quiet in another. How its
-power is spread says more, and is the same in all of them: of n independent bins of Gaussian noise the strongest has
-(ln n + γ)/n of the power, γ = 0.577, for that is the mean of the largest of n exponentials; of a line two thirds.
+A band's level says little if the healthy machine was loud in it in one condition and quiet in another. How its power is
+spread over the bins does not depend on the level: the strongest of n independent bins of Gaussian noise has a share of
+(ln n + γ)/n on average, γ = 0.577 (the mean of the largest of n exponential variables), that of a line two thirds.
 """
 
 import math
@@ -15,38 +15,38 @@ from models.levels.measures import WindowLevels
 from models.signals.block import FloatArray
 
 _OVER_HEALTHY = 2.0
-"""Times the largest part that the strongest bin of a band had on the healthy machine, from which on it is a line."""
+"""A new line has more than this times the largest share of its band's power that one bin had on the healthy machine."""
 _HAD_ONE = 0.25
-"""Part from which on the healthy machine is taken to have a line there; a narrow resonance has less."""
+"""Share from which on the healthy machine is taken to have had a line in the band; a narrow resonance has less."""
 _NOISE, _STEADY = 2.0, 1e-3
-"""Where healthy hops of one window differed by more than this in speed, lines were spread over several bins, and become
-narrower when it is steadier: what had more than so many times the part of noise may be one."""
+"""If the speed varied by more than `_STEADY` (relative) between the healthy hops of a window, lines were spread over
+several bins, and become narrower at a steadier speed: a share above `_NOISE` times that of noise may have been one."""
 _MOVED = 1.35
-"""Times its natural frequency by which a mode may be off that of the machine file, or have changed."""
+"""Factor by which a mode's natural frequency may differ from that by the machine file, or have changed."""
 _OTHERS = 0.16
-"""Part that the strongest bin of any band may have by theory: a machine has modes that its file knows nothing of."""
+"""Share that theory allows the strongest bin of any band: a machine has modes that its file does not describe."""
 _SCATTERS, _MODE, _LIKE_A_LINE = 1.8, 0.2, 0.45
-"""Times the mean part of a mode's power that its strongest bin may have in a window, the most that is reckoned with,
-and the mean from which on a mode cannot be told from a line. On the rotor kits, 36 windows in conditions of their own
-(seed 20261341), the strongest bins had up to 0.26 where modes are damped by 0.1 % and 0.40 would be the mean, and 0.21
-where 0.15 would."""
+"""Share allowed in a window over the mean share of a mode's strongest bin; the most that is allowed; and the mean share
+from which on a mode cannot be distinguished from a line. In 36 windows of the rotor kits, each in conditions of its own
+(seed 20261341), the strongest bins had up to 0.26 where modes are damped by 0.1 % and the mean would be 0.40, and up to
+0.21 where it would be 0.15."""
 _LOUD = 0.02
-"""Part of a channel's power without 1x from which on a line is told, as of the lines that diagnosis leaves out."""
+"""Least share of its channel's power without 1x that a reported line has, as of lines that diagnosis leaves out."""
 
 
 def learn_lines(windows: Sequence[FloatArray], bands: BandLevels, hops: float, unsteady: float) -> FloatArray:
-    """Largest part of each band's power that healthy windows have in one bin, shape (n_bands, n); 1 where it may grow.
+    """Largest share of each band's power that one bin has in healthy windows, shape (n_bands, n); 1 where it may grow.
 
     Parameters
     ----------
     windows : sequence of ndarray, shape (n_bands, n)
-        Part of each band's power that the strongest bin of a hop has.
+        Share of each band's power that the strongest bin of a hop has.
     bands : BandLevels
-        Of one of them.
+        Of one of the windows.
     hops : float
-        Of which a window has the mean.
+        Number of hops that a window is the mean of.
     unsteady : float
-        From the slowest hop of a window to its fastest, relative to the speed.
+        Range of the speed over the hops of a window, relative to the speed.
     """
     largest = np.asarray(np.max(windows, axis=0), dtype=np.float64)
     if unsteady > _STEADY:
@@ -55,27 +55,27 @@ def learn_lines(windows: Sequence[FloatArray], bands: BandLevels, hops: float, u
 
 
 def expected_lines(bands: BandLevels, hops: float, modes: Sequence[tuple[float, float]]) -> FloatArray:
-    """The same by theory of a linear machine that is shaken at random; shape (n_bands,).
+    """The same share for a linear machine under random excitation, by theory; shape (n_bands,).
 
-    Modes are natural frequency, Hz, and damping ratio.
+    Each mode is a natural frequency, Hz, and a damping ratio.
     """
     bins = _bins(bands, hops)
     parts, bin_hz = np.maximum(_of_noise(bins), _OTHERS), np.diff(bands.edges_hz) / bins
     for natural_hz, damping in modes:
         near = (bands.edges_hz[1:] > natural_hz / _MOVED) & (bands.edges_hz[:-1] < natural_hz * _MOVED)
-        of_mode = _of_noise(np.maximum(np.pi * damping * natural_hz / bin_hz, 1.0))  # bins that it is as wide as
+        of_mode = _of_noise(np.maximum(np.pi * damping * natural_hz / bin_hz, 1.0))  # of its noise bandwidth, bins
         most = np.where(of_mode < _LIKE_A_LINE, np.minimum(_SCATTERS * of_mode, _MODE), 1.0)
         parts[near] = np.maximum(parts, most)[near]
     return parts
 
 
 def _bins(bands: BandLevels, hops: float) -> FloatArray:
-    """Bins of each band."""
+    """Number of independent bins in each band."""
     return np.asarray(np.maximum(bands.freedom / (2 * hops), 1.0), dtype=np.float64)
 
 
 def _of_noise(bins: FloatArray) -> FloatArray:
-    """Part of the power of noise that the strongest of so many bins has in the mean."""
+    """Mean share of the power of noise that the strongest of `bins` independent bins has."""
     return np.asarray((np.log(bins) + np.euler_gamma) / bins, dtype=np.float64)
 
 
@@ -86,7 +86,7 @@ def new_line(
     healthy_bands: Mapping[str, BandReference],
     unlike: str = "the healthy machine did not have",
 ) -> str:
-    """The new line that has most of its channel's power; empty if there is none.
+    """Describe the new line with the largest share of its channel's power; empty if there is none.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def new_line(
         By channel. A line that is no louder than its band was in the quietest window may have been there, under noise,
         or spread by a speed that varied within a hop.
     unlike : str
-        How the sentence goes on: what no such line is of.
+        Relative clause of the text: what has or makes no such line.
     """
     bands, parts = levels.bands, levels.line_parts
     if bands is None or parts is None or levels.moments is None:
@@ -111,7 +111,7 @@ def new_line(
     power = OF_BIN * parts * bands.rms**2
     new &= power > least[1:-1] + np.maximum(least[:-2], least[2:])
     turning_hz = abs(levels.speed_rad_s or 0.0) / (2 * math.pi)
-    # 1x is lifted by an unbalance, goes where the speed goes, and the taper spreads it over the edges of its band.
+    # An unbalance raises 1x, which moves with the speed, and the taper spreads it over the edges of its band.
     off = 0.03 + min(levels.unsteady if math.isfinite(levels.unsteady) else 0.0, 0.5)
     of_1x = (turning_hz * (1 + off) > bands.edges_hz[:-1]) & (turning_hz * (1 - off) < bands.edges_hz[1:])
     new[of_1x] = False

@@ -1,4 +1,4 @@
-"""What is measured of a channel in one hop and in one window: overall, orders of running speed, shape of the waveform.
+"""Levels of a channel in one hop and in one window: overall, at orders of running speed, shape of the waveform.
 
 ========== ======================================================= ===================================================
 measure    displacement (shaft)                                    velocity, acceleration (casing)
@@ -14,7 +14,7 @@ x2, x3     running speed (ISO 13373-2)
 not_x1     rms of what is not at running speed                     the same
 mean       mean position: the gap (API 670)
 crest      peak over rms                                           the same
-kurtosis   fourth moment over the square of the second: 3 of a     the same
+kurtosis   fourth moment over the square of the second: 3 for      the same
            Gaussian vibration (ISO 13373-3)
 growth     the band of a twelfth of an octave that has grown most, the same
            times the reference (`models.levels.bands`)
@@ -46,21 +46,21 @@ from models.signals.channels import LEAST_APART_DEG, Channel, Quantity, apart_de
 from models.signals.waveform import Waveform
 
 COMPARED = ("overall", "velocity", "s_max", "x1", "x2", "high", "envelope")
-"""Those that are compared with a reference."""
+"""Measures that are compared with a reference."""
 
 _SUMS = (
     "mean", "peak", "peak_to_peak", "fourth", "radius", "contact", "swell", "mean_square",
     "velocity_square", "high_square", "envelope_square",
 )  # fmt: skip
 CONTACT = _SUMS.index("contact")
-"""Row of `HopLevels.sums`."""
+"""Row of `HopLevels.sums` that has the contact statistics."""
 _SQUARES = slice(7, None)  # mean squares, of which a root is shown
 _HIGH_HZ = 1000.0
 _HANN_BINS = 1.5
-"""Bins of a tapered spectrum that say as much as one of an untapered one."""
+"""Bins of a Hann-tapered spectrum that carry as much information as one of an untapered spectrum."""
 STANDS_RAD_S = 2 * np.pi * 0.5
-"""Slower than this, rad/s, a shaft is not taken to turn."""
-_LEAST_HOPS = 4  # that tell how much a line scatters
+"""Speed, rad/s, up to which a shaft counts as standing still."""
+_LEAST_HOPS = 4  # fewest from which the scatter of a line is estimated
 
 _ComplexArray = npt.NDArray[np.complex128]
 _Number = TypeVar("_Number", np.float64, np.complex128)
@@ -75,10 +75,10 @@ class LevelPlan:
     band_hz: tuple[float, float]  # of velocities, from and to
     pairs: tuple[tuple[int, int], ...]  # columns of two displacements of one place
     skew: tuple[float, ...]  # cosine of the angle between their axes: 0 at right angles, as nearly all are
-    # (n,), what is taken out of 1x: q of x = Re{q e^{jθ}} at slow roll, for an angle that grows.
+    # (n,), run-out, which is subtracted from 1x: q of x = Re{q e^{jθ}} at slow roll, for an angle that grows.
     runout: _ComplexArray | None = None
-    lines: bool = False  # whether the strongest line of every narrow band is wanted
-    # Columns that show a contact and their skew: the pairs, and velocities of the rotor where there is none.
+    lines: bool = False  # whether the strongest bin of every narrow band is wanted
+    # Columns examined for a contact and their skew: `pairs`, and velocities of the rotor at a place without one.
     contacts: tuple[tuple[int, int, float], ...] = ()
 
     @property
@@ -104,7 +104,7 @@ class LevelPlan:
 
     @cached_property
     def shown(self) -> FloatArray:
-        """What an amplitude is times, to be shown: peak to peak of displacements, rms of others."""
+        """Factor from an amplitude to the level shown: peak to peak of displacements, rms of others."""
         return np.where(self.displacements, 2.0, np.sqrt(0.5))
 
 
@@ -123,7 +123,7 @@ def level_plan(
     channels : sequence of Channel
         In the order of the columns; none of them a shaft angle.
     band_hz : tuple of float
-        Of velocities; cut off where the sampling rate ends it.
+        Of velocities; its upper end is limited by the sampling rate.
     """
     pairs = _pairs(channels, Quantity.DISPLACEMENT)
     unseen = {"bearing", "disc"} - {channels[first].location for first, _ in pairs}
@@ -165,13 +165,13 @@ class HopLevels:
     # (11, n): mean, largest deviation from it, peak to peak, fourth moment, at the first channel of a pair the largest
     # distance from the mean position; at the two of a pair the two numbers of `models.levels.contact`, where it is
     # looked for; `swell`, mean square about the mean, mean square velocity in the band, mean squares of the
-    # high-frequency band and of its envelope about its mean. Nan where a quantity has none.
+    # high-frequency band and of its envelope about its mean. NaN where a quantity has none.
     sums: FloatArray
-    # (4, n), q of x = Re{q e^{jkθ}} for the orders k of `ORDERS`; nan without a rotation. At half running speed its
-    # angle means nothing: the shaft angle is known to a whole turn.
+    # (4, n), q of x = Re{q e^{jkθ}} for the orders k of `ORDERS`; NaN without a rotation. At half running speed its
+    # phase means nothing, because the shaft angle is known only modulo a turn.
     orders: _ComplexArray
     bands: FloatArray  # (n_bands, n), mean squares in the bands of `models.levels.bands`
-    lines: FloatArray  # (n_bands, n), of the strongest bin of each; without rows where lines are not wanted
+    lines: FloatArray  # (n_bands, n), mean square of each band's strongest bin; no rows if lines are not wanted
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything as named arrays."""
@@ -209,8 +209,8 @@ def hop_levels(
     angle_rad : ndarray, shape (n_samples,), or None
         Shaft angle, or one that turns with it from an unknown zero.
     spectrum : ndarray of complex, shape (n, n_samples // 2 + 1), optional
-        Fourier transform of the deviations under Hann's taper, its squared magnitude the two-sided power spectral
-        density per Hz, where it is known already; otherwise it is taken here.
+        Fourier transform of the Hann-tapered deviations, if it is known already, scaled so that its squared magnitude
+        is the two-sided power spectral density per Hz; otherwise it is computed here.
     """
     x = deviations[: len(plan.quantities)]
     n, n_samples = x.shape
@@ -221,7 +221,7 @@ def hop_levels(
     sums[6], sums[7] = 0.0, rms**2
     # Strong lines must not leak into the low end of a band, where integration would magnify them.
     taper, scale = hann_taper(n_samples)
-    # In parts of the peak single precision is enough, and quicker.
+    # Relative to the peak, single precision is enough, and quicker.
     unit = amplitude = np.where(peak > 0, peak, 1.0)
     if spectrum is None:
         tapered = np.multiply(x, (1 / unit)[:, None], out=np.empty(x.shape, np.float32), casting="same_kind")
@@ -259,7 +259,7 @@ def hop_levels(
 def _band_cuts(
     n_samples: int, rate_hz: float, band_hz: tuple[float, float]
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Bins at which a band begins or ends, and which of them are edges of narrow bands, and of that of velocities."""
+    """Bins at which any band begins or ends; places in these of the edges of narrow bands, and of the velocity band."""
     edges = band_edges(n_samples)
     low, high = (round(edge_hz / (rate_hz / n_samples)) for edge_hz in band_hz)
     band = np.array([min(max(low, 1), high + 1), high + 1])
@@ -270,9 +270,9 @@ def _band_cuts(
 def _acceleration_squares(
     plan: LevelPlan, spectrum: Spectrum, parts: FloatArray | npt.NDArray[np.float32], band: slice, n_samples: int
 ) -> FloatArray:
-    """Of accelerations: squares of velocity in the band, of the high-frequency band and of its envelope; shape (3, n).
+    """Squares for accelerations, shape (3, n): velocity in the band, the high-frequency band, and its envelope.
 
-    In parts of what makes mean squares of the squares of the spectrum's bins.
+    They become mean squares with the factor that turns squared magnitudes of the spectrum's bins into mean squares.
     """
     step_hz = plan.rate_hz / n_samples
     found = np.full((3, len(spectrum)), np.nan)
@@ -286,7 +286,7 @@ def _acceleration_squares(
         # The band shifted to zero frequency: its magnitude is the envelope, a sample for each of its bins.
         envelope = np.abs(scipy.fft.ifft(high, axis=1)) * (2 * high.shape[1] / n_samples)
         weights = np.interp(np.arange(high.shape[1]) / high.shape[1], np.arange(n_samples) / n_samples, taper)
-        level = envelope.sum(axis=1) / weights.sum()  # the taper is on the envelope too: compared with its like
+        level = envelope.sum(axis=1) / weights.sum()  # the taper is on the envelope too: less a tapered mean
         found[2] = np.sum((envelope - level[:, None] * weights) ** 2, axis=1) / np.sum(weights**2) / scale
     return found
 
@@ -296,8 +296,7 @@ class WindowLevels:
     """Levels of one window, SI units."""
 
     values: Mapping[str, FloatArray]  # (n,) by measure; nan where a quantity has none, or the rotation is not known
-    # (n,), standard errors by the scatter of the hops, of the measures that are compared with a reference (`COMPARED`);
-    # empty if not asked for.
+    # (n,), standard errors, from the scatter of the hops, of the measures in `COMPARED`; empty if not asked for.
     errors: Mapping[str, FloatArray]
     vectors: _ComplexArray | None  # (4, n), mean of q of the hops at the orders, with a phase reference
     speed_rad_s: float | None = None  # mean; None where it is not known
@@ -305,14 +304,14 @@ class WindowLevels:
     bands: BandLevels | None = None
     lines: FloatArray | None = None  # (n_hops, n_bands, n), mean squares of each band's strongest bin, if looked for
     speeds_rad_s: FloatArray | None = None  # (n_hops,), nan where it is not known
-    # Of each hop, what `random_kurtosis` is made of, and the mean squares in the bands.
+    # Of each hop: second and fourth moments, whole orders (all for `random_kurtosis`), mean squares in the bands.
     moments: tuple[FloatArray, FloatArray, _ComplexArray, FloatArray] | None = None
     contact: FloatArray | None = None  # (n_hops, n), see `models.levels.contact`
 
     def without(self, columns: Sequence[int], pairs: Sequence[tuple[int, int]]) -> "WindowLevels":
-        """The same, but nan for what some of the channels show, alone or as one of a pair of displacements.
+        """Copy these levels with NaN for some channels, and for levels of the pairs of displacements they are in.
 
-        That is for what is learned, or tells a fault; errors, vectors and lines stay.
+        The copy serves to learn a reference and to detect faults; errors, vectors and lines stay.
         """
         if not columns or self.bands is None:
             return self
@@ -331,7 +330,7 @@ class WindowLevels:
 
     @property
     def unsteady(self) -> float:
-        """From the slowest hop to the fastest, relative to the speed; infinite where that is not known."""
+        """Range of the speed over the hops, relative to its mean; infinite if a hop has no speed or stands still."""
         speeds = self.speeds_rad_s
         if not self.speed_rad_s or speeds is None or not np.all(np.abs(speeds) > STANDS_RAD_S):
             return math.inf
@@ -339,7 +338,7 @@ class WindowLevels:
 
     @property
     def line_parts(self) -> FloatArray | None:
-        """Part of each band's power that the strongest bin of a hop has; shape (n_bands, n)."""
+        """Share of each band's power that the strongest bin of a hop has; shape (n_bands, n)."""
         if self.lines is None or self.moments is None:
             return None
         return np.asarray(_mean(self.lines) / np.maximum(_mean(self.moments[3]), np.finfo(float).tiny))
@@ -351,14 +350,14 @@ class WindowLevels:
 
     @property
     def hidden_twice(self) -> npt.NDArray[np.bool_] | None:
-        """Whether random vibration as loud as it is now explains the 2x, shape (n,); None where that cannot be told.
+        """Whether the random vibration at its present level explains the 2x, shape (n,); None if that is not known.
 
-        With a phase reference its steps from hop to hop say how loud that is, otherwise the bands around it.
+        With a phase reference that level follows from the steps of 2x between hops, otherwise from the bands around it.
         """
         if self.moments is None or self.speed_rad_s is None or self.bands is None or self.hops < _LEAST_HOPS:
             return None
         if self.vectors is not None:
-            steps = np.abs(np.diff(self.moments[2][:, 1], axis=0)) ** 2  # where a line begins, one of them is its own
+            steps = np.abs(np.diff(self.moments[2][:, 1], axis=0)) ** 2  # where a line begins, it makes one of them
             error = np.sqrt(np.median(steps, axis=0) / (2 * math.log(2) * self.hops))
             return np.asarray(np.abs(self.vectors[2]) < ERRORS * error)
         known = self.moments[2][~np.isnan(self.moments[2][:, 1]).any(axis=1), 1]
@@ -374,22 +373,22 @@ class WindowLevels:
 def window_levels(
     plan: LevelPlan, hops: Sequence[HopLevels], speeds_rad_s: FloatArray, *, phase_reference: bool, errors: bool = True
 ) -> WindowLevels:
-    """Levels of the window that hops make.
+    """Combine the levels of hops into those of a window.
 
     Parameters
     ----------
     speeds_rad_s : ndarray, shape (n_hops,)
-        Nan where the rotation is not known.
+        NaN where the rotation is not known.
     phase_reference : bool
         Whether the angle is the shaft's own, so that the vectors of the hops can be added up.
     errors : bool
-        Whether standard errors are wanted; only what learns a reference needs them.
+        Whether standard errors are wanted; only learning a reference needs them.
     """
     count, n = len(hops), len(plan.quantities)
     sums = np.concatenate([hop.sums for hop in hops]).reshape(count, len(_SUMS), n)
     in_bands = np.concatenate([hop.bands for hop in hops]).reshape(count, -1, n)
     every_order = np.concatenate([hop.orders for hop in hops]).reshape(count, len(ORDERS), n)
-    turning = np.abs(speeds_rad_s) > STANDS_RAD_S  # not where it is not known
+    turning = np.abs(speeds_rad_s) > STANDS_RAD_S  # False where it is not known
     orders = every_order if turning.all() else every_order[turning]
     speed_rad_s, vectors, amplitudes = None, None, np.full((len(ORDERS), n), np.nan)
     if len(orders):
@@ -409,7 +408,7 @@ def window_levels(
         vectors, amplitudes = vectors.copy(), amplitudes.copy()
         vectors[1] -= plan.runout if speed_rad_s >= 0 else plan.runout.conj()
         amplitudes[1] = np.where(plan.runout == 0, amplitudes[1], np.abs(vectors[1]))
-    # Peak to peak is a mean of the hops, what is rms that of the whole window.
+    # Peak to peak is the mean of the hops, an rms that of the whole window.
     average = _mean(sums)
     square = average[7] + _mean((sums[:, 0] - average[0]) ** 2)
     peak = np.maximum.reduce(sums[:, 1])
@@ -437,13 +436,13 @@ def window_levels(
 
 
 def _mean(values: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
-    """Mean over the hops; of arrays as small as these numpy's own takes three times as long."""
+    """Mean over the hops; NumPy's own takes three times as long for such small arrays."""
     total: npt.NDArray[_Number] = np.add.reduce(values, axis=0)
     return total / len(values)
 
 
 def _compared(plan: LevelPlan, sums: FloatArray) -> dict[str, FloatArray]:
-    """Levels but for the orders, of a window or of each hop, of sums as those of `HopLevels`."""
+    """Measures in `COMPARED` without the orders, from `HopLevels.sums` of each hop or their mean over a window."""
     rms, velocity, high, envelope = np.sqrt(sums[_SQUARES])
     return {
         "overall": np.where(plan.displacements, sums[2], np.where(plan.accelerations, rms, velocity)),
@@ -467,7 +466,7 @@ def _order_errors(orders: _ComplexArray, vectors: _ComplexArray | None) -> Float
 
 @lru_cache(maxsize=64)
 def _band_grid(rate_hz: float, n_samples: int, count: int) -> tuple[FloatArray, FloatArray]:
-    """Edges of the bands, Hz, and degrees of freedom of mean squares in them, of windows of so many hops."""
+    """Edges of the bands, Hz, and degrees of freedom of mean squares in them, for windows of `count` hops."""
     edges = band_edges(n_samples) - 0.5  # halfway between bins
     edges_hz = np.asarray(edges * (rate_hz / n_samples), dtype=np.float64)
     freedom = 2 * count * np.maximum(1.0, np.diff(edges) / _HANN_BINS)

@@ -13,9 +13,9 @@ ORDERS = {"x_half": 0.5, "x1": 1.0, "x2": 2.0, "x3": 3.0}
 
 _MANY_REVOLUTIONS = 8.0
 _SAMPLES_A_TURN = 8.0
-"""At least: products of two orders go up to six times running speed."""
+"""Fewest samples per turn: products of two orders reach six times running speed."""
 _NEAR = 8
-"""Samples over which a shaft's speed does not change."""
+"""Samples over which a shaft's speed is taken as constant."""
 
 ComplexArray = npt.NDArray[np.complex128]
 Spectrum = npt.NDArray[np.complex64] | ComplexArray
@@ -27,35 +27,34 @@ def order_vectors(
 ) -> ComplexArray:
     """Amplitudes at the orders, by weighted least squares: exact for orders, whatever the number of revolutions.
 
-    Over many revolutions the samples are tapered, so that other lines stay out, and thinned out: tapered, they begin
-    and end with nothing, so the low end of their spectrum is the same signal in fewer samples, in which nothing that
-    the orders see is missing.
+    Over many revolutions the samples are tapered, to keep other lines out, and decimated: as tapered samples begin and
+    end at zero, the low end of their spectrum is the same signal in fewer samples, without loss at the orders.
 
     Parameters
     ----------
     x : ndarray, shape (n, n_samples)
     unit : ndarray, shape (n,)
-        What the amplitudes are given in parts of: single precision has no range for those of anything.
+        Unit of each channel's amplitudes: the range of single precision is too small for any unit.
     spectrum : ndarray, shape (n, n_samples // 2 + 1)
         Of the tapered samples.
     amplitude : ndarray, shape (n,)
-        What the spectrum is times, to be that of x.
+        Factor that turns the spectrum into that of x.
     angle_rad : ndarray, shape (n_samples,), or None
         See `models.levels.measures.hop_levels`.
 
     Returns
     -------
     ndarray of complex, shape (4, n)
-        q of x = Re{q e^{jkθ}} for the orders k of `ORDERS`; nan without a rotation.
+        q of x / unit = Re{q e^{jkθ}} for the orders k of `ORDERS`; NaN without a rotation.
     """
     n, n_samples = x.shape
     if angle_rad is None:
         return np.full((len(ORDERS), n), np.nan, dtype=np.complex128)
-    steps = (angle_rad[1::_NEAR] - angle_rad[:-1:_NEAR]) / (2 * np.pi)  # of neighbours, here and there
-    steps -= np.rint(steps)  # where it begins anew from zero
+    steps = (angle_rad[1::_NEAR] - angle_rad[:-1:_NEAR]) / (2 * np.pi)  # between neighbours, here and there
+    steps -= np.rint(steps)  # where the angle starts again from zero
     weights: FloatArray | _SingleArray
     if abs(np.add.reduce(steps)) * n_samples < _MANY_REVOLUTIONS * steps.size:
-        # Orders are nearly alike then: what tells them apart needs all digits.
+        # Over few revolutions the orders are nearly collinear: separating them needs double precision.
         angle, tapered, weights, every = angle_rad, x / unit[:, None], np.ones(n_samples), 1
     else:
         most = int(1 / (_SAMPLES_A_TURN * np.abs(steps).max()))
@@ -64,7 +63,7 @@ def order_vectors(
         tapered = np.fft.irfft(spectrum[:, : kept // 2 + 1], n=kept, axis=1)
         tapered = (tapered * (amplitude / unit)[:, None]).astype(np.float32)
         weights, _ = hann_taper(kept)
-    # Halves of a turn, near zero: single precision has few digits for the angle after many turns.
+    # Half the angle, wrapped to near zero: single precision has too few digits for the angle after many turns.
     halves = angle / (2 * np.pi)
     halves[1:] -= np.rint(halves[1:] - halves[:-1]).cumsum()
     halves /= 2
@@ -85,16 +84,16 @@ def order_vectors(
 
 
 def without_orders(x: FloatArray, vectors: ComplexArray, angle_rad: FloatArray) -> FloatArray:
-    """What is left of samples, shape (n, n_samples), without the whole orders among the vectors of `order_vectors`."""
+    """Samples, shape (n, n_samples), less their parts at the whole orders among the vectors of `order_vectors`."""
     turn = np.exp(1j * angle_rad.astype(np.float32)).astype(np.complex64)
     turning = np.stack([turn, turn * turn, turn * turn * turn])
-    vectors = np.nan_to_num(vectors[1:]).T  # of a shaft that stands still
+    vectors = np.nan_to_num(vectors[1:]).T  # NaN if the shaft stands still
     return np.asarray(x - (vectors.real @ turning.real - vectors.imag @ turning.imag), dtype=np.float64)
 
 
 @lru_cache(maxsize=8)
 def hann_taper(size: int) -> tuple[_SingleArray, float]:
-    """Hann's, of so many samples, and what makes mean squares of the squares of its bins."""
+    """Hann taper of `size` samples, and the factor that turns squared magnitudes of bins into mean squares."""
     taper = np.hanning(size + 1)[:-1].astype(np.float32)
     taper.flags.writeable = False
     return taper, 2 / (size * float(taper @ taper))

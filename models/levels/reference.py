@@ -1,4 +1,4 @@
-"""What levels were when the machine was healthy: their mean, range and error in each operating state."""
+"""Levels of the healthy machine: their mean, range and error in each operating state."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,23 +22,22 @@ _Level = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _SAME_SPEED = 0.03
 """Windows whose speeds differ by less, relative, are of one operating state."""
 _BY_THEORY, _OF_MEANS = 1000, 0.6
-"""What theory knows is known as from so many hops; and how far the mean of a window of twelve is off, of one in
-thirty windows."""
+"""Number of hops that theory counts as; and the error that the mean of twelve hops exceeds in one of thirty windows."""
 QUIET = 0.25
-"""Part of the running vibration below which a machine may stand; what its neighbours shake it with should be less."""
+"""Fraction of the running vibration below which a machine may be standing; what neighbours excite should be less."""
 
 
 class ReferenceLevel(BaseModel, extra="forbid", frozen=True, strict=True):
     """One measure of one channel over the healthy windows of an operating state, SI units."""
 
     mean: _Level
-    # Smallest and largest of them.
+    # Smallest and largest of the windows.
     low: _Level
     high: _Level
     error: _Level  # mean standard error of one window
     # Of 1x, with a phase reference: real and imaginary part of the mean of q.
     vector: tuple[_Finite, _Finite] | None = None
-    turned: _Level = 0.0  # largest distance of a window's vector from that
+    turned: _Level = 0.0  # largest distance of a window's vector from `vector`
 
 
 class OperatingState(BaseModel, extra="forbid", frozen=True, strict=True):
@@ -52,7 +51,7 @@ class OperatingState(BaseModel, extra="forbid", frozen=True, strict=True):
     varied: bool = Field(default=False, exclude_if=lambda found: not found)
     # By channel.
     bands: dict[str, BandReference] = {}
-    # Largest part of each band's power that the strongest bin of a hop had, see `models.levels.lines`.
+    # Largest share of each band's power that the strongest bin of a hop had, see `models.levels.lines`.
     lines: dict[str, tuple[_Level, ...]] = Field(default={}, exclude_if=lambda found: not found)
     kurtosis: dict[str, HopReference] = Field(default={}, exclude_if=lambda found: not found)
     contact: dict[str, HopReference] = Field(default={}, exclude_if=lambda found: not found)
@@ -63,13 +62,13 @@ class LevelReference(BaseModel, extra="forbid", frozen=True, strict=True):
 
     source: str  # where they are from, as operators will read it
     states: tuple[OperatingState, ...] = Field(min_length=1)
-    # Of the places side by side.
+    # Contrasts between the places, see `models.levels.gains`.
     gains: GainReference | None = Field(default=None, exclude_if=lambda found: found is None)
-    # Frequency, Hz, and order of each line; None where they were not looked for.
+    # Frequency, Hz, and order of each line; None if lines were not looked for.
     lines: tuple[tuple[_Level, _Level], ...] | None = Field(default=None, exclude_if=lambda found: found is None)
     # Whether they were looked for next to multiples of the speed as well.
     beside: bool = Field(default=False, exclude_if=lambda found: not found)
-    # Whether those were kept that are too faint to be certain of in one window.
+    # Whether lines were kept that are too faint to be certain of in one window.
     faint: bool = Field(default=False, exclude_if=lambda found: not found)
 
     @model_validator(mode="after")
@@ -123,10 +122,10 @@ def expected_levels(
     speeds_rad_s: tuple[float, float],
     modes: Sequence[tuple[float, float]],
 ) -> LevelReference:
-    """What theory says of a machine with these modes that is shaken at random: no levels, for they depend on the force.
+    """Reference by theory for a machine under random excitation: no levels, because they depend on the force.
 
-    Its shaft, which runs between these speeds, touches nothing, and there are no lines in its bands but what is narrow
-    of its modes (natural frequency, Hz, and damping ratio). `levels` are those of any window of the machine.
+    The shaft, running between these speeds, touches nothing, and its bands hold no lines but those of narrow modes
+    (natural frequency, Hz, and damping ratio). `levels` are those of any window of the machine.
     """
     bands, parts, nothing = {}, {}, HopReference(mean=0.0, scatter=1.0, hops=_BY_THEORY, range=_OF_MEANS)
     if levels.bands is not None and levels.lines is not None:
@@ -176,7 +175,7 @@ def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingS
         lines=dict(zip(channels, map(tuple, lines.T.round(3).tolist()), strict=False)),  # of all channels, or none
         kurtosis=_hops(channels, kurtosis),
         contact={
-            # As theory says; and no push outwards, which is made by something else, hides one inwards.
+            # A scatter as in theory at least; and a push outwards, which has another cause, must not hide one inwards.
             name: one.model_copy(update={"mean": max(0.0, one.mean), "scatter": max(1.0, one.scatter)})
             for name, one in _hops(channels, contact).items()
         },
@@ -184,7 +183,7 @@ def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingS
 
 
 def _hops(channels: Sequence[str], windows: Sequence[FloatArray | None]) -> dict[str, HopReference]:
-    """By channel what its hops have, of those of which every window tells it."""
+    """Hop references of the channels that have values in all windows; empty if a window has none at all."""
     known = [one for one in windows if one is not None]
     if len(known) < len(windows):
         return {}
@@ -193,7 +192,7 @@ def _hops(channels: Sequence[str], windows: Sequence[FloatArray | None]) -> dict
 
 
 def _reference(name: str, column: int, levels: Sequence[WindowLevels]) -> ReferenceLevel | None:
-    # Where a sensor was not connected in some windows, or its partner of a pair, the others tell.
+    # Without the windows in which the sensor, or its partner of a pair, was not connected.
     levels = [one for one in levels if one.bands is None or np.isfinite(one.bands.rms[:, column]).all()]
     if name == "s_max":
         levels = [one for one in levels if np.isfinite(one.values[name][column])]
@@ -217,23 +216,23 @@ def _reference(name: str, column: int, levels: Sequence[WindowLevels]) -> Refere
 
 
 class FirstWindows:
-    """Takes the first windows that are seen as a reference, where nothing was commissioned.
+    """Learns a reference from the first windows, if nothing was commissioned.
 
-    A channel whose values are nan in some of them is learned from the others.
+    A channel whose values are NaN in some of them is learned from the others.
 
-    Where the machine was not seen to turn in them, and every channel vibrates four times as much once it is, it stood,
-    and the first windows in which it turns are a reference besides.
+    If the machine was not seen to turn in them, and every channel vibrates four times as much once it is, it stood
+    still: the first windows in which it turns become a second reference.
 
     Parameters
     ----------
     count : int
-        Windows that do not overlap.
+        Number of windows, which do not overlap.
     turns : bool
-        Whether it can be seen to turn: with a shaft angle, or a speed about which to look.
+        Whether rotation can be detected: by a shaft angle, or near a nominal speed.
     since : str
         Since when they count, as operators will read it; empty if from the beginning.
     of : str
-        Tells apart whatever levels depend on: a reference of another machine, or of other settings, is not restored.
+        Identifies what the levels depend on: a reference of another machine, or other settings, is not restored.
     """
 
     def __init__(
@@ -256,7 +255,7 @@ class FirstWindows:
         )
 
     def take(self, start_ns: int, end_ns: int, levels: WindowLevels) -> None:
-        """Take note of a full window."""
+        """Learn from a full window, if it is still needed and does not overlap the last one."""
         before = self.reference
         if not self.learning or start_ns < self._end_ns or (before is not None and not self._started(before, levels)):
             return
@@ -269,11 +268,11 @@ class FirstWindows:
             self.reference = learned.model_copy(update={"states": states})
 
     def _started(self, reference: LevelReference, levels: WindowLevels) -> bool:
-        """Whether the machine turns, and stood in the reference."""
+        """Whether the machine turns now, and stood still in the reference."""
         stood, _ = reference.at(None)
         quiet = [stood.levels[name].get("overall") for name in self._channels]
         means = np.array([np.nan if one is None else one.mean for one in quiet])
-        # Not of channels that had no numbers then, or have none now.
+        # False for channels that had no numbers then, or have none now.
         still = QUIET * levels.values["overall"] <= means
         return levels.speed_rad_s is not None and not still.any()
 

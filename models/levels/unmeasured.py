@@ -1,4 +1,4 @@
-"""What a machine file asks of levels that its sensors will never show: a limit on it would guard nothing."""
+"""Limits of a machine file on levels that its sensors can never give: they would guard nothing."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,7 @@ _OF = {
 def unmeasured(
     settings: LevelSettings, sensors: Sequence[Channel], rate_hz: float, speed_rpm: float | None
 ) -> str | None:
-    """The first thing, if any, that is asked for and will never be there; orders need an angle or a nominal speed."""
+    """Describe the first band or limit without a level, if there is one; orders need an angle or a nominal speed."""
     band_hz, end_hz = settings.band(speed_rpm), NYQUIST_PART * rate_hz / 2
     if settings.band_hz is not None and band_hz[0] >= end_hz:
         return f"levels.band_hz begins at {band_hz[0]:g} Hz, expected below 0.4 of rate_hz, {end_hz:g} Hz"

@@ -14,7 +14,7 @@ from types import MappingProxyType
 class Zones:
     """Boundaries A/B, B/C and C/D of one measure."""
 
-    # Of the peak-to-peak displacement of the shaft relative to its bearing, else of the rms velocity of the casing.
+    # Whether of the peak-to-peak displacement of the shaft relative to its bearing, or of the casing's rms velocity.
     shaft: bool
     # Casing: m/s rms. Shaft: times 1/√n, m peak to peak with n in rpm.
     boundaries: tuple[float, float, float]
@@ -46,7 +46,7 @@ ZONES: Mapping[str, Zones] = MappingProxyType(
         "ISO 20816-3 shaft": Zones(True, (4800e-6, 9000e-6, 13200e-6)),
     }
 )
-"""By the name that a machine file gives."""
+"""Zones by the name that a machine file gives."""
 
 
 def zone_of(value: float, boundaries: tuple[float, float, float]) -> str:
