@@ -1,7 +1,7 @@
-"""A block of samples, the unit that travels, is refused, recorded and replayed; and how its samples are integrated.
+"""A block of samples, the unit that is sent, refused, recorded and replayed; and how its samples are integrated.
 
-Integration amplifies what is slow: 1/ω once, 1/ω² twice, so that an accelerometer's drift would drown the vibration. A
-high-pass filter has to go with it, and below its corner the result is not a measurement. Both are done in the
+Integration amplifies low frequencies, by 1/ω once and 1/ω² twice, so that an accelerometer's drift would drown the
+vibration. It needs a high-pass filter, and below its corner the result is not a measurement. Both are done in the
 frequency domain (A. Brandt, R. Brincker: Integrating time signals in frequency domain. Comparison with time domain
 integration. Measurement 58, 2014, 511-519): the samples' Fourier transform is divided by (jω)ⁿ, exact in amplitude and
 phase up to half the sampling rate, where trapezoids would fall short, and multiplied by the gain of a fourth-order
@@ -37,7 +37,7 @@ class SampleBlock:
 
 
 class NewestBlocks:
-    """The newest blocks without a gap that hold at least so many samples, for whoever wants to see some."""
+    """The newest blocks without a gap: as few as hold `n_samples` samples, or all if there are fewer samples."""
 
     def __init__(self, n_samples: int) -> None:
         self._enough = n_samples
@@ -50,7 +50,7 @@ class NewestBlocks:
         return tuple(self._blocks)
 
     def add(self, block: SampleBlock, *, continuous: bool) -> None:
-        """Append a block; if it does not continue the others, these are forgotten."""
+        """Append a block; if it does not continue the others, these are discarded."""
         if not continuous:
             self._blocks.clear()
             self._held = 0
@@ -71,7 +71,7 @@ def lowest_valid_hz(high_pass_hz: float) -> float:
 
 
 def settling_s(high_pass_hz: float) -> float:
-    """How far beginning and end of a stretch reach into the result: five periods of the corner frequency.
+    """How far the ends of a stretch disturb the result, s: five periods of the corner frequency.
 
     The slowest pole of the filter decays with sin(π/8) of its corner frequency, to 6e-6 within this time.
     """
@@ -91,7 +91,7 @@ def integrated(acceleration: FloatArray, rate_hz: float, times: int, high_pass_h
     >>> bool(np.allclose(v[1000:3000], np.sin(2 * np.pi * 25 * t[1000:3000]) / (2 * np.pi * 25), atol=1e-7))
     True
     """
-    from scipy import fft  # noqa: PLC0415  # which nobody else who has blocks needs
+    from scipy import fft  # noqa: PLC0415  # most users of blocks do not need it
 
     count = acceleration.size
     size = fft.next_fast_len(count, real=True)
@@ -99,5 +99,5 @@ def integrated(acceleration: FloatArray, rate_hz: float, times: int, high_pass_h
     response = np.zeros(frequency.size, dtype=np.complex128)
     above = frequency[1:]
     response[1:] = 1 / ((2j * np.pi * above) ** times * (1 + (high_pass_hz / above) ** (2 * _ORDER)))
-    level = acceleration.mean()  # what comes out of a constant is nothing; taken off, the padding makes no step
+    level = acceleration.mean()  # a constant adds nothing to the result; without it, the padding makes no step
     return np.asarray(fft.irfft(fft.rfft(acceleration - level, size) * response, size)[:count], dtype=np.float64)

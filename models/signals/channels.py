@@ -1,4 +1,4 @@
-"""What a stream's columns are: channels, their units here and elsewhere, and the descriptor beside the blocks."""
+"""The columns of a stream: channels, their units here and in other programs, and the descriptor beside the blocks."""
 
 import hashlib
 import json
@@ -54,9 +54,9 @@ _STATE_NAMES: dict[tuple[Quantity, str, str], str] = {
 }
 _LOCATIONS, _DIRECTIONS = ("bearing", "disc", "shaft"), ("y", "z", "rotation")
 _ELSEWHERE = ("DE", "NDE", "casing")
-"""Names of other places that are never taken for a misspelt one."""
+"""Names of other places, which are never taken for a misspelt location of the model."""
 LEAST_APART_DEG = 30.0
-"""Angle between two sensors from which on they are turned to y and z: nearer, their noise would be all there is."""
+"""Least angle between two sensors that are resolved into y and z: at less, the result would be mostly their noise."""
 _PLACE = r"^[A-Za-z0-9][A-Za-z0-9 _.:/+-]*$"
 
 ACCELERATIONS: tuple[str, ...] = tuple(
@@ -66,7 +66,7 @@ ACCELERATIONS: tuple[str, ...] = tuple(
 
 
 def not_given(value: float | None) -> bool:
-    """Whether a field is left out of what is written, so that identities stay as they were before it was there."""
+    """Whether to leave a field out of what is written, so that identities stay as they were before it existed."""
     return value is None
 
 
@@ -88,7 +88,7 @@ class Channel(BaseModel, extra="forbid", frozen=True):
     unit: str = Field(
         description="; ".join(f"{', '.join(units)} for {quantity}" for quantity, units in UNIT_TO_SI.items())
     )
-    # Left out where it is not given: descriptors of other sensors, and their hashes, are as they were before it.
+    # Left out if not given: descriptors without it, and their hashes, stay as they were before it existed.
     angle_deg: float | None = Field(
         default=None, ge=-360, le=360, exclude_if=not_given, description="angle of the sensor's axis from +y towards +z"
     )
@@ -96,7 +96,7 @@ class Channel(BaseModel, extra="forbid", frozen=True):
     @field_validator("unit", mode="before")
     @classmethod
     def _spelled(cls, unit: object) -> object:
-        """As a person writes it: either micro sign, a raised two."""
+        """Accept what people write: either micro sign, a superscript two or ``^2``."""
         return unit.translate(_SPELLING).strip() if isinstance(unit, str) else unit
 
     @model_validator(mode="after")
@@ -139,7 +139,7 @@ class Channel(BaseModel, extra="forbid", frozen=True):
 
     @property
     def axis(self) -> tuple[float, float]:
-        """Parts of a motion in y and of one in z that it sees."""
+        """Direction cosines of its axis: the parts that it sees of a motion in y and of one in z."""
         if self.angle_deg is None:
             return (1.0, 0.0) if self.direction == "y" else (0.0, 1.0)
         exact = {0: (1.0, 0.0), 1: (0.0, 1.0), 2: (-1.0, 0.0), 3: (0.0, -1.0)}.get(_cardinal(self.angle_deg))
@@ -163,7 +163,7 @@ class Channel(BaseModel, extra="forbid", frozen=True):
 
 
 def _cardinal(angle_deg: float) -> int:
-    """Quarter turns; -1 where it is none."""
+    """Number of quarter turns, 0 to 3; -1 if the angle is no multiple of 90°."""
     turns = angle_deg / 90
     return int(turns) % 4 if turns == round(turns) else -1
 
@@ -177,7 +177,7 @@ _STATE = re.compile(
 def state_name(channel: Channel) -> str:
     """Name of the state variable that a channel measures (``y1`` … ``phi_dot``, ``theta``).
 
-    One at an angle is known by its place and angle, one that is at none of the model's places by its own name, after
+    A channel at an angle is named by its place and angle, one at a place that is not in the model by its own name after
     an ``@``.
 
     Examples
@@ -195,7 +195,7 @@ def state_name(channel: Channel) -> str:
 
 
 def parts_seen(channel: Channel) -> dict[str, float]:
-    """States whose sum, each times a factor, is what a channel measures.
+    """States and their factors: a channel measures the sum of the states, each times its factor.
 
     Examples
     --------
@@ -209,12 +209,12 @@ def parts_seen(channel: Channel) -> dict[str, float]:
 
 
 def turned_pairs(channels: Sequence[Channel]) -> list[tuple[int, int]]:
-    """Columns of sensors at an angle that are turned to y and z: the one nearer to y, and the one nearer to z.
+    """Pairs of columns of sensors at an angle that are resolved into y and z; the sensor nearer to y is the first.
 
     Raises
     ------
     ValueError
-        Naming sensors that cannot be turned.
+        Naming sensors that cannot be resolved.
     """
     found = []
     columns = [column for column, one in enumerate(channels) if one.location in ("bearing", "disc")]
@@ -263,9 +263,9 @@ def apart_deg(first: Channel, second: Channel) -> float:
 
 
 def with_channel_names(text: str, channels: Iterable[Channel]) -> str:
-    """A sentence about states (``y1``, ``z2_dot``) in the names that the machine's channels have.
+    """Replace the states in a sentence (``y1``, ``z2_dot``) by the names of the machine's channels.
 
-    A state that two sensors at an angle tell together is called by both.
+    A state that two sensors at an angle measure together is replaced by both names.
 
     Examples
     --------
@@ -279,7 +279,7 @@ def with_channel_names(text: str, channels: Iterable[Channel]) -> str:
         state = found["state"]
         seen_by = [one for one in known if state in {state_name(one), *parts_seen(one)}]
         if found["gain"] and "@" not in state:
-            # Two sensors of a motion contradict each other: where one of them is turned, so may its partner be wrong.
+            # Two sensors of a motion contradict each other: if one of them is at an angle, its partner may be wrong.
             own = state.partition("_")[0]
             place = [one for one in known if own in {part.partition("_")[0] for part in parts_seen(one)}]
             seen_by = place if any(len(parts_seen(one)) > 1 for one in place) else seen_by
@@ -303,7 +303,7 @@ class ChannelDescriptor(BaseModel, frozen=True):
     @field_validator("channels", mode="before")
     @classmethod
     def _known_fields(cls, channels: object) -> object:
-        """In a machine file, where channels stand too, an unknown field is a mistake."""
+        """Drop unknown fields of channels here; in a machine file, which has channels as well, they are a mistake."""
         if not isinstance(channels, list):
             return channels
         known = Channel.model_fields
@@ -328,7 +328,7 @@ class ChannelDescriptor(BaseModel, frozen=True):
 
     @property
     def states(self) -> tuple[str, ...]:
-        """State variable measured by each column, in column order; of two at an angle, that which each is turned to."""
+        """State variable of each column, in column order; for two sensors at an angle, what each is resolved into."""
         names = [state_name(channel) for channel in self.channels]
         for pair in turned_pairs(self.channels):
             for column, name in zip(pair, parts_seen(self.channels[pair[0]]), strict=True):
@@ -398,7 +398,7 @@ def unit_factor(quantity: str, unit: str) -> float:
 def same_unit(quantity: str, one: str, other: str) -> bool:
     """Whether two spellings mean one unit; a spelling that is not understood contradicts nothing.
 
-    Of an overall value's unit, which may stand on a waveform by mistake, the unit itself counts.
+    A mark of an overall value in `other` (pp, rms), which a waveform may have by mistake, is ignored.
 
     Examples
     --------
@@ -413,7 +413,7 @@ def same_unit(quantity: str, one: str, other: str) -> bool:
 
 
 def unit_in_text(unit: str) -> str:
-    """A unit as texts have it.
+    """Spell a unit as in texts.
 
     Examples
     --------

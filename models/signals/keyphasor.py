@@ -1,7 +1,7 @@
 """Pulses of a keyphasor or tachometer to shaft angle.
 
-Between two pulses the shaft is taken to turn uniformly. A pulse that is missing, or one too many, shows against the
-pulses around it; what cannot be told apart from a stop leaves the angle unknown there, which is said and not guessed.
+Between two pulses the shaft is taken to turn uniformly. A missing or extra pulse is recognised by the intervals around
+it; where it cannot be distinguished from a stop, the angle is left unknown instead of being guessed.
 """
 
 from collections.abc import Sequence
@@ -22,8 +22,8 @@ _WHOLE = 0.25
 def jump_within_a_turn(steps_rad: FloatArray) -> float:
     """Largest angle by which a sampled shaft angle jumps, between two samples or in one turn of the mark, rad.
 
-    Two turns gain it over the two before, and lose it again to the next two; of a speed they gain, or lose, for good.
-    Steps, shape (n,), are those from sample to sample, -π to π.
+    Two turns with a jump in them are longer than the two before, and the next two are shorter by as much; after a
+    change of the speed turns stay longer or shorter. Steps, shape (n,), are those from sample to sample, -π to π.
 
     Examples
     --------
@@ -43,7 +43,7 @@ def jump_within_a_turn(steps_rad: FloatArray) -> float:
 
 
 class EdgeDetector:
-    """Finds the pulses in a sampled tachometer signal, piece by piece: they begin at a threshold, in its unit.
+    """Finds the pulses in a sampled tachometer signal, piece by piece, by a threshold in the unit of the signal.
 
     The signal must fall below it (rise above it for falling edges) by the hysteresis before the next pulse counts; 0
     counts every crossing.
@@ -57,7 +57,7 @@ class EdgeDetector:
         self._armed = False
 
     def interrupt(self) -> None:
-        """Tell that the next piece does not continue the last one: no pulse lies between them."""
+        """State that the next piece does not continue the last one: no pulse lies between them."""
         self._last, self._armed = None, False
 
     def feed(self, time: FloatArray, signal: FloatArray) -> FloatArray:
@@ -197,7 +197,7 @@ def _without_extra(times: FloatArray) -> FloatArray:
 
 
 def _extra_of(times: FloatArray, interval: int, usual: float) -> int:
-    """Of the two pulses around a short interval, the one without which the neighbours are the more even."""
+    """Choose the pulse at either end of a short interval without which the intervals nearby are more even."""
     candidates = [pulse for pulse in (interval, interval + 1) if 0 < pulse < times.size - 1] or [interval + 1]
     first = max(interval - 2, 0)
     near = times[first : interval + 4]

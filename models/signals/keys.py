@@ -27,7 +27,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
 Topic = Literal["report", "alarm_event", "alarm_state", "health"]
-"""What a monitor publishes, after the fields of `MachineKeys`."""
+"""What a monitor publishes, by the names of the fields of `MachineKeys`."""
 
 
 class Key:
@@ -98,7 +98,7 @@ _ALL = ("/**", "/**/@adv/**")
 _EVERYWHERE = (f"{PREFIX}/**", f"{PREFIX}/**/@adv/**")
 _LISTENED = ("declare_subscriber", "query")
 _LIVELINESS = ("declare_liveliness_subscriber", "liveliness_query")
-# What tells a partner who listens and who asks. Nothing is read or written by it, and without it nothing is sent.
+# These tell a partner who listens and who asks. They neither read nor write data, and without them nothing is sent.
 _INTERESTS = (*_LISTENED, "declare_queryable", *_LIVELINESS)
 
 
@@ -153,7 +153,7 @@ def access_control(grants: Sequence[Grant], known_by: Literal["usernames", "cert
             rules.append({"id": f"rule {len(rules)}", **allows})
         for name in grant.who:
             allowed.setdefault(name, []).extend(f"rule {number}" for number in range(begin, len(rules)))
-    # One subject for each name: of several that fit a partner, Zenoh would take one.
+    # One subject for each name: if several fitted a partner, Zenoh would take only one.
     return {
         "enabled": True,
         "default_permission": "deny",

@@ -115,7 +115,7 @@ def _check_certificate(field: str, path: Path) -> None:
 
 
 def _check_key(certificate: Path, key: Path) -> None:
-    """Check that a file has a private key that others may not read, and that it is that of a certificate."""
+    """Check that a file holds a private key that others may not read, and that it belongs to the certificate."""
     text = _secret("tls.key", key)
     if "ENCRYPTED" in text:
         raise MachineFileError(
@@ -246,12 +246,12 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         return self
 
     def check_reach(self, place: str) -> None:
-        """Check that others than programs on this computer have grants, or may do everything in so many words.
+        """Check that there are grants, or `without_grants` is set, if other computers can reach an endpoint.
 
         Raises
         ------
         MachineFileError
-            Naming the endpoints that they reach.
+            Naming the endpoints that they can reach.
         """
         far = [end for end in self.listen if endpoint_fault(end) is None and not is_local(end)]
         if far and not self.grants and not self.without_grants:
@@ -271,7 +271,7 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         MachineFileError
             If a password, certificate or key cannot be used, or the settings contradict each other.
         """
-        for fault in self._faults():  # again: endpoints of a command line are put over settings that were checked
+        for fault in self._faults():  # again: a command line may have replaced the endpoints that were checked
             raise MachineFileError(f"link: {fault}")
         items = {
             "mode": json.dumps(self.mode),
@@ -281,10 +281,10 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
             "scouting/gossip/enabled": "false",
             "timestamping/enabled": "true",
             "transport/shared_memory/enabled": json.dumps(self.shared_memory),
-            # Zenoh sends heartbeats from the thread that serves its sockets. One that waits for its turn behind others
-            # of its priority, which wait for room in the socket, stops both until the link breaks: so none has theirs.
+            # Zenoh sends heartbeats from the thread that serves its sockets. A heartbeat behind messages of the same
+            # priority that wait for room in the socket blocks that thread until the link breaks: so theirs differs.
             "qos/publication": json.dumps([{"key_exprs": ["**/@adv/**"], "config": {"priority": "background"}}]),
-            # Up to 256 messages wait in each of Zenoh's queues, and by itself it takes a gigabyte each.
+            # Up to 256 messages wait in each of Zenoh's queues, each of up to a gigabyte by default.
             "transport/link/rx/max_message_size": str(round(self.max_message_mb * 1e6)),
         }
         if self.namespace:
@@ -294,7 +294,7 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
     def explain(self, error: str) -> str:
         """Why a session could not be opened, in plain words.
 
-        Zenoh does not tell a program why it was turned away; what may be the reason with these settings is listed.
+        Zenoh does not tell a program why it was turned away, so the possible reasons with these settings are listed.
         """
         if "Address already in use" in error:
             return "address already in use: is another program listening there?"
@@ -303,7 +303,7 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         return re.sub(r"\s*\(?at \S+\.rs:\d+\)?\.?", "", error)
 
     def refusal(self) -> str:
-        """Why nobody may have let this program in; a sentence."""
+        """Possible reasons why no endpoint accepted this program, in a sentence."""
         reasons = []
         if self.user is not None:
             where = (
@@ -326,7 +326,7 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         return f"nothing answers there; or {'; or '.join(reasons)}"
 
     def _faults(self) -> Iterator[str]:
-        """What cannot be an endpoint, and what contradicts what."""
+        """Describe what cannot be an endpoint, and settings that contradict each other."""
         for role, ends in (("listen", self.listen), ("connect", self.connect)):
             for fault in filter(None, map(endpoint_fault, ends)):
                 yield f"{role}: {fault}"
@@ -349,7 +349,7 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         if not self.listen:
             yield "grants are for clients of this program, which has no listen endpoint"
         if self.connect:
-            # Who is at the other end of an outgoing connection has shown no name, so all of it would be refused.
+            # The partner of an outgoing connection has shown no name, so everything it sends would be refused.
             yield "grants and connect endpoints do not go together: give the grants to the router that all connect to"
         if self.passwords_file is None:
             if self.tls is None or not self.tls.mutual:

@@ -71,13 +71,14 @@ class RecordingWriter:
     """Writes a recording; a context manager.
 
     Leaving the context without an exception gives the file its name. With an exception the file is completed but
-    stays ``NAME.part``. Every method raises `RecordingError` if the file cannot be written. One may `overwrite` a
-    recording that is already there, or a ``.part`` that a crash left.
+    stays ``NAME.part``. Every method raises `RecordingError` if the file cannot be written. With `overwrite`, an
+    existing recording is replaced, and a ``.part`` that a crash left.
 
     Raises
     ------
     RecordingError
-        If one of them exists, or cannot be written, or `path` is a folder or device; the message names it.
+        If one of them exists without `overwrite`, or cannot be written, or `path` is a folder or device; the message
+        names it.
     """
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
@@ -203,15 +204,15 @@ class RecordingWriter:
 def read_recording(
     path: Path, *, keys: Collection[str] | None = None, from_ns: int | None = None
 ) -> Iterator[RecordedMessage]:
-    """Read messages in the order in which they were written; of some keys, and from a log time on.
+    """Read messages in the order in which they were written, of some keys only or from a log time on if given.
 
     Raises
     ------
     RecordingError
         If the file is missing, not a recording, incomplete or damaged; raised where the damage is met.
     """
-    # Chunk by chunk, in the order of the file: the library's own iteration collects every message of the file before it
-    # gives the first when it is not asked for the order of time.
+    # Chunk by chunk, in the order of the file: unless it is asked for the order of time, the library's own iteration
+    # collects every message of the file before it gives the first.
     with reading(path), path.open("rb") as file:
         summary = make_reader(file, validate_crcs=True).get_summary()
         if summary is None:

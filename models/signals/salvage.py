@@ -16,7 +16,7 @@ from models.signals.recording import DAMAGE, RecordedMessage, RecordingWriter, r
 
 @dataclass(slots=True)
 class Salvage:
-    """What came out of a damaged recording, and what did not."""
+    """What was recovered from a damaged recording, and what was lost."""
 
     messages: dict[str, int] = field(default_factory=dict)  # number of messages recovered, by key
     # Earliest and latest log time recovered; both 0 if nothing was.
@@ -43,8 +43,8 @@ def salvage_recording(damaged: Path, target: Path) -> Salvage:
     """Copy what can be read of an interrupted or damaged recording into a complete one.
 
     A chunk that cannot be read is passed over; what comes after the place where the file is cut off is lost. The
-    damaged one, usually the ``.part`` file of a program that was killed, stays as it is; the target may be the name
-    that it was to get.
+    damaged file, usually the ``.part`` file of a program that was killed, stays as it is; the target may be the name
+    that it was meant to get.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def _nothing_yet(path: Path) -> Salvage:
 
 
 def _salvaged(damaged: Path, salvage: Salvage) -> Iterator[RecordedMessage]:
-    """Messages in the order in which they were written; what is found is entered into `salvage` as it goes."""
+    """Messages in the order in which they were written; `salvage` is updated on the way."""
     with reading(damaged), damaged.open("rb") as file, suppress(*DAMAGE):
         channels = _listed_channels(file)
         begin = file.seek(0)

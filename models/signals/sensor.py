@@ -1,4 +1,4 @@
-"""A sensor of a machine file: its channel, and how what it gives differs from the vibration."""
+"""A sensor of a machine file: its channel, and how its signal differs from the vibration."""
 
 import cmath
 import math
@@ -10,7 +10,7 @@ from models.signals.channels import Channel, Quantity, not_given
 
 
 class Sensor(Channel):
-    """A channel, its run-out as it shows when the shaft turns slowly, and what its signal goes through."""
+    """A channel, its run-out as measured at slow roll, and the high-pass and delay of its signal."""
 
     slow_roll_um_pp: float | None = Field(
         default=None, ge=0, le=1e6, exclude_if=not_given, description="1x at slow roll, um peak to peak"
@@ -64,7 +64,7 @@ class Sensor(Channel):
 
     @property
     def runout(self) -> complex:
-        """Q of x = Re{q e^{jθ}} for a shaft angle that grows, SI; 0 where nothing is given."""
+        """Run-out vector q of x = Re{q e^{jθ}} for a shaft angle that grows, SI; 0 if none is given."""
         if self.slow_roll_um_pp is None or self.slow_roll_phase_lag_deg is None:
             return 0j
         return cmath.rect(self.slow_roll_um_pp * 0.5e-6, -math.radians(self.slow_roll_phase_lag_deg))

@@ -15,7 +15,7 @@ from models.signals.block import FloatArray
 CountArray = npt.NDArray[np.int64]
 
 _DROPPED, _JUMPS = 4, 4.0
-"""Least samples of a run that a channel jumps into and out of, and least jump, in steps as they usually are."""
+"""Fewest equal samples in a row that a channel jumps into and out of, and least jump, in median steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,14 +33,14 @@ class Waveform:
     at_minimum: CountArray
     at_maximum: CountArray
     longest_run: CountArray  # most samples in a row that are exactly equal; 1 if no neighbours are
-    # Samples in runs of equal ones that the channel jumps into and out of, as where its line is broken for a moment.
+    # Samples in runs of equal ones that the channel jumps into and out of, as when its line is broken for a moment.
     dropped: CountArray
-    # Smallest difference between unequal neighbours: the quantisation step, if there is one. Nan where no neighbours
+    # Smallest difference between unequal neighbours: the quantisation step, if there is one. NaN where no neighbours
     # are equal (not quantised) or all are.
     step: FloatArray
 
     def of(self, columns: Sequence[int]) -> "Waveform":
-        """Of some of the channels, in that order."""
+        """Waveform of some of the channels, in that order."""
         _, *names = (one.name for one in fields(self))
         return Waveform(self.n_samples, *(getattr(self, name)[..., columns] for name in names))
 
@@ -62,9 +62,9 @@ class Waveform:
 
 
 def waveform_of(samples: FloatArray) -> tuple[Waveform, FloatArray]:
-    """Look at finite samples of one hop, shape (n_samples, n_channels), at least one.
+    """Describe finite samples of one hop, shape (n_samples, n_channels), at least one.
 
-    Returns their deviations from the mean, shape (n_channels, n_samples), too.
+    Also returns their deviations from the mean, shape (n_channels, n_samples).
     """
     x = np.array(samples.T, order="C")  # a copy: the mean is taken out of it below
     n, n_samples = x.shape
@@ -85,7 +85,7 @@ def waveform_of(samples: FloatArray) -> tuple[Waveform, FloatArray]:
             moves = np.abs(np.diff(x[row]))
             step[row] = moves[~equal[row]].min()
             inside = (lengths >= _DROPPED) & (first > 0) & (last < n_samples - 1)
-            if inside.any() and 2 * follows.size < n_samples:  # or the channel may be one that is held between values
+            if inside.any() and 2 * follows.size < n_samples:  # otherwise the channel may be held between values
                 jumps = np.minimum(moves[first[inside] - 1], moves[last[inside]])
                 dropped[row] = lengths[inside][jumps > _JUMPS * np.median(moves[~equal[row]])].sum()
     x -= mean[:, None]

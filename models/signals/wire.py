@@ -45,7 +45,7 @@ def write_arrow(samples: npt.NDArray[Any], metadata: dict[str, str]) -> bytes:
 def _read_arrow(stream: bytes) -> tuple[npt.NDArray[Any], dict[str, bytes]]:
     """Read what `write_arrow` writes, from any Arrow library: samples, a read-only view of the stream, and metadata.
 
-    Whatever else it is, nothing larger than the stream is allocated to find out.
+    Whatever the bytes are, nothing larger than the stream is allocated to find out.
     """
     try:
         kind, schema, _, after = _message(stream, 0)
@@ -61,7 +61,7 @@ def _read_arrow(stream: bytes) -> tuple[npt.NDArray[Any], dict[str, bytes]]:
 
 
 def _message(stream: bytes, at: int) -> tuple[int, Table, tuple[int, int], int]:
-    """Kind and header of the message that begins there, where its body begins and ends, and where the next one is."""
+    """Kind and header of the message at byte `at`, begin and end of its body, and begin of the next message."""
     size = struct.unpack_from("<i", stream, at + 4)[0] if stream[at : at + 4] == _CONTINUES else 0
     start = at + 8
     if not 0 < size <= len(stream) - start:
@@ -144,7 +144,7 @@ def _values(
 
 
 def _structs(table: Table, slot: int, size: int) -> list[tuple[int, int]]:
-    """The structs of two 64-bit numbers of a vector."""
+    """The entries of a vector of structs, each of two 64-bit numbers."""
     offset = table.Offset(slot)
     if offset == 0 or table.VectorLen(offset) > _MOST_ENTRIES:
         raise WireError("Arrow record batch lacks its lists of lengths or buffers, or has too many")
@@ -257,7 +257,7 @@ def _metadata_number(metadata: Mapping[str, bytes], field: str) -> Any:
 
 
 def _checked(start_ns: int, sequence: int, run: int, rate_hz: float, samples: npt.NDArray[Any]) -> SampleBlock:
-    """A block whose fields are within what the header can say, whatever it came in."""
+    """Make a block of fields, in either encoding, that are within what the header can hold."""
     _check_shape(*samples.shape)
     for field, value, least, most in (
         ("start_ns", start_ns, -(2**63), 2**63 - 1),
