@@ -27,13 +27,13 @@ def data_alarm(kind: FaultKind) -> str:
 
 @dataclass(frozen=True, slots=True)
 class AlarmKind:
-    """What is to be known of an alarm beside its name."""
+    """Texts and subject of an alarm."""
 
     text: str  # what it is about, in words
-    # What is wrong while it is raised. What is wrong with the data or the monitor says nothing of the machine.
+    # What is at fault while it is raised. A fault of the data or the monitor says nothing about the machine.
     about: Literal["machine", "data", "monitor"]
-    cleared: str  # what is so again once it has cleared
-    raised: str = ""  # what is so while it is raised, where nothing more is known of it
+    cleared: str  # what holds again once it has cleared
+    raised: str = ""  # what holds while it is raised, if nothing more is known
 
 
 ALARMS: Mapping[str, AlarmKind] = MappingProxyType(
@@ -82,12 +82,12 @@ ALARMS: Mapping[str, AlarmKind] = MappingProxyType(
 
 
 def is_alarm(name: str) -> bool:
-    """Whether there is such an alarm; of a machine that has the channel, if it is on a channel's levels."""
+    """Whether an alarm of this name exists; one on a channel's levels does on machines that have the channel."""
     return name in ALARMS or re.fullmatch(f"{LEVEL}[A-Za-z0-9_.:-]{{1,64}}", name) is not None
 
 
 def alarm_kind(name: str) -> AlarmKind:
-    """What is to be known of an alarm; one without a row is told by its name rather than not at all."""
+    """Texts and subject of an alarm; one without a row in `ALARMS` is described by its name."""
     if name.startswith(LEVEL):
         channel = name.removeprefix(LEVEL)
         return AlarmKind(f"vibration level, {channel}", "machine", f"the levels of {channel} are within their limits")

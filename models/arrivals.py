@@ -1,4 +1,4 @@
-"""Blocks as the network delivers them: put into the order in which they were sent, and who sent them.
+"""Blocks as the network delivers them: putting them into the order in which they were sent, and finding two publishers.
 
 ::
 
@@ -8,8 +8,8 @@
     arrive   0 1 3 4 5 6 7      ... or until more than `bound` blocks wait (here 4): then the hole is given up,
     go on    0 1         3…7    and the gate (`models.ingest`) states the gap
 
-Nothing is lost here and nothing is refused: that is the gate's work. It only has to see every block in its place, with
-repetitions behind their originals, where they change nothing.
+Nothing is lost or refused here: refusing is the gate's work. It has to see every block in its place, and repetitions
+behind their originals, where they change nothing.
 
 Whether two publishers send::
 
@@ -17,8 +17,8 @@ Whether two publishers send::
     arrive   A0 B7 A1 B8 A2 B9 ...    two publishers: each goes on after the other
     arrive   A0 A1 A2 A2'             one number, other samples: somebody is not who he says
 
-Only what is new counts: a repetition is a matter of the network. Which of two publishers is the machine's nobody can
-tell from the blocks, so it is stated, not decided; of a block in two versions neither is believed.
+Only new blocks count: repetitions come from the network. The blocks do not show which of two publishers is the
+machine's, so the conflict is stated, not decided; if a block comes in two versions, neither is used.
 """
 
 import hashlib
@@ -44,8 +44,8 @@ class Arrived:
 class Arrivals:
     """Puts the blocks of one machine in the order of their sequence, run by run.
 
-    A run begins at sequence 0: where its first blocks are overtaken, they are waited for. Where a stream that has run
-    for longer is joined, the first block that arrives is the first.
+    A run begins at sequence 0: if its first blocks are overtaken, the others wait for them. If the stream has run for
+    longer, it begins with the first block that arrives.
 
     Parameters
     ----------
@@ -92,8 +92,8 @@ class Arrivals:
         Returns
         -------
         tuple of Arrived
-            What may go to the gate now, in order. Repetitions of blocks that have gone on go at once and change nothing
-            here; those of waiting blocks follow their originals.
+            Blocks that may go to the gate now, in order. Repetitions of blocks that have gone on do so at once and
+            change nothing here; those of waiting blocks follow their originals.
         """
         arrived = Arrived(block, schema_hash)
         if self._bound == 0 or self._is_repetition(block):
@@ -104,7 +104,7 @@ class Arrivals:
             self._note(block)
             self._next += 1
             return (arrived,)
-        # Another run, or a count that began anew: nothing of the old one will come in its place any more.
+        # Another run, or a count that began anew: the missing blocks of the old one will not come any more.
         gone_on = self.flush()
         known = 0 if block.run == self._run else self._known(block.run)
         self._run = block.run
@@ -124,7 +124,7 @@ class Arrivals:
         return tuple(found)
 
     def resume(self, courses: Iterable[Course]) -> None:
-        """Go on where a restored gate stands."""
+        """Continue after the courses of a restored gate, of which the present one is the last."""
         self._waiting.clear()
         self._earlier.clear()
         self._earlier.extend(courses)
@@ -139,7 +139,7 @@ class Arrivals:
         return any(course.covers(block) for course in self._earlier)
 
     def _known(self, run: int) -> int:
-        """What comes next in a run that was left for another one; 0 if it is new."""
+        """Next sequence in a run that was left for another one; 0 if the run is new."""
         courses = (*self._earlier, *(() if self._course is None else (self._course,)))
         return max((course.sequence for course in courses if course.run == run), default=0)
 
@@ -191,23 +191,23 @@ def _same(one: Arrived, other: Arrived) -> bool:
 
 
 _REMEMBERED = 256
-_AHEAD = 64  # blocks by which a publisher may be ahead of what was heard of it, for it to be the same one
+_AHEAD = 64  # most blocks by which a publisher may jump ahead and still be taken for the same one
 _MOST = 8
-# Times that each of two publishers has gone on after the other: more than blocks out of order can amount to.
+# How often each of two publishers must have gone on after the other: blocks out of order cannot amount to as much.
 _RETURNS = 6
-_HORIZON_S = 300.0  # length of the data that came in, from all, in which these are counted
+_HORIZON_S = 300.0  # length of the data, from all publishers together, in which these are counted
 
 
 @dataclass(slots=True, eq=False)
 class _Sender:
-    """A count of blocks that goes on, and when it went on after which other one had."""
+    """Blocks of one publisher: its highest sequence, and when it went on after which other publisher."""
 
     run: int
     highest: int
     returns: deque[tuple[float, "_Sender"]] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
 
     def after(self, other: "_Sender") -> int:
-        """How often it has gone on after the other one."""
+        """How often this publisher has gone on after the other one."""
         return sum(before is other for _, before in self.returns)
 
 
@@ -238,7 +238,7 @@ class Senders:
         Returns
         -------
         bool
-            Whether it, or an earlier one of its number and time, is another version of the same block.
+            Whether the block has come in two versions: the same run, number and time, but other contents.
         """
         self._heard_s += block.samples.shape[0] / block.rate_hz
         self._follow(block)
@@ -278,7 +278,7 @@ class Senders:
         return "; ".join(said)
 
     def _follow(self, block: SampleBlock) -> None:
-        """Find out who goes on with this block."""
+        """Find the publisher that goes on with this block, and note after which other one it does."""
         for sender in self._senders:
             if sender.run == block.run and -_REMEMBERED <= block.sequence - sender.highest <= _AHEAD:
                 break

@@ -4,11 +4,11 @@
 
     RWCP | version | BLAKE2b of the rest | zstd of: length, list of names, types, shapes and orders as JSON, contents
 
-The digest is looked at first, so that damaged bytes are refused before anything is read from them. Arrays of Python
+The digest is checked first, so that damaged bytes are refused before anything is read from them. Arrays of Python
 objects are refused: nothing in stored bytes is ever executed.
 
-What is remembered gives its arrays in `checkpoint` and takes them in `restore` or `restored`, which raise
-`CheckpointError` if one is missing or of another form.
+Objects with a state to remember give it in `checkpoint` and take it in `restore` or `restored`, which raise
+`CheckpointError` if an array is missing or of another form.
 """
 
 import hashlib

@@ -68,9 +68,9 @@ class Admission:
     reason: Reason | None = None  # why it was refused; None if it was accepted
     text: str = ""  # a sentence naming machine, field, value and expectation; empty if there is nothing to say
     gap_s: float = 0.0  # seconds of data missing before an accepted block (0 = contiguous)
-    clock_step_s: float = 0.0  # seconds by which the data's time is another one from this block on, either way
-    new_run: bool = False  # whether that is because the publisher was started anew, and not because its clock was set
-    new_snapshot: bool = False  # whether it begins a snapshot, after a silence that was to be expected
+    clock_step_s: float = 0.0  # step of the data's time at this block, s, of either sign
+    new_run: bool = False  # whether the cause of that step is a restart of the publisher, and not a clock that was set
+    new_snapshot: bool = False  # whether the block begins a snapshot, after the silence that was to be expected
 
     @property
     def accepted(self) -> bool:
@@ -101,7 +101,7 @@ class Course:
         return cls(block.run, block.sequence, block.start_ns, block.sequence + 1, block.end_ns)
 
     def extended(self, block: SampleBlock) -> "Course":
-        """Return the same up to the end of a later block."""
+        """Return the course up to the end of a later block."""
         return Course(self.run, self.first, self.first_ns, block.sequence + 1, block.end_ns)
 
     def covers(self, block: SampleBlock) -> bool:
@@ -119,8 +119,8 @@ class Gate:
     Parameters
     ----------
     partial : bool
-        Whether blocks are accepted in which a channel, but not every one, has no finite number at all: its sensor is
-        not connected. Where single numbers are missing, samples have been lost.
+        Whether blocks are accepted in which some channels, but not all, have no finite number at all: their sensors
+        are not connected. Where single numbers are missing, samples have been lost, and the block is refused.
     """
 
     def __init__(self, machine: MachineFile, *, partial: bool = False) -> None:
@@ -150,13 +150,13 @@ class Gate:
         return any(course.covers(block) for course in self.courses)
 
     def begin(self) -> None:
-        """Take note that whatever comes is heard from now on; what is known so far is from before a restart."""
+        """Mark all courses known so far as received before a restart, see `had`."""
         self._had = [*self.courses]
 
     def had(self, block: SampleBlock) -> bool:
-        """Whether a block is from before a restart, and comes again for the first time.
+        """Whether a block that was received before a restart comes again for the first time.
 
-        A publisher's cache sends each once more when it is asked. Whoever goes on repeating himself is refused.
+        A publisher's cache sends each block once more when it is asked. Further repetitions are refused.
         """
         for number, course in enumerate(self._had):
             if course.covers(block):
@@ -165,12 +165,12 @@ class Gate:
         return False
 
     def is_newest(self, block: SampleBlock) -> bool:
-        """Whether it is the latest block that was received."""
+        """Whether the block is the latest one received."""
         expected = self._expected
         return expected is not None and expected.covers(block) and block.sequence == expected.sequence - 1
 
     def could_use(self, payload: bytes, attachment: bytes, encoding: str, *, size_alone: bool = False) -> bool:
-        """Whether a message may be one of the machine's blocks, whatever its time; of Arrow only the size is looked at.
+        """Whether a message may be one of the machine's blocks, whatever its time; in Arrow by its size alone.
 
         Takes microseconds and changes nothing: any thread may ask.
         """

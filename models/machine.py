@@ -30,7 +30,7 @@ _SHIPPED = Path(__file__).parent / "machines"
 
 _BINS = 20
 _MOST_OF_SEGMENT = 0.02  # delay over the length of a segment: what came before it is missing in it
-_MOST_OF_BAND = 2.0  # corner of a high-pass over the beginning of the band: one of first order halves it there
+_MOST_OF_BAND = 2.0  # corner of a high-pass over the lowest frequency of the band, where a first-order one halves it
 _LONGEST_HOP_S = 600.0
 
 
@@ -153,7 +153,7 @@ class AlarmSettings(BaseModel, extra="forbid", frozen=True):
         default=_NAME_CONFIDENCE,
         ge=0.5,
         lt=1,
-        # Identities stay as they were before it was there.
+        # Identities stay as they were before this field existed.
         exclude_if=lambda value: value == _NAME_CONFIDENCE,
         description="how probable it must be that a parameter is among the changed ones for an alarm to name it; "
         "below, the alarm is changed, with the candidates",
@@ -199,13 +199,13 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
     ingest: IngestSettings = IngestSettings()
     alarms: AlarmSettings = AlarmSettings()
     levels: LevelSettings = LevelSettings()
-    # Left out of what identifies a machine where it is not given: identities stay as they were before it was there.
+    # Left out of a machine's identity if not given: identities stay as they were before this field existed.
     schedule: Schedule | None = Field(default=None, exclude_if=lambda schedule: schedule is None)
 
     @model_validator(mode="before")
     @classmethod
     def _defaults_that_depend_on_others(cls, fields: object) -> object:
-        """What is not given: what goes with rate and natural frequencies or speed, and what follows from a schedule."""
+        """Fill in what is not given but follows from rate and natural frequencies or speed, or from a schedule."""
         if not isinstance(fields, dict) or not isinstance(fields.get("window", {}), dict):
             return fields
         given, rate_hz = fields.get("window", {}), fields.get("rate_hz")
@@ -213,7 +213,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
             return fields
         modes_hz: tuple[float, ...] = ()
         schedule, speed_hz = None, None
-        with suppress(KeyError, ValidationError):  # told when the table itself is looked at
+        with suppress(KeyError, ValidationError):  # reported when the table itself is checked
             schedule = Schedule.model_validate(fields["schedule"])
         with suppress(KeyError, ValidationError):
             speed_hz = Operation.model_validate(fields["operation"]).speed_rpm / 60
@@ -254,7 +254,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
             )
         if self.window.band_hz[1] >= self.rate_hz / 2:
             raise ValueError(f"window.band_hz {self.window.band_hz} ends above half of rate_hz {self.rate_hz}")
-        _ = self.descriptor  # refuses double channels
+        _ = self.descriptor  # refuses duplicate channels
         names = [channel.name for channel in self.sensors if channel.quantity != "shaft_angle"]
         from models.levels.unmeasured import unmeasured  # noqa: PLC0415  # it imports scipy, for which no --help waits
 
@@ -289,7 +289,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
         return self
 
     def _check_hops(self) -> None:
-        """Refuse segments and lags that do not go into a hop."""
+        """Refuse segments and lags that do not fit into a hop."""
         window, schedule = self.window, self.schedule
         if schedule is None:
             if window.hop_s > _LONGEST_HOP_S:  # all samples of a hop are held
@@ -336,9 +336,9 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
 
     @property
     def time_scale(self) -> float:
-        """How much slower it moves than machines that the usual window suits, see `models.stream_settings`.
+        """How many times slower the machine moves than those that the usual window suits, see `time_scale`.
 
-        One of a fast machine whose file gives lags for a slower one: those are what it is evaluated by.
+        It is 1 for a fast machine whose file gives lags for a slower one, because it is evaluated by those.
         """
         speed_hz = None if self.operation is None else self.operation.speed_rpm / 60
         scale = time_scale(() if self.rotor is None else self.rotor.modes_hz, speed_hz)
@@ -391,7 +391,7 @@ def load_machine(name_or_path: str | Path) -> Machine:
 def load_machine_file(name_or_path: str | Path, changes: str = "") -> MachineFile:
     """Load a machine file, whatever is known of the machine; a `Machine` if all its parameters are.
 
-    TOML in `changes` goes over the file, see `models.mistakes.changed`.
+    TOML in `changes` is merged into the file, see `models.mistakes.changed`.
 
     Raises
     ------
@@ -402,7 +402,7 @@ def load_machine_file(name_or_path: str | Path, changes: str = "") -> MachineFil
     found = checked(MachineFile, changed(read_toml(path), changes), path)
     if found.rotor is None or found.rotor.unknown or found.operation is None or found.condition is None:
         return found
-    return Machine.model_validate(found.model_dump() | {"operation": found.operation})  # and what it was given
+    return Machine.model_validate(found.model_dump() | {"operation": found.operation})  # which knows its given fields
 
 
 def _path(name_or_path: str | Path) -> Path:

@@ -1,4 +1,4 @@
-"""Files that people write, read and checked; what is wrong with one is said in the words of who wrote it.
+"""Reading and checking files that people write; mistakes are described in the words of the file.
 
 Every message names the file, the field (as a path such as ``sensors.0.unit``), what was expected, what was found, and
 the name that was probably meant. The checks themselves are fields and validators of the models.
@@ -74,7 +74,7 @@ def read_toml(path: Path) -> dict[str, object]:
 
 
 def _at_once(path: str, flags: int) -> int:
-    """Open a file; a named pipe, too, without waiting for somebody who writes into it."""
+    """Open a file, also a named pipe, without waiting for somebody who writes into it."""
     descriptor = os.open(path, flags | os.O_NONBLOCK)
     os.set_blocking(descriptor, True)  # a pipe into which somebody writes is read to its end
     return descriptor
@@ -104,7 +104,7 @@ def parse_toml(text: str, place: object) -> dict[str, object]:
 
 
 def changed(fields: dict[str, object], changes: str) -> dict[str, object]:
-    """The fields of a file with others over them: tables are gone into, everything else takes the place of what was.
+    """Merge changes into the fields of a file: tables name by name, while anything else is replaced.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def changed(fields: dict[str, object], changes: str) -> dict[str, object]:
 
 
 def checked(model: type[_Model], fields: object, place: object) -> _Model:
-    """The fields of a file as the record they describe.
+    """Turn the fields of a file into the record they describe.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def checked(model: type[_Model], fields: object, place: object) -> _Model:
 def unseen_mistakes(fields: object, model: type[BaseModel]) -> list[str]:
     """Mistakes that pydantic does not see.
 
-    True and false in the place of a number, which it takes for 1 and 0, and characters 0 in text, which no name of a
+    True and false in place of a number, which it takes for 1 and 0, and null characters in text, which no name of a
     file or host can have.
     """
     told = []
@@ -187,7 +187,7 @@ def _leaves(fields: object, at: _Place = ()) -> Iterator[tuple[_Place, object]]:
 
 
 def in_folder(model: _Model, folder: Path) -> _Model:
-    """The fields of a file, with paths that are not whole taken from its folder; also those in its tables and lists."""
+    """Take relative paths in the fields of a file from its folder, also those in its tables and lists."""
 
     def found(value: Any) -> Any:
         if isinstance(value, tuple):
@@ -250,7 +250,7 @@ def expectation(fault: ErrorDetails, info: FieldInfo | None = None) -> str:
     fault : ErrorDetails
         One of `ValidationError.errors`.
     info : FieldInfo, optional
-        The field, whose range is told from both ends.
+        The field, whose range the text gives with both ends.
     """
     kind, context, value = fault["type"], fault.get("ctx", {}), fault["input"]
     between = "" if info is None else _range(info)
@@ -295,7 +295,7 @@ def plainly(fault: Mapping[str, Any]) -> str:
     Parameters
     ----------
     fault : mapping
-        One of `ValidationError.errors`, or an own one that has nothing but its place and ``msg``.
+        One of `ValidationError.errors`, or one made elsewhere with only its place and ``msg``.
     """
     kind = fault.get("type", "value_error")
     if kind in {"missing", "extra_forbidden"}:
@@ -322,12 +322,12 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def argument_text(error: Exception) -> str | None:
-    """What an argument of a command should have been, where that was found out by the same checks as those of files.
+    """What was expected of an argument of a command, if it was refused by the same checks as fields of files.
 
     Parameters
     ----------
     error : Exception
-        What refuses the argument; its cause says why.
+        The refusal of the argument; its cause says why.
     """
     cause = error.__cause__
     return expectation(cause.errors(include_url=False)[0]) if isinstance(cause, ValidationError) else None
@@ -343,7 +343,7 @@ def _nearest(word: str, known: Iterable[str]) -> str | None:
 
 
 def _unreadable(message: str, text: str) -> str:
-    """Of a file that is no TOML: the line, what is wrong there, and the line itself."""
+    """Describe why a text is no TOML: the number of the line, what is wrong there, and the line itself."""
     where = re.search(r" \(at line (\d+), column \d+\)$", message)
     if where is None:
         return f"cannot be read as TOML: {message[0].lower()}{message[1:]}"
@@ -411,7 +411,7 @@ def _owner(place: _Place, model: type[BaseModel]) -> type[BaseModel] | None:
 
 
 def _field(place: _Place, model: type[BaseModel]) -> tuple[_Place, FieldInfo | None]:
-    """The field at a place, without what pydantic adds: entries of lists, kinds of value of which one would do."""
+    """The field at a place, without the parts that pydantic adds: entries of lists, members of unions."""
     for end in range(len(place), 0, -1):
         owner = _owner(place[: end - 1], model)
         info = None if owner is None else owner.model_fields.get(str(place[end - 1]))
@@ -451,7 +451,7 @@ def _value(place: _Place, fields: object) -> object:
 
 
 def _named(place: _Place, fields: object) -> str:
-    """The field, and the name of the entry in a list that it is of."""
+    """Path of the field, with the name of the list entry to which it belongs."""
     names = []
     for end, part in enumerate(place, start=1):
         entry = _value(place[:end], fields)

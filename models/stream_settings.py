@@ -1,8 +1,8 @@
-"""How a machine's samples come and what windows are made of them: settings, and what they are where a file is silent.
+"""Settings of how a machine's samples come and of the windows made of them, with the defaults for what a file omits.
 
-Windows, lags and band suit machines whose motion lies between some 6 and 120 Hz. Of a faster or slower one the natural
-frequencies say how far off that is, or where they are not known the speed; all times are multiplied by one factor then,
-unless it is near one.
+The usual window, lags and band suit machines whose motion lies between some 6 and 120 Hz. For a faster or slower one
+all times are multiplied by one factor, unless it is near one: the factor follows from the natural frequencies, or from
+the speed if these are not known.
 """
 
 import math
@@ -12,18 +12,18 @@ from typing import Self
 from pydantic import BaseModel, Field, model_validator
 
 _USABLE = 0.4
-"""Part of the sampling rate up to which an anti-aliasing filter lets through."""
+"""Fraction of the sampling rate up to which an anti-aliasing filter passes the signal."""
 _SLOW_HZ, _FAST_HZ = 6.0, 120.0
-"""Lowest and fourth natural frequency, those of bearing and disc across, between which the usual window suits."""
+"""Least first and largest fourth natural frequency (lateral, of bearing and disc) that the usual window suits, Hz."""
 _FAST_SPEED_HZ = 50.0
 _SLOWEST = 59.0  # segments of two minutes are the longest
 NEAR = 0.8
-"""Time scale, or one over it, from which on the usual window is near enough."""
+"""Time scale, or its reciprocal, from which on the usual window is near enough."""
 _LENGTHS = ("segment_s", "hop_s", "length_s", "max_span_s")
 
 
 def whole(value: float) -> bool:
-    """Whether a number is a whole one, but for rounding."""
+    """Whether a number is whole, except for rounding."""
     return abs(value - round(value)) < 1e-9 * max(1.0, abs(value))
 
 
@@ -88,7 +88,7 @@ class WindowSettings(BaseModel, extra="forbid", frozen=True):
 
 
 class Schedule(BaseModel, extra="forbid", frozen=True):
-    """Snapshots: so many seconds of samples, again and again, and silence between them."""
+    """Snapshots: a stretch of samples at regular intervals, with silence between them."""
 
     on_s: float = Field(gt=0, le=600, description="length of a snapshot")
     every_s: float = Field(gt=0, le=86400, description="from the start of a snapshot to that of the next one")
@@ -105,14 +105,14 @@ class Schedule(BaseModel, extra="forbid", frozen=True):
         return self.every_s - self.on_s
 
     def is_silence(self, silence_s: float) -> bool:
-        """Whether nothing is missing where nothing came for so long: snapshots may come half a period late."""
+        """Whether a silence of this length leaves no snapshot missing: snapshots may come half a period late."""
         return self.silence_s / 2 <= silence_s <= self.silence_s + self.every_s / 2
 
     def window(self, rate_hz: float, usual: WindowSettings) -> dict[str, float]:
-        """Settings of the window where the machine file says nothing, from what they would be of an unbroken stream.
+        """Defaults of the window, from the `usual` ones of an unbroken stream.
 
         A hop is a snapshot, a window twelve of them. Seven half-overlapping segments or more go into a snapshot, and
-        the longest lag is a quarter of it.
+        the longest lag is at most a quarter of it.
         """
         segment_s = min(usual.segment_s, 2 * math.floor(self.on_s * rate_hz / 8) / rate_hz)
         lag_to_s = min(usual.lag_to_s, math.floor(self.on_s * rate_hz / 4) / rate_hz)
@@ -126,7 +126,7 @@ class Schedule(BaseModel, extra="forbid", frozen=True):
         }
 
     def ingest(self) -> dict[str, float]:
-        """Settings of ingest where the machine file says nothing: a block may be a snapshot, two may fail to come."""
+        """Defaults of ingest: a block may be a whole snapshot, and two snapshots may fail to come."""
         defaults = IngestSettings()
         return {
             "block_to_s": max(defaults.block_to_s, 1.05 * self.on_s),
@@ -136,14 +136,14 @@ class Schedule(BaseModel, extra="forbid", frozen=True):
 
 
 def time_scale(modes_hz: Sequence[float], speed_hz: float | None) -> float:
-    """How much slower a machine moves than those that the usual window suits: one of those is 1, below 1 is faster.
+    """How many times slower a machine moves than those that the usual window suits: 1 for these, less for faster ones.
 
     Parameters
     ----------
     modes_hz : sequence of float
-        Natural frequencies, ascending; empty where they are not known. A machine with slow and fast ones is usual.
+        Natural frequencies, ascending; empty if they are not known. A machine with both slow and fast ones counts as 1.
     speed_hz : float, optional
-        Nominal speed, for where they are not. A slow shaft says nothing of how fast the machine vibrates.
+        Nominal speed, used if they are not known. A slow shaft says nothing about how fast the machine vibrates.
 
     Examples
     --------
@@ -168,9 +168,9 @@ def default_window(
 
     Data acquisition often divides a clock by whole numbers (51 200 / 3 Hz), and slow machines are sampled slowly: the
     nearest settings that are whole numbers of samples are taken, and the band ends within what the rate allows. Fast
-    and slow machines have their own, see `time_scale`; a slow one has the usual where one of the lengths is given, for
-    the others have to go with that. A fast one tells more in the same time, so that what leaks from
-    one frequency into the next has to be smaller too: segments are not shortened.
+    and slow machines have their own, see `time_scale`; a slow one has the usual ones if one of the lengths is given,
+    because the others have to fit it. Segments of a fast machine are not shortened: the same time gives more
+    information about it, so the leakage from one frequency into the next has to be smaller too.
 
     Examples
     --------
@@ -188,7 +188,7 @@ def default_window(
     if modes_hz:
         low_hz, high_hz = min(low_hz, modes_hz[0] / 2), max(high_hz, 1.25 * modes_hz[3])
     low_hz, high_hz = float(f"{low_hz:.3g}"), float(f"{high_hz:.3g}")
-    if 2 * low_hz > _USABLE * rate_hz:  # the rate shows nothing of that: levels are left
+    if 2 * low_hz > _USABLE * rate_hz:  # the rate is too low for that band: levels are left
         scale, (low_hz, high_hz) = 1.0, usual.band_hz
     if high_hz >= rate_hz / 2 and _USABLE * rate_hz > low_hz:
         high_hz = _USABLE * rate_hz
