@@ -22,9 +22,9 @@ from models.errors import MachineFileError, RotorwatchError
 
 
 class Commands(TyperGroup):
-    """The commands of a program; a refused argument is told like a field of a file.
+    """The commands of a program; a refused argument is reported like a field of a file.
 
-    Exit 2 for a file or argument that cannot be used, 1 for what goes wrong later, each with one message.
+    The exit code is 2 for a file or argument that cannot be used, and 1 for a later error, each with one message.
     """
 
     def invoke(self, ctx: Any) -> Any:
@@ -55,7 +55,7 @@ VersionOption = Annotated[
 
 
 def finite(value: float | None) -> float | None:
-    """Refuse NaN, which no limit of an option does."""
+    """Refuse NaN and infinity: the limits of an option let NaN pass."""
     if value is not None and not math.isfinite(value):
         raise typer.BadParameter(f"{value} is not a finite number.")
     return value
@@ -70,7 +70,7 @@ def bars(*, remaining: bool = False) -> Progress:
 
 @contextmanager
 def labelled_bars(*, remaining: bool = False) -> Iterator[Callable[[str, int, int], None]]:
-    """Show a bar for every label that it is told of: what is being done, how much of it is done, how much there is."""
+    """Show a progress bar for each label: the function yielded takes label, amount done and total amount."""
     with bars(remaining=remaining) as shown:
         tasks: dict[str, TaskID] = {}
 

@@ -2,28 +2,28 @@
 
 The motion is split as ``x(t) = d(t) + s(θ)``. ``s`` is the steady response to the unbalance at the shaft angle θ, known
 in closed form; the rest ``d`` obeys ``ḋ = A* d + B* w`` without unbalance, because s solves the forced equation. So the
-unbalance enters without any discretisation error. At a change ``x`` carries over and ``d`` is what remains of it beside
-the new ``s``: the transient is in ``d``.
+unbalance enters without any discretisation error. At a change ``x`` carries over and ``d`` becomes ``x`` minus the new
+``s``: the transient is in ``d``.
 
-**Crack and rub** act beside the linear rotor, and the rest obeys
+**Crack and rub** add a force f to the linear rotor, and the rest obeys
 ``ḋ = A* d + B* w + f(d + s, θ)``. With f = 0 this plant is the linear one, to rounding.
 
 **Crack.** Across the open crack the shaft loses a part of its bending stiffness. The crack turns with the shaft, its
 direction at the phase reference (angle θ from the y axis), and breathes under the weight: fully open where it points
 up, to the tension side of an overhung shaft, closed below, ``½(1 + sin θ)`` between (the smooth law of I. W. Mayes and
-W. G. R. Davies, ASME J. Vibration, Acoustics, Stress and Reliability in Design 106, 1984). Stiffness then has harmonics
-up to three times the speed and acts on the shaft's static sag too: that is where 1x and 2x vibration come from. The
-displacements count from where the uncracked machine rests. The system is linear and periodic. Its transition over one
-sample is a product of matrix exponentials, of the stiffness at the middle of eight parts of the sample; as a function
-of the angle at the start of the sample it is smooth and periodic, so that a few Fourier coefficients give it at any
-angle. Its process noise is that of the uncracked shaft: within one sample the crack hardly acts on that sample's noise.
+W. G. R. Davies, ASME J. Vibration, Acoustics, Stress and Reliability in Design 106, 1984). The stiffness then has
+harmonics up to three times the speed, and acts on the shaft's static sag too, which gives rise to 1x and 2x vibration.
+Displacements count from where the uncracked machine rests. The system is linear and periodic. Its transition over one
+sample is a product of matrix exponentials, with the stiffness at the middle of each of eight parts of the sample; it is
+a smooth, periodic function of the angle at the start of the sample, so a few Fourier coefficients give it at any angle.
+The process noise is that of the uncracked shaft: within one sample the crack hardly acts on that sample's noise.
 
 **Rub.** Where the disc's radius r exceeds the clearance c, the casing pushes back with k(r - c), and sliding friction
 μk(r - c) acts against the sense of rotation; the surface speed is taken to be larger than that of any whirl. Between
 contacts the exact discretisation holds. During a contact the force is sampled at eight parts of the sample, and the
 trapezoidal rule for its convolution with the rotor's exact impulse response gives displacement and velocity. The
-response of a displacement at lag zero is nil, so this is explicit, of second order, and as stable as the rotor itself
-for contacts up to a few times stiffer than the shaft.
+impulse response of a displacement is zero at lag zero, so this is explicit, of second order, and as stable as the rotor
+itself for contacts up to a few times stiffer than the shaft.
 """
 
 from dataclasses import dataclass
@@ -52,9 +52,8 @@ class PlantSamples:
 class Plant:
     """Rotor, coloured excitation and unbalance, advanced sample by sample with an exact discretisation.
 
-    The first sample is a draw from the stationary distribution, at shaft angle 0. The machine is the original one, the
-    condition holds from the first sample on; `rng` is used by nothing else, so that the realisation depends on the seed
-    alone.
+    The first sample is a draw from the stationary distribution, at shaft angle 0. `machine` is the original machine,
+    and `condition` holds from the first sample on. Nothing else uses `rng`: the realisation depends on its seed alone.
     """
 
     def __init__(self, machine: Machine, condition: Condition, rng: np.random.Generator) -> None:
@@ -74,7 +73,7 @@ class Plant:
         return float(self._angles(1)[0])
 
     def change(self, condition: Condition) -> None:
-        """Let another condition hold from the next sample on; displacement, velocity and shaft angle carry over.
+        """Apply another condition from the next sample on; displacement, velocity and shaft angle carry over.
 
         Raises
         ------
@@ -94,7 +93,7 @@ class Plant:
         self._d = state
 
     def advance(self, n_samples: int) -> PlantSamples:
-        """Return the next `n_samples` samples and move on behind them."""
+        """Return the next `n_samples` samples and move on."""
         theta = self._angles(n_samples)
         noise = self._noise(n_samples)
         after = advance(self._system, self._d, noise)
@@ -124,7 +123,7 @@ class Plant:
         self._revolutions_per_sample = condition.speed_rpm / 60 / self._machine.rate_hz
 
     def _angles(self, n_samples: int) -> FloatArray:
-        # Counted from the last change of speed, never summed up: the error stays at rounding level over days.
+        # Computed from the count of samples since the last change of speed: rounding errors do not add up over days.
         count = self._since_change + np.arange(n_samples)
         turned = np.mod(self._start_revolution + self._revolutions_per_sample * count, 1.0)
         return np.asarray(2 * np.pi * turned, dtype=np.float64)
@@ -138,8 +137,8 @@ class Plant:
 def rotor_in(machine: Machine, condition: Condition) -> RotorParameters:
     """Return the rotor in a condition: changed parameters, and a deposit on the disc.
 
-    The deposit lies evenly around the shaft: masses and moments of inertia of the disc grow by the same part, and the
-    unbalance m₂e stays what it is.
+    The deposit lies evenly around the shaft: mass and moments of inertia of the disc grow by the same factor, and the
+    unbalance m₂e stays the same.
     """
     rotor = changed(machine.rotor, condition.relative_changes)
     factor = 1 + condition.anomalies.get("added_mass", 0.0)
@@ -156,14 +155,14 @@ def rotor_in(machine: Machine, condition: Condition) -> RotorParameters:
 
 
 def theoretical_rms(machine: Machine, condition: Condition) -> FloatArray:
-    """Root mean square of each of the twelve states in a condition, see `theoretical_moments`."""
+    """Theoretical rms of each of the twelve states in a condition, see `theoretical_moments`."""
     return np.asarray(np.sqrt(np.diag(theoretical_moments(machine, condition))), dtype=np.float64)
 
 
 def theoretical_moments(machine: Machine, condition: Condition) -> FloatArray:
     """Mean products of the twelve states in a condition, stochastic and synchronous together; SI, shape (12, 12).
 
-    Of the linear rotor: a crack or a rub is left out.
+    They are those of the linear rotor: a crack or a rub is left out.
     """
     rotor = rotor_in(machine, condition)
     speed_rad_s = condition.speed_rpm * 2 * np.pi / 60
@@ -174,7 +173,7 @@ def theoretical_moments(machine: Machine, condition: Condition) -> FloatArray:
 
 
 def _draw(covariance: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Draw from N(0, covariance); the states are scaled first, or the factor loses the small ones."""
+    """Draw from N(0, covariance); the states are scaled first, so that the factor keeps the small ones."""
     deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     scale = np.where(deviation > 0, deviation, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
@@ -189,15 +188,15 @@ _NODES = 32
 _HARMONICS = 10
 _RUN_IN_S = 5.0
 _PIECE_S = 0.5
-_RUNAWAY = 1e3  # radius in clearances beyond which friction has obviously driven the disc off
+_RUNAWAY = 1e3  # radius, in clearances, beyond which friction has made the motion unstable
 _Y2, _Z2 = STATE_INDEX["y2"], STATE_INDEX["z2"]
 
 
 def crack_stiffness(rotor: RotorParameters, theta_rad: FloatArray) -> FloatArray:
     """Stiffness that a crack of size 1 takes away, shape (n, 6, 6), N/m, N and N m; shaft angles have shape (n,).
 
-    ``½(1 + sin θ) PᵀKP``, with K the shaft's stiffness in a plane, P = (I cos θ, J sin θ) the motion in the crack's
-    direction θ, and J the mirror of the tilt between the planes.
+    ``½(1 + sin θ) PᵀKP``, with K the shaft's stiffness in a plane, P = (I cos θ, J sin θ) the projection onto the
+    crack's direction θ, and J the change of sign of the tilt between the planes.
     """
     plane = Q_shaft(rotor)[:3, :3]
     mirror = np.diag([1.0, 1.0, -1.0])
@@ -209,14 +208,14 @@ def crack_stiffness(rotor: RotorParameters, theta_rad: FloatArray) -> FloatArray
 
 
 class NonlinearPlant(Plant):
-    """Rotor with a crack or a rub; same interface, same random numbers as the linear plant.
+    """Rotor with a crack or a rub; same interface and random numbers as the linear plant.
 
-    An anomaly that is there from the first sample on has run in for five seconds before it.
+    If there is an anomaly at the first sample, the plant has run with it for five seconds before.
 
     Raises
     ------
     EstimationError
-        Here, in `change` or in `advance`: if a crack or a rub makes the rotor unstable.
+        If a crack or a rub makes the rotor unstable; also raised by `change` and `advance`.
     """
 
     def __init__(self, machine: Machine, condition: Condition, rng: np.random.Generator) -> None:
@@ -229,12 +228,12 @@ class NonlinearPlant(Plant):
             self._start_revolution, self._since_change = 0.0, 0
 
     def advance(self, n_samples: int) -> PlantSamples:
-        """Return the next `n_samples` samples and move on behind them.
+        """Return the next `n_samples` samples and move on.
 
         Raises
         ------
         EstimationError
-            If friction drives the disc off.
+            If friction makes the motion of the disc unstable.
         """
         if self._crack is None and self._contact is None:
             return super().advance(n_samples)
@@ -281,14 +280,14 @@ class NonlinearPlant(Plant):
             )
 
     def _periodic(self, rotor: RotorParameters, depth: float, condition: Condition) -> FloatArray:
-        """Fourier coefficients of (F, g)(θ), d ← F d + g over one sample; shape (2 · harmonics + 1, n · (n + 1))."""
+        """Fourier coefficients over θ of (F, g) in d ← F d + g, one sample; shape (2 · harmonics + 1, n · (n + 1))."""
         n, step_s = len(self._A), 1 / self._machine.rate_hz
         speed_rad_s = 2 * np.pi * self._revolutions_per_sample / step_s
         theta = 2 * np.pi * np.arange(_NODES) / _NODES
         weight = np.zeros(6)
         weight[3], weight[4] = -rotor.m1_kg * _GRAVITY_M_PER_S2, -rotor.m2_kg * _GRAVITY_M_PER_S2
         bent = np.column_stack([self._q1[:6], self._q2[:6], np.linalg.solve(Q_matrix(rotor), weight)])
-        # The force on what is steady and on the static sag rides along in the states (cos, sin, 1) of the heavy spot.
+        # Three more states, (cos, sin, 1) of the heavy spot's angle, carry the crack's force on s and the static sag.
         deviation = np.sqrt(np.diag(stationary_covariance(self._A, expanded_B(condition.sources))))
         scale = np.concatenate([np.where(deviation > 0, deviation, 1.0), np.ones(3)])
         product = np.broadcast_to(np.eye(n + 3), (_NODES, n + 3, n + 3))
@@ -328,7 +327,7 @@ class NonlinearPlant(Plant):
 
 
 class _Contact:
-    """Contact of the disc with the casing: force law and what the force does within one sample."""
+    """Contact of the disc with the casing: force law, and effect of the force within one sample."""
 
     def __init__(
         self, A: FloatArray, m2_kg: float, k_N_per_m: float, clearance_m: float, friction: float, step_s: float
@@ -351,7 +350,7 @@ class _Contact:
         self._final = np.concatenate([pushed[_PARTS - i] for i in range(_PARTS + 1)], axis=1)
 
     def follow(self, rest: FloatArray, transitions: FloatArray, driven: FloatArray, disc: FloatArray) -> None:
-        """Fill `rest` from its first row on; `disc` is the steady (y2, z2) at all parts, (n_samples, parts + 1, 2)."""
+        """Fill `rest` after its first row; `disc` is the steady (y2, z2) at all parts, (n_samples, parts + 1, 2)."""
         limit, runaway = self._clearance**2, (self._clearance * _RUNAWAY) ** 2
         begin, end = disc[:, 0].tolist(), disc[:, -1].tolist()
         touching = (rest[0, _Y2] + begin[0][0]) ** 2 + (rest[0, _Z2] + begin[0][1]) ** 2 > limit

@@ -6,7 +6,7 @@
                 │                   │
                 └──── stop ─────────┴─────────────────────^
 
-Draining matters because closing a Zenoh session throws away what is still on its way: several megabytes after an
+Draining matters because closing a Zenoh session discards what has not been delivered yet: several megabytes after an
 unpaced run.
 """
 
@@ -109,7 +109,7 @@ def _session(settings: PublishSettings) -> Iterator[zenoh.Session]:
         try:
             config.insert_json5(path, value)
         except zenoh.ZError as error:
-            # Only endpoints are text of the user's that Zenoh may refuse; a password is never shown.
+            # Endpoints are the only text of the user that Zenoh may refuse; a password is never shown.
             shown = f" = {value}" if path.endswith("endpoints") else ""
             reason = re.sub(r"\s*at \S+\.rs:\d+\.?", "", str(error))  # without the source lines of the library
             raise MachineFileError(f"link setting {path}{shown} is refused: {reason}") from error
@@ -129,8 +129,8 @@ def _session(settings: PublishSettings) -> Iterator[zenoh.Session]:
 def _declared(session: zenoh.Session, machine: MachineFile, pace: float | None) -> Iterator[_Outlets]:
     keys, descriptor = machine.keys, descriptor_payload(machine)
     # A real machine never waits for its monitor: a block that finds the queue full is dropped, and the subscriber
-    # fetches it from the cache. Without pace there is nothing to fall behind of, and a cache of any size would
-    # overflow: there, a slow subscriber slows the publisher down instead.
+    # fetches it from the cache. Without a pace there is nothing to fall behind, and a cache of any size would overflow:
+    # there a slow subscriber slows the publisher down instead.
     congestion = zenoh.CongestionControl.BLOCK if pace is None else zenoh.CongestionControl.DROP
 
     def outlet(key: str, cache: int) -> zenoh.ext.AdvancedPublisher:

@@ -22,9 +22,9 @@ def record(
 ) -> RunSummary:
     """Record descriptor, truth and blocks under the keys a publisher would use.
 
-    All times in the file are data time: a block is logged at the time of the sample after its last one, which is when a
-    real machine could first have sent it. The file is ``.part`` until complete; when `stop` is set, it ends after the
-    current block and is complete.
+    All times in the file are data time: a block is logged at the time of the sample after its last one, when a real
+    machine could have sent it at the earliest. The file is ``.part`` until complete; when `stop` is set, it ends after
+    the current block and is complete.
 
     Raises
     ------

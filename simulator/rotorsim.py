@@ -222,7 +222,7 @@ def _stream(scenario: Scenario, machine: Machine, block_s: float, start_ns: int 
 
 
 def _link(file: Path | None, mode: _Mode | None, listen: list[str] | None, connect: list[str] | None) -> LinkSettings:
-    """What the file says, and the command line over it; without either, a monitor on this computer."""
+    """Settings of the file, with those of the command line in their place; a local monitor if there are neither."""
     from simulator.publisher import DEFAULT_CONNECT  # noqa: PLC0415  # keeps --help quick
 
     update: dict[str, object] = {} if mode is None else {"mode": mode}
@@ -259,7 +259,7 @@ def _time_ns(text: str) -> int:
 
 @contextmanager
 def _stop_on_signal() -> Iterator[threading.Event]:
-    """Event that SIGINT and SIGTERM set, so that a run ends between two blocks with everything closed."""
+    """Give an event that SIGINT and SIGTERM set, so that a run ends between two blocks with everything closed."""
     stop = threading.Event()
     asked: queue.SimpleQueue[bool] = queue.SimpleQueue()
 
@@ -267,7 +267,7 @@ def _stop_on_signal() -> Iterator[threading.Event]:
         if asked.get():
             stop.set()
 
-    # The handler itself may not set the event: it may interrupt this thread where it holds the event's lock.
+    # The handler itself must not set the event: it may interrupt this thread while that holds the event's lock.
     listener = threading.Thread(target=listen, name="signals", daemon=True)
     listener.start()
     before = {number: signal.signal(number, lambda *_: asked.put(True)) for number in (signal.SIGINT, signal.SIGTERM)}

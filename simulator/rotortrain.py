@@ -63,7 +63,7 @@ def train(
     with _running():
         from models.machine import load_machine  # noqa: PLC0415  # start-up stays free of numpy and torch
 
-        known = load_machine(machine)  # or say so before torch, which takes seconds
+        known = load_machine(machine)  # fails before torch is imported, which takes seconds
         from simulator.training.command import train_for  # noqa: PLC0415
 
         train_for(known, out, windows, draws, seed, processes)
@@ -166,9 +166,9 @@ def commission(
 
 @contextmanager
 def _running() -> Iterator[None]:
-    """Run a command's work: linear algebra on one thread, the workers are processes; trouble is told in a sentence.
+    """Run a command's work, with linear algebra on one thread since workers are processes; report errors in a sentence.
 
-    Takes effect on the linear algebra only before numpy is first imported, so the command imports its work inside.
+    The number of threads takes effect only before numpy is first imported, so the command imports its work inside.
     """
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")

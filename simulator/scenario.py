@@ -1,4 +1,4 @@
-"""The scenario file: what happens to a simulated machine, and how well its sensors see it.
+"""The scenario file: what happens to a simulated machine, and how well its sensors measure it.
 
 Every field carries its unit in its name; unknown keys are refused. ``docs/scenario.md`` explains each field.
 """
@@ -23,9 +23,9 @@ _FAULT = re.compile(r"(?P<parameter>\w+)=(?P<change>[-+.\deE]+)@(?P<at_s>[.\deE]
 SensorFault = Literal["offset", "gain", "noise_relative", "stuck", "dropout", "clip", "delay", "swapped", "none"]
 # Kinds of sensor fault that have a value.
 SENSOR_FAULTS_WITH_VALUE = ("offset", "gain", "noise_relative", "clip", "delay")
-# What can go wrong that no diagnosed parameter describes, and the largest size of it.
+# Faults that no diagnosed parameter describes, and the largest size of each.
 ANOMALIES: Mapping[str, float] = MappingProxyType({"crack": 0.8, "rub": 10.0, "added_mass": 10.0})
-LONGEST_DELAY_S = 1.0  # most by which a sensor can be late
+LONGEST_DELAY_S = 1.0  # of a sensor
 _WITH_RAMP = ("offset", "gain", "noise_relative")
 
 
@@ -50,7 +50,7 @@ class SensorSettings(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False
 
 
 class ChannelSettings(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
-    """Settings of one channel; what is left out is as for all channels."""
+    """Settings of one channel; those left out are as for all channels."""
 
     noise_relative: float | None = Field(default=None, ge=0, le=100)
     noise_corner_hz: float | None = Field(default=None, gt=0, le=1e6)
@@ -67,8 +67,8 @@ class Sensors(SensorSettings):
     def settings(self, channel: Channel) -> SensorSettings:
         """Return the settings that hold for one channel.
 
-        The common settings describe vibration sensors. A shaft angle is ideal unless it has its own entry, because one
-        noise level in parts of the rms makes no sense for both.
+        The common settings describe vibration sensors. A shaft angle is ideal unless it has its own entry, because a
+        noise level relative to the rms does not suit both.
         """
         own = self.channels.get(channel.name, ChannelSettings()).model_dump(exclude_none=True)
         common = {} if channel.quantity is Quantity.SHAFT_ANGLE else self.model_dump(exclude={"channels"})
@@ -76,7 +76,7 @@ class Sensors(SensorSettings):
 
 
 class Rub(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
-    """Where the disc may touch the casing; how hard is the size of the event that brings it there."""
+    """Where the disc may touch the casing; the contact's stiffness is the size of the event that starts the rub."""
 
     clearance_m: float = Field(gt=0, le=0.1, description="radial, around the disc's place at rest")
     friction: float = Field(default=0.1, ge=0, le=1, description="sliding friction coefficient")
@@ -98,7 +98,7 @@ class Event(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     direction: tuple[float, float, float, float, float, float] | None = None
     # Factor on the white noise that drives all sources; 1 at the start.
     excitation_level: float | None = Field(default=None, ge=0, le=1e3)
-    # "crack", "rub" or "added_mass" and how much of it: relative loss of the shaft's bending stiffness across the open
+    # "crack", "rub" or "added_mass", and its size: relative loss of the shaft's bending stiffness across the open
     # crack; stiffness of the contact over the shaft's 3EI/L³; relative increase of the disc's mass. 0 is none.
     anomaly: str | None = None
     size: float | None = Field(default=None, ge=0)
@@ -189,7 +189,7 @@ class Event(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
 
 
 class Scenario(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
-    """A machine, what excites it, how its sensors are, and what happens when."""
+    """A machine, its excitation, the errors of its sensors, and what happens when."""
 
     name: str = Field(default="scenario", description="shown in truth records; the file's name if left out")
     description: str = ""

@@ -26,12 +26,12 @@ _AHEAD = 8192
 class SimulatedSensor:
     """One channel: (value + noise) · gain + offset, clipped, rounded to a step, in the channel's unit.
 
-    The value goes through the high-pass and the delay that the machine file states. A delay that is a fault shifts it
-    by whole samples, the nearest number; before the first sample it was what it is then.
+    The value passes the high-pass and the delay of the machine file. A delay that is a fault shifts it by the nearest
+    whole number of samples; before the first sample the value is taken as constant.
 
-    ``noise_relative`` refers to `rms_SI`: the channel's own theoretical rms, one revolution for a shaft angle. Its
-    signal comes `late_s` later than that of the machine's first. `rng` is of this sensor alone: one number per sample
-    is drawn whatever the settings are, so that a noise level can change without changing the noise.
+    ``noise_relative`` refers to `rms_SI`: the channel's own theoretical rms, one revolution for a shaft angle. The
+    signal is `late_s` late, 0 or more. `rng` belongs to this sensor alone, and one number per sample is drawn whatever
+    the settings are, so that a noise level can change without changing the noise.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class SimulatedSensor:
         self._filtered: FloatArray | None = None  # its state
 
     def noise(self, n_samples: int) -> FloatArray:
-        """Take the next samples of unit-variance noise, first-order noise sampled exactly; shape (n_samples,)."""
+        """Take the next samples of noise of unit variance (white or exact first-order), shape (n_samples,)."""
         if self._ahead.size < n_samples:  # a filter takes as long to be set up as for thousands of samples
             self._ahead = np.concatenate([self._ahead, self._drawn(max(n_samples - self._ahead.size, _AHEAD))])
         taken, self._ahead = self._ahead[:n_samples], self._ahead[n_samples:]
@@ -72,14 +72,14 @@ class SimulatedSensor:
         if self._memory == 0:
             return white
         innovation = float(np.sqrt(1 - self._memory**2))
-        # Stationary from the first sample on: it has the full variance instead of one innovation's.
+        # Stationary from the first sample on, which has the full variance instead of that of one innovation.
         carried = white[0] * (1 - innovation) if self._noise is None else self._memory * self._noise
         coloured, _ = scipy.signal.lfilter([innovation], [1.0, -self._memory], white, zi=[carried])
         self._noise = float(coloured[-1])
         return np.asarray(coloured, dtype=np.float64)
 
     def measure(self, value_SI: FloatArray, noise: FloatArray, faults: SensorFaults) -> FloatArray:
-        """Samples, in the channel's unit, of true values while the same faults are active; NaN after a dropout."""
+        """Turn true values, while the same faults are active, into samples in the channel's unit; NaN in a dropout."""
         settings = self._settings
         level = _value(faults, "noise_relative", settings.noise_relative) * self._rms_SI
         seen = self._delayed(self._passed(value_SI), round(_value(faults, "delay", 0.0) * self._rate_hz))
@@ -98,7 +98,7 @@ class SimulatedSensor:
         return np.asarray(seen / self.channel.to_si, dtype=np.float64)
 
     def _passed(self, value_SI: FloatArray) -> FloatArray:
-        """Values behind the high-pass and the delay of the file; before the first sample it was what it is then."""
+        """Pass values through the high-pass and the delay of the file, as if constant before the first sample."""
         if self._filter is None:
             return value_SI
         if self._filtered is None:
@@ -107,7 +107,7 @@ class SimulatedSensor:
         return np.asarray(passed, dtype=np.float64)
 
     def _delayed(self, value_SI: FloatArray, late: int) -> FloatArray:
-        """Values some samples ago."""
+        """Values `late` samples earlier."""
         if self._reach == 0:
             return value_SI
         past = np.full(self._reach, value_SI[0]) if self._past is None else self._past
@@ -117,7 +117,7 @@ class SimulatedSensor:
 
 
 class SensorBank:
-    """All channels of a machine, in the order of its file; `moments` as of `simulator.plant.theoretical_moments`."""
+    """All channels of a machine, in the order of its file; `moments` are those of `theoretical_moments`."""
 
     def __init__(
         self,
@@ -184,7 +184,7 @@ class SensorBank:
 
 
 def _ago(angle_rad: FloatArray, late: float) -> FloatArray:
-    """Shaft angle some samples ago, at the speed of now."""
+    """Shaft angle `late` samples earlier, extrapolated at the present speed."""
     if not late or angle_rad.size < 2:
         return angle_rad
     return np.asarray(angle_rad - late * np.gradient(np.unwrap(angle_rad)))
@@ -222,7 +222,7 @@ def _value(faults: SensorFaults, kind: str, otherwise: float) -> float:
 
 
 def _seen(channel: Channel, states: FloatArray) -> FloatArray:
-    """What a channel sees of states, shape (..., 12); those at an angle see two of them."""
+    """What a channel measures of states, shape (..., 12); channels at an angle measure two of them."""
     parts = [(STATE_INDEX[state], part) for state, part in parts_seen(channel).items()]
     if len(parts) == 1:
         return states[..., parts[0][0]]
@@ -236,6 +236,6 @@ def _reference(channel: Channel, moments: FloatArray) -> float:
 
 
 def _wrapped(angle: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    """Bring angles into [0, 2π); a remainder that rounds up to 2π, as that of an angle just below 0 does, becomes 0."""
+    """Wrap angles into [0, 2π); a remainder that rounds up to 2π, as for an angle just below 0, becomes 0."""
     wrapped = np.mod(angle, _TURN)
     return np.where(wrapped >= _TURN, 0.0, wrapped)

@@ -1,8 +1,8 @@
 """A scenario as a stream of sample blocks and truth records, and the messages they are sent or recorded as.
 
 The same scenario and seed give bit-identical samples whatever the length of the blocks: samples are made in pieces on a
-grid of their own and only then cut into blocks. The pieces end at changes of the plant but not at those of a sensor,
-so that a sensor's fault or setting never changes how the machine moves.
+grid of their own and only then cut into blocks. A piece ends at a change of the plant, but not at one of a sensor, so
+that a sensor's fault or setting never changes the motion of the machine.
 """
 
 from collections import deque

@@ -1,6 +1,6 @@
 """A scenario's events as conditions that hold from one sample to the next.
 
-A ramp becomes a staircase of 0.1 s steps, each at the value the ramp has in its middle::
+A ramp becomes a staircase of 0.1 s steps, each at the value of the ramp in the middle of the step::
 
     value                 ┌──  end
                        ┌──┘
@@ -28,13 +28,13 @@ _Values = tuple[float, ...]
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """What the plant is made of, from one change to the next."""
+    """Parameters, speed, excitation and anomalies of the plant, from one change to the next."""
 
     relative_changes: Mapping[str, float]  # every diagnosed parameter's change from the original machine
     speed_rpm: float
     sources: tuple[NamedSource, ...]  # always as many and in the same order, so that the state carries over
     excitation_level: float = 1.0  # factor on the white noise that drives all sources
-    # Size of what the diagnosis knows nothing of, by kind; kinds of size 0 are left out.
+    # Size of each fault that no parameter describes, by kind; kinds of size 0 are left out.
     anomalies: Mapping[str, float] = field(default_factory=dict)
     rub: Rub | None = None  # where the disc may touch the casing
 
@@ -129,7 +129,7 @@ def _plant_target(event: Event) -> tuple[_Target, _Values]:
 def _steps(
     start: Mapping[_Target, _Values], events: list[tuple[Event, _Target, _Values]], rate_hz: float
 ) -> dict[_Target, list[tuple[int, _Values]]]:
-    """Staircase of each target; a later event cuts an unfinished ramp off and starts from where it stands."""
+    """Staircase of each target; a later event cuts off an unfinished ramp and starts from its present value."""
     steps: dict[_Target, list[tuple[int, _Values]]] = {}
     for event, target, end in events:
         first = round(event.at_s * rate_hz)
@@ -148,7 +148,7 @@ def _by_sample(steps: Mapping[_Target, list[tuple[int, _Values]]]) -> list[tuple
 
 
 def _ramp(event: Event, rate_hz: float) -> list[tuple[int, float]]:
-    """Sample numbers at which the steps of a change begin, and how much of it is done then."""
+    """Sample numbers at which the steps of a change begin, and the fraction of the change reached there."""
     stairs: dict[int, float] = {}
     begin_s = 0.0
     number = 0

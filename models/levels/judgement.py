@@ -399,7 +399,7 @@ def _nearest_limits(name: str, limits: Sequence[Limit]) -> _Nearest:
         fall=None if fall is None else rounded(fall.fall or 0.0),
         source="" if decided is None else decided.source,
         state="normal",
-        bounds=tuple(one.bound() for one in limits if one.source != _TURNED_OUT) if several else (),  # it is no level
+        bounds=tuple(one.bound() for one in limits if one.source != _TURNED_OUT) if several else (),  # no level's limit
     )
     high = min((alert and alert.alert) or math.inf, (danger and danger.danger) or math.inf)
     return _Nearest(alert, danger, fall, normal, (fall and fall.fall) or 0.0, high)

@@ -113,8 +113,8 @@ def commission_machine(
 ) -> bool:
     """Commission a machine, write its bundle, and say whether it was commissioned; if not, the report says why.
 
-    Only the first seconds of every recording are used, if `first_s` is given. Where `out` holds a commissioning
-    already, it must be said `why` it is made again. Networks are trained only where the parameters are known.
+    Only the first seconds of every recording are used, if `first_s` is given. If `out` holds a commissioning already,
+    `why` must say why it is made again. Networks are trained only if the parameters are known.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def commission_machine(
 
 
 def _check_names(paths: Sequence[Path]) -> None:
-    """Recordings are told apart by their file names, in the report and in the bundle."""
+    """Refuse equal file names, because these identify the recordings in the report and in the bundle."""
     names = [path.name for path in paths]
     for path in paths:
         if names.count(path.name) > 1:
@@ -153,7 +153,7 @@ def _check_names(paths: Sequence[Path]) -> None:
 
 
 def _before(out: Path, machine: MachineFile, why: str) -> Commissioned | None:
-    """The commissioning that is replaced; replacing one is said, never by accident."""
+    """Load the commissioning that is replaced, if there is one; this needs a reason, so that none is by accident."""
     if not (out / FILE).is_file():
         return None
     try:
@@ -169,9 +169,9 @@ def _before(out: Path, machine: MachineFile, why: str) -> Commissioned | None:
 
 
 def _remove_networks(out: Path, machine: Machine) -> str:
-    """Remove networks that are not the machine's, or damaged: beside its commissioning no monitor would start.
+    """Remove networks that are damaged or not the machine's: with them beside its commissioning no monitor would start.
 
-    Says what is wrong with them; empty if they stay, or there are none.
+    Returns what is wrong with them; empty if they stay, or there are none.
     """
     if not (out / MANIFEST).exists():
         return ""
@@ -206,7 +206,7 @@ def _write(out: Path, made: Commissioning, replaces: Commissioned | None) -> Non
             shutil.copyfile(out / FILE, out / _KEPT.format(version=replaces.version))
         if made.machine is not None and (why := _remove_networks(out, made.machine)):
             typer.echo(f"the networks that were there cannot be used and were removed: {why}")
-        draft = out / (FILE + ".new")  # what is replaced stays whole until the new one is
+        draft = out / (FILE + ".new")  # the old file stays intact until the new one is complete
         draft.write_text(made.commissioned.model_dump_json(indent=1) + "\n", encoding="utf-8")
         draft.replace(out / FILE)
     except OSError as error:

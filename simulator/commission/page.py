@@ -32,7 +32,7 @@ _COMPARED = {
 
 @dataclass(frozen=True, slots=True)
 class ReportPicture:
-    """A picture and what stands below it."""
+    """A picture with its title and caption."""
 
     title: str
     svg: Markup
@@ -42,7 +42,7 @@ class ReportPicture:
 def pictures_of(
     report: CommissioningReport, names: Sequence[str], portraits: Sequence[Portrait]
 ) -> tuple[ReportPicture, ...]:
-    """Draw all that there is something to draw of: names of all recordings, portraits of those with usable data."""
+    """Draw the pictures for which there are data; names of all recordings, portraits of those with usable data."""
     drawn: list[tuple[str, str, Callable[[], Figure | None], str]] = [
         (
             "readings",
@@ -59,7 +59,7 @@ def pictures_of(
             "mark lies left of the dashed one, the wished change is found by one window with 95% probability.",
         ),
     ]
-    if portraits and portraits[0].statistics.states:  # of channels elsewhere there are levels alone
+    if portraits and portraits[0].statistics.states:  # channels at other places have levels alone
         drawn += [
             ("spectra", "Spectra of the recordings", lambda: draw_spectra(portraits), _spectra_caption(portraits)),
             ("levels", "Speed and level over time", lambda: draw_levels(portraits), _levels_caption(portraits)),
@@ -126,8 +126,8 @@ def write_report(
 ) -> Path:
     """Write ``report.html``, whose path is returned, and ``report.json``.
 
-    What was stored as `commissioned` says what it replaces and why, and the hash of each file. The same arguments give
-    the same page, to the last byte.
+    `commissioned`, if it was stored, tells what it replaces and why, and the hash of each recording. The same arguments
+    give the same page, to the last byte.
 
     Raises
     ------
@@ -181,7 +181,7 @@ def _render(
 
 
 def _symbols(report: CommissioningReport) -> tuple[tuple[str, str], ...]:
-    """Quantities that the table of equations calls by their symbols, in words."""
+    """Symbols of quantities in the table of equations, each with its meaning in words."""
     words = {word.strip(",;") for one in report.equations for word in one.reason.split()}
     return tuple((word, verdict.channel_text(word)) for word in sorted(words) if verdict.channel_text(word) != word)
 

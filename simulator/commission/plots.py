@@ -1,4 +1,4 @@
-"""Pictures of what a commissioning can tell, and how they get into the page: SVG in the page's own colours."""
+"""Pictures of the readings and errors of a commissioning, for the page: SVG in the page's own colours."""
 
 import math
 import re
@@ -18,7 +18,7 @@ from models.diagnosis.readings import Z95
 from models.diagnosis.verdict.stretch import to_scale
 from simulator.commission.verdict import percent
 
-# After Okabe and Ito: told apart with any colour vision.
+# After Okabe and Ito: distinguishable with any colour vision.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 INK, GREY, BAND = "#1c2530", "#66727f", "#edf2f6"
 WIDTH_IN = 10.0  # width of every picture, so that letters are of one size on the page
@@ -26,7 +26,7 @@ _GRID = "#dde2e6"
 _VARIABLES = {INK: "var(--ink)", GREY: "var(--grey)", _GRID: "var(--line)", BAND: "var(--band)"} | {
     colour: f"var(--c{number})" for number, colour in enumerate(COLOURS)
 }
-"""Colours and the properties of the page that replace them: light, dark and on paper."""
+"""Colours and the page's properties that replace them, which differ between light, dark and paper."""
 
 _STYLE = {
     "font.size": 9.0,
@@ -60,7 +60,7 @@ _NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 def inline_svg(name: str, label: str, paint: Callable[[], Figure | None]) -> Markup | None:
     """Draw a picture in the house style, of width `WIDTH_IN`, as an element of an HTML page; None if there is nothing.
 
-    Every identifier in the picture begins with the name, unique on the page. The label is for those who cannot see it.
+    Every identifier in the picture begins with the name, unique on the page. The label is for screen readers.
     """
     written = StringIO()
     with style.context(["default", _STYLE]):
@@ -191,7 +191,7 @@ def _allowed(parameter: ParameterSummary) -> float | None:
     if own is None or gain is None or wished is None:
         return None
     now = math.hypot(own, parameter.commissioning_error or 0.0)
-    # A gain, the stricter side: as the report reckons what the wished change takes.
+    # For a gain, the stricter side, as the report computes what the wished change takes.
     return abs(to_scale(parameter.name, wished)) * now / to_scale(parameter.name, gain)
 
 

@@ -83,7 +83,7 @@ def _rank(state: str) -> tuple[int, int, int]:
 
 
 def _number(place: str) -> int:
-    """Place and plane; sensors at an angle stand where those in the nearer plane would."""
+    """Rank by place and plane; sensors at an angle rank as those in the nearer plane."""
     location, at, angle_deg = place.partition("@")
     if not at:
         return _PLACES.index(place)
@@ -91,7 +91,7 @@ def _number(place: str) -> int:
 
 
 def draw_spectra(portraits: Sequence[Portrait]) -> Figure:
-    """Spectra of every channel, all recordings in each; at least one."""
+    """Draw the spectra of every channel, each with all recordings, at least one."""
     states = ordered(portraits[0].statistics.states)
     columns = min(2, len(states))
     rows = -(-len(states) // columns)
@@ -142,7 +142,7 @@ def _line(number: int) -> dict[str, str | float]:
 
 
 def _mark_rotation(axes: Axes, portraits: Sequence[Portrait], highest_hz: float) -> None:
-    """Once and twice the speed: a line, or a stripe for speeds that are near each other."""
+    """Mark once and twice the speed: by a line, or a stripe for speeds that are near each other."""
     speeds = sorted(one.speed_hz for one in portraits if np.isfinite(one.speed_hz))
     groups: list[list[float]] = []
     for speed in speeds:
@@ -165,7 +165,7 @@ def _mark_rotation(axes: Axes, portraits: Sequence[Portrait], highest_hz: float)
 
 
 def draw_levels(portraits: Sequence[Portrait]) -> Figure:
-    """Speed and level of random vibration hop by hop, the recordings one after the other; at least one."""
+    """Draw speed and level of random vibration hop by hop, the recordings, at least one, one after the other."""
     speeds_known = any(np.isfinite(one.statistics.hop_speed_rad_s).any() for one in portraits)
     heights = [1.0, 1.8] if speeds_known else [1.8]
     figure = Figure(figsize=(WIDTH_IN, 0.7 + 1.4 * sum(heights)), layout="constrained")
@@ -212,7 +212,7 @@ def draw_levels(portraits: Sequence[Portrait]) -> Figure:
 def _pieces(
     x: FloatArray, y: FloatArray, broken: np.ndarray[tuple[int], np.dtype[np.bool_]]
 ) -> tuple[FloatArray, FloatArray]:
-    """The same points with a hole wherever a gap lies."""
+    """The same points with NaN inserted wherever data are missing, which breaks the line there."""
     at = np.flatnonzero(broken)
     return np.insert(x, at, np.nan), np.insert(y, at, np.nan)
 
@@ -229,7 +229,7 @@ def _channel_line(state: str) -> dict[str, str | float]:
 
 
 def _speed_limits(portraits: Sequence[Portrait]) -> tuple[float, float]:
-    """At least two per cent of the speed from bottom to top: a steady speed must look steady."""
+    """Limits of the axis of speeds, at least two per cent apart: a steady speed must look steady."""
     rpm = _RPM * np.concatenate([one.statistics.hop_speed_rad_s for one in portraits])
     low, high = float(np.nanmin(rpm)), float(np.nanmax(rpm))
     middle, reach = (low + high) / 2, (high - low) / 2
@@ -238,7 +238,7 @@ def _speed_limits(portraits: Sequence[Portrait]) -> tuple[float, float]:
 
 
 def _level_limits(portraits: Sequence[Portrait], reference: FloatArray) -> tuple[float, float]:
-    """At least half to double."""
+    """Limits of the axis of levels: at least half to double."""
     ratios = np.concatenate([one.levels for one in portraits]) / np.maximum(reference, np.finfo(float).tiny)
     seen = ratios[np.isfinite(ratios) & (ratios > 0)]
     low, high = (float(seen.min()), float(seen.max())) if seen.size else (1.0, 1.0)

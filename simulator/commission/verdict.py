@@ -38,7 +38,7 @@ def significant(value: float, digits: int = 2) -> str:
 
 
 def percent(value: float) -> str:
-    """Size of a part, in percent with two digits.
+    """Ratio in percent, with two significant digits.
 
     Examples
     --------
@@ -132,14 +132,14 @@ def listed(words: Iterable[str]) -> str:
 
 
 VERDICT_TEXT = {"commissioned": "commissioned", "limited": "commissioned with limits", "refused": "not commissioned"}
-_ALIKE = 2.0  # errors add as squares: beside one twice as large, the other makes a tenth of the total
+_ALIKE = 2.0  # errors add as squares: one half as large as the other contributes a tenth of the total
 _MOST_OF_A_LOSS = 0.99
 _MANY_TIMES = 10.0
 _LONGEST_WINDOW_S = 3600.0  # a machine file allows no longer one
 
 
 def dominant(parameter: ParameterSummary) -> str:
-    """Which error is nearly all of the total: ``commissioning``, ``window``, or ``both``; empty where there is none."""
+    """Which error makes nearly all of the total: ``commissioning``, ``window``, or ``both``; empty if not known."""
     own, shared = parameter.window_error, parameter.commissioning_error
     if own is None or shared is None:
         return ""
@@ -149,7 +149,7 @@ def dominant(parameter: ParameterSummary) -> str:
 
 
 def smallest_change(parameter: ParameterSummary) -> tuple[str, str]:
-    """Smallest loss and gain that are found, in words; empty where there is none."""
+    """Smallest loss and gain that are detected, in words; empty if not known."""
     loss, gain = parameter.detectable_loss, parameter.detectable_gain
     if loss is None or gain is None:
         return "", ""
@@ -206,7 +206,7 @@ def next_steps(report: CommissioningReport) -> tuple[str, ...]:
 
 
 def budget_sentences(report: CommissioningReport) -> tuple[str, ...]:
-    """What limits the readings, and what a wished change takes."""
+    """What limits the readings, and whether the wished changes can be detected."""
     read = [one for one in report.parameters if one.evaluable]
     if not read:
         return ()
@@ -251,7 +251,7 @@ def budget_sentences(report: CommissioningReport) -> tuple[str, ...]:
 
 
 def growth_sentence(report: CommissioningReport) -> str:
-    """What growth of a level raises an alert, at best and at worst; empty where there is no such limit."""
+    """Least and largest growth of a level that raises an alert, in words; empty if no level has such a limit."""
     found = [(one.growth, one) for one in report.levels if one.growth is not None]
     if not found:
         return ""

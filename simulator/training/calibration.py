@@ -19,14 +19,14 @@ from models.physics.rotor import PARAMETERS
 from simulator.commands import bars
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition, windows, with_tilt
 
-# Per training window of a relation network: windows of either layout with everything changed, for each relation
-# network; windows of either layout for the amortised networks.
+# Calibration windows of either layout over training windows of a relation network: those with everything changed, for
+# each relation network; those for the amortised networks.
 _CHANGED_SHARE, _AMORTISED_SHARE = 0.75, 4.0
 _AMORTISED_STREAM, _CHANGED_STREAM = 20, 30
 
 
 def calibrate_again(machine: Machine, bundle: str, out: Path, processes: int) -> None:
-    """Calibrate trained networks anew: weights stay what they are.
+    """Calibrate trained networks anew, with the same weights.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What ``rotortrain train`` does: simulate, train, and have calibrated."""
+"""What ``rotortrain train`` does: simulate, train, calibrate, and write the bundle."""
 
 import platform
 from dataclasses import replace
@@ -29,8 +29,8 @@ _CONDITIONS_PER_BATCH = 480
 def train_for(machine: Machine, out: Path, n_windows: int, n_draws: int, seed: int, processes: int) -> None:
     """Train every equation's relation network and amortised network for the machine and write the bundle.
 
-    `n_windows` are simulated for the training of each relation network; those of the calibration go with them.
-    `n_draws` are random machines and conditions for the first reading of the amortised networks, half for the second.
+    `n_windows` are simulated for the training of each relation network, and a number in proportion for the calibration.
+    `n_draws` random machines and conditions train the first reading of the amortised networks, half as many the second.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def train_for(machine: Machine, out: Path, n_windows: int, n_draws: int, seed: i
             )
         else:
             amortised = _train_amortised(machine, n_draws, seed, processes, bar, near=False)
-            near = _train_amortised(machine, n_draws // 2, seed, processes, bar, near=True)  # what is left is simpler
+            near = _train_amortised(machine, n_draws // 2, seed, processes, bar, near=True)  # a simpler task
             basis = replace(near.basis, precision_factor=near.basis.precision_factor[:, :0])
             amortised = replace(amortised, near=NearNetworks(basis, near.networks))
     versions = {name: version(name) for name in ("numpy", "torch")} | {

@@ -58,14 +58,14 @@ class Excitation(IntEnum):
 
 
 class Anomaly(IntEnum):
-    """A fault that none of the diagnosed parameters describes; in parentheses its size if none is given."""
+    """A fault that none of the diagnosed parameters describes; its default size is in parentheses."""
 
     NONE = 0
     CRACK = 1  # breathing crack (0.3 of the shaft's bending stiffness); halved until the machine is stable at its speed
     RUB = 2
     """Disc touching the casing (0.2 of the shaft's stiffness), clearance 1.5 times the disc's radial rms.
 
-    That is a contact a tenth of the time. Sizes of 1 and more may be unstable on lightly damped machines.
+    The disc is then in contact a tenth of the time. Sizes of 1 and more may be unstable on lightly damped machines.
     """
     ADDED_MASS = 3  # even deposit on the disc (0.07 of its mass)
     GAIN_DRIFT = 4
@@ -89,8 +89,8 @@ class Draw:
     spread: float = 0.3  # the others vary uniformly by up to this relative amount
     faults: dict[str, float] = field(default_factory=dict)  # fixed relative changes on top
     layout: Layout | None = None  # None draws one of them at random for each window
-    # All windows share the condition drawn for number 0; only the realisation of force and noise differs. The number 0
-    # itself has another realisation than without.
+    # All windows share the condition drawn for number 0; only the realisation of force and noise differs. Number 0
+    # itself has another realisation than with `fixed_condition` false.
     fixed_condition: bool = False
     excitation: Excitation = Excitation.SECOND_ORDER  # another one leaves everything else of the condition as it is
     anomaly: Anomaly = Anomaly.NONE  # the same holds for this
@@ -157,7 +157,7 @@ def draw_condition(draw: Draw, number: int) -> Scenario:
 
 
 def _generator(draw: Draw, number: int, *topic: int) -> np.random.Generator:
-    """Random numbers of one window; a topic has numbers of its own, so that a new one leaves the others alone."""
+    """Random numbers of one window; a topic has numbers of its own, so that a new topic does not change the others."""
     return np.random.default_rng([draw.seed, draw.purpose, draw.stream, number, *topic])
 
 
@@ -177,7 +177,7 @@ def _sources(layout: Layout, cutoff_hz: float, machine: Machine, rng: np.random.
 
 
 def _coloured(sources: tuple[NamedSource, ...], draw: Draw, rng: np.random.Generator) -> tuple[NamedSource, ...]:
-    """Give the sources the colour that is asked for."""
+    """Give the sources the colour of the draw's excitation."""
     match draw.excitation:
         case Excitation.FIRST_ORDER:
             colours: list[dict[str, float]] = [{"order": 1}] * len(sources)
@@ -216,7 +216,7 @@ def _anomaly(
     duration_s: float,
     rng: np.random.Generator,
 ) -> tuple[Rub | None, list[Event]]:
-    """What a scenario needs for the anomaly that is asked for."""
+    """Rub settings and events of a scenario with the draw's anomaly."""
     size = _SIZES[draw.anomaly] if draw.anomaly_size is None else draw.anomaly_size
     match draw.anomaly:
         case Anomaly.NONE:

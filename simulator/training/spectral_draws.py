@@ -1,15 +1,14 @@
 """Training windows for the amortised networks, drawn as spectra: no time series is made.
 
 A window's averaged cross-spectrum at one frequency is a sum of outer products of nearly independent complex Gaussian
-Fourier coefficients. Its distribution therefore follows from the expected spectrum alone: complex Wishart, as many
+Fourier coefficients. Its distribution therefore follows from the expected spectrum alone: complex Wishart, with as many
 degrees of freedom as untapered segments fit into the window. The Hann taper of the real segments mixes three
 neighbouring frequencies, (1, 4, 1)/6 in power. The theoretical spectrum is mixed like this, and so are the white
 Wishart matrices that scatter around it; so expectation, scatter at one frequency and correlation between neighbouring
-frequencies come out as in `models.diagnosis.window.moments`. A thousand times faster than simulating, which is what
-lets every training step see windows never seen before.
+frequencies come out as in `models.diagnosis.window.moments`. This is a thousand times faster than simulating in time,
+so that every training step can use new windows.
 
-The real thing remains the judge: calibration and evaluation use windows simulated in time
-(`simulator.training.draws`).
+Calibration and evaluation still use windows simulated in time (`simulator.training.draws`).
 
 References
 ----------
@@ -42,7 +41,7 @@ _Complex = TypeVar("_Complex", npt.NDArray[np.complex64], npt.NDArray[np.complex
 # Every parameter is drawn log-uniformly from -42 % to +73 %: wide, continuous, and without a peak at healthy, which
 # would teach the network to answer "healthy" to everything small.
 LOG_RATIO = 0.55
-_CHANGED_BEFORE = 0.25  # how often a parameter of a centre is not nominal
+_CHANGED_BEFORE = 0.25  # probability that a parameter of a centre is not nominal
 _PER_ROTOR = 3  # windows that share a rotor and a speed; excitation, noise, unbalance and realisation are their own
 _HANN = (np.float32(1 / 6), np.float32(4 / 6), np.float32(1 / 6))
 
@@ -52,22 +51,22 @@ class DrawnConditions:
     """A batch of random machines in random conditions."""
 
     log_ratio: FloatArray  # (n_windows, 6), logarithm of each of `PARAMETERS` over nominal
-    centre: FloatArray  # (n_windows, 6), the same of the machine through which spectra are taken back
+    centre: FloatArray  # (n_windows, 6), the same of the machine by which spectra are turned into those of forces
     speed_rad_s: FloatArray  # (n_windows,)
     # (n_windows, n_bins, n, n): expected cross-spectra of the segments, as `WindowStatistics.spectrum` estimates them,
     # SI²/Hz
     spectrum: ComplexArray
     synchronous: ComplexArray  # (n_windows, n), rotation-synchronous vectors as of `WindowStatistics.synchronous`, SI
-    # (n_windows, n, n): factor of the covariance that the stochastic part gives the estimate of `synchronous`
+    # (n_windows, n, n): Cholesky factor of the covariance that the stochastic part gives the estimate of `synchronous`
     synchronous_factor: ComplexArray
 
 
 class SpectralDraws:
     """Draws windows of one machine in random conditions and with random parameters.
 
-    With `near`, parameters are drawn around a centre as the first reading leaves them, each centre mostly nominal. The
-    excitation is drawn more broadly than the diagnosis assumes: mostly one second-order low-pass for all sources, as in
-    the simulator, but also other slopes and a cutoff per source, and sensor noise that differs between channels.
+    With `near`, parameters are drawn as near a centre as the first reading comes; most parameters of a centre are
+    nominal. The excitation is drawn more broadly than the diagnosis assumes: mostly one second-order low-pass for all
+    sources, as in the simulator, but also other slopes and a cutoff per source, and noise that differs between sensors.
     """
 
     def __init__(self, machine: Machine, near: bool = False) -> None:
@@ -84,7 +83,7 @@ class SpectralDraws:
         self._averages = (self._duration_s + machine.window.segment_s / 2) * self._spacing_hz
 
     def draw(self, rng: np.random.Generator, count: int) -> DrawnConditions:
-        """Draw machines and conditions: what is expected of their windows."""
+        """Draw machines and conditions, with the expected statistics of their windows."""
         groups = [self._rotor(rng, min(_PER_ROTOR, count - first)) for first in range(0, count, _PER_ROTOR)]
         parts = (np.concatenate(part) for part in zip(*groups, strict=True))
         return DrawnConditions(*parts)
@@ -94,10 +93,10 @@ class SpectralDraws:
     ) -> Iterator[npt.NDArray[np.complex64]]:
         """Realisations of the averaged cross-spectra, each of the shape of `expected`, (n_windows, n_bins, n, n).
 
-        They may be those of any linear combinations of the measured states; speeds have shape (n_windows,).
+        `expected` may be of any linear combinations of the measured states; speeds have shape (n_windows,).
         """
         n_windows, n_bins, n, _ = expected.shape
-        # What the regression on the shaft angle takes out of the bins around the rotation: one coefficient's worth.
+        # The regression on the shaft angle takes one coefficient in all out of the bins around the rotation.
         turns = speed_rad_s[:, None] / (2 * np.pi)
         removed = np.clip(1 - np.abs(self._grid_hz - turns) / self._spacing_hz, 0, 1)
         freedom = (self._averages - removed)[:, :, None] - np.arange(n)
@@ -235,7 +234,7 @@ class FeatureDraws:
     # Principal directions, see `models.diagnosis.networks.features`.
     mean: Float32Array
     directions: Float32Array
-    near: bool = False  # for the networks that read again: parameters over those of the centre
+    near: bool = False  # for the networks of the second reading: parameters relative to those of the centre
 
     @classmethod
     def for_machine(cls, machine: Machine, seed: int, conditions: int, near: bool = False) -> "FeatureDraws":
@@ -299,7 +298,7 @@ class FeatureDraws:
 
 
 def _through(machine: Machine, centre: FloatArray, near: bool) -> Iterator[tuple[slice, ForceFeatures]]:
-    """Windows of one centre after the other, and the features of the machine there."""
+    """Slices of windows with the same centre, and the features of the machine at that centre."""
     starts = [0, *(np.flatnonzero(np.any(np.diff(centre, axis=0) != 0, axis=1)) + 1), len(centre)]
     for first, end in pairwise(starts):
         yield slice(first, end), ForceFeatures(around(machine, centre[first]), near=near)
