@@ -1,4 +1,4 @@
-"""The gate: every block is accepted or refused here, in one place, with a reason. Trouble is a value, not an exception.
+"""The gate: every block is accepted or refused here, in one place, with a reason. Refusal is a value, not an exception.
 
 ::
 

@@ -18,12 +18,12 @@ sample is a product of matrix exponentials, with the stiffness at the middle of 
 a smooth, periodic function of the angle at the start of the sample, so a few Fourier coefficients give it at any angle.
 The process noise is that of the uncracked shaft: within one sample the crack hardly acts on that sample's noise.
 
-**Rub.** Where the disc's radius r exceeds the clearance c, the casing pushes back with k(r - c), and sliding friction
-μk(r - c) acts against the sense of rotation; the surface speed is taken to be larger than that of any whirl. Between
-contacts the exact discretisation holds. During a contact the force is sampled at eight parts of the sample, and the
-trapezoidal rule for its convolution with the rotor's exact impulse response gives displacement and velocity. The
-impulse response of a displacement is zero at lag zero, so this is explicit, of second order, and as stable as the rotor
-itself for contacts up to a few times stiffer than the shaft.
+**Rub.** Where the disc's radial displacement r exceeds the clearance c, the casing pushes back with k(r - c), and
+sliding friction μk(r - c) acts against the sense of rotation; the surface speed is taken to be larger than that of any
+whirl. Between contacts the exact discretisation holds. During a contact the force is sampled at eight parts of the
+sample, and the trapezoidal rule for its convolution with the rotor's exact impulse response gives displacement and
+velocity. The impulse response of a displacement is zero at lag zero, so this is explicit, of second order, and as
+stable as the rotor itself for contacts up to a few times stiffer than the shaft.
 """
 
 from dataclasses import dataclass

@@ -215,7 +215,7 @@ def _load(
 
 
 def _stream(scenario: Scenario, machine: Machine, block_s: float, start_ns: int | None, run: int) -> "BlockStream":
-    """Blocks of the scenario; without a start time, "now" is when the first one is asked for."""
+    """Blocks of the scenario; without a start time, they start at the moment when the first one is asked for."""
     from simulator.stream import blocks  # noqa: PLC0415  # imports scipy
 
     yield from blocks(scenario, machine, block_s, time.time_ns() if start_ns is None else start_ns, run)

@@ -194,8 +194,7 @@ def _sections(sensor: Sensor, rate_hz: float, late_s: float) -> FloatArray | Non
     """Second-order sections of a sensor's high-pass and delay; None without either.
 
     The part of a delay below a sample is a Thiran all-pass of first order (Laakso et al., IEEE Signal Processing
-    Magazine 13(1), 1996): its delay is right at low frequencies, within 1 % up to a
-    twentieth of the sampling rate.
+    Magazine 13(1), 1996): its delay is right at low frequencies, within 1 % up to a twentieth of the sampling rate.
     """
     found = []
     if sensor.high_pass_hz is not None:

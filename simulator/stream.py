@@ -131,7 +131,7 @@ def _cut(scenario: Scenario, machine: Machine, n_block: int, start_ns: int, run:
 
 
 def _spans(machine: MachineFile, n_samples: int, n_block: int) -> Iterator[tuple[int, int]]:
-    """First sample of each block and the one after its last; with a schedule, of snapshots alone."""
+    """First sample of each block and the one after its last; with a schedule, only blocks within snapshots."""
     schedule, rate_hz = machine.schedule, machine.rate_hz
     period = n_samples if schedule is None else round(schedule.every_s * rate_hz)
     length = n_samples if schedule is None else round(schedule.on_s * rate_hz)
@@ -168,7 +168,7 @@ class _Simulation:
         self._rest = np.empty((0, len(machine.sensors)), dtype=machine.dtype)
 
     def skip(self, first: int) -> None:
-        """Go on to a sample; the machine moves meanwhile."""
+        """Discard the samples before `first`; the machine goes on moving in them."""
         while self._taken < first:
             self.take(min(_PIECE, first - self._taken))
 

@@ -22,17 +22,17 @@ from models.signals.block import FloatArray
 _LAGS = (0, 2, 4, 8, 16, 64, 128)
 """Samples back from which the next is predicted: the longest lags separate running speed from a line beside it."""
 _FAR_OUT = (0.02, 0.15)
-"""Fractions of samples that count as far out: the first shows a light contact best, the second one in every turn."""
+"""Fractions of samples that count as far out: the first shows a light contact best, the second one of every turn."""
 _BEFORE = 2
 """The second test counts the shaft as far out only if it was so this many samples earlier (one of the lags) as well. A
 stiff contact is over by then and the shaft returns later than predicted: the first test, without this, shows it."""
 _OFF = 8.0
-"""Mean absolute remainders from which on a sample is a spike, which is far out only if the shaft was so before as well.
-No sample of a Gaussian vibration is that far off its prediction."""
+"""A sample whose remainder exceeds this many mean absolute ones is a spike: it counts as far out only if the shaft was
+so before as well. No sample of a Gaussian vibration is that far off its prediction."""
 _LEAST = 1000
 """Fewest samples: of fewer, hardly any are far out."""
 _FITTED = 4
-"""The predictor is fitted to one in so many samples, which is enough."""
+"""The predictor is fitted to one sample in this many, which is enough."""
 _STEPS = 20.0
 """Least rms in converter steps. With fewer, the rounding error correlates with the shaft position: on the rotor kit
 *heavy*, steps of rms/12 to rms/7 gave 4.3 standard errors in an average hop, steps half that size none."""

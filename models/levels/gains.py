@@ -22,7 +22,7 @@ _COUNTS = 0.01
 """Fraction of a channel's rms below which a third octave is ignored: it is mostly sensor noise."""
 _FEWEST_PLACES, _FEWEST_THIRDS = 3, 4
 _LEAST = 0.08
-"""Least natural logarithm of a gain that is reported; sensors differ by smaller ones."""
+"""Least change of a gain that is reported, as a natural logarithm; sensors differ by smaller ones anyway."""
 _SCATTER = 0.005
 _FITS, _EXPLAINED = 4.0, 0.25
 """Mean square of the contrasts that a gain may leave, in variances of the healthy windows, and relative to that without

@@ -37,13 +37,13 @@ from models.signals.channels import Channel, Quantity, unit_in_text
 from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth, LevelLimits
 
 _ERRORS_OF_CONTACT = 5.0
-"""Standard errors of a contact, which is tested on one side and Gaussian in theory: chance seldom exceeds five."""
+"""Standard errors from which on a contact is reported: one-sided and Gaussian in theory, chance seldom makes five."""
 _STILL = 0.3
 """Fraction of the effect in several windows that the newest one must show; otherwise the contact is over."""
 _SPREAD = 4.0
 """Range of the windows of a healthy machine, in standard deviations."""
 _ERRORS_OF_DOUBT = 4.0
-"""Standard errors of a kurtosis that casts doubt on a parameter already named, instead of `ERRORS`."""
+"""Standard errors from which on a kurtosis casts doubt on a parameter that is named; on its own it takes `ERRORS`."""
 _TURNED_OUT = "1x vector"
 _MOST_KEPT = 16  # sets of limits kept per channel: for its zones, operating states, lengths of a window that fills
 _DEADBAND = 0.9
@@ -70,10 +70,10 @@ class _Nearest:
 
 
 class Foreign(NamedTuple):
-    """What the levels of a window show that no change of a parameter makes."""
+    """What the levels of a window show that no change of a parameter can cause."""
 
     text: str = ""  # empty if there is nothing
-    hides: bool = False  # whether readings of parameters cannot be believed beside it
+    hides: bool = False  # whether no parameter read in the same window can be believed
     direction: str = ""  # of the sensors of a place that all have a wrong gain
     unlike: float = 0.0  # what that gain leaves of the change of 1x, see `left_of_1x`
 
@@ -137,7 +137,7 @@ class LevelJudge:
         named: bool,
         faulty: Sequence[int] = (),
     ) -> Foreign:
-        """Find what the levels of a window show that no change of a parameter makes.
+        """Find what the levels of a window show that no change of a parameter can cause.
 
         A shaft that is pushed back where it is far out, a new line, a wrong gain of all sensors of a place, a 2x that
         has grown, or a random part whose kurtosis departs from that of the healthy machine.
@@ -198,7 +198,7 @@ class LevelJudge:
         )
 
     def _turned_up(self, levels: WindowLevels, state: OperatingState) -> tuple[FloatArray, FloatArray]:
-        """Logarithm of each channel's 1x over that of the healthy machine, and its error; nan where it is not known."""
+        """Logarithm of each channel's 1x over that of the healthy machine, and its error; NaN where it is not known."""
         healthy = [state.levels.get(one.name, {}).get("x1") for one in self._channels]
         mean, low, high, error = np.array(
             [(np.nan,) * 4 if one is None else (one.mean, one.low, one.high, one.error) for one in healthy]
@@ -217,7 +217,7 @@ class LevelJudge:
             if (healthy := state.contact.get(self._channels[column].name)) is None:
                 continue
             now, lasting = (departure(hops[:, at], healthy, _ERRORS_OF_CONTACT) for hops in (window, several))
-            # If `several` is no longer than the window, it shows nothing more, and may be one impact.
+            # With no more hops than the window, `several` adds nothing to it, and may rest on one impact.
             if len(several) > len(window) and window[:, at].mean() - healthy.mean > _STILL * lasting:
                 now = max(now, lasting)
             looked.append((now, healthy.mean, pair))
@@ -332,12 +332,12 @@ class LevelJudge:
         return name, measure, (first, second, third)
 
     def _alike(self, levels: WindowLevels, reference: LevelReference) -> tuple[int, bool, int]:
-        """Key of the relative limits that a window shares with others, which are made here if there are none yet."""
+        """Key of the relative limits of a window, which are computed if no earlier window had the same."""
         if reference is not self._reference:
             self._reference, self._relatives = reference, {}
             self._limits.clear()
         state, seen = reference.at(levels.speed_rad_s)
-        alike = (id(state), seen, levels.hops)  # of the reference that is kept here
+        alike = (id(state), seen, levels.hops)  # unique while the reference is kept
         if alike not in self._relatives:
             self._relatives[alike] = relative_limits(levels, reference, self._channels, self._settings)
         return alike
@@ -446,7 +446,7 @@ _NO_GROWTH = {"mean", "crest", "kurtosis"}
 
 
 def growth_seen(levels: Sequence[ChannelLevels]) -> LevelGrowth:
-    """Growth that every channel of a window would need to raise an alert; the one that needs most decides."""
+    """Least growth with which every channel of a window would raise an alert; the one that needs most decides."""
     nearest = [(one, _nearest(one)) for one in levels]
     unlimited = [one.channel for one, found in nearest if found is None]
     if unlimited:

@@ -83,9 +83,9 @@ def learn_hops(windows: Sequence[FloatArray]) -> HopReference | None:
 
 GAUSSIAN = 3.0
 _STEADIER = 0.3
-"""A band holds a line if its power scatters by less than this part of what noise does; noise does so once in 100."""
+"""A band holds a line if its power scatters by less than this fraction of the scatter of noise; 1 % of noise does."""
 _STEPS = 2
-"""Largest differences between hops that are ignored: a line that begins within a hop differs there from both sides."""
+"""Number of largest differences between hops to ignore: the hop in which a line begins differs from both neighbours."""
 
 
 def fallen_by_lines(
@@ -155,7 +155,7 @@ def without_lines(healthy: HopReference) -> HopReference:
 
 
 def departure(hops: FloatArray, reference: HopReference, n_errors: float) -> float:
-    """Difference of the newest half of a window, or all of it, from the healthy mean; 0 within `n_errors`.
+    """Difference of a window's newest half, or all of it, from the healthy mean; 0 within `n_errors` standard errors.
 
     It must persist without the hop that departs most: a hop in which the level steps, or the machine stops, mixes two
     vibrations and has a large kurtosis of its own, and a single impact is no state of a machine.

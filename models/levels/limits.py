@@ -88,7 +88,7 @@ def relative_limits(
                 overall = state.levels[channel.name].get("overall")
                 if name in {"x1", "x2"} and one.mean < ERRORS * one.error and overall is not None:
                     danger = max(danger, _LEAST_DANGER * overall.mean)
-            fall = None  # nor is a machine at fault that is quieter there, as while it runs down
+            fall = None  # at another speed a quieter machine is not at fault, as while it runs down
             if seen and name in {"overall", "velocity"} and given.fall_ratio:
                 quietest = one.low * min(1 / BEYOND_RANGE, 1 - _filling(one, shorter))
                 fall = min(given.fall_ratio * one.mean, quietest, one.mean - spread)

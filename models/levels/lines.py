@@ -22,7 +22,7 @@ _NOISE, _STEADY = 2.0, 1e-3
 """If the speed varied by more than `_STEADY` (relative) between the healthy hops of a window, lines were spread over
 several bins, and become narrower at a steadier speed: a share above `_NOISE` times that of noise may have been one."""
 _MOVED = 1.35
-"""Factor by which a mode's natural frequency may differ from that by the machine file, or have changed."""
+"""Factor by which a mode's natural frequency may differ from that of the machine file, or have changed."""
 _OTHERS = 0.16
 """Share that theory allows the strongest bin of any band: a machine has modes that its file does not describe."""
 _SCATTERS, _MODE, _LIKE_A_LINE = 1.8, 0.2, 0.45

@@ -54,7 +54,7 @@ _SUMS = (
 )  # fmt: skip
 CONTACT = _SUMS.index("contact")
 """Row of `HopLevels.sums` that has the contact statistics."""
-_SQUARES = slice(7, None)  # mean squares, of which a root is shown
+_SQUARES = slice(7, None)  # mean squares, whose roots are shown
 _HIGH_HZ = 1000.0
 _HANN_BINS = 1.5
 """Bins of a Hann-tapered spectrum that carry as much information as one of an untapered spectrum."""
@@ -159,7 +159,7 @@ def _skew(first: Channel, second: Channel) -> float:
 
 @dataclass(frozen=True, slots=True)
 class HopLevels:
-    """What one hop adds to the levels of a window."""
+    """Contribution of one hop to the levels of a window."""
 
     n_samples: int
     # (11, n): mean, largest deviation from it, peak to peak, fourth moment, at the first channel of a pair the largest
@@ -259,7 +259,7 @@ def hop_levels(
 def _band_cuts(
     n_samples: int, rate_hz: float, band_hz: tuple[float, float]
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Bins at which any band begins or ends; places in these of the edges of narrow bands, and of the velocity band."""
+    """Bins at which any band begins or ends; their indices for the edges of narrow bands, and for the velocity band."""
     edges = band_edges(n_samples)
     low, high = (round(edge_hz / (rate_hz / n_samples)) for edge_hz in band_hz)
     band = np.array([min(max(low, 1), high + 1), high + 1])
@@ -295,7 +295,7 @@ def _acceleration_squares(
 class WindowLevels:
     """Levels of one window, SI units."""
 
-    values: Mapping[str, FloatArray]  # (n,) by measure; nan where a quantity has none, or the rotation is not known
+    values: Mapping[str, FloatArray]  # (n,) by measure; NaN where a quantity has none, or the rotation is not known
     # (n,), standard errors, from the scatter of the hops, of the measures in `COMPARED`; empty if not asked for.
     errors: Mapping[str, FloatArray]
     vectors: _ComplexArray | None  # (4, n), mean of q of the hops at the orders, with a phase reference
@@ -303,7 +303,7 @@ class WindowLevels:
     hops: int = 1
     bands: BandLevels | None = None
     lines: FloatArray | None = None  # (n_hops, n_bands, n), mean squares of each band's strongest bin, if looked for
-    speeds_rad_s: FloatArray | None = None  # (n_hops,), nan where it is not known
+    speeds_rad_s: FloatArray | None = None  # (n_hops,), NaN where it is not known
     # Of each hop: second and fourth moments, whole orders (all for `random_kurtosis`), mean squares in the bands.
     moments: tuple[FloatArray, FloatArray, _ComplexArray, FloatArray] | None = None
     contact: FloatArray | None = None  # (n_hops, n), see `models.levels.contact`
@@ -330,7 +330,7 @@ class WindowLevels:
 
     @property
     def unsteady(self) -> float:
-        """Range of the speed over the hops, relative to its mean; infinite if a hop has no speed or stands still."""
+        """Range of the speed over the hops, relative to its mean; infinite if it is not known or zero in a hop."""
         speeds = self.speeds_rad_s
         if not self.speed_rad_s or speeds is None or not np.all(np.abs(speeds) > STANDS_RAD_S):
             return math.inf

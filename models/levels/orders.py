@@ -34,7 +34,7 @@ def order_vectors(
     ----------
     x : ndarray, shape (n, n_samples)
     unit : ndarray, shape (n,)
-        Unit of each channel's amplitudes: the range of single precision is too small for any unit.
+        Scale of each channel, to which the amplitudes are relative: SI values may be out of range of single precision.
     spectrum : ndarray, shape (n, n_samples // 2 + 1)
         Of the tapered samples.
     amplitude : ndarray, shape (n,)
@@ -50,7 +50,7 @@ def order_vectors(
     n, n_samples = x.shape
     if angle_rad is None:
         return np.full((len(ORDERS), n), np.nan, dtype=np.complex128)
-    steps = (angle_rad[1::_NEAR] - angle_rad[:-1:_NEAR]) / (2 * np.pi)  # between neighbours, here and there
+    steps = (angle_rad[1::_NEAR] - angle_rad[:-1:_NEAR]) / (2 * np.pi)  # between neighbours, every `_NEAR` samples
     steps -= np.rint(steps)  # where the angle starts again from zero
     weights: FloatArray | _SingleArray
     if abs(np.add.reduce(steps)) * n_samples < _MANY_REVOLUTIONS * steps.size:

@@ -154,7 +154,7 @@ def shaft_angle(train: PulseTrain, at: FloatArray, *, reverse: bool = False) -> 
     """Shaft angle in [0, 2π), 0 at the (first) pulse of each turn.
 
     Before the first pulse, after the last and around an interruption the angle is carried on at the neighbouring
-    interval's speed for one interval at most; where it is unknown, it is nan. Times, shape (n,), are in the unit of the
+    interval's speed for one interval at most; where it is unknown, it is NaN. Times, shape (n,), are in the unit of the
     train's. In reverse, the shaft turns from z to y, and the angle falls.
     """
     times, counts = train.times, train.counts

@@ -36,7 +36,7 @@ class Portrait:
 
     @property
     def speed_hz(self) -> float:
-        """Mean speed, nan if unknown."""
+        """Mean speed, NaN if unknown."""
         return self.statistics.speed_rad_s / (2 * np.pi)
 
     @property

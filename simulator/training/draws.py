@@ -84,7 +84,7 @@ class Draw:
     machine: Machine
     seed: int  # of the whole training or study
     purpose: Purpose
-    stream: int = 0  # tells apart series of windows of the same purpose (equations, cells of a table)
+    stream: int = 0  # distinguishes series of windows of the same purpose (equations, cells of a table)
     kept_nominal: tuple[str, ...] = PARAMETERS  # parameters that do not vary
     spread: float = 0.3  # the others vary uniformly by up to this relative amount
     faults: dict[str, float] = field(default_factory=dict)  # fixed relative changes on top
