@@ -36,6 +36,7 @@ from models.signals.block import FloatArray
 _SINGLE = 2.326  # standard errors beyond which no single parameter explains a window (one per cent, one-sided)
 _COMMON = 2.576  # standard errors within which a common factor explains it (one per cent, two-sided)
 _MOST_LOSS = -0.95
+_NO_SPEED = "no phase reference, and no speed found in the vibration"
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,7 +335,7 @@ class BaselineDiagnostician:
                 f"compared up to {SPEED_TOLERANCE:.0%}"
             )
         if now is None:
-            raise EstimationError("no phase reference, and no speed found in the vibration")
+            raise EstimationError(_NO_SPEED)
         healthy = min(self._baseline.rotations, key=lambda one: abs(now.speed_rad_s / one.speed_rad_s - 1))
         if abs(now.speed_rad_s / healthy.speed_rad_s - 1) > SPEED_TOLERANCE:
             learned = ", ".join(f"{one.speed_rad_s * _RPM:.0f}" for one in self._baseline.rotations)
@@ -382,7 +383,7 @@ def _read(row: Row, relation: Relation | None, window: WindowStatistics, why: st
     if lacking:
         return None, f"not measured: {', '.join(lacking)}, which the baseline was learned with"
     if row.needs_speed and not np.isfinite(window.speed_rad_s):
-        return None, "no phase reference"
+        return None, _NO_SPEED
     references = tuple(name for name in relation.references if name in window.states)
     try:
         return read_row(row, relation, row_window(row, window, relation.states, references)), ""
