@@ -18,7 +18,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def alarm_entries(alarms: Iterable[Alarm], *, include_normal: bool = False) -> tuple[AlarmJson, ...]:
-    """Alarms as they are now; those where nothing is to be seen only if asked for."""
+    """Alarms as they are now; normal ones without a running on-delay only if asked for."""
     return tuple(_alarm(alarm) for alarm in alarms if include_normal or alarm.open)
 
 
@@ -83,6 +83,6 @@ def _interval(alarm: Alarm) -> tuple[float, float] | None:
 
 
 def rfc3339(time_ns: int) -> str:
-    """A time in text, UTC, microseconds."""
+    """A time in text (RFC 3339), UTC, with microseconds."""
     moment = _EPOCH + timedelta(microseconds=time_ns // 1000)
     return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")

@@ -24,7 +24,7 @@ def health(  # noqa: PLR0913  # what the worker counts
     last_worker_error: str = "",
     restart: str = "",
 ) -> Health:
-    """Convert a machine's health; silence is the state of a machine without a raised alarm, and is said of any."""
+    """Convert a machine's health; silence decides the state only if no alarm is raised, but is always stated."""
     silence = ""
     if stream.silent:
         since_ns = stream.silent_since_ns
@@ -70,7 +70,7 @@ def machine_description(identity: Identity, machine: MachineFile, state: HealthS
 def detectable_changes(
     identity: Identity, machine: MachineFile, record: MachineHealth, change: float | None
 ) -> DetectableChanges:
-    """Say what the latest window would have shown, and how much data a wished change takes."""
+    """State the smallest changes that the latest window would have shown, and how much data finding `change` takes."""
     latest = record.latest
     found = () if latest is None else latest.detectable
     reason = ""

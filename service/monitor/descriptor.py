@@ -7,10 +7,10 @@ from models.mistakes import plainly
 from models.signals.channels import ChannelDescriptor
 
 MOST_BYTES = 65_536
-"""Of an announced descriptor that is read at all; one of 64 channels takes a tenth of it."""
+"""Size of the largest announced descriptor that is read; one of 64 channels takes a tenth of it."""
 
 MOST_DIFFERENCES = 20
-"""That are stated one by one."""
+"""Differences that are stated one by one."""
 
 _LONGEST = 80
 
@@ -18,8 +18,8 @@ _LONGEST = 80
 def descriptor_mismatch(announced: bytes, machine: MachineFile) -> tuple[str, ...]:
     """Differences between an announced descriptor (JSON) and the machine file, one sentence per field.
 
-    Empty if they agree; else each names the field, the value found and the value expected, the first `MOST_DIFFERENCES`
-    of them.
+    Empty if they agree. Each sentence names the field, the value found and the value expected; differences beyond the
+    first `MOST_DIFFERENCES` are only counted.
     """
     if len(announced) > MOST_BYTES:
         return (f"descriptor has {len(announced)} bytes, expected at most {MOST_BYTES}",)

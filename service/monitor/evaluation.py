@@ -27,27 +27,27 @@ from rotorwatch.records.windows import Equation, Opinion, Parameter, SensorFault
 _INSIDE = 2.0  # standard deviations of the misfit within which nothing has to be explained
 
 Newest = tuple[SlidingWindow, SequentialTest]
-"""Where the window is the latest, and what wants its latest hops evaluated."""
+"""The sliding window whose latest window is evaluated, and the sequential test that asks for shorter stretches."""
 
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
     """What the diagnosticians say about a window."""
 
-    deciding: Diagnosis  # the likelihood's, every parameter in the order of `PARAMETERS`
-    # The same of the latest hops, by how many; without those that have no news or could not be evaluated.
+    deciding: Diagnosis  # of the diagnostician that decides, every parameter in the order of `PARAMETERS`
+    # Diagnoses of the latest hops alone, by number of hops; lengths without news or not evaluable are left out.
     short: Mapping[int, Diagnosis]
-    equations: tuple[Equation, ...]  # every equation of the table, by its network, or why not
-    opinions: tuple[Opinion, ...]  # what the others say
+    equations: tuple[Equation, ...]  # every equation of the table, with its readings or why there are none
+    opinions: tuple[Opinion, ...]  # readings of the other diagnosticians
     speed_rad_s: float | None
-    shapes: tuple[Shape, ...] = ()  # where no equation can be evaluated: whether each channel's vibration is as it was
-    gyroscopic: Literal["", "opposite"] = ""  # where it is not that of Eq. (27): sense of the moments in theory
-    alone: bool = False  # whether only later windows can say that this one is astride a change
+    shapes: tuple[Shape, ...] = ()  # where no equation can be evaluated: whether each channel's shape has changed
+    gyroscopic: Literal["", "opposite"] = ""  # sense of the gyroscopic moments where it is not that of Eq. (27)
+    alone: bool = False  # whether only later windows can show that this one straddles a change
 
     def calm(self, *, outside: bool, without: bool = False) -> HealthState:
-        """State without raised alarms: healthy only if something was read that could have said otherwise.
+        """State if no alarm is raised: healthy only if a parameter was read that could have shown a change.
 
-        Not if it was evaluated `without` some of the sensors: those that are at fault come first.
+        If the window was evaluated `without` faulty sensors, their fault takes precedence.
         """
         if outside:
             return HealthState.OUTSIDE_MODEL
@@ -62,7 +62,7 @@ class Evaluation:
 
     @property
     def read(self) -> dict[str, Any]:
-        """What a report has of it as it is."""
+        """Fields that a report takes over unchanged."""
         return {
             "speed_rad_s": self.speed_rad_s,
             "parameters": self.readings,
@@ -73,7 +73,7 @@ class Evaluation:
 
     @property
     def readings(self) -> tuple[Parameter, ...]:
-        """What the deciding diagnostician reads of the window; nothing that it cannot explain."""
+        """Readings of the deciding diagnostician: none of an unexplained window, no unbalance if 1x is foreign."""
         deciding, vector = self.deciding, self.deciding.unbalance
         if deciding.unexplained:
             return tuple(no_reading(one.name, one.by, deciding.unexplained) for one in deciding.parameters)
@@ -88,10 +88,10 @@ class Evaluation:
         return self.deciding.unexplained != "" or (self.deciding.misfit_z or 0.0) > _INSIDE
 
     def rivals(self, foreign: Foreign) -> tuple[str, ...]:
-        """Parameters one of which explains the window as well as a wrong gain of a place does.
+        """Stiffness and damping of a place, if one of them explains the window as well as a wrong gain there.
 
-        A gain changes stiffness and damping as they are read by one factor, and 1x as `left_of_1x` says. Below its
-        resonance a bearing looks like that, too, where its damping is not known well.
+        A wrong gain scales the stiffness and damping read by one factor, and 1x as `left_of_1x` says. A bearing below
+        its resonance looks the same if its damping is not known well.
         """
         names = tuple(f"{of}_b{foreign.direction}" for of in "kc")
         left = self.deciding.left_by(names) if foreign.direction else None
@@ -99,7 +99,7 @@ class Evaluation:
 
     @property
     def unlike_healthy(self) -> str:
-        """What has been seen, where no equation can be evaluated."""
+        """What differs from the healthy machine, where no equation can be evaluated."""
         return "; ".join(filter(None, (self.deciding.suspect, *self._changed)))
 
     @property
@@ -107,9 +107,9 @@ class Evaluation:
         return [shape.text for shape in self.shapes if shape.verdict == "changed"]
 
     def reason(self, *, told: bool) -> str:
-        """Why no parameter could be read, every reason once; first what has changed, where channels alone are compared.
+        """Why no parameter could be read, each reason once; shapes that have changed come first.
 
-        It is told already where the verdict says it: what has changed explains a window astride the change.
+        If the verdict has readings (`told`), an unexplained window needs no reason: it straddles the change.
         """
         if self.deciding.unexplained or self.deciding.evaluable:
             return "" if told else self.deciding.unexplained
@@ -119,11 +119,10 @@ class Evaluation:
     def named(
         self, channels: Sequence[Channel], window: WindowStatistics, foreign: str, faulty: Collection[str] = ()
     ) -> "Evaluation":
-        """The same with sentences in the names of a machine's channels.
+        """Return the evaluation with its sentences in the names of a machine's channels, and with its suspect.
 
-        What was seen that no change of a parameter makes (`foreign`, empty if nothing) is the first suspect. Channels
-        of the window that reach the end of their range explain what does not fit, too; not `faulty` ones, which it was
-        evaluated without.
+        The first suspect is what no change of a parameter makes (`foreign`, empty if nothing). Where the window fits
+        badly, channels at the end of their range come next, except `faulty` ones, which the evaluation left out.
         """
         told = foreign or self.shapes or not self._doubtful
         limited = [] if told else at_range_end([window], Naming(channels), faulty)
@@ -141,16 +140,15 @@ class Evaluation:
 class WindowEvaluator(ABC):
     """Evaluates the windows of one machine.
 
-    Unless it says otherwise, each evaluation stands for itself: only the whole window is taken, and nothing is
-    remembered of it.
+    Unless a subclass says otherwise, evaluations are independent: each takes only the whole window and leaves no state.
     """
 
     takes_short: bool = False
     """Whether stretches shorter than the window can be evaluated."""
 
     directed: bool = True
-    """Whether the directions of vectors say something: the shaft angle has not jumped since the monitor was set up, and
-    nothing has shown that the heavy spot is not where it was looked for without a word of the file."""
+    """Whether the directions of vectors mean anything: the shaft angle has not jumped since the monitor was set up, and
+    no window has contradicted an angle of the heavy spot that was assumed because the machine file gives none."""
 
     by: str
     """Name of the diagnostician that decides."""
@@ -160,7 +158,7 @@ class WindowEvaluator(ABC):
 
     @abstractmethod
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
-        """Evaluate one full window, and with `newest` its latest hops for themselves, too.
+        """Evaluate one full window and, given `newest`, also its latest hops on their own.
 
         Raises
         ------
@@ -169,22 +167,22 @@ class WindowEvaluator(ABC):
         """
 
     def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
-        """Sensors without which a window can be evaluated although these are at fault; None if it cannot be.
+        """Sensors to leave out so that a window can be evaluated despite these faults; None if it cannot be.
 
-        A fault of a channel elsewhere says nothing of the equations, but it is all there is where they are none.
+        Faults of channels outside the equations do not matter, unless the machine has no equations.
         """
         return () if not findings or (plan.states and implicated(findings).issubset(plan.others)) else None
 
     def heard(self, findings: Sequence[SensorFault]) -> None:
-        """Take note of what is wrong with the sensors: what an angle that jumped costs stays lost."""
+        """Take note of sensor faults: once the shaft angle has jumped, directions mean nothing any more."""
         self.directed &= ("theta", FaultKind.OFFSET) not in {(*one.states, one.kind) for one in findings}
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """Everything that the next evaluations depend on, as named arrays; empty if each stands for itself."""
+        """Everything that the next evaluations depend on, as named arrays; empty if they are independent."""
         return {}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called: the next evaluations are the same to the last bit.
+        """Continue from where `checkpoint` was called: the next evaluations are the same to the last bit.
 
         Raises
         ------
@@ -196,19 +194,19 @@ class WindowEvaluator(ABC):
 
 
 def left_out(finding: SensorFault) -> SensorFault:
-    """A fault of a sensor that the others are evaluated without."""
+    """The finding, with the remark that the machine is diagnosed without that sensor."""
     return finding.model_copy(update={"text": f"{finding.text}; the machine is diagnosed without it"})
 
 
 def settled(place: str, window: WindowStatistics, newest: Newest | None) -> tuple[WindowStatistics, int]:
-    """The window without the hops in which a drive went from one set point to another, and how many came after them.
+    """Leave out hops in which a drive changed its set point; return the window and the number of hops after the last.
 
-    Without a shaft angle the rotation cannot be taken out of those. `place` is what the machine is called.
+    Without a shaft angle the rotation cannot be removed from those hops. `place` is the machine's title.
 
     Raises
     ------
     EstimationError
-        If too little is left.
+        If less than `LEAST_SETTLED` of the hops is left.
     """
     passed = np.flatnonzero(~window.settled)
     if newest is None or not passed.size:
@@ -222,23 +220,23 @@ def settled(place: str, window: WindowStatistics, newest: Newest | None) -> tupl
 
 
 class LatestRotation:
-    """How strong the rotation was when it last stood out of the vibration, where there is no shaft angle."""
+    """Power of the rotation line when it last stood out of the vibration, where there is no shaft angle."""
 
     def __init__(self) -> None:
         self.power = 0.0
 
     def take(self, window: WindowStatistics) -> None:
-        """Go on with a window."""
+        """Update the power with a window."""
         if window.speed_source == "estimated":
             found = np.isfinite(window.hop_speed_rad_s)
             strength = float(np.median(window.hop_strength[found]))
-            # Found in all hops it is no chance: after balancing, or at another set point, there may be less of it.
+            # A weak line that is found in all hops is real: after balancing, or at another set point, less may be left.
             self.power = strength * _noise(window) if strength > STRONG or found.all() else self.power
 
     def lost(self, window: WindowStatistics, operation: Operation) -> str:
-        """In how many hops it was found, where that is not all of them and as much of it would stand out.
+        """In how many hops the rotation was found, if not in all although its latest power would stand out; else empty.
 
-        A hop in which the shaft came to its speed, or left it, has a line that is much weaker than the others'.
+        Hops in which the shaft reached or left its speed are not counted: their line is much weaker than the others'.
         """
         found = np.isfinite(window.hop_speed_rad_s) & window.settled
         if window.speed_source == "phase reference" or self.power <= STRONG * _noise(window) or found.all():
@@ -251,13 +249,13 @@ class LatestRotation:
 
 
 def _noise(window: WindowStatistics) -> float:
-    """How strong a window is without its lines, as a power: over all channels, whatever their units."""
+    """Power of a window without its lines: geometric mean over the channels of each spectrum's median, units mixed."""
     power = np.median(np.einsum("fii->fi", window.spectrum).real, axis=0)
     return float(np.exp(np.log(np.maximum(power, np.finfo(float).tiny)).mean()))
 
 
 def opinion_of(deciding: Diagnosis, other: Diagnosis) -> Opinion:
-    """What another diagnostician says; one that could read nothing says why, once."""
+    """Readings of another diagnostician with their agreement, or each reason why it could read nothing, once."""
     if other.evaluable:
         return Opinion(by=other.by, parameters=other.parameters, agreement=agreements(deciding, other))
     reasons = dict.fromkeys(reading.reason for reading in other.parameters)

@@ -1,8 +1,8 @@
-"""What evaluates the windows of a machine, by what is known of it.
+"""The evaluator of a machine's windows, chosen by what is known of the machine.
 
-A machine whose parameters are known, given or identified, is compared with theory (`KnownMachineEvaluator`). One of
-which only healthy recordings are known is compared with its baseline (`BaselineEvaluator`), and where its sensors allow
-no equation, each channel with its own healthy form.
+A machine whose parameters are known, given or identified, is compared with theory (`KnownMachineEvaluator`). One with
+healthy recordings only is compared with its baseline (`BaselineEvaluator`) or, where its sensors allow no equation,
+channel by channel with its healthy shape.
 """
 
 from collections.abc import Mapping
@@ -32,14 +32,14 @@ from service.monitor.known_machine import KnownMachineEvaluator
 
 _SHAPE, _ROTATION = "shape", "rotation"
 # Standard deviations of the misfit: up to which a window holds no change and a shorter stretch is explained, and by how
-# many one must leave less than its share of what the window does, to be of another machine than the rest.
+# many a stretch's misfit must be below its share of the window's to be of another machine than the rest.
 _INSIDE, _LESS = 2.0, 3.0
 _ASTRIDE = "the machine changed within the window: its latest data fit for themselves, all of it together does not"
 _NO_EQUATION = "no equation can be evaluated on this machine; see the result for each channel"
 
 
 def evaluator_for(installed: Installed) -> WindowEvaluator:
-    """The evaluator that what is known of the machine allows."""
+    """The evaluator that fits what is known of the machine."""
     known, commissioned = installed.known, installed.commissioned
     if known is not None:
         return KnownMachineEvaluator(known, installed.bundle, commissioned)
@@ -49,7 +49,7 @@ def evaluator_for(installed: Installed) -> WindowEvaluator:
 
 
 class NoEvaluator(WindowEvaluator):
-    """Of a machine of which nothing is known: its levels are watched, and nothing is diagnosed."""
+    """For a machine of which nothing is known: its levels are watched, and nothing is diagnosed."""
 
     by = "nobody"
     needs_lags = False
@@ -74,7 +74,7 @@ class BaselineEvaluator(WindowEvaluator):
         self._conditions = commissioned.conditions
         self._naming = Naming(machine.sensors)
         self._diagnosed = states_of(machine) != ()
-        self._lines = commissioned.lines != ()  # without any, relations were learned with all that the windows held
+        self._lines = commissioned.lines != ()  # without any, relations were learned with all lines left in
         self._shape = commissioned.shape
         self._length_s, self._on_delay_ns = machine.window_data_s, round(machine.alarms.on_delay_s * 1e9)
         self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate
@@ -107,11 +107,11 @@ class BaselineEvaluator(WindowEvaluator):
         return Evaluation(deciding, short, _row_readings(deciding, window), (), speed, shapes, alone=not short)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """How strong the rotation was."""
+        """Power of the rotation line, see `LatestRotation`."""
         return {_ROTATION: np.array(self._rotation.power)}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called, see `WindowEvaluator`."""
+        """Continue from where `checkpoint` was called, see `WindowEvaluator`."""
         self._rotation.power = float(checked(arrays, _ROTATION, np.float64, ()))
 
     def _read(self, window: WindowStatistics) -> Diagnosis:
@@ -121,12 +121,12 @@ class BaselineEvaluator(WindowEvaluator):
     def _newest(
         self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int
     ) -> tuple[Diagnosis, dict[int, Diagnosis]]:
-        """What the window and its latest hops, at most so many, say, by how many, where it may be astride a change.
+        """Diagnoses of the window and, if it may straddle a change, of its newest hops by their number, up to `latest`.
 
-        A short stretch has little power: of a machine that no parameter describes it leaves as much less as it is
-        shorter, and is then no witness for a change of parameters. So it is heard only where it is well inside and
-        leaves clearly less than its share of what the window does, some of which has been explained before. The window
-        is of two machines then.
+        A short stretch has little power: on a machine that no parameter describes, its misfit is smaller just because
+        it is shorter, which is no evidence of changed parameters. So where the window is outside the model, a stretch
+        counts only if some of the window was explained before, and if it is well inside with a misfit clearly below its
+        share of the window's. The window then straddles a change.
         """
         found: dict[int, Diagnosis] = {}
         whole, misfit_z = test.settings.window_hops, deciding.misfit_z or 0.0
@@ -149,11 +149,11 @@ class BaselineEvaluator(WindowEvaluator):
         return deciding, found
 
     def _witnessed(self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int) -> Diagnosis:
-        """What the window says, with the misfit of its latest hops if an unbalance is named and theirs is larger.
+        """The window's diagnosis, with the misfit of its latest hops if an unbalance is named and theirs is larger.
 
-        The unbalance is what stands out first where a foundation goes soft: while the window is mostly of before the
-        change it fits, and its latest hops alone do not, or only with other parameters changed than are named. They are
-        asked from when an alarm is due: of a bearing, too, an unbalance may be the first guess.
+        Where a foundation goes soft, an unbalance stands out first: while most of the window is from before the change,
+        it fits, but its latest hops alone do not, or only if parameters that are not named have changed. They are
+        evaluated once an alarm is due, as an unbalance may be the first guess for a bearing, too.
         """
         names, hops = test.astride, min(test.settings.short_hops, default=latest + 1)
         due_ns = sliding.hops[-1].end_ns - self._on_delay_ns
@@ -167,7 +167,7 @@ class BaselineEvaluator(WindowEvaluator):
         return deciding
 
     def _baseline_for(self, window: WindowStatistics) -> BaselineDiagnostician:
-        """The baseline of these conditions."""
+        """The baseline that was learned in the window's conditions."""
         reasons = []
         for conditions, baseline in self._baselines:
             outside = conditions.outside(window, self._naming)

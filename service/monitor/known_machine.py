@@ -31,27 +31,27 @@ from service.monitor.evaluation import Evaluation, LatestRotation, Newest, Windo
 
 _LIKELIHOOD, _EXPLAINED, _SENSE, _DIRECTED, _ROTATION = "likelihood", "explained_ns", "sense", "directed", "rotation"
 _STEADY = 0.15
-"""Range of speed within a window, relative, up to which the rotation taken out hop by hop leaves nothing behind: on the
+"""Relative range of speed within a window up to which removing the rotation hop by hop leaves nothing behind: on the
 rotor kit readings stay unbiased at ramps of 5, 10 and 15 % (16 seeds each,
 ``tests/diagnosis/window/test_window.py``)."""
 
 _INSIDE, _BETTER, _SURELY_OUTSIDE = 2.0, 3.0, 8.0
-"""Standard deviations of the misfit with which a window is explained beyond doubt, by which one explanation is better
-than another, and of what is outside the model by something else than its spectra."""
+"""Standard deviations of the misfit: up to which a window is explained beyond doubt, by which one explanation must be
+better than another, and assigned at least to a window that is outside the model for other reasons than its spectra."""
 _HEAVIEST, _SURELY = 20.0, 3.0
-"""Times the unbalance of the machine file, in standard errors: a lost blade makes ten of it, millimetres in place of
-micrometres a thousand."""
+"""Largest credible multiple of the machine file's unbalance, and by how many standard errors it must be exceeded: a
+lost blade makes ten times the unbalance, millimetres in place of micrometres a thousand times."""
 _SILENT = {FaultKind.MISSING, FaultKind.STUCK}
-"""Faults of a sensor that shows nothing: all others can be believed, and it is sure which one it is."""
+"""Faults of a sensor without a signal: it is certain which sensor it is, and all others can be believed."""
 _OUTSIDE = 4.0
-"""Standard deviations of the misfit from which the short stretches of a window are tested for themselves."""
+"""Standard deviations of the misfit from which the short stretches of a window are tested on their own."""
 
 
 class KnownMachineEvaluator(WindowEvaluator):
     """Compares the windows of one machine with theory.
 
-    Without a bundle the equations are reported as not evaluable. A commissioning says how uncertain the parameters are
-    that were identified, part of every reading; and the healthy windows' misfit, which later ones are compared with.
+    Without a bundle the equations are reported as not evaluable. A commissioning gives the uncertainty of identified
+    parameters, which is part of every reading, and the healthy windows' misfit, with which that of others is compared.
     """
 
     by = "likelihood"
@@ -61,7 +61,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         identified = None if commissioned is None else commissioned.identified
         self._shared = None if identified is None else identified.matrix()
         self._commissioned = commissioned is not None
-        # Of a machine that was commissioned, too, where that has found how large its unbalance is.
+        # A commissioned machine's unbalance has a known size only if the commissioning identified it.
         self._sized = commissioned is None or (identified is not None and "e" in identified.names)
         self._healthy_misfit = None if commissioned is None else commissioned.misfit
         self.needs_lags = bundle is not None  # only the networks look at lags
@@ -69,10 +69,10 @@ class KnownMachineEvaluator(WindowEvaluator):
         self._given, self._bundle = machine, bundle
         # The sense of the gyroscopic moments is open until a window has been explained.
         self._open, self._opposite = commissioned is None, False
-        # Where the file does not say where the heavy spot is, it is looked for in the first window that shows it.
+        # If the file gives no angle of the heavy spot, the assumed one is checked in the first window that shows it.
         given = "unbalance_phase_rad" in machine.operation.model_fields_set
         self._sought = commissioned is None and not given
-        self._tried_ns, self._tried_in_vain = 0, False  # end of the window that the other one was tried on
+        self._tried_ns, self._tried_in_vain = 0, False  # end of the window on which the other sense was tried
         self._rotation = LatestRotation()
         self._compare_with(machine)
 
@@ -86,9 +86,9 @@ class KnownMachineEvaluator(WindowEvaluator):
         self._others = tuple(others)
 
     def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
-        """Those that show nothing, too, as long as most are left: the theory holds for any of them.
+        """Also leave out sensors without a signal while most are left, as the theory holds for any of them.
 
-        Where the speed is found in the vibration, how much of it there is depends on which sensors are left.
+        Not if the speed is found in the vibration: the strength of its line depends on which sensors are left.
         """
         none = super().spared(plan, findings)
         own = [one for one in findings if not set(one.states).issubset(plan.others)]
@@ -131,9 +131,9 @@ class KnownMachineEvaluator(WindowEvaluator):
         return Evaluation(deciding, short, equations, tuple(opinions), speed, gyroscopic=sense)
 
     def _elsewhere(self, deciding: Diagnosis) -> bool:
-        """Whether the first window that shows the heavy spot shows it where it was only supposed not to be.
+        """Whether the first window with a readable 1x vector contradicts the assumed angle of the heavy spot.
 
-        Where the file does not say where it is, no turn of it can be told then: the unbalance is judged by its size.
+        Only if the file gives no angle. A turn cannot be read then, and the unbalance is judged by its size.
         """
         vector = deciding.unbalance
         if not self._sought or self._open or deciding.unexplained or vector is None or vector.foreign:
@@ -150,16 +150,16 @@ class KnownMachineEvaluator(WindowEvaluator):
             return Diagnosis(self.by, nothing, covariance=np.zeros((0, 0)), unexplained=reason)
 
     def _by_sense(self, window: WindowStatistics, given: Diagnosis) -> Diagnosis:
-        """The diagnosis with gyroscopic moments of that sense which explains the window, if either does.
+        """The diagnosis with the sense of the gyroscopic moments that explains the window; `given` if neither does.
 
-        The other sense is a search from nothing: it is tried once in a window's length.
+        The other sense takes a search from scratch, so it is tried once in a window's length.
         """
         misfit_z = _misfit_z(given)
         tried = window.start_ns < self._tried_ns <= window.end_ns and (self._tried_in_vain or np.isinf(misfit_z))
         if misfit_z <= _INSIDE or tried:
             self._open = misfit_z > _INSIDE
             return given
-        # What neither sense explains, a disturbance for instance, says nothing of it: the next that is read does.
+        # A window that neither sense explains, such as a disturbance, decides nothing: try the next that is read.
         self._tried_ns, self._tried_in_vain = window.end_ns, bool(np.isfinite(misfit_z))
         before = self._machine, self._likelihood, self._others
         self._compare_with(in_sense(self._given, "opposite"))
@@ -175,7 +175,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         return other if self._opposite else given
 
     def _within(self, decided: Diagnosis) -> Diagnosis:
-        """The diagnosis, unexplained where it takes an unbalance that means wrong units, or a wrong e_m."""
+        """The diagnosis, marked as unexplained if its unbalance is so large that units or e_m must be wrong."""
         vector, e = decided.unbalance, next((one for one in decided.evaluable if one.name == "e"), None)
         if decided.unexplained:
             return decided
@@ -192,24 +192,24 @@ class KnownMachineEvaluator(WindowEvaluator):
         return replace(decided, suspect="", unexplained=why)
 
     def _judged(self, window: WindowStatistics, decided: Diagnosis) -> Diagnosis:
-        """The diagnosis, unless it does not fit where the speed changed faster than the rotation can be taken out.
+        """Return the diagnosis, unless it fits badly and the speed changed too fast for the rotation to be removed.
 
-        A shaft that is switched off, or changes its speed at once, leaves a part of its rotation in a hop or two. What
-        fits all the same does so for the machine's own sake.
+        A shaft that is switched off, or changes its speed at once, leaves part of its rotation in a hop or two. A
+        diagnosis that fits all the same is accepted.
 
         Raises
         ------
         EstimationError
-            If it does not fit.
+            If it fits badly, and the speed changed too fast or the rotation was not found in every hop.
         """
         if not decided.unexplained and (decided.misfit_z or 0.0) <= _INSIDE:
             return decided
         if lost := self._rotation.lost(window, self._machine.operation):
             raise EstimationError(f"{self._machine.title}: {lost}")
-        adjoin = np.isfinite(window.hop_jump_rad[1:])  # and the shaft angle is measured
+        adjoin = np.isfinite(window.hop_jump_rad[1:])  # hops adjoin, and the shaft angle is measured
         steps = np.abs(np.diff(window.hop_speed_rad_s))[adjoin] / self._machine.operation.speed_rad_s
         fastest = float(np.max(steps, initial=0.0))
-        limit = max(STEADY, round(_STEADY / max(1, self._machine.window.hops - 1), 3))  # of a ramp as long as a window
+        limit = max(STEADY, round(_STEADY / max(1, self._machine.window.hops - 1), 3))  # per hop of a window-long ramp
         if fastest <= limit:
             return decided
         told, most = beyond(100 * fastest, 100 * limit)
@@ -221,18 +221,18 @@ class KnownMachineEvaluator(WindowEvaluator):
     def _newest(
         self, window: WindowStatistics, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int
     ) -> dict[int, Diagnosis]:
-        """What the latest hops, at most so many, say for themselves, by how many."""
+        """Diagnose the newest hops alone, at each length (hops, up to `latest`) that the sequential test asks for."""
         wanted, evaluated = tuple(hops for hops in test.wanted() if hops <= latest), {}
-        # Where the window is outside the model it may be astride a change: then its newest hops are inside.
+        # A window outside the model may straddle a change; its newest hops are then inside.
         closely = deciding.misfit_z is not None and deciding.misfit_z > _OUTSIDE
         if deciding.unexplained:
-            # One machine or two in this window? If some of its data were explained, the shortest stretch says.
+            # If some of the window's data were explained, it may straddle a change: the shortest stretch shows that.
             straddles = self._explained_ns is not None and window.start_ns < self._explained_ns
             wanted = tuple(sorted(wanted)[: int(straddles)])
         elif test.unchanged and not closely and not self._likelihood.has_news(sliding, window, wanted):
             return {}
         for hops in wanted:
-            with suppress(EstimationError):  # too little data for itself; the window has said what there is to say
+            with suppress(EstimationError):  # too little data on its own: the window's diagnosis has to do
                 if (statistics := sliding.statistics(hops, lost=window.lost)) is not None:
                     statistics = replace(statistics, directed=self.directed, lines=window.lines)
                     decided = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
@@ -240,7 +240,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         return evaluated
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """Where the likelihood's maximum is followed from, and what is known; networks remember nothing."""
+        """Starting points of the likelihood search, and what was found out so far; networks have no state."""
         explained = np.array([] if self._explained_ns is None else [self._explained_ns], dtype=np.int64)
         sense = [self._open, self._opposite, self._tried_in_vain, self._tried_ns, self._sought]
         known = {_EXPLAINED: explained, _SENSE: np.array(sense, dtype=np.int64), _DIRECTED: np.array(self.directed)}
@@ -248,7 +248,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | known
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called, see `WindowEvaluator`."""
+        """Continue from where `checkpoint` was called, see `WindowEvaluator`."""
         explained = checked(arrays, _EXPLAINED, np.int64, (None,)).tolist()
         still_open, opposite, in_vain, tried_ns, sought = checked(arrays, _SENSE, np.int64, (5,)).tolist()
         directed = bool(checked(arrays, _DIRECTED, np.bool_, ()))
@@ -262,7 +262,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         self._rotation.power = float(checked(arrays, _ROTATION, np.float64, ()))
 
     def _speed(self, window: WindowStatistics) -> float | None:
-        """Mean speed, if it is one that is evaluated."""
+        """Mean speed, rad/s, None if unknown; raises `EstimationError` if it is out of range or not steady."""
         if not np.isfinite(window.speed_rad_s):
             return None
         operation, speed = self._machine.operation, float(window.speed_rad_s)
@@ -284,7 +284,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         return speed
 
     def _decide(self, window: WindowStatistics, diagnose: Callable[[WindowStatistics], Diagnosis]) -> Diagnosis:
-        """The likelihood's diagnosis with what these sensors do not determine taken out."""
+        """The likelihood's diagnosis without the parameters that these sensors do not determine."""
         try:
             diagnosis = diagnose(window)
         except np.linalg.LinAlgError as error:
@@ -298,7 +298,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         seen = any(state.endswith("_dot") for state in window.states)  # displacements alone may have run-out
         usable = not (self._commissioned or stated.unexplained)
         if vector is not None and vector.foreign and seen and usable and stated.misfit_z is not None:
-            # Of a commissioned machine levels know what its 1x was.
+            # Not on a commissioned machine: its levels are compared with the healthy 1x.
             misfit_z = max(stated.misfit_z, _SURELY_OUTSIDE)
             stated = replace(stated, misfit_z=misfit_z, suspect=stated.suspect or vector.foreign)
         return stated if self._shared is None else with_shared_error(stated, self._shared)

@@ -1,4 +1,4 @@
-"""The vibration levels of one machine: taken of every window, and judged against limits and reference."""
+"""The vibration levels of one machine: measured in every window, and judged against limits and reference."""
 
 import hashlib
 import math
@@ -34,12 +34,12 @@ _DEPENDS_ON: Any = {
     "window": {"hop_s"},
     "levels": {"band_hz", "reference", "reference_windows", "reference_since"},
 }
-"""Of a machine file: what levels of first windows depend on. They outlast any other change, and another program."""
+"""Fields of a machine file on which the levels of first windows depend; these outlast other changes and updates."""
 _WINDOWS_OF_CONTACT = 4
 _STILL_RAD = 0.1
-"""Less than this in a hop is no turning: an encoder may waver. The slowest kilns turn further."""
+"""A smaller turn in a hop counts as standstill: an encoder may waver. The slowest kilns turn further."""
 _NEARLY_ALL = 0.9
-"""Part of a channel's random vibration from which on a new line hides what the machine does by itself."""
+"""Share of a channel's random vibration from which a new line hides the machine's own vibration."""
 _OF_THE_ANGLE = {*ORDERS, "not_x1", "x1_phase_lag_deg", "x2_phase_lag_deg"}
 
 
@@ -67,32 +67,32 @@ class LevelWatch:
         )
         self._contact = LatestContact(_WINDOWS_OF_CONTACT * plan.hops)
         self._lines = LatestLines()
-        self._moved, self._moved_ns = False, 0  # from when on all has been at about the newest speed
+        self._moved, self._moved_ns = False, 0  # time from which all data are at about the newest speed
         self.latest: tuple[ChannelLevels, ...] = ()  # of the latest window; empty before the first hop
         self._found: WindowLevels | None = None
-        self._to_learn: tuple[int, int, WindowLevels] | None = None  # if the shaft angle is in order
+        self._to_learn: tuple[int, int, WindowLevels] | None = None  # learned unless the shaft angle is at fault
         self._states = [state_name(channel) for channel in channels]
         self._machine = machine
         self._hop_ns = round(machine.window.hop_s * 1e9)
 
     @property
     def reference(self) -> LevelReference | None:
-        """What relative limits refer to; None while there is nothing."""
+        """Reference of the relative limits; None while there is none."""
         return self._first.reference if self._takes_first else self._commissioned
 
     @property
     def _several_speeds(self) -> bool:
-        """Whether lines lay in different bands at the speeds of the reference."""
+        """Whether the reference holds speeds so far apart that lines lay in different bands."""
         states = () if self.reference is None else self.reference.states
         speeds = [abs(edge) for state in states for edge in state.speed_rad_s or ()]
         return bool(speeds) and max(speeds) / (1 + NEIGHBOURHOOD) > min(speeds)
 
     def judged(self, levels: WindowLevels) -> tuple[ChannelLevels, ...]:
-        """Levels, channel by channel, against what limits there are."""
+        """Judge levels, channel by channel, against the limits there are."""
         return self._judge.judge(levels, self.reference)
 
     def take(self, window: SlidingWindow, missing: Collection[str] = ()) -> None:
-        """Take the levels of the window as it is after a hop, in which some channels lacked numbers."""
+        """Take the levels of the window after a hop; `missing` channels lacked numbers in it."""
         self._to_learn = None
         found = window.levels(errors=self._takes_first and self._first.learning)
         if found is None:
@@ -100,37 +100,37 @@ class LevelWatch:
         self._moved, columns = self._has_moved(found, window.hops), self._at(missing)
         self.latest = self._judge.judge(found, self.reference, moved=self._moved, missing=columns)
         self._found = found
-        stood = any(abs(hop.turned_rad) < _STILL_RAD for hop in window.hops)  # not where there is no angle: nan
+        stood = any(abs(hop.turned_rad) < _STILL_RAD for hop in window.hops)  # False without a shaft angle: nan
         if self._takes_first and window.filled == 1 and not stood:
             learned = found.without(columns, self._pairs)
             self._to_learn = window.hops[0].start_ns, window.hops[-1].end_ns, learned
 
     def _at(self, states: Collection[str]) -> list[int]:
-        """Columns of some channels."""
+        """Columns of the channels that measure these states."""
         return [column for column, state in enumerate(self._states) if state in states]
 
     def _has_moved(self, found: WindowLevels, hops: Sequence[HopMoments]) -> bool:
-        """Whether lines lay in other bands for a part of the window, as they did in no healthy one."""
+        """Whether the speed moved lines to other bands within the window, as in no healthy window."""
         speeds = found.speeds_rad_s
         if speeds is not None:
             turns = abs(speeds[-1]) > STANDS_RAD_S
             apart = np.abs(speeds / speeds[-1] - 1) > NEIGHBOURHOOD if turns else np.full(speeds.shape, False)
-            if self._several_speeds:  # one that is not known, as in a run-up without a shaft angle, may be any of them
+            if self._several_speeds:  # an unknown speed, as in a run-up without a shaft angle, may be any of them
                 apart |= np.isnan(speeds)
-            if apart.any():  # the hop after them may have begun as they were
+            if apart.any():  # the next hop may have begun at the other speed
                 self._moved_ns = hops[min(int(np.flatnonzero(apart)[-1]) + 1, len(hops) - 1)].end_ns
             elif self._moved_ns <= hops[-1].end_ns:  # those that were not known were at this speed but for the oldest
                 self._moved_ns = min(self._moved_ns, hops[0].end_ns)
         if self.reference is not None and self.reference.at(found.speed_rad_s)[0].varied:
             return False
-        return hops[0].start_ns < self._moved_ns <= hops[-1].end_ns  # it is later where the clock was set back
+        return hops[0].start_ns < self._moved_ns <= hops[-1].end_ns  # later only if the clock was set back
 
     def foreign(
         self, window: SlidingWindow, statistics: WindowStatistics, *, named: bool, faulty: Collection[str] = ()
     ) -> Foreign:
         """What the latest window shows that no change of a parameter makes: a new line, or see `LevelJudge.foreign`.
 
-        Nothing is made of what `faulty` channels show.
+        `faulty` channels are ignored.
         """
         turned = self.reference is not None and any(state.speed_rad_s for state in self.reference.states)
         if self._found is None:
@@ -138,7 +138,7 @@ class LevelWatch:
         healthy, speed_rad_s = self.reference, statistics.speed_rad_s
         judge = partial(self._judge.foreign, named=named, faulty=self._at(faulty))
         if not statistics.settled.all() or (turned and statistics.speed_source == "unknown"):
-            # What turns with the shaft is in the random part, too, and in lines: what pushes it back is told by hop.
+            # Rotation has leaked into the random part and the lines, so leave both out; contact is judged hop by hop.
             bare = replace(self._found, moments=None, lines=None)
             return judge(bare, self.latest, healthy, self._contact)
         if healthy is not None and healthy.lines is not None and math.isfinite(speed_rad_s) and speed_rad_s:
@@ -161,24 +161,24 @@ class LevelWatch:
                 return Foreign(with_channel_names(text, self._machine.sensors), hides=line.share >= _NEARLY_ALL)
         if self._by_theory is not None:
             healthy = self._expected or self._by_file(self._by_theory, self._found)
-            if self._found.contact is not None and self._found.lines is not None:  # all of it can be told
+            if self._found.contact is not None and self._found.lines is not None:  # the reference is complete
                 self._expected = healthy
         return judge(self._found, self.latest, healthy, self._contact)
 
     def _by_file(self, machine: Machine, levels: WindowLevels) -> LevelReference:
-        """What theory says of a machine that nobody has commissioned."""
+        """Reference from theory, for a machine that has not been commissioned."""
         operation, names = machine.operation, [machine.sensors[column].name for column in self._columns]
         slowest, fastest = (operation.speed_rad_s * (1 + sign * operation.speed_tolerance) for sign in (-1, 1))
         modes = zip(*(each.tolist() for each in natural_frequencies(machine)), strict=True)
         return expected_levels(names, levels, (slowest, fastest), tuple(modes))
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """What is remembered, as named arrays: the first windows, and what the latest had of a contact and of lines."""
+        """State as named arrays: the first windows, and contact and lines in the latest ones."""
         moved = {"moved_ns": np.array(self._moved_ns, dtype=np.int64)}
         return {**self._first.checkpoint(), **self._contact.checkpoint(), **self._lines.checkpoint(), **moved}
 
     def restore(self, arrays: Mapping[str, np.ndarray], *, first_alone: bool) -> None:
-        """Go on where `checkpoint` was called, or with the first windows alone, which outlast a commissioning.
+        """Continue from a checkpoint, or (`first_alone`) from its first windows only, which outlast a commissioning.
 
         Raises
         ------
@@ -200,21 +200,21 @@ class LevelWatch:
         explained: bool = False,
         standing: bool = False,
     ) -> None:
-        """Let operators hear of what is beyond its limits at the end of a hop.
+        """Update the alarms on levels at the end of a hop.
 
         Parameters
         ----------
         faulty : collection of str
-            States whose sensors are at fault: what they show may be no vibration, so only what is dangerously loud
-            counts. Of a faulty shaft angle (``theta``) that is what turns with the shaft, in every channel: a hop in
-            which the angle was lost has it at no multiple of its speed. It is not stated then, and nothing is compared
-            with the machine as it was at several speeds.
+            States whose sensors are at fault. Their signal may not be vibration, so only absolute limits and dangers
+            count. If the shaft angle (``theta``) is at fault, order levels of all channels are left out, as a hop
+            that lost the angle has them at no multiple of its speed, and nothing is compared with a reference of
+            several speeds.
         standing : bool
-            Whether the machine stood in the window. The same counts then, unless the reference holds a machine that
-            stands; without a shaft angle that says so what has fallen counts too, for its sensors may have no supply.
+            Whether the machine stood in the window. The same limits count then, unless the reference holds a standing
+            machine; without a shaft angle, fallen levels count too, as the sensors may have lost their supply.
         explained : bool
-            Whether alarms on parameters, without reserve, say what has become louder, and why: an alert is not raised
-            beside them. What is raised already stays, and a danger is always told.
+            Whether alarms on parameters already explain, without reserve, what has become louder. No new alert is
+            raised then; present ones stay, and absolute limits and dangers always count.
         """
         evidence = Evidence(start_ns=end_ns - self._hop_ns, end_ns=end_ns)
         turning = "theta" not in faulty
@@ -233,12 +233,12 @@ class LevelWatch:
             held = state in faulty or (explained and not alarms.present(name))
             held |= unlike and (self._by_angle or not fallen(levels))
             beyond = now.beyond and (now.absolute or now.danger or not held)
-            # In the deadband, while a sensor is at fault, or growth or s_max cannot be told, an alarm stays as it is.
+            # An alarm stays as it is in the deadband, while a sensor is at fault, and without growth or s_max.
             small = now.small and not self._moved and turning and state not in halved.union(faulty)
             alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=small)
 
     def _known(self, levels: ChannelLevels, *, turning: bool, halved: bool) -> ChannelLevels:
-        """The same without what takes the angle, where it is at fault, or both probes of a place, where one is."""
+        """Drop measures that need the shaft angle if not `turning`, or both probes of a place if `halved`."""
         gone = (set() if turning else _OF_THE_ANGLE) | ({"s_max"} if halved else set())
         usual = turning or not self._several_speeds  # else the reference may be that of another speed
         kept = (one for one in levels.limits if one.measure not in gone and (usual or one.absolute))

@@ -6,8 +6,8 @@
                (order)   (ingest)  (correlations)     (residuals)     (what changed)     (alarms)
 
 `MachineMonitor` knows no network, clock or thread: all times are the data's own. Live running and replay are two ways
-of feeding it, and the same blocks give the same reports. What it remembers can be taken out between two blocks and put
-into another one, which goes on as if nothing had happened.
+of feeding it, and the same blocks give the same reports. Its state can be saved between two blocks and restored in
+another monitor, which continues as if nothing had happened.
 """
 
 from collections import deque
@@ -42,15 +42,15 @@ class MachineMonitor:
     Parameters
     ----------
     skips : callable
-        Takes the end of a hop and says whether its window is not to be evaluated: live, because the computer cannot
-        keep up; in a replay, because the live monitor did not.
+        Takes the end of a hop, ns, and returns whether its window is to be skipped: live, because the computer cannot
+        keep up; in a replay, because the live monitor skipped it.
     remembered : bool
-        Whether `state` will be asked for; what is only for that takes time with every hop.
+        Whether `state` will be called; preparing for it takes time with every hop.
 
     Attributes
     ----------
     used : bool
-        Whether the latest message was itself used at once, and not one that waited for it.
+        Whether the block used last is that of the latest message, rather than one that had waited for it.
     end_ns : int or None
         End of the newest data; None before the first.
     """
@@ -90,14 +90,14 @@ class MachineMonitor:
     def step_payload(
         self, payload: bytes, attachment: bytes, encoding: str, dropped_before: int = 0
     ) -> tuple[MonitorReport, ...]:
-        """Decode a message of the stream and take what is in order now as `step` does.
+        """Decode a message of the stream, and `step` every block that is in order now.
 
         Parameters
         ----------
         payload, attachment, encoding : bytes, bytes, str
             See `models.signals.wire`.
         dropped_before : int
-            Messages before this one that this computer could not keep up with.
+            Messages before this one that were dropped because this computer could not keep up.
 
         Returns
         -------
@@ -113,10 +113,10 @@ class MachineMonitor:
             return (MonitorReport(self._count(Admission(Reason.MALFORMED, f"{self.machine.title}: {error}"))),)
         if (misshapen := self._gate.form(block, schema_hash)) is not None:  # before its run and number are used
             return (MonitorReport(self._count(misshapen)),)
-        if self._window.lacks or self._gate.had(block):  # the latter is no news, and no fault of the publisher
+        if self._window.lacks or self._gate.had(block):  # sent again after a restart: neither new nor a mistake
             if self._gate.knows(block):
                 self._recall(block)
-            else:  # one that is known may have been overtaken
+            else:  # a new block may have overtaken a known one
                 self._held.append((payload, attachment, encoding))
             return self._released()
         if self._disputed(block):
@@ -130,9 +130,9 @@ class MachineMonitor:
         return done
 
     def recall(self, payload: bytes, attachment: bytes, encoding: str) -> bool:
-        """Take a message of a recording, for the window that a restored monitor lacks; nothing else comes of it.
+        """Take a recorded message to refill the window of a restored monitor, and for nothing else.
 
-        Returns whether it is the newest block that the monitor has had: what was recorded after it is new.
+        Returns whether it is the newest block that the monitor has had: blocks recorded after it are new.
         """
         try:
             block, schema_hash = decode_block(payload, attachment, encoding)
@@ -147,14 +147,14 @@ class MachineMonitor:
 
     @property
     def recalled(self) -> str:
-        """What became of a window that was to be recalled, in words; empty if nothing of it is missing."""
+        """What is missing of a window that was to be refilled after a restart, in words; empty if nothing is."""
         if self._window.lacks:
             return "there is no window until its samples are received again"
         lost = self._not_recalled
         return f"{lost} hops of the window were not received again, and it is filling anew" if lost else ""
 
     def _released(self) -> tuple[MonitorReport, ...]:
-        """New blocks that came while the window was recalled, once it is there or not waited for any longer."""
+        """Step the new blocks held while the window is refilled, once it is complete or too many blocks are held."""
         if self._window.lacks and len(self._held) <= self.machine.ingest.reorder_blocks:
             return ()
         self._not_recalled += self._window.give_up()
@@ -162,14 +162,14 @@ class MachineMonitor:
         return tuple(report for one in held for report in self.step_payload(*one))
 
     def flush(self) -> tuple[MonitorReport, ...]:
-        """Take the blocks that wait for earlier ones: those will not come any more."""
+        """Take the blocks that wait for earlier ones, which will not come any more."""
         self._not_recalled += self._window.give_up()
         self._done += self._released()
         self._due.extend(self._arrivals.flush())
         return self._step_due()
 
     def _disputed(self, block: SampleBlock) -> bool:
-        """Whether a block contradicts one that has come; what is known of publishers is brought to the alarm."""
+        """Whether a block contradicts one received before; also raise the alarm on conflicting publishers."""
         disputed = self._senders.take(block)
         if disputed and not self._arrivals.withdraw(block.run, block.sequence):
             self._window.gap()  # the other version may be in the unfinished hop
@@ -178,7 +178,7 @@ class MachineMonitor:
         return disputed
 
     def _step_due(self) -> tuple[MonitorReport, ...]:
-        """Take what is due; a defect that one block brings to light leaves the others for the next time."""
+        """Step the blocks that are due; if one raises an error, the others are left for the next call."""
         while self._due:
             one = self._due.popleft()
             self._done.append(self.step(one.block, None))
@@ -207,14 +207,14 @@ class MachineMonitor:
         windows: list[Report] = []
         try:
             windows.extend(map(self._evaluate, self._hops(block, verdict, dropped)))  # each before the next hop
-        except Exception as error:  # whatever it is, the machine must not look healthy on account of it
+        except Exception as error:  # whatever it is, the machine must not look healthy because of it
             self._window.gap()
             self._failed(error, block.end_ns)
         fault, self._defect = self._defect, None
         return MonitorReport(verdict, tuple(windows), self._alarms.take(), len(block.samples) / block.rate_hz, fault)
 
     def _hops(self, block: SampleBlock, verdict: Admission, dropped: int) -> Iterable[int]:
-        """Take an accepted block into the window; ends of the hops that it completes, each to be evaluated in turn."""
+        """Feed an accepted block to the window; return the ends of hops it completes, each to be evaluated in turn."""
         self._not_recalled += self._window.give_up()
         joined = verdict.continuous and not verdict.new_snapshot
         if not joined:
@@ -222,11 +222,11 @@ class MachineMonitor:
         self._newest.add(self._used or block, continuous=joined and not verdict.clock_step_s)
         if verdict.clock_step_s:
             self._window.clear()
-            self._kept_is_valid = False  # hops may end at the same times as before
+            self._kept_is_valid = False  # parts are named by the ends of hops, which may now recur
             self._test.clear()
             self._alarms.clock_stepped(block.start_ns, round(verdict.clock_step_s * 1e9))
         elif self.end_ns is None and self._reached_ns is not None:
-            # Until now the time of day was all there was; shelving goes on by the time of the data.
+            # Until now shelving ran on the time of day; it goes on by the time of the data.
             self._alarms.clock_stepped(block.start_ns, block.start_ns - self._reached_ns)
         self._alarms.passed(block.start_ns)
         self._fault = self._data_path.accepted(verdict, block.start_ns, dropped) or self._fault
@@ -239,7 +239,7 @@ class MachineMonitor:
         return self._alarms.take()
 
     def _failed(self, error: Exception, time_ns: int) -> None:
-        """A defect: nothing can be said of the machine until a window is evaluated again."""
+        """Note a defect of the monitor: the machine is not evaluable until a window is evaluated again."""
         self._defect = error
         self._fault = f"a defect in the monitor, not in the machine: {type(error).__name__}: {error}"
         self._data_path.fault(self._fault, time_ns)
@@ -250,7 +250,7 @@ class MachineMonitor:
         Parameters
         ----------
         time_ns : int
-            Data time that has been reached by now, as far as anybody knows.
+            Best estimate of the data time reached by now.
         """
         self._reached_ns = time_ns
         self._alarms.passed(time_ns)
@@ -259,17 +259,17 @@ class MachineMonitor:
 
     @property
     def window(self) -> Callable[[], WindowStatistics] | None:
-        """What makes the statistics of the window of the latest report, if it was full."""
+        """Function that computes the statistics of the latest report's window; None if that was not full."""
         return self._reporter.window
 
     @property
     def blocks_to_hop(self) -> int:
-        """How many more blocks like the latest one complete a hop, at least one: little is news before."""
+        """How many more blocks as long as the latest one complete the next hop, at least one; little changes before."""
         return 1 if self._used is None else max(1, -(-self._window.lacking // self._used.samples.shape[0]))
 
     @property
     def blocks(self) -> tuple[SampleBlock, ...]:
-        """The newest blocks, without a gap, about 20 000 samples at most."""
+        """The newest blocks without a gap between them, about 20 000 samples at most."""
         return self._newest.blocks
 
     @property
@@ -284,11 +284,11 @@ class MachineMonitor:
         return self._alarms.take()
 
     def take_events(self) -> tuple[AlarmEvent, ...]:
-        """What has happened and was never handed over, because a defect came in between."""
+        """Hand over alarm events that a defect has kept from being handed over."""
         return self._alarms.take()
 
     def state(self, kept: Collection[str] = (), *, whole: bool = False) -> MonitorState:
-        """What is remembered, without parts named in `kept`; with `whole` the window too, megabytes."""
+        """The state to restore from, without parts named in `kept`; with `whole` including the window, megabytes."""
         arrays = {
             **prefixed("window", self._window.checkpoint(whole=whole)),
             **prefixed("test", self._test.state.checkpoint()),
@@ -302,9 +302,9 @@ class MachineMonitor:
         return MonitorState(self._alarms.checkpoint(), state, new, names, self.end_ns)
 
     def restore(self, state: bytes, parts: Collection[bytes] = (), *, levels_alone: bool = False) -> None:
-        """Go on where another monitor of the same machine, files and version stood; alarms are restored by themselves.
+        """Continue from the state of a monitor of the same machine, files and version; alarms are restored separately.
 
-        With `levels_alone` these may differ: of all that was remembered only the first windows are taken.
+        With `levels_alone` files and version may differ: only the levels of the first windows are restored.
 
         Raises
         ------
@@ -328,13 +328,12 @@ class MachineMonitor:
         self._arrivals.resume(self._gate.courses)
 
     def restore_alarms(self, alarms: str, next_sequence: int | None = None, end_ns: int | None = None) -> None:
-        """Go on with the alarms of another monitor, see `AlarmBook.restore`.
+        """Continue with the alarms of another monitor, see `AlarmBook.restore`.
 
         Parameters
         ----------
         end_ns : int, optional
-            End of the newest data of the other monitor, where nothing else of it was restored: the times of the alarms
-            are of the same clock.
+            End of the newest data of the other monitor, if nothing else of it was restored; on the alarms' clock.
         """
         self._alarms.restore(alarms, next_sequence)
         self.end_ns = end_ns if self.end_ns is None else self.end_ns
@@ -354,7 +353,7 @@ class MachineMonitor:
         )
 
     def _judged(self, block: SampleBlock, schema_hash: str | None, dropped: int) -> Admission:
-        """What the gate says; of the data that another monitor had before this one it knows nothing."""
+        """Judge a block by the gate and, as the gate does not know them, by the data before a restart."""
         anew = not self._gate.courses
         verdict = self._gate.judge(block, schema_hash)
         if anew and verdict.accepted and self.end_ns is not None:
@@ -379,7 +378,7 @@ class MachineMonitor:
         return verdict
 
     def _evaluate(self, end_ns: int) -> Report:
-        """Evaluate the window as it is after a completed hop; a defect is a reason why it cannot be."""
+        """Evaluate the window after a completed hop; after a defect, report it as not evaluable for that reason."""
         self._fault = ""
         skipped = self._skips(end_ns) and self._window.filled == 1
         try:

@@ -1,9 +1,9 @@
-"""What a monitor remembers, divided so that little of it is written with every hop.
+"""The state of a monitor, divided so that little of it is written with every hop.
 
 ::
 
     arrays -- small ------------> state, written with every hop
-           '- 4 kB and more ----> parts, each named by what it holds: most stay the same for many hops
+           '- 4 kB and more ----> parts, named by a digest of their content: most stay the same for many hops
     hops of the sequential test -> parts, each named by the hop's end: none changes afterwards
 """
 
@@ -24,7 +24,7 @@ _LARGE = 4096
 def divided(
     arrays: Mapping[str, np.ndarray], hops: Mapping[int, list[tuple[int, Stretch]]], kept: Collection[str]
 ) -> tuple[bytes, tuple[tuple[str, bytes], ...], tuple[str, ...]]:
-    """State, new parts by name, and the names of all parts; the hops are `SequentialState.hops`."""
+    """State, new parts (not in `kept`) by name, and the names of all parts; the hops are `SequentialState.hops`."""
     large = {name: array for name, array in arrays.items() if array.nbytes >= _LARGE}
     names = {f"{_HOP}{end_ns:019}": came for end_ns, came in hops.items()}
     known = frozenset(kept)
@@ -38,7 +38,7 @@ def divided(
 
 
 def joined(state: bytes, parts: Iterable[bytes]) -> tuple[dict[str, np.ndarray], list[dict[str, np.ndarray]]]:
-    """Arrays, and those of the hops of the sequential test, oldest first.
+    """Arrays of the monitor, and arrays of each hop of the sequential test, oldest first.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What is reported of the window after each hop: sensors first, then levels, then what the diagnosticians say."""
+"""The report on the window after each hop: sensors first, then levels, then the diagnosticians' readings."""
 
 from collections.abc import Callable
 from typing import Any
@@ -34,7 +34,7 @@ _SKIPPED = "not evaluated: this computer cannot keep up; levels and sensors were
 
 
 class WindowReporter:
-    """Reports on the windows of one machine, and lets its alarms know what they show.
+    """Reports on the windows of one machine and updates its alarms.
 
     Parameters
     ----------
@@ -44,11 +44,11 @@ class WindowReporter:
     Attributes
     ----------
     samples : SlidingWindow
-        What is reported on; whoever has the samples feeds it.
+        The window reported on; the caller feeds it with samples.
     window : callable or None
-        Makes the statistics of the window of the latest report; None before it was full.
+        Computes the statistics of the latest report's window; None before that was full.
     calm : HealthState
-        State of the latest report without raised alarms.
+        State of the latest report, raised alarms left aside.
     """
 
     def __init__(self, installed: Installed, alarms: AlarmBook, data_path: DataPathAlarms, *, remembered: bool) -> None:
@@ -68,9 +68,9 @@ class WindowReporter:
         self.calm = HealthState.WARMING
 
     def report(self, end_ns: int, missing: tuple[SensorFault, ...], *, skipped: bool) -> Report:
-        """Report on the window as it is after a completed hop, in which some channels lacked numbers.
+        """Report on the window after a completed hop; `missing` are channels that lacked numbers in it.
 
-        It is skipped if it is not to be evaluated, because the monitor cannot keep up.
+        With `skipped`, it is not evaluated because the monitor cannot keep up.
         """
         samples, levels, test = self.samples, self.levels, self.test
         levels.take(samples, implicated(missing))
@@ -78,7 +78,7 @@ class WindowReporter:
         there = statistics or samples.statistics(len(samples.hops))  # while it fills
         stood = "" if there is None else self.standstill.found(there)
         if statistics is None:
-            if missing and there is not None:  # it ends no other fault: those are looked for in whole windows
+            if missing and there is not None:  # no alarm clears here: other faults are looked for in full windows
                 self._data_path.sensors(missing, there, standing=True)
             levels.tell(self._alarms, end_ns, faulty=implicated(missing), standing=bool(stood))
             return self.unread(end_ns, end_ns, HealthState.WARMING, sensors=missing)
@@ -95,7 +95,7 @@ class WindowReporter:
 
         def unread(state: HealthState, reason: str) -> Report:
             levels.tell(self._alarms, end_ns, faulty=faulty, standing=bool(stood))
-            calm = state if lost == () else HealthState.DATA_HEALTH  # a sensor at fault comes first
+            calm = state if lost == () else HealthState.DATA_HEALTH  # a sensor fault takes precedence
             return self.unread(start_ns, end_ns, calm, **seen, reason=reason)
 
         if lost is None:
@@ -141,9 +141,9 @@ class WindowReporter:
         return Report(**self._window_now(start_ns, end_ns, calm), **seen)
 
     def _window_now(self, start_ns: int, end_ns: int, calm: HealthState) -> dict[str, Any]:
-        """What every report on a window begins with."""
+        """Fields common to all reports on a window."""
         state = self.state(calm)
-        little = state in {HealthState.UNCHANGED, HealthState.WATCHING}  # is claimed: what would be seen has to be said
+        little = state in {HealthState.UNCHANGED, HealthState.WATCHING}  # is claimed: add what growth would be seen
         return {
             **self.identity,
             "start_ns": start_ns,
@@ -155,7 +155,7 @@ class WindowReporter:
         }
 
     def state(self, otherwise: HealthState) -> HealthState:
-        """A raised alarm outranks warming and not-evaluable: missing data clears nothing."""
+        """State with alarms: a raised one outranks warming and not-evaluable, as missing data clear nothing."""
         self.calm = otherwise
         severity = self._alarms.severity
         return otherwise if severity is None else HealthState[severity.name]

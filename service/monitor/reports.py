@@ -1,4 +1,4 @@
-"""Who speaks in what a monitor says, what it says of one block and of the machine; and what it remembers."""
+"""What a monitor returns: its identity, the result of one block, the machine's health, and the state to restore."""
 
 import hashlib
 import json
@@ -13,7 +13,7 @@ from service.monitor.alarms.alarm import Alarm, AlarmEvent
 
 
 class Identity(TypedDict):
-    """Who speaks, the same in every record: the machine and the exact files its monitor runs on."""
+    """Origin of every record: the machine and the exact files its monitor runs on."""
 
     site: str
     machine: str
@@ -39,7 +39,7 @@ def machine_hash(machine: MachineFile) -> str:
 
 
 def counted(quality: Quality, verdict: Admission) -> Quality:
-    """What was refused or is missing, with one more block."""
+    """Count one more block that was refused, or before which data are missing."""
     if verdict.reason is not None:
         refused = {**quality.refused_blocks}
         refused[verdict.reason.value] = refused.get(verdict.reason.value, 0) + 1
@@ -52,13 +52,13 @@ def counted(quality: Quality, verdict: Admission) -> Quality:
 
 @dataclass(frozen=True, slots=True)
 class MonitorReport:
-    """What one block did."""
+    """Result of one block."""
 
     verdict: Admission  # accepted or refused, and why
     windows: tuple[Report, ...] = ()  # one per hop that the block completed
     events: tuple[AlarmEvent, ...] = ()  # what happened to alarms
     data_s: float = 0.0  # length of the block, if it was accepted
-    # A defect of the monitor that came to light with the block; what it cost is said in `windows` and `events`.
+    # A defect of the monitor that came to light with the block; its consequences are in `windows` and `events`.
     fault: Exception | None = None
 
 
@@ -68,14 +68,14 @@ class MonitorState:
 
     alarms: str  # the alarms, JSON
     state: bytes  # everything else that is small (`models.checkpoint`)
-    new_parts: tuple[tuple[str, bytes], ...]  # what is large and is not known to be kept already, by name
+    new_parts: tuple[tuple[str, bytes], ...]  # large arrays that are not known to be kept already, by name
     parts: tuple[str, ...]  # names of all parts that belong to the state
     end_ns: int | None  # end of the newest data; None before the first
 
 
 @dataclass(frozen=True, slots=True)
 class MachineHealth:
-    """Where the machine stands."""
+    """State of the machine now, and why."""
 
     state: HealthState
     filled: float  # fraction of a full window
@@ -89,9 +89,9 @@ class MachineHealth:
 
 @dataclass(slots=True)
 class Tally:
-    """What a worker has done since it started, for whoever measures the service."""
+    """What a worker has done since it started, for measuring the service."""
 
-    # Windows evaluated, those that were skipped left out; blocks taken.
+    # Windows evaluated, without skipped ones; blocks taken.
     windows: int = 0
     blocks: int = 0
     step_s: float = 0.0  # time spent in the monitor altogether

@@ -19,13 +19,13 @@ class Alarm:
     since_ns: int = 0
     raised_ns: int | None = None
     occurrence: int = 0
-    # Since when the readings have asked for the condition to begin, or to end: the delays run.
+    # Since when readings have called for the condition to begin, or to end: starts of the on-delay and off-delay.
     beyond_ns: int | None = None
     small_ns: int | None = None
     change: float | None = None
     standard_error: float | None = None
     low_confidence: bool = False
-    taken_back: bool = False  # it reads as changed as before, but need not be the parameter that has changed
+    taken_back: bool = False  # it still reads as changed, but another parameter may have changed instead
     note: str = ""
     evidence: Evidence | None = None
     shelf: Shelf | None = None
@@ -33,23 +33,23 @@ class Alarm:
     suppressed_by: str = ""
     out_of_service_by: str = ""
     out_of_service_reason: str = ""
-    # While suppressed: where it comes back to without its condition, because somebody has to acknowledge or reset.
+    # While suppressed: state to return to without the condition, because somebody has to acknowledge or reset.
     owed: AlarmState = AlarmState.NORMAL
     version: int = -1
 
     @property
     def raised(self) -> bool:
-        """Whether the condition is there and operators are to see it."""
+        """Whether the condition is present and operators are notified."""
         return self.present and self.state.annunciated
 
     @property
     def due(self) -> bool:
-        """Whether the condition is there, or will be after the on-delay."""
+        """Whether the condition is present, or will be after the on-delay."""
         return self.present or self.beyond_ns is not None
 
     @property
     def open(self) -> bool:
-        """Whether there is anything to see: any state but normal, or a delay that runs."""
+        """Whether the alarm is in any state but normal, or its on-delay runs."""
         return self.state is not AlarmState.NORMAL or self.beyond_ns is not None
 
 

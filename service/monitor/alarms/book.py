@@ -1,13 +1,13 @@
 """All alarms of one machine: from readings to conditions, from conditions and operators to events.
 
-A reading asks for an alarm's condition (*beyond* its limit) or for its end (*small* again). Between the two limits, the
-dead band, and where nothing was read, neither is asked for: missing data neither raises nor clears. What has been asked
-for long enough (on-delay, off-delay, in data time) happens, and `service.monitor.alarms.life_cycle` says what becomes
-of the alarm.
+A reading calls for an alarm's condition to begin (*beyond* its limit) or to end (*small* again). In the deadband
+between the two limits, and where nothing was read, it calls for neither: missing data neither raise nor clear. What is
+called for throughout the on-delay or off-delay, in data time, happens; `service.monitor.alarms.life_cycle` gives the
+alarm's next state.
 
-Beyond the limit is a parameter that the sequential test names as changed, by more than its limit, and as good as
-certainly: where others explain the data too, the alarm is `changed`, with the candidates. It is small again when it has
-come back, or when a whole window after the change says that it is not this parameter.
+A parameter is beyond its limit if the sequential test names it as changed, almost certainly, by more than that limit.
+If others explain the data too, the alarm is `changed`, with the candidates. A parameter is small again when it has come
+back, or when a whole window after the change says that it is not this parameter.
 """
 
 import math
@@ -36,8 +36,8 @@ from service.monitor.alarms.operation import (
 _TAKEN_BACK = 0.5
 """Probability below which a parameter that was named is no longer taken to have changed."""
 _ANOTHER = 4
-"""Parameters that seem to have changed outside the model from which none is named: it is another machine, or what is
-wrong concerns all of it."""
+"""Outside the model, number of apparently changed parameters from which none is named: it is another machine, or what
+is wrong concerns all of it."""
 _HELD = "no fault makes a shaft stiffer; something may hold it, such as a locked coupling"
 
 
@@ -52,7 +52,7 @@ class _Page:
 _PAGE = TypeAdapter(_Page)
 
 NO_ALARMS = _PAGE.dump_json(_Page((), 0)).decode()
-"""What `AlarmBook.checkpoint` gives where nothing has happened yet."""
+"""What `AlarmBook.checkpoint` returns before anything has happened."""
 
 
 class AlarmBook:
@@ -71,20 +71,20 @@ class AlarmBook:
 
     @property
     def severity(self) -> Severity | None:
-        """Highest severity of what is raised on the machine; what is wrong with the data is none of the machine."""
+        """Highest severity of the alarms raised on the machine; alarms on its data do not count."""
         of_machine = (one for one in self._alarms.values() if one.raised and alarm_kind(one.name).about == "machine")
         raised = {alarm.severity for alarm in of_machine}
         return next((severity for severity in (Severity.DANGER, Severity.ALERT) if severity in raised), None)
 
     def present(self, name: str) -> bool:
-        """Whether the condition of an alarm is there."""
+        """Whether the condition of an alarm is present."""
         return name in self._alarms and self._alarms[name].present
 
     def take(self) -> tuple[AlarmEvent, ...]:
-        """Hand over, in order and once, everything that has happened.
+        """Hand over, in order and once, all events that have happened.
 
-        An event has its number as soon as it has happened. If whoever made it happen comes to grief before passing it
-        on, the next one does: otherwise the number would be missing from the log for ever.
+        An event is numbered as soon as it happens. If its caller fails before passing it on, the next caller does:
+        otherwise the number would be missing from the log for ever.
         """
         told, self._untold = tuple(self._untold), []
         return told
@@ -101,21 +101,21 @@ class AlarmBook:
         *,
         hidden: bool = False,
     ) -> bool:
-        """Judge what the sequential test has found at the end of a hop; without clean data alarms stay where they are.
+        """Judge the sequential test's verdict at the end of a hop; without clean data alarms stay as they are.
 
-        Returns whether a change of a parameter that operators hear of explains the data without reserve.
+        Returns whether a parameter change that operators are told of explains the data without reserve.
 
         Parameters
         ----------
         unexplained : str
-            Why nothing can be said of parameters; empty if something can.
+            Why no parameter can be read; empty if one can.
         suspect : str
             What explains data outside the model best; empty if nothing does.
         astride_s : float
-            For how long the window may still hold the moment of a change, and be outside the model for that alone.
+            For how long the window may still straddle a change, and be outside the model for that alone.
         hidden : bool
-            Whether it hides what a parameter does: none is named then, and none that was named is taken back. Where a
-            parameter explains the data as well, so that they are not outside the model, both may be.
+            Whether the suspect hides what parameters do: none is named then, and none that was named is taken back. If
+            a parameter explains the data as well, so that they are not outside the model, both are candidates.
         """
         named = [finding.name for finding in verdict.changed]
         unreserved = set(named)
@@ -124,16 +124,16 @@ class AlarmBook:
         nameless = another or hidden
         sure = {one for one in named if not nameless and probability.get(one, 0.0) >= self._settings.name_confidence}
         held = {*named, *(one for one, likely in probability.items() if likely >= _TAKEN_BACK)}
-        # Without parameters the unbalance is read through the stiffness to ground at running speed. Where that has
-        # changed in both planes, what the bearings stand on may move, and it is another one than at other frequencies;
-        # so too where only one of them, or the unbalance in their place, is named, and both read softer.
+        # Without parameters the unbalance is read through the stiffness to ground at running speed. If that has changed
+        # in both planes, the bearings' support may move, which makes the stiffness differ between frequencies. The same
+        # holds if only one stiffness, or the unbalance in their place, is named, and both read softer.
         softer = {
             one.name
             for one in verdict.current
             if one.relative_change is not None and one.relative_change < -Z95 * (one.standard_error or math.inf)
         }
-        # While the window holds the moment at which a bearing changed, their means are not those of one machine: near a
-        # resonance an unbalance would fit them.
+        # While the window straddles a change of a bearing, its means are not those of one machine: near a resonance an
+        # unbalance would fit them.
         bearings = set(named) - {"e", "EI"}
         unlike = {"k_by", "k_bz"} <= bearings | softer or (bearings != set() and not verdict.settled)
         start_ns = end_ns - round(verdict.decided_s * 1e9)
@@ -161,12 +161,12 @@ class AlarmBook:
                     note=_HELD if held_stiff else "" if reading.vector is None else reading.vector.text,
                 )
         if verdict.outside_model and not verdict.current:
-            # Of what nothing explains nothing is read, and what was named before is named with reserve from now on.
+            # Nothing is read from unexplained data, and parameters named before are named with reserve from now on.
             self._alarms |= {
                 name: replace(self._alarms[name], low_confidence=True) for name in PARAMETERS if self.present(name)
             }
         if verdict.current:
-            # Outside the model no candidate need be right, and `model` says so; and one cause has one alarm.
+            # Outside the model no candidate need be right, which alarm `model` says; and one cause has one alarm.
             told = verdict.outside_model or any(self.present(name) for name in probability)
             unsure = [] if sure or told else named
             rival = [suspect] if hidden and suspect else []  # told however little the parameter would have changed
@@ -207,7 +207,7 @@ class AlarmBook:
         evidence: Evidence | None = None,
         note: str = "",
     ) -> tuple[AlarmEvent, ...]:
-        """Judge one evaluated parameter at the end of a hop, whose data time is given.
+        """Judge the reading of one parameter at the end of a hop (`time_ns`).
 
         Parameters
         ----------
@@ -216,7 +216,7 @@ class AlarmBook:
         taken_back : bool
             Whether a whole window after the change says that it is not.
         growth : float, optional
-            By how much the machine is loaded more, where that is not all of the change: an unbalance that has only
+            Relative increase of the load on the machine, if it differs from the change: an unbalance that has only
             turned, or has become smaller, is not dangerous.
         """
         if not (math.isfinite(change) and 0 < standard_error < math.inf):
@@ -232,7 +232,7 @@ class AlarmBook:
             note=note,
         )
         beyond, small = named and size > limits.raise_above, taken_back or size < limits.clear_below
-        # With reserve the size is one of a parameter that need not be the one; levels say whether it is dangerous.
+        # With reserve, another parameter may have changed instead; levels say whether it is dangerous.
         danger = beyond and min(size, size if growth is None else growth) > limits.danger_above and not low_confidence
         return self._judge(alarm, time_ns, beyond=beyond, small=small, danger=danger)
 
@@ -248,9 +248,9 @@ class AlarmBook:
         danger: bool = False,
         small: bool | None = None,
     ) -> tuple[AlarmEvent, ...]:
-        """Judge what is no parameter: without a delay if it is a fact rather than an estimate.
+        """Judge an alarm that is not on a parameter: `at_once`, without delay, if it is a fact rather than an estimate.
 
-        Whether it is gone for good is said by `small`; without it, it is where it is not present.
+        `small` is whether the condition has ended; by default it has if it is not `present`.
         """
         if not present and name not in self._alarms:
             return ()
@@ -261,9 +261,9 @@ class AlarmBook:
         return self._judge(alarm, time_ns, beyond=present, small=gone, danger=danger, at_once=at_once)
 
     def suppress(self, speed_rpm: float | None, time_ns: int) -> tuple[AlarmEvent, ...]:
-        """Follow the rules of suppression; where the speed is unknown, what depends on it stays as it is.
+        """Apply the suppression rules; where the speed is unknown, those that depend on it stay as they are.
 
-        An alarm that no rule is about any more, because the machine file has changed, comes back.
+        An alarm that no rule names any more, because the machine file has changed, is no longer suppressed.
         """
         events: list[AlarmEvent] = []
         ruled = [name for rule in self._settings.suppress for name in rule.alarms]
@@ -296,7 +296,7 @@ class AlarmBook:
         return tuple(events)
 
     def clock_stepped(self, time_ns: int, step_ns: int) -> None:
-        """Restart all running delays, and keep shelving as long as it was meant to be: the data's clock was set."""
+        """Restart all running delays and keep the remaining shelving times: the data's clock was set."""
         for name, alarm in self._alarms.items():
             shelf = alarm.shelf
             self._alarms[name] = replace(
@@ -348,10 +348,10 @@ class AlarmBook:
         return _PAGE.dump_json(_Page(self.alarms, self.next_sequence)).decode()
 
     def restore(self, text: str, next_sequence: int | None = None) -> None:
-        """Go on from what `checkpoint` gave.
+        """Continue from what `checkpoint` returned.
 
-        The number of the next event by the log may be ahead of what was remembered; it is behind only where the log was
-        begun anew.
+        The log's number of the next event may be ahead of the checkpoint's; it is behind only if the log was begun
+        anew.
 
         Raises
         ------
@@ -362,7 +362,7 @@ class AlarmBook:
             page = _PAGE.validate_json(text)
         except ValueError as error:
             raise CheckpointError(f"alarms cannot be restored: {error}") from error
-        # Another version of the program may have known others.
+        # Another version of the program may have had other alarms.
         self._alarms = {alarm.name: alarm for alarm in page.alarms if is_alarm(alarm.name)}
         self.next_sequence = max(page.next_sequence, next_sequence or 0)
         self._untold = []
@@ -408,7 +408,7 @@ class AlarmBook:
     def _judge(
         self, alarm: Alarm, time_ns: int, *, beyond: bool, small: bool, danger: bool, at_once: bool = False
     ) -> tuple[AlarmEvent, ...]:
-        """Let the delays run, and make happen what was asked for long enough."""
+        """Run the delays, and raise, clear or escalate the alarm if that is due."""
         settings = self._settings
         began_ns = [time_ns if since_ns is None else since_ns for since_ns in (alarm.beyond_ns, alarm.small_ns)]
         beyond_ns = began_ns[0] if beyond and not alarm.present else None
@@ -441,7 +441,7 @@ class AlarmBook:
         return events + self._suppressed_again(alarm.name, time_ns)
 
     def _suppressed_again(self, name: str, time_ns: int) -> tuple[AlarmEvent, ...]:
-        """An alarm that comes back among the others is suppressed if a rule still says so."""
+        """Suppress an alarm that is no longer hidden by an operator, if a rule still applies."""
         alarm = self._alarms[name]
         if not alarm.rules or not alarm.state.annunciated:
             return ()
@@ -450,13 +450,13 @@ class AlarmBook:
     def _happen(
         self, alarm: Alarm, kind: EventKind, time_ns: int, *, actor: str = "", reason: str = ""
     ) -> tuple[AlarmEvent, ...]:
-        """Follow the life cycle and write the event down."""
+        """Move the alarm through its life cycle and record the event."""
         before, latching = alarm.state, self._latches(alarm)
         state = follow(before, kind, present=alarm.present, latching=latching, owed=alarm.owed)
         if state is None:
             raise OperationRefused(f"{alarm.name} is {before.value}: it cannot be {kind.value}")
         if state is before and kind in {EventKind.SUPPRESSED, EventKind.UNSUPPRESSED}:
-            self._alarms[alarm.name] = alarm  # the rule is noted; the operator's own silence outranks it
+            self._alarms[alarm.name] = alarm  # the rule is noted; what an operator has hidden stays so
             return ()
         since_ns = alarm.since_ns if state is before else time_ns
         owed = alarm.owed if state is before else AlarmState.NORMAL
@@ -471,5 +471,5 @@ class AlarmBook:
 
 
 def _candidate(one: Candidate, *, alone: bool) -> str:
-    """A candidate, with its probability where there are none but parameters."""
+    """A candidate; with its probability if parameters are the only candidates (`alone`)."""
     return f"{one.text} ({one.name}) {one.probability:.0%}" if alone else f"{one.text} ({one.name})"

@@ -1,4 +1,4 @@
-"""Alarms that say nothing of the machine: on the stream, its clock, the sensors, and the monitor itself."""
+"""Alarms that are not about the machine: on the stream, its clock, the sensors, and the monitor itself."""
 
 from collections.abc import Mapping
 
@@ -15,11 +15,11 @@ from rotorwatch.records.windows import SensorFault
 from service.monitor.alarms.book import AlarmBook
 
 _MOST_HOPS = 4
-"""After a gap the next hop is whole within three."""
+"""Hops' time without a whole hop from which gaps are too frequent: after a single gap a hop is whole within three."""
 
 
 class DataPathAlarms:
-    """Judges what happens to the data on their way from the sensors through the monitor."""
+    """Judges the data on their way from the sensors through the monitor."""
 
     def __init__(self, book: AlarmBook, machine: MachineFile) -> None:
         self._book = book
@@ -52,14 +52,14 @@ class DataPathAlarms:
         self._refused_ns = int(checked(arrays, "refused_ns", np.int64, ()))
 
     def judged(self, verdict: Admission, start_ns: int) -> None:
-        """Remember why data that come are of no use, in case nothing else comes; a repetition says nothing of that."""
+        """Remember why the first block was refused, in case no usable data follow; repeated blocks do not count."""
         if verdict.reason is not None and verdict.reason is not Reason.OVERLAP and not self._refused:
             self._refused, self._refused_ns = verdict.text, start_ns
 
     def accepted(self, verdict: Admission, start_ns: int, dropped: int) -> str:
-        """A block was accepted, before which the monitor itself threw so many away.
+        """Take note of an accepted block, before which the monitor itself dropped `dropped` blocks.
 
-        Returns why nothing has been evaluated for long, although data come; empty if it has.
+        Returns why nothing has been evaluated for long although data arrive; empty if something has been.
         """
         book, before_ns = self._book, start_ns - round(verdict.gap_s * 1e9)
         missing = Evidence(start_ns=before_ns, end_ns=start_ns) if verdict.gap_s > 0 else None
@@ -82,7 +82,7 @@ class DataPathAlarms:
         return torn
 
     def _torn(self, verdict: Admission, start_ns: int) -> str:
-        """Whether gaps, each too short for an alarm, follow each other so closely that no hop is whole."""
+        """Sentence saying that gaps, each too short for an alarm, are so frequent that no hop is whole; else empty."""
         if self._whole_ns is None or verdict.clock_step_s or verdict.gap_s >= self._gap_s:
             self._whole_ns = start_ns
         without_ns = start_ns - self._whole_ns
@@ -94,18 +94,18 @@ class DataPathAlarms:
         )
 
     def passed(self, time_ns: int, end_ns: int | None) -> None:
-        """Time has passed since the end of the newest data."""
+        """Raise the alarm on silence if the newest data ended long enough ago."""
         if end_ns is not None and time_ns - end_ns >= self._silence_ns:
             self._lost(end_ns)
 
     def conflict(self, text: str, time_ns: int, *, at_once: bool = False) -> None:
-        """Publishers contradict each other, or do not; `text` says which."""
+        """Update the alarm on publishers that contradict each other; `text` is empty if none do."""
         self._book.update_state(CONFLICT, bool(text), time_ns, text, at_once=at_once)
 
     def hop(self, end_ns: int, *, skipped: bool) -> None:
-        """A hop is complete, without a gap: what could have spoiled it is over, unless it is found again.
+        """Take note of a complete hop, without a gap: alarms on what could have spoiled it may clear.
 
-        Its window is skipped if it is not evaluated, because the monitor cannot keep up.
+        With `skipped`, its window is not evaluated because the monitor cannot keep up, which raises an alarm.
         """
         self._whole_ns = end_ns
         for name in (GAP, CLOCK) if skipped else (GAP, CLOCK, FAULT, OVERLOADED):
@@ -116,13 +116,13 @@ class DataPathAlarms:
             self._book.update_state(OVERLOADED, True, end_ns, note, evidence=evidence, at_once=True)
 
     def sensors(self, findings: tuple[SensorFault, ...], statistics: WindowStatistics, *, standing: bool) -> None:
-        """One alarm for each kind of fault, with a sentence for each channel it is found in.
+        """Update one alarm for each kind of fault, with a sentence for each channel it is found in.
 
-        Where the machine stood nothing is seen of most faults, and those that were there stay.
+        While the machine stands, most faults cannot be seen, so alarms that are present stay.
         """
         said: dict[str, list[str]] = {}
         for found in findings:
-            # Whatever is wrong with the shaft's angle costs the phase reference.
+            # With any fault of the shaft angle the phase reference is lost.
             name = PHASE_REFERENCE if found.states == ("theta",) else data_alarm(found.kind)
             said.setdefault(name, []).append(found.text)
         evidence = Evidence(start_ns=statistics.start_ns, end_ns=statistics.end_ns)
@@ -136,7 +136,7 @@ class DataPathAlarms:
         self._book.update_state(FAULT, True, time_ns, what, at_once=True)
 
     def _unseen(self, *, windows: int = 0, blocks: int = 0, gap_s: float = 0.0) -> str:
-        """What has not been evaluated since the alarm on it was raised, with what is added just now."""
+        """Add to what has not been evaluated since the alarm on it was raised, and return the sum in words."""
         if not self._book.present(OVERLOADED):
             self._unseen_windows, self._unseen_blocks, self._unseen_s = 0, 0, 0.0
         self._unseen_windows += windows
@@ -147,8 +147,8 @@ class DataPathAlarms:
         return f"this computer cannot keep up{skipped}{lost if self._unseen_blocks else ''}"
 
     def _lost(self, end_ns: int) -> None:
-        """Raise the alarm on silence, at the time at which it was due: then live and replay say the same."""
-        # Not what came later, or just before the alarm was due: live that is not known yet.
+        """Raise the alarm on silence, at the time at which it was due, so that live and replay say the same."""
+        # Not blocks that came later, or just before the alarm was due: live they are not known yet.
         known = self._refused and end_ns - self._silence_ns < self._refused_ns < end_ns + self._silence_ns // 2
         refused = f"; the first block since was refused: {self._refused}" if known else ""
         note = f"no usable data for {self._silence_s:g} s; alarms already raised stay raised{refused}"
@@ -158,7 +158,7 @@ class DataPathAlarms:
         self._book.suppress(None, due_ns)
 
     def _found_again_ns(self, start_ns: int) -> int:
-        """When the silence ended; data that came late, but without a gap, are older than the alarm on them."""
+        """When the silence ended: late data without a gap are older than the alarm, so its own time is taken."""
         raised_ns = next((one.raised_ns for one in self._book.alarms if one.name == STREAM_LOST), None)
         late = raised_ns is not None and 0 <= raised_ns - start_ns <= self._silence_ns
         return raised_ns if raised_ns is not None and late else start_ns

@@ -11,9 +11,9 @@
         '-------------------------------------------------------------'
 
 A latching alarm goes to a latched state where others return, and leaves it by *reset*. From every state an alarm can be
-taken away from the operator's eyes: shelved, suppressed by design, out of service. It goes on following its condition
-there, and on leaving it is unacknowledged if the condition is there. If not, it is normal where an operator took it
-away; where a rule did, what was owed before is owed still: an acknowledgement, or a reset.
+hidden from operators: shelved, suppressed by design, out of service. It goes on following its condition there, and on
+leaving it is unacknowledged if the condition is present. If not, it is normal if an operator had hidden it; if a rule
+had, the acknowledgement or reset that was owed before is still owed.
 """
 
 from collections.abc import Mapping
@@ -22,17 +22,17 @@ from types import MappingProxyType
 from rotorwatch.records.alarms import AlarmState, EventKind
 
 STAYS = "stays"
-"""What happens is taken note of, and the state stays as it is."""
+"""The event is recorded, and the state stays as it is."""
 
 REFUSED = "refused"
-"""Nobody may ask for this in this state."""
+"""The operation is not allowed in this state."""
 
 OWED = "as owed"
-"""Back to where somebody still has to acknowledge or reset; normal if nobody has to."""
+"""To the state in which somebody still has to acknowledge or reset; normal if nobody has to."""
 
 Cell = str | tuple[str, AlarmState]
 """A state, `STAYS`, `REFUSED`, or two states: for *cleared* without and with latching, otherwise without and with the
-condition there."""
+condition present."""
 
 _N, _U, _A, _R = AlarmState.NORMAL, AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED, AlarmState.RETURNED
 _LU, _LA = AlarmState.LATCHED_UNACKNOWLEDGED, AlarmState.LATCHED_ACKNOWLEDGED
@@ -55,11 +55,11 @@ _ROWS: Mapping[EventKind, tuple[Cell, ...]] = {
 TABLE: Mapping[tuple[AlarmState, EventKind], Cell] = MappingProxyType(
     {(state, kind): row[at] for kind, row in _ROWS.items() for at, state in enumerate(AlarmState)}
 )
-"""What becomes of an alarm in a state when something happens."""
+"""Next state of an alarm, by its state and the event."""
 
 
 def owed_after(state: AlarmState, *, latching: bool) -> AlarmState:
-    """Where an alarm that a rule takes away from a state comes back to, once its condition is gone.
+    """State that an alarm suppressed by a rule in `state` returns to, once its condition is gone.
 
     Examples
     --------
@@ -74,10 +74,9 @@ def owed_after(state: AlarmState, *, latching: bool) -> AlarmState:
 def follow(
     state: AlarmState, kind: EventKind, *, present: bool, latching: bool, owed: AlarmState = AlarmState.NORMAL
 ) -> AlarmState | None:
-    """The state an alarm goes to; None if that is refused in this state.
+    """Next state of an alarm; None if the event is refused in this state.
 
-    What counts is whether the condition is present after what happens. Without it, the alarm comes back after a rule to
-    what is owed.
+    `present` is whether the condition is present after the event. If not, the end of suppression leads to `owed`.
 
     Examples
     --------

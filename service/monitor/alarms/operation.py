@@ -14,7 +14,7 @@ KIND_OF_EVENT: dict[OperationKind, EventKind] = {
     "remove-from-service": EventKind.REMOVED_FROM_SERVICE,
     "return-to-service": EventKind.RETURNED_TO_SERVICE,
 }
-"""What each operation is in the life cycle and in the log."""
+"""The event that each operation makes in the life cycle and in the log."""
 
 
 class UnknownAlarm(RotorwatchError):  # noqa: N818  # said to an operator, by its name
