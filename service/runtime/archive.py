@@ -1,4 +1,4 @@
-"""An archive of recordings through the monitor, each machine a task on the computers of a Ray cluster."""
+"""Runs an archive of recordings through the monitor, each machine as a task on the computers of a Ray cluster."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -14,7 +14,7 @@ from service.recordings.replay.source import RecordingSource
 
 @dataclass(frozen=True, slots=True)
 class MachineTask:
-    """What is evaluated of one machine; files are at the same place on every computer."""
+    """Recordings of one machine to be evaluated; files are at the same place on every computer."""
 
     title: str  # site/machine
     files: tuple[Path, ...]
@@ -36,14 +36,14 @@ def evaluated(task: MachineTask) -> tuple[OfflineSummary, str]:
 
 
 def on_cluster(address: str, tasks: Sequence[MachineTask]) -> Iterator[tuple[OfflineSummary, str]]:
-    """What `evaluated` returns of every task, each as soon as it is there.
+    """Yield what `evaluated` returns for every task, each as soon as it is there.
 
     Raises
     ------
     RotorwatchError
         If there is no cluster; or naming the machine that cannot be evaluated, and why.
     """
-    # Here and not above: every worker imports this module, and what these bring takes as long as all that it needs.
+    # Not at the top: every worker imports this module, and this import takes as long as all that a worker needs.
     from service.runtime.fleet import imported_ray, join_cluster  # noqa: PLC0415
 
     ray = imported_ray()

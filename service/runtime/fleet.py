@@ -1,4 +1,4 @@
-"""Shards on the computers of a Ray cluster: Ray says where each runs, and revives it when its computer is lost.
+"""Shards on the computers of a Ray cluster: Ray places each of them, and revives it when its computer is lost.
 
 ::
 
@@ -34,14 +34,14 @@ from service.terminal.logs import logger
 
 _CORES_OF_A_MACHINE = 0.025
 _MB_OF_A_PROCESS, _MB_OF_A_MACHINE = 150, 45
-"""What a machine of 13 channels with networks was seen to take, rounded up, see ``docs/performance.md``."""
+"""Measured for a machine of 13 channels with networks, rounded up, see ``docs/performance.md``."""
 _USER = "shard"
 _ANSWER_S = 5.0
 _BALANCE_S = 5.0
 _SETTLED_S = 60.0
-"""Since its latest start, before a shard is moved: one that is moved while it catches up is out of service twice."""
+"""Time from its latest start until a shard may be moved: if moved while it catches up, it is out of service twice."""
 HEALTH_CHECKS = '{"health_check_period_ms": 1000, "health_check_timeout_ms": 2000, "health_check_failure_threshold": 5}'
-"""Of Ray, to notice after some 5 s that a computer is lost; it takes 13 to 15 s without them."""
+"""Settings of Ray with which it notices after some 5 s that a computer is lost; without them it takes 13 to 15 s."""
 _VARIABLES = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """As in a monitor of one process: results do not depend on the number of cores."""
 
@@ -54,7 +54,7 @@ def fleet_count(settings: ServiceSettings) -> int:
     Raises
     ------
     MachineFileError
-        If the settings are not those of a fleet, which no computer of it may keep something of for itself.
+        If the settings are not those of a fleet, in which nothing may be tied to one of its computers.
     """
     if settings.fleet is None:
         raise MachineFileError('expected [fleet] with listen = "tcp/HOST:7448", where the shards reach this process')
@@ -75,7 +75,7 @@ class Fleet:
     Parameters
     ----------
     address : str
-        Of the cluster: ``auto`` for that of this computer, or ``HOST:6379``.
+        Address of the cluster: ``auto`` for that of this computer, or ``HOST:6379``.
 
     Raises
     ------
@@ -130,7 +130,7 @@ class Fleet:
         return made
 
     def _balance(self) -> None:
-        """Move shards to computers that have come."""
+        """Move shards to computers that have joined the cluster."""
         while not self._over.wait(_BALANCE_S):
             try:
                 cores = {
@@ -143,7 +143,7 @@ class Fleet:
                 continue
             placed = [one for one in self._processes if one.computer]
             if len(placed) < len(self._processes):
-                continue  # a shard is on its way, and its cores are taken soon
+                continue  # a shard is being placed, and will soon take its cores
             shards = [(one.computer, one.cores) for one in placed]
             move = better_place(shards, cores)
             settled_s = time.monotonic() - _SETTLED_S
@@ -213,7 +213,7 @@ def join_cluster(address: str, undo: ExitStack) -> None:
 
 
 class ShardActor:
-    """What Ray runs for a shard: begins with its process, wherever that is."""
+    """What Ray runs for a shard: monitors from the start of its process, on whichever computer that is."""
 
     def __init__(self, settings: ServiceSettings, inner: LinkSettings) -> None:
         self._arguments = (settings, inner)
@@ -223,7 +223,7 @@ class ShardActor:
         self.begin()
 
     def begin(self) -> None:
-        """Monitor its machines, if it does not."""
+        """Start to monitor its machines, unless it does so already."""
         if self._thread is not None and self._thread.is_alive():
             return
         if (niceness := os.nice(0)) > 0:
@@ -235,20 +235,20 @@ class ShardActor:
         self._thread.start()
 
     def said(self, number: int, wait_s: float) -> tuple[str, str] | None:
-        """What it said, and on which computer; None if it has not said so much yet."""
-        with self._listening:  # whoever asked in vain may ask again before this one has ended
+        """Its message of this number, and the computer it runs on; None if there is no such message yet."""
+        with self._listening:  # a caller that gave up waiting may ask again before this call has ended
             if len(self._said) <= number and self._connection.poll(wait_s):
                 self._said.append(self._connection.recv_bytes().decode())
         computer = imported_ray().get_runtime_context().get_node_id()
         return (self._said[number], computer) if len(self._said) > number else None
 
     def wait(self) -> None:
-        """Return when it monitors nothing any more."""
+        """Return once it has stopped monitoring."""
         if self._thread is not None:
             self._thread.join()
 
     def ask_to_stop(self) -> None:
-        """Let it end in order."""
+        """Ask it to end in order."""
         with suppress(OSError):  # it has ended by itself
             self._connection.send_bytes(b"")
 
@@ -272,8 +272,8 @@ class _Actor:
             "scheduling_strategy": "SPREAD",
         }
         self._moves_to = ""
-        self._life: Any = None  # what comes to its end with it, once it has begun
-        self._next = 0  # of what it says
+        self._life: Any = None  # Ray's reference to `ShardActor.wait`, once it has begun
+        self._next = 0  # number of its next message
         self._begin()
 
     def begin_again(self) -> None:
@@ -285,7 +285,7 @@ class _Actor:
             self._moves_to = ""
             self._begin()
         else:
-            # Ray has revived it, or does so now: this is for one whose process goes on without monitoring anything.
+            # Ray has revived it or is doing so; this is for an actor whose process no longer monitors anything.
             self._actor.begin.remote()
         self._life, self._next = None, 0
 
@@ -323,7 +323,7 @@ class _Actor:
         return how
 
     def move_to(self, computer: str) -> None:
-        """Let it end in order, to be begun on another computer."""
+        """Ask it to end in order, to be started on another computer."""
         self._moves_to = computer
         self.ask_to_stop()
 

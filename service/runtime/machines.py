@@ -12,9 +12,9 @@
     queries on health, alarm/state <-------------------- snapshot
     queries on alarm/event <-- Store
 
-Only a machine's own thread touches its monitor; everybody else reads immutable snapshots, or asks it to do something
+Only a machine's own thread touches its monitor; other threads read immutable snapshots, or ask it to do something
 between two blocks (operators; the passing of time, twice a second). Silence is noticed on the monotonic clock; the
-time of day is used for what is recorded when, and for how long a restart took.
+time of day only says when something was recorded, and how long a restart took.
 """
 
 import threading
@@ -45,7 +45,7 @@ _log = logger(part="runtime")
 
 
 class Listener(Protocol):
-    """Who hears what happens to machines; called from any thread."""
+    """Is told what happens to machines; called from any thread."""
 
     def health(self, health: Health) -> None:
         """Hear that a machine's health has changed."""
@@ -84,14 +84,14 @@ class LocalMachines:
         undo.callback(self._link.close)
 
     def open(self, undo: ExitStack) -> Sequence[MachineWorker]:
-        """Go on from the history of every machine; it has to be open.
+        """Make a worker for every machine, which continues from the history; that has to be open.
 
         Raises
         ------
         StoreError
-            If another monitor writes that of one of them.
+            If another monitor writes the history of one of the machines.
         """
-        _ = undo  # what `start` begins is undone
+        _ = undo  # nothing to undo before `start`
         self.workers = tuple(
             MachineWorker(
                 installed,
@@ -117,11 +117,11 @@ class LocalMachines:
         supervisor.start()
 
     def refused(self) -> str:
-        """What the history did not take of the latest steps, which is lost; empty if it took everything."""
+        """Why the history refused the latest steps of machines, which are lost; empty if it took everything."""
         return "; ".join(f"{one.history.title}: {one.steps.refused}" for one in self.workers if one.steps.refused)
 
     def _recent(self, machine: MachineFile) -> Callable[[int], Iterable[RecordedMessage]]:
-        """What was recorded of a machine until now, where anything of it is."""
+        """Function that reads the messages recorded so far, as `MachineWorker` takes it; without recording, none."""
         directory = self._settings.recording.directory
         if directory is None or self._settings.link.namespace:
             return lambda _: ()
@@ -130,7 +130,7 @@ class LocalMachines:
         )
 
     def _record(self, worker: MachineWorker, link: Link, undo: ExitStack) -> None:
-        """Record the machine, if that is wanted; trouble with the disk is the recorder's own affair."""
+        """Record the machine if the settings say so; the recorder itself deals with disk errors."""
         machine = worker.machine
         if self._settings.recording.directory is None:
             return
@@ -141,7 +141,7 @@ class LocalMachines:
         recorder = MachineRecorder(machine, self._settings.recording, committed)
         undo.callback(recorder.stop)
         recorder.start()
-        # Before anything is published for the machine, and undeclared after everything is.
+        # Declared before anything is published for the machine, and undeclared after everything has been.
         undo.callback(tap(link, machine.keys, recorder.put))
         worker.recorder = recorder
 
@@ -199,7 +199,7 @@ class _Supervisor:
     def _look(self, number: int, worker: MachineWorker, link: MachineLink) -> None:
         health = worker.health()
         before, now = self._published.get(number), with_flow(health, None, 0)
-        # An alarm that changed and changed back is news, to whoever asked in between: its event's number has changed.
+        # An alarm that changed and changed back counts too, as somebody may have asked in between: its number differs.
         if before == now:
             return
         self._published[number] = now

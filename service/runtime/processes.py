@@ -1,4 +1,4 @@
-"""Where shards run: processes of this computer, or what else there is with the same face.
+"""Where shards run: in processes of this computer, or elsewhere behind the same interface.
 
 ::
 
@@ -29,16 +29,16 @@ class ShardProcess(Protocol):
         """Start it again, after it has ended or could not begin; raises `RotorwatchError`."""
 
     def said(self, wait_s: float) -> str | None:
-        """What it says next; None if it says nothing in this time. Raises `EOFError` if it never will."""
+        """Its next message; None if none comes in this time. Raises `EOFError` if none will ever come."""
 
     def ended(self, wait_s: float) -> str:
         """How it has ended within this time; empty if it is at work."""
 
     def ask_to_stop(self) -> None:
-        """Let it end in order."""
+        """Ask it to end in order."""
 
     def end(self, patience_s: float) -> None:
-        """Wait for its end, and end it after this time."""
+        """Wait for its end, and kill it after this time."""
 
 
 class Placement(Protocol):
@@ -46,17 +46,17 @@ class Placement(Protocol):
 
     @property
     def session_open(self) -> bool:
-        """Whether streams can pass, where they come through this process."""
+        """Whether streams can pass, if they come through this process."""
 
     def connect(self, undo: ExitStack) -> Link:
         """Listen where streams and shards come in; returns the session that the shards connect to."""
 
     def process(self, number: int, settings: ServiceSettings) -> ShardProcess:
-        """A process for a shard, which begins; raises `RotorwatchError` if it cannot."""
+        """Start a process for a shard; raises `RotorwatchError` if it cannot."""
 
 
 class OneComputer:
-    """Processes of this computer; streams come in through this one, which, if it `waits`, slows sources down."""
+    """Processes of this computer; streams come in through this one, which with `waits` slows down sources."""
 
     def __init__(self, link: LinkSettings, *, waits: bool) -> None:
         self._link, self._waits = link, waits
@@ -105,7 +105,7 @@ class _Spawned:
         self._begin()
 
     def _begin(self) -> None:
-        # Not a fork: threads of this process hold locks that nobody would let go of in a copy.
+        # Not a fork: locks that threads of this process hold would never be released in the copy.
         context = multiprocessing.get_context("spawn")
         try:
             ours, theirs = context.Pipe()
@@ -143,7 +143,7 @@ class _Spawned:
 
 
 def _run(settings: ServiceSettings, inner: LinkSettings, connection: Connection) -> None:
-    # Meant for whoever started this process, and decides when it ends.
+    # Signals are for the process that started this one and decides when it ends.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     run_shard(settings, inner, connection)

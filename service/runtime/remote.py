@@ -1,4 +1,4 @@
-"""A machine that another process monitors, as the process that serves it knows it."""
+"""A machine that another process monitors, as seen by the process that serves it."""
 
 import threading
 import time
@@ -29,7 +29,7 @@ from service.stream.transport import Link
 
 _LATEST_S = 0.5
 _SILENT_S = 10.0
-"""A shard says every second how it stands."""
+"""Silence after which a shard is not believed any more; it sends its status every second."""
 _ERRORS = (UnknownAlarm, OperationRefused, OperationConflict, NotInTime, StoreError)
 _CALM = {HealthState.WARMING, HealthState.HEALTHY, HealthState.UNCHANGED, HealthState.WATCHING}
 
@@ -41,7 +41,7 @@ class RemoteMachine:
         self._entry = entry
         self._link = link
         self._lock = threading.Lock()
-        self._process = ""  # the one whose word counts
+        self._process = ""  # the one that is believed
         self._numbers = [-1, -1]  # of status and health
         self._latest: LatestData | None = None
         self._latest_s = 0.0
@@ -55,15 +55,15 @@ class RemoteMachine:
         self._accepted = 0
 
     def follow(self, process: str) -> None:
-        """Believe this process from now on, and ask for all that it tells."""
+        """Believe this process from now on, and ask it for the complete state."""
         with self._taking:
             self._process, self._numbers = process, [-1, -1]
         self.take(Standing.model_validate_json(self._answer(Question(about="standing"))))
 
     def take(self, standing: Standing) -> None:
-        """Take note of what its shard tells, from any thread; what is older than what is known does not count."""
+        """Take note of a state that its shard sent, from any thread; one older than what is known does not count."""
         with self._taking:
-            if standing.process != self._process:  # one that was given up and does not know it
+            if standing.process != self._process:  # that process was given up and does not know it
                 return
             self.history.go_on_from(standing.sequence)
             if standing.number > self._numbers[0]:
@@ -75,7 +75,7 @@ class RemoteMachine:
 
     @property
     def not_monitored(self) -> str:
-        """Why what was told does not count any more; empty if it does."""
+        """Why the latest known state does not count any more; empty if it does."""
         silent_s = time.monotonic() - self._told_s
         return self.down or (
             f"the process that monitors it has not responded for more than {_SILENT_S:g} s"
@@ -93,12 +93,12 @@ class RemoteMachine:
 
     @cached_property
     def snapshots(self) -> MachineSnapshots:
-        """What shows a window; its files are read when somebody first looks."""
+        """Makes snapshots of a window; the machine's files are read when somebody first looks."""
         return MachineSnapshots(install(self._entry.load(), self._entry.bundle), self.identity)
 
     @property
     def latest(self) -> LatestData:
-        """What its monitor holds; asked for twice a second at most."""
+        """Latest data of its monitor, fetched twice a second at most."""
         with self._lock:
             self._check()
             if self._latest is None or time.monotonic() - self._latest_s > _LATEST_S:
@@ -106,7 +106,7 @@ class RemoteMachine:
             return self._latest
 
     def health(self) -> Health:
-        """Where the machine stands now, as far as it was told."""
+        """State of the machine now, by the latest message of its shard."""
         with self._taking:
             health, age_s, told_s, accepted = self._health, self._data_age_s, self._told_s, self._accepted
         if age_s is not None:
@@ -118,7 +118,7 @@ class RemoteMachine:
         return health.model_copy(update={"state": state, "reason": why})
 
     def status(self) -> MachineStatus:
-        """How its monitoring is at work."""
+        """State of its monitoring."""
         if not (why := self.not_monitored):
             return self._status
         return replace(self._status, trouble=why, alive=self._status.alive and not self.down)
@@ -139,7 +139,7 @@ class RemoteMachine:
             raise NotInTime(f"{error}; look at the alarm before trying again") from error
 
     def _ask(self, question: Question) -> bytes:
-        """Ask its shard; of one that hangs or has ended nothing is asked, for whoever asks waits."""
+        """Ask its shard; raise at once, rather than wait, if that hangs or has ended."""
         self._check()
         return self._answer(question)
 

@@ -1,4 +1,4 @@
-"""The running service: the machines, whoever hears of them, and the HTTP server; start and stop.
+"""The running service: the machines, their listeners, and the HTTP server; start and stop.
 
 ::
 
@@ -58,7 +58,7 @@ class Runtime:
         self.settings = settings
         self._monitored: Sequence[Monitored] = ()
         self._history_open = False
-        # What is heard in a namespace is a replay, of which nobody must be told.
+        # What is received in a namespace is a replay, of which nobody must be notified.
         self.webhooks = Webhooks(() if settings.link.namespace else settings.webhooks)
         self._requests = RequestCounts()
         self.metrics = Metrics(self, self._requests)
@@ -69,7 +69,7 @@ class Runtime:
         self.replays = ReplayRequests(settings, self.catalogue)
         self._machines: LocalMachines | Shards
         if ray_address is not None:
-            from service.runtime.fleet import Fleet, fleet_count  # noqa: PLC0415  # needs what few have installed
+            from service.runtime.fleet import Fleet, fleet_count  # noqa: PLC0415  # needs Ray, which few have installed
 
             fleet = fleet_count(settings), Fleet(settings, ray_address)
             self._machines = Shards(settings, *fleet, self.store, self)
@@ -83,7 +83,7 @@ class Runtime:
 
     @property
     def http_url(self) -> str:
-        """Where the HTTP API is, once started."""
+        """Address of the HTTP API, once started."""
         if self._server is None:
             raise HttpError("the HTTP API is not started")
         return self._server.url
@@ -153,7 +153,7 @@ class Runtime:
                 _log.error("a new history is begun", why=self.store.lost)
             undo.callback(self.store.close)
             self._history_open = True
-            # After the machines, whose last events they tell, and before the history that these are read from.
+            # Closed after the machines, whose last events they send, and before the history, where they read these.
             undo.callback(self.feed.close)
             undo.callback(self.webhooks.close)
             self._monitored = self._machines.open(undo)
@@ -178,7 +178,7 @@ class Runtime:
         Raises
         ------
         StoreError
-            Saying what is lost, if the history does not take the last of it; everything has stopped all the same.
+            If the history does not take the last steps, saying what is lost; everything has stopped all the same.
         """
         try:
             self._undo.close()
@@ -199,10 +199,10 @@ def readiness_of(
     history_lost: str,
     failing_webhooks: Sequence[str],
 ) -> Readiness:
-    """Judge.
+    """Judge whether everything that monitoring needs works.
 
-    Recordings and webhooks are stated and no reason: machines are monitored, and alarms kept, all the same. What is
-    wrong with the history is empty if nothing is.
+    Recordings and webhooks are stated but are no reason against it: without them machines are still monitored, and
+    alarms kept. `history_trouble` and `history_lost` are empty if nothing is wrong with the history.
     """
     reasons = []
     if not session_open:

@@ -1,6 +1,6 @@
 """A process that monitors some of the machines for another one, which serves them.
 
-It goes on until the other one says so or ends, and is told apart from a monitor by nobody on the network.
+It runs until the other one stops it or ends. Nobody on the network can tell it from a monitor of its own.
 """
 
 import threading
@@ -26,7 +26,7 @@ from service.terminal.memory import keep_loaded, prepare_memory
 
 _STATUS_S = 1.0
 _PATIENCE_S = 15.0
-"""For SQLite's one lock, which other processes hold in turn."""
+"""Longest wait for SQLite's one lock, which other processes hold in turn."""
 
 _log = logger(part="shard")
 
@@ -34,10 +34,10 @@ _log = logger(part="shard")
 def run_shard(settings: ServiceSettings, inner: LinkSettings, connection: Connection) -> None:
     """Monitor machines until something comes over the connection, or its other end is closed.
 
-    The settings are those of this process alone; by `inner` it connects to the one that serves its machines.
+    The settings are those of this process alone; by `inner` it connects to the process that serves its machines.
 
-    Says over it, once it is ready, what its answers and news are known by, or else the kind of an error and, after a
-    line break, what is wrong; and at its end what was lost.
+    Sends over the connection, once ready, the identity of this process in its answers and news, or else the kind of an
+    error and, after a line break, what is wrong; and at its end what was lost.
     """
     prepare_memory()
     configure_logging(settings.log)
@@ -47,7 +47,7 @@ def run_shard(settings: ServiceSettings, inner: LinkSettings, connection: Connec
             shard = _Shard(settings, inner, starting)
             undo = starting.pop_all()
             keep_loaded()
-    except Exception as error:  # whatever it is, somebody waits to hear it
+    except Exception as error:  # whatever it is, the other process waits to be told
         if not isinstance(error, RotorwatchError):
             _log.exception("a shard cannot begin")
         connection.send_bytes(f"{type(error).__name__}\n{error}".encode())
@@ -68,7 +68,7 @@ def run_shard(settings: ServiceSettings, inner: LinkSettings, connection: Connec
 
 
 class _Shard:
-    """The machines of this process, and what is told of them."""
+    """The machines of this process, and the news and answers that it sends about them."""
 
     def __init__(self, settings: ServiceSettings, inner: LinkSettings, undo: ExitStack) -> None:
         self.process = uuid.uuid4().hex
@@ -98,7 +98,7 @@ class _Shard:
                 self._tell(place, changed=True)
 
     def tell_all(self) -> None:
-        """Tell how the machines are monitored."""
+        """Send the status of every machine."""
         for place in self._workers:
             self._tell(place)
 
@@ -108,9 +108,9 @@ class _Shard:
 
     def _standing(self, place: str, *, changed: bool) -> Standing:
         worker = self._workers[place]
-        with self._looking:  # so that what has a larger number was seen later
+        with self._looking:  # so that a larger number means a later look
             number = time.monotonic_ns()
-            sequence = worker.told - 1  # before the health: who hears of an event finds it there
+            sequence = worker.told - 1  # before the health, which then contains the event
             changed = changed or sequence != self._told.get(place)
             self._told[place] = sequence
             health = worker.health()

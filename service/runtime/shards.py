@@ -1,8 +1,8 @@
 """Processes that share the machines of one monitor, seen from the one that serves them.
 
 A shard is a process with the machines it was given: streams in, evaluation, history, topics out. This process serves
-HTTP, page, metrics and webhooks, from what the shards tell, what it asks them, and the history. A shard that ends is
-started again and goes on where it stood. Where they run: `service.runtime.processes`, and `service.runtime.fleet`.
+HTTP, page, metrics and webhooks, from messages of the shards, their answers, and the history. A shard that ends is
+started again and continues from its state. Where they run: `service.runtime.processes`, and `service.runtime.fleet`.
 """
 
 import os
@@ -24,7 +24,7 @@ from service.stream.transport import LinkError
 from service.terminal.logs import logger
 
 OF_A_SHARD = 15
-"""Machines from which on another process is worth its memory."""
+"""Machines for which another process is worth its memory."""
 _START_S = 120.0
 _STOP_S = 60.0
 _LOOK_S = 0.25
@@ -43,7 +43,7 @@ def shard_count(settings: ServiceSettings) -> int:
     Raises
     ------
     MachineFileError
-        If more are asked for than can be.
+        If more are asked for than the settings allow.
     """
     wanted = settings.shards.count
     if (why := _why_one(settings)) is not None:
@@ -81,7 +81,7 @@ class _Shard:
         self._watcher = threading.Thread(target=self._watch, name=self._name, daemon=True)
 
     def ready(self) -> str:
-        """Wait until its machines are monitored; returns what its process is known by."""
+        """Wait until its machines are monitored; returns the identity of its process."""
         said = self._received(_START_S)
         if said is None:
             how = self.process.ended(0.0) or f"was not ready in {_START_S:g} s"
@@ -98,7 +98,7 @@ class _Shard:
         self._watcher.start()
 
     def ask_to_stop(self) -> None:
-        """Let it end in order."""
+        """Ask it to end in order."""
         self._stopping.set()
         if self._watcher.is_alive():
             self._watcher.join()
@@ -113,7 +113,7 @@ class _Shard:
         return f"{self._name} did not end in order" if lost is None else lost
 
     def _received(self, patience_s: float, *, to_the_end: bool = False) -> str | None:
-        """What it says; None if it has ended instead, or says nothing."""
+        """Its next message; None if it has ended or sends nothing."""
         end_s = time.monotonic() + patience_s
         with suppress(EOFError):
             while time.monotonic() < end_s and (to_the_end or not self._stopping.is_set()):
@@ -137,9 +137,9 @@ class _Shard:
                     known_by = self.ready()
                     for one in self.machines:
                         one.follow(known_by)
-                    self._listener.wake()  # events that were committed and not told any more
-                except Exception as error:  # whatever it is, the machines must not stay without anybody
-                    trace = None if isinstance(error, RotorwatchError) else error  # those say by themselves what it is
+                    self._listener.wake()  # for events that were committed but no longer sent
+                except Exception as error:  # whatever it is, the machines must not stay unmonitored
+                    trace = None if isinstance(error, RotorwatchError) else error  # those explain themselves
                     self._log.error("a shard could not be started again", exc_info=trace, why=str(error))
                     self._say(f"{why}, which failed: {error}")
                     self._stopping.wait(wait_s)
@@ -151,7 +151,7 @@ class _Shard:
                     break
 
     def _look(self) -> None:
-        """Tell of a process that hangs, and when it is heard again."""
+        """Report a process that hangs, and when it responds again."""
         hangs = any(one.not_monitored for one in self.machines)
         if hangs != self._hangs:
             self._hangs = hangs
@@ -169,7 +169,7 @@ class _Shard:
 
 
 class Shards:
-    """All of the processes; the store is opened by whoever has it, between `connect` and `open`."""
+    """All of the processes; the caller opens the store between `connect` and `open`."""
 
     def __init__(
         self, settings: ServiceSettings, count: int, placement: Placement, store: Store, listener: Listener
@@ -185,11 +185,11 @@ class Shards:
 
     @property
     def session_open(self) -> bool:
-        """Whether the Zenoh sessions are open that streams come in by."""
+        """Whether the Zenoh sessions by which streams come in are open."""
         return self._placement.session_open and all(one.status().session_open for one in self._remote.values())
 
     def connect(self, undo: ExitStack) -> None:
-        """Listen where the settings say, for the shards, and for what they tell; raises `LinkError`."""
+        """Listen for streams as the settings say, for shards, and for their messages; raises `LinkError`."""
         self._link = self._placement.connect(undo)
         undo.callback(hear(self._link, self._heard))
 
@@ -199,7 +199,7 @@ class Shards:
         Raises
         ------
         RotorwatchError
-            As the first of them says that cannot.
+            The error of the first process that cannot begin.
         """
         undo.callback(self._stop)
         for number in range(self._count):
@@ -218,7 +218,7 @@ class Shards:
         return [of_entry[entry] for entry in self._settings.machines]
 
     def start(self, undo: ExitStack) -> None:
-        """Tell where the machines stand; they are monitored already."""
+        """Report the health of the machines, which are monitored already."""
         _ = undo
         for one in self._remote.values():
             self._listener.health(one.health())
@@ -235,7 +235,7 @@ class Shards:
     def _heard(self, content: bytes) -> None:
         standing = Standing.model_validate_json(content)
         machine = self._remote.get(standing.place)
-        if machine is None:  # its shard is not ready yet; it is asked for all of it then
+        if machine is None:  # its shard is not ready yet, and will be asked for the complete state
             return
         before = machine.history.last_sequence()
         machine.take(standing)

@@ -1,16 +1,16 @@
-"""What a plant will take: processor, memory, disk and network, from what machines of several kinds were seen to take.
+"""What a plant will take: processor, memory, disk and network, from measurements on several kinds of machines.
 
-The figures are data (``costs.toml``, written by ``python benchmarks/costs.py``). Between them stands a model in which
-everything is a sum of terms that are not negative, fitted to all kinds at once so that relative deviations are least
+The figures are data (``costs.toml``, written by ``python benchmarks/costs.py``). A model interpolates between them. In
+it every cost is a sum of non-negative terms, fitted to all kinds at once so that relative deviations are least
 (non-negative least squares, C. L. Lawson, R. J. Hanson: Solving Least Squares Problems, 1974):
 
-- processor for a report: so much each, for each second of data, for each sample of all channels; of a machine that is
-  diagnosed, more each and for each sample; for its networks;
-- memory of a machine: so much each, for each sample of a hop; diagnosed, more each and for each pair of channels; for
-  its networks; beside what a process has before it monitors any;
-- bytes of a report, whatever their way: so much each, for each channel, where it is diagnosed, for its networks.
+- processor time of a report: a constant, and terms per second of data and per sample of all channels; if the machine is
+  diagnosed, a further constant and a further term per sample; a constant for its networks;
+- memory of a machine, beside that of a process without machines: a constant, and a term per sample of a hop; if it is
+  diagnosed, a further constant and a term per pair of channels; a constant for its networks;
+- bytes of a report, wherever they go: a constant, a term per channel, and constants for diagnosis and for networks.
 
-What is computed exactly: samples as they come in, 4 bytes each, and how long things are kept.
+Computed exactly are the samples as they come in, 4 bytes each, and how long things are kept.
 """
 
 import math
@@ -32,14 +32,15 @@ from service.settings.service import RecordingSettings
 _DAY_S = 86_400.0
 _SAMPLE_BYTES = 4
 _BUCKET = 2.2
-"""Bytes of a bucket to those of the readings of a window: 20 machines, a million windows (benchmarks/history.py)."""
+"""Ratio of the bytes of a bucket to those of a window's readings: 20 machines, a million windows
+(benchmarks/history.py)."""
 _FIGURES = Path(__file__).with_name("costs.toml")
 
 Measured = Literal["processor_ms", "memory_mb", "written_kb", "reports_kb", "readings_kb", "told_kb"]
 
 
 class Kind(BaseModel, extra="forbid", frozen=True):
-    """How much data come of a machine, and what is made of them."""
+    """How much data a machine sends, and how they are evaluated."""
 
     channels: int = Field(ge=1, description="channels of the stream, the shaft angle among them")
     rate_hz: float = Field(gt=0, le=1e6, allow_inf_nan=False, description="samples per second and channel")
@@ -53,7 +54,7 @@ class Kind(BaseModel, extra="forbid", frozen=True):
         return self.channels * self.rate_hz * self.hop_s / 1e6
 
     def terms(self, what: Measured) -> list[float]:
-        """What the model adds up, each times a cost that is the same for all kinds."""
+        """Terms of the model, each to be multiplied by a cost that is the same for all kinds."""
         diagnosed, networks = float(self.diagnosed), float(self.networks)
         if what == "processor_ms":
             return [1.0, self.hop_s, self.samples, diagnosed, diagnosed * self.samples, networks]
@@ -63,7 +64,7 @@ class Kind(BaseModel, extra="forbid", frozen=True):
 
 
 class Case(Kind):
-    """A kind of machine that was measured: of a report and machine, memory of a machine."""
+    """A kind of machine that was measured: what one report of one machine takes, and the memory of one machine."""
 
     processor_ms: float = Field(gt=0)
     memory_mb: float = Field(gt=0, description="beside that of a process without machines")
@@ -74,7 +75,7 @@ class Case(Kind):
 
 
 class RecordingCost(BaseModel, extra="forbid", frozen=True):
-    """What recorders take of the samples (``python benchmarks/recording.py``)."""
+    """What it takes to record samples (``python benchmarks/recording.py``)."""
 
     compressed: float = Field(gt=0, le=1, description="bytes in the file to bytes that came; noise hardly compresses")
     processor_s_per_mb: float = Field(ge=0)
@@ -105,7 +106,7 @@ class Costs(BaseModel, extra="forbid", frozen=True):
         return of_terms
 
     def of(self, kind: Kind, what: Measured) -> float:
-        """What the model says of a kind of machine."""
+        """Cost of a kind of machine by the model."""
         cost: float = self._of_terms[what] @ np.array(kind.terms(what))
         return cost
 
@@ -116,7 +117,7 @@ class Costs(BaseModel, extra="forbid", frozen=True):
         return max(abs(ratio - 1) for ratio in ratios)
 
     def outside(self, kind: Kind) -> list[str]:
-        """In what a kind lies outside of those that were measured, in words; empty if it does not."""
+        """In which respects a kind lies outside those that were measured, in words; empty if in none."""
         like = [case for case in self.cases if (case.diagnosed, case.networks) == (kind.diagnosed, kind.networks)]
         told = []
         for name, unit in (("channels", ""), ("rate_hz", " Hz"), ("hop_s", " s")):
@@ -132,7 +133,7 @@ _ALL: tuple[Measured, ...] = ("processor_ms", "memory_mb", "written_kb", "report
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """What machines of one kind take, all of them together."""
+    """What a number of machines of one kind take together."""
 
     machines: int
     cores: float
@@ -152,7 +153,7 @@ class Size:
 
 
 def load_costs() -> Costs:
-    """What was measured."""
+    """Read the measured costs."""
     return Costs.model_validate(read_toml(_FIGURES))
 
 
@@ -166,7 +167,7 @@ def sized(
     cores: int,
     busy: float,
 ) -> Size:
-    """Size of a plant, on computers of so many cores, of which a part `busy`, up to 1, may be used in the mean."""
+    """Size of a plant on computers with `cores` cores, of which a fraction `busy`, up to 1, may be used on average."""
     a_day = _DAY_S / kind.hop_s
     stream_mb_s = kind.channels * kind.rate_hz * _SAMPLE_BYTES / 1e6
     recorded_gb_day = stream_mb_s * costs.recording.compressed * _DAY_S / 1e3
@@ -175,7 +176,7 @@ def sized(
     computers = min(machines, math.ceil((used + recorders) / (busy * cores)))
     in_fleet, on_one = math.ceil(machines / OF_A_SHARD), max(1, min(cores, machines // OF_A_SHARD))
     processes = in_fleet if computers > 1 else on_one  # as `fleet_count` and `shard_count` say
-    # No process uses more than one core, and none is on two computers: then more than these are needed.
+    # More are needed if they do not suffice: no process uses more than one core or runs on two computers.
     processes = min(machines, max(processes, math.ceil(used / busy), computers if computers > 1 else 1))
     shards = processes if processes > 1 else 0
     reports_kb, readings_kb = costs.of(kind, "reports_kb"), costs.of(kind, "readings_kb")

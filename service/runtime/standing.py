@@ -1,4 +1,4 @@
-"""How a machine stands, from the process that monitors it to the one that serves it, and what is asked in between."""
+"""State of a machine, sent by the process that monitors it to the one that serves it, and questions in return."""
 
 import dataclasses
 import json
@@ -25,21 +25,21 @@ EVENTS = TypeAdapter(tuple[AlarmCloudEvent, ...])
 
 
 class Standing(BaseModel, frozen=True, arbitrary_types_allowed=True):
-    """What has changed of a machine; what is None has not."""
+    """The state of a machine; the health is None if it has not changed."""
 
     process: str
     place: str
-    number: int  # larger than those of all that this process saw of the machine before
+    number: int  # larger than in all earlier states of the machine from this process
     sequence: int  # of the latest alarm event
     status: MachineStatus
-    # What is no reason to tell all of its health.
+    # Changes of these are no reason to send the whole health.
     data_age_s: float | None
     accepted_blocks: int
     health: Health | None = None
 
 
 class Question(BaseModel, frozen=True):
-    """What is asked of the process that monitors a machine."""
+    """A question to the process that monitors a machine."""
 
     about: str  # ``standing``, ``alarms``, ``detectable``, ``operate``, ``latest``
     change: float | None = None
@@ -48,14 +48,14 @@ class Question(BaseModel, frozen=True):
 
 
 def latest_to_bytes(data: LatestData) -> bytes:
-    """What a monitor holds, as bytes that hold numbers and text alone."""
+    """Latest data of a monitor as bytes that hold nothing but numbers and text."""
     arrays: list[np.ndarray] = []
     form = json.dumps(_form(data, arrays))
     return to_bytes({"form": np.array([form])} | {str(number): array for number, array in enumerate(arrays)})
 
 
 def latest_from_bytes(content: bytes) -> LatestData:
-    """The same from what `latest_to_bytes` gave.
+    """Latest data from the bytes of `latest_to_bytes`.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def latest_from_bytes(content: bytes) -> LatestData:
 
 
 def _form(value: object, arrays: list[np.ndarray]) -> Any:
-    """The value with its arrays taken out, as JSON has it: what is not plain is a pair of its kind and its content."""
+    """The value for JSON, with its arrays moved to `arrays`; what is not plain becomes a pair of kind and content."""
     if isinstance(value, np.ndarray):
         arrays.append(value)
         return ["array", str(len(arrays) - 1)]

@@ -1,4 +1,4 @@
-"""What of a monitor goes into the history with every hop, and how a monitor comes back from it."""
+"""What a monitor writes into the history with every hop, and how it is restored from there."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -26,7 +26,7 @@ from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import Identity, MonitorState
 
 FORMAT = 11
-"""Goes up when what a monitor remembers changes its form."""
+"""Goes up when the form of a monitor's state changes."""
 _LOOK_BACK_NS, _LATE_NS = 300 * 10**9, 3600 * 10**9
 
 
@@ -76,11 +76,10 @@ def stored_event(identity: Identity, event: AlarmEvent, recorded_ns: int) -> Sto
 
 
 class StepWriter:
-    """Commits what one machine's monitor says, and what it remembers afterwards, in one step.
+    """Commits reports and events of one machine's monitor, and its state after them, in one step.
 
-    Alarm events come first: whatever else cannot be put into words, remembered or written, they go into the log and out
-    to operators. What the log refuses is tried again with the next step: it takes no event that comes after a missing
-    one.
+    Alarm events come first: whatever else cannot be converted, saved or written, they go into the log and out to
+    operators. Events that the log refuses are tried again with the next step: it takes none that follows a missing one.
     """
 
     def __init__(self, history: MachineStore, identity: Identity) -> None:
@@ -97,7 +96,7 @@ class StepWriter:
         self._kept = parts
 
     def begun_anew(self) -> str:
-        """Why the history has to be given everything again; empty if it has not."""
+        """Why everything has to be written to the history again; empty if it need not be."""
         return "" if self._generation == self._history.generation else self._history.news
 
     def owe(self, events: tuple[AlarmEvent, ...]) -> None:
@@ -109,8 +108,8 @@ class StepWriter:
     ) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...], bool]:
         """Commit windows, the events that are owed, and the state of the monitor; raises nothing.
 
-        With the `whole` that is in the window nothing has to be recalled. Returns reports and events as they are to be
-        published, and whether all of it is in the database now.
+        With `whole` the state includes the window, which then need not be refilled. Returns reports and events as they
+        are to be published, and whether all of it is in the database now.
         """
         self.refused = None
         if (generation := self._history.generation) != self._generation:
@@ -130,7 +129,7 @@ class StepWriter:
         return reports, told, written
 
     def _told(self, event: AlarmEvent, recorded_ns: int) -> StoredEvent:
-        """An event as it is published; one that cannot be put into words is told without its particulars."""
+        """An event as it is published; one that cannot be converted is published without its details."""
         try:
             return stored_event(self._identity, event, recorded_ns)
         except Exception as error:
@@ -140,7 +139,7 @@ class StepWriter:
             return stored_event(self._identity, replace(event, alarm=bare), recorded_ns)
 
     def _commit_events(self, told: tuple[StoredEvent, ...]) -> None:
-        """Bring the events alone into the log; a restart goes on from an older state, with the log's own numbers."""
+        """Commit the events alone; a restart then continues from an older state, with the log's own numbers."""
         try:
             if told:
                 self._history.commit(Step(events=told))
@@ -150,7 +149,7 @@ class StepWriter:
 
 
 def checkpoint_step(identity: Identity, state: MonitorState, recorded_ns: int) -> CheckpointStep:
-    """What a monitor remembers, for the history."""
+    """Convert the state of a monitor for the history."""
     head = CheckpointHead(
         format=FORMAT,
         bundle=identity["bundle"],
@@ -167,10 +166,10 @@ def checkpoint_step(identity: Identity, state: MonitorState, recorded_ns: int) -
 def restored(
     build: Callable[[], MachineMonitor], identity: Identity, checkpoint: Checkpoint, next_sequence: int
 ) -> tuple[MachineMonitor, str]:
-    """A monitor that goes on from what was remembered, as far as that fits, and what became of the past, in a sentence.
+    """Build a monitor that continues from a checkpoint, as far as that fits; say in a sentence what was restored.
 
-    Alarms are restored whatever else differs, with the number of the next event by the log, and so are first windows
-    while sensors and settings of levels are the same; windows and tests only if the files and the program are.
+    Alarms are restored whatever else differs, with the log's number of the next event. First windows are restored if
+    sensors and settings of levels are the same; windows and tests only if the files and the program are.
     """
     head, monitor = checkpoint.head, build()
     at = rfc3339(head.end_ns) if head.end_ns else "the beginning, before any data"
@@ -195,13 +194,13 @@ def restored(
 
 
 def recorded_since_ns(head: CheckpointHead) -> int:
-    """From when on, by the computer's time, recordings hold all that the window was made of."""
+    """Time of this computer from which on recordings hold all that the window was made of."""
     late_ns = head.recorded_ns - head.end_ns  # long after the latest data, or by another clock
     return head.recorded_ns - _LOOK_BACK_NS - (late_ns if 0 < late_ns < _LATE_NS else 0)
 
 
 def recorded_after(monitor: MachineMonitor, recorded: Iterable[RecordedMessage]) -> Iterator[RecordedMessage]:
-    """What was recorded after the newest block that the monitor has had; what was before goes into its window."""
+    """Messages recorded after the newest block that the monitor has had; earlier ones refill its window."""
     newest = False
     for message in recorded:
         if newest:

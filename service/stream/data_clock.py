@@ -1,14 +1,14 @@
-"""What time it is by a machine's data while none come, and since when there have been none."""
+"""The time by a machine's data, also while none come, and for how long there have been none."""
 
 from service.stream.liveness import Clocks
 
 _HELD_UP_S = 2.0
-"""Time passes in steps of a fraction of this; if not, the program itself stood still."""
-_AGAIN_S = 20.0  # to hear a stream again after a restart: of all machines, what publishers have kept comes first
+"""Ticks are a fraction of this apart; if not, the program itself stood still."""
+_AGAIN_S = 20.0  # to hear a stream again after a restart: the publishers' cached blocks of all machines come first
 
 
 class DataClock:
-    """Goes on from the end of the newest data as time passes; its machine's thread turns it, any thread may look.
+    """Goes on from the end of the newest data as time passes; its machine's thread ticks it, any thread may read it.
 
     Parameters
     ----------
@@ -25,25 +25,25 @@ class DataClock:
         self._begin_s = self._ticked_s = self._held_up_s = clocks.monotonic_s()
 
     def slept(self, since_ns: int) -> None:
-        """What is known was recorded then, by this computer's time of day."""
+        """Take note of when, by this computer's time of day, the latest known state or message was recorded."""
         self._asleep_s = max(0.0, (self._clocks.utc_ns() - since_ns) / 1e9)
 
     def wake(self) -> None:
-        """All that came so far was recorded, and is as old as it is."""
+        """Take note that all blocks so far came from a recording, none of them just now."""
         self._latest_s = None
 
     def begin(self) -> None:
-        """From now on blocks may come."""
+        """Take note that blocks may come from now on."""
         self._begin_s = self._ticked_s = self._clocks.monotonic_s()
 
     def came(self, *, continuous: bool) -> None:
-        """A block was accepted."""
+        """Take note of an accepted block."""
         if self._latest_s is None or not continuous:
             self._operated_ns = 0  # perhaps by another clock
         self._latest_s = self._clocks.monotonic_s()
 
     def tick(self) -> None:
-        """Time has passed; after the program stood still, that is no silence unless one had begun before."""
+        """Take note that time has passed; a standstill of the program is no silence unless one had begun before."""
         now_s = self._clocks.monotonic_s()
         if now_s - self._ticked_s > _HELD_UP_S and self._ticked_s - self._heard_s < self._limit_s:
             self._held_up_s = now_s
@@ -63,12 +63,12 @@ class DataClock:
 
     @property
     def given_up(self) -> bool:
-        """Whether, when it was turned last, no block had come for so long that none is waited for any longer."""
+        """Whether, at the last tick, no block had come for so long that none is waited for any longer."""
         return self._ticked_s - self._heard_s >= self._limit_s
 
     @property
     def stands(self) -> bool:
-        """Whether, when it was turned last, blocks may have been lacking only because none could be heard yet."""
+        """Whether, at the last tick, blocks may have been lacking only because none could be heard yet."""
         return self._latest_s is None or self._ticked_s - self._latest_s >= self._limit_s
 
     @property
@@ -77,11 +77,11 @@ class DataClock:
 
     @property
     def _heard_s(self) -> float:
-        """When the latest block came, or later, when this program went on after it had stood still."""
+        """When the latest block came or, if later, when this program went on after it had stood still."""
         return max(self._held_up_s, self._begin_s if self._latest_s is None else self._latest_s)
 
     def now_ns(self, end_ns: int | None) -> int:
-        """Data time that has been reached: end of the newest data, and what has passed since."""
+        """Data time that has been reached: end of the newest data plus the time since; time of day before any data."""
         if end_ns is None:
             return self._clocks.utc_ns()
         now_s = self._clocks.monotonic_s()
@@ -90,6 +90,6 @@ class DataClock:
         return end_ns + round((now_s - self._latest_s) * 1e9)
 
     def next_ns(self, end_ns: int | None) -> int:
-        """The same for what an operator does: no two operations have one time."""
+        """The same for an operator's action: no two actions have the same time."""
         self._operated_ns = max(self.now_ns(end_ns), self._operated_ns + 1)
         return self._operated_ns

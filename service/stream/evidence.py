@@ -1,6 +1,6 @@
-"""Keeps what alarms rest on: pictures of the machine before, when they were raised, and after the change.
+"""Keeps the evidence of alarms: pictures of the machine before the change, when they were raised, and after it.
 
-An alarm can then be understood long after its window is gone. Nothing of this decides anything.
+An alarm can then be understood long after its window is gone. Nothing is decided by them.
 """
 
 from models.alarm_names import alarm_kind
@@ -15,18 +15,18 @@ from service.terminal.logs import Limiter, logger
 _CALM = {HealthState.HEALTHY, HealthState.UNCHANGED, HealthState.WATCHING}
 _CALM_NS = 3_600 * 10**9  # between pictures of a machine that nothing is wrong with
 _NOT_KEPT = "predictions are not kept with an alarm"
-_BEFORE = ""  # stands for the alarm where none is meant
+_BEFORE = ""  # stands for the alarm's name in the picture of a machine that nothing is wrong with
 _log = logger(part="evidence")
 
 
 class EvidenceCollector:
-    """Keeps pictures of one machine, in its history, for they are large; for one thread."""
+    """Keeps pictures of one machine in its history, as they are large; for one thread."""
 
     def __init__(self, worker: MachineWorker) -> None:
         self._worker = worker
         self._looked_ns: int | None = None
         self._calm_ns: int | None = None  # end of the latest window kept while nothing was wrong
-        # What alarms that are raised rest on, until it is whole.
+        # Evidence of raised alarms; None once it is complete.
         self._standing: dict[tuple[str, int], AlarmEvidence | None] = {}
         self._generation = worker.history.generation
         self._limiter = Limiter()
@@ -37,7 +37,7 @@ class EvidenceCollector:
         if report is None or report.end_ns == self._looked_ns:
             return
         try:
-            if self._generation != self._worker.history.generation:  # begun anew, without what was kept
+            if self._generation != self._worker.history.generation:  # the history was begun anew, without pictures
                 self._generation, self._calm_ns = self._worker.history.generation, None
             elif self._looked_ns is None and (before := self._before()) is not None:
                 self._calm_ns = before.report.end_ns
@@ -60,7 +60,7 @@ class EvidenceCollector:
         return Picture.model_validate_json(text) if text else None
 
     def _keep(self, kept: AlarmEvidence | None, alarm: Alarm, report: Report) -> AlarmEvidence | None:
-        """Keep what is not kept yet; returns it until it is whole."""
+        """Keep the pictures that an alarm still lacks; return its evidence, or None once that is complete."""
         history, settled = self._worker.history, _is_settled(alarm, report)
         if kept is None and (text := history.evidence(alarm.name, alarm.occurrence)):  # from before a restart
             kept = AlarmEvidence.model_validate_json(text)
@@ -92,7 +92,7 @@ class EvidenceCollector:
 
 
 def _measured(found: CorrelationSnapshot) -> CorrelationSnapshot:
-    """What was measured, in half the space: how far theory was from it is still told."""
+    """Leave out the predictions, which halves the size; how far theory was from the measurement is kept."""
     theory = found.theory
     reasons = {
         "nominal_reason": theory.nominal_reason or _NOT_KEPT,

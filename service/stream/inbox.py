@@ -1,4 +1,4 @@
-"""Blocks of one machine between their arrival and their evaluation, and what else its thread is to do."""
+"""Queue of a machine's blocks between arrival and evaluation, and of other calls for its thread."""
 
 import threading
 from collections import deque
@@ -19,35 +19,35 @@ class RawBlock:
     payload: bytes
     attachment: bytes
     encoding: str
-    source: str = ""  # of which session's publisher it is, empty if it does not say
+    source: str = ""  # session and number of its publisher; empty if it does not say
     dropped_before: int = 0  # messages that arrived before it and were thrown away because the queue was full
 
     @property
     def sender(self) -> tuple[str, str, int | None]:
-        """Who seems to send it."""
+        """Apparent sender: source, kind of encoding, and run."""
         return (self.source, *sender_of(self.attachment, self.encoding))
 
 
 class Inbox:
     """Bounded queue between the network's thread and the machine's worker.
 
-    What cannot be a block, and what others send than the publisher that is followed, costs that publisher no block: its
-    own blocks are taken first, and the others' make room for them.
+    Messages that cannot be blocks, and those of publishers other than the one that is followed, never displace a block
+    of that publisher: its blocks are taken first, and the others make room for them.
 
     Parameters
     ----------
     bound : int
         Most blocks that wait.
     when_full : {"drop", "wait"}
-        "drop" throws away what others sent, or else everything that waits, and counts it: one long gap. Dropping block
-        by block would make many short gaps, and each of them costs the hop it falls into. "wait" makes `put` wait for
-        the worker.
+        "drop" throws away the blocks of others or, if there are none, all that wait, and counts them: one long gap.
+        Dropping block by block would make many short gaps, each of which costs the hop it falls into. "wait" makes
+        `put` wait for the worker.
     most_bytes : int
         Most bytes that wait.
     may_be_block : callable
-        Whether a message may be one of the machine's blocks; told whether it is of the publisher that is followed.
-        Of those that cannot, a few are handed on, so that it can be said what is wrong with them; the others are
-        counted.
+        Takes a message, and whether it is from the publisher that is followed; returns whether it may be one of the
+        machine's blocks. Of those that cannot, a few are passed on, so that their error can be reported; the others
+        are counted.
     """
 
     def __init__(
@@ -76,9 +76,9 @@ class Inbox:
 
     @property
     def behind(self) -> int:
-        """Blocks of the publisher that is followed which wait; 0 where all had been taken since this was asked last.
+        """Waiting blocks of the publisher that is followed; 0 if the worker has taken everything since the last call.
 
-        Blocks that come many at a time wait for a worker that has long been ready for them.
+        Blocks that come many at a time wait even for a worker that is not behind.
         """
         ready, self._ready = self._ready, False
         return 0 if ready else len(self._blocks)
@@ -87,7 +87,7 @@ class Inbox:
         return len(self._blocks) + len(self._others) + len(self._odd)
 
     def follow(self, block: RawBlock) -> None:
-        """Take note of a block that was used: its publisher is the one that is followed."""
+        """Follow the publisher of a block that was used."""
         if block.sender == self._followed:
             return
         with self._changed:
@@ -98,7 +98,7 @@ class Inbox:
 
     def put(self, block: RawBlock) -> None:
         """Append a block; after `close` it is ignored."""
-        known = block.source != "" and block.sender == self._followed  # a run alone is anybody's
+        known = block.source != "" and block.sender == self._followed  # anybody may send the same run
         odd = not self._may_be_block(block, known)
         with self._changed:
             if self._closed:
@@ -125,7 +125,7 @@ class Inbox:
                 self._changed.notify_all()
 
     def _is_worth_it(self) -> bool:
-        """Whether there is something to do that need not wait for more."""
+        """Whether to wake the worker now, rather than wait for more blocks."""
         others = self._closed or self._calls or self._odd or self._others
         return bool(others) or len(self._blocks) >= self._enough or (bool(self._blocks) and self._is_full)
 
@@ -134,7 +134,7 @@ class Inbox:
         return len(self._blocks) + len(self._others) >= self._bound or self._bytes >= self._most_bytes
 
     def _with_room(self, block: RawBlock) -> RawBlock:
-        """Make room: others go first. The block with what was dropped before it."""
+        """Make room, if possible by dropping others' blocks; return the block with the count dropped before it."""
         if self._others:
             self.unread += len(self._others)
             self._others.clear()
@@ -155,10 +155,10 @@ class Inbox:
             return not self._closed
 
     def get(self, enough: int = 1) -> RawBlock | Callable[[], None] | None:
-        """Take what is to be called, or else the oldest block, waiting for one; None after `close`.
+        """Take the next function to be called, or else the oldest block, waiting for one; None after `close`.
 
-        A worker that has taken everything may wait for enough blocks: to be woken for each of them costs more than most
-        have to say. It waits half a second at most, and a call lets it take what is there.
+        A worker that has taken everything may wait for `enough` blocks: to be woken for each of them costs more than
+        most take to process. It waits half a second at most, and a call ends the wait.
         """
         with self._changed:
             if not (self._calls or len(self)):

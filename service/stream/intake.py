@@ -1,4 +1,4 @@
-"""One thread that takes what has come for many machines, many messages at a time."""
+"""One thread that takes the messages for many machines, many at a time."""
 
 import threading
 from collections.abc import Callable
@@ -7,10 +7,10 @@ _EVERY_S = 0.05
 
 
 class Intake:
-    """Has everybody take what waits in his channel, every twentieth of a second.
+    """Has all channels emptied every twentieth of a second.
 
-    A thread for each channel that is woken for each message takes nearly three times the processor: most of it is
-    waking up, and waiting for Python's lock.
+    A thread for each channel that is woken for each message takes nearly three times the processor time: most of that
+    goes into waking up and waiting for Python's lock.
     """
 
     def __init__(self) -> None:
@@ -20,9 +20,9 @@ class Intake:
         self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
 
     def add(self, take: Callable[[], None]) -> Callable[[], None]:
-        """Have a channel emptied from now on; returns what ends it, after which nothing is called any more.
+        """Have a channel emptied by `take` from now on; returns a function that ends this at once.
 
-        What takes what waits there does not raise; everybody else waits for it.
+        `take` must not raise; all other channels wait for it.
         """
         with self._lock:
             self._takers.append(take)

@@ -1,4 +1,4 @@
-"""What time it is for a machine's thread, and whether it still comes round."""
+"""The clocks of a machine's thread, and whether the thread still responds."""
 
 import time
 from collections.abc import Callable
@@ -10,9 +10,9 @@ STUCK_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Clocks:
-    """The computer's clocks; a test puts others in."""
+    """The computer's clocks; tests replace them."""
 
-    monotonic_s: Callable[[], float] = time.monotonic  # seconds that only pass
+    monotonic_s: Callable[[], float] = time.monotonic
     utc_ns: Callable[[], int] = time.time_ns  # time of day
 
 
@@ -20,16 +20,16 @@ COMPUTER = Clocks()
 
 
 class Pulse:
-    """Measures how long a thread has been at work on the same thing, without its help.
+    """Measures from outside how long a thread has been at work on the same thing.
 
-    What is called goes before every block that waits, so that only the present one can hold it up.
+    Its calls go before all waiting blocks, so that only the present block can hold them up.
 
     Parameters
     ----------
     call : callable
         Has a function called by the thread; False if it never will be. `service.stream.inbox.Inbox.call` is one.
     work : callable
-        What the thread does when it comes round.
+        What the thread does with every beat that it answers.
 
     Examples
     --------
@@ -63,7 +63,7 @@ class Pulse:
         return 0.0 if sent_s is None else self._clock() - sent_s
 
     def beat(self) -> None:
-        """Ask for a sign of life, unless one is owed already; called every now and then."""
+        """Ask for a sign of life, unless one is still outstanding; called every now and then."""
         if self._sent_s is None:
             self._sent_s = self._clock()
             if not self._call(self._answered):

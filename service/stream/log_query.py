@@ -1,4 +1,4 @@
-"""What may be asked of an alarm log by a query on the network: ``after=17;limit=500``."""
+"""Parameters of a query for an alarm log on the network: ``after=17;limit=500``."""
 
 import re
 
@@ -12,7 +12,7 @@ _LIMITS = {"after": (-1, 2**53), "limit": (1, MOST_EVENTS)}
 def read_log_query(parameters: str) -> tuple[int, int]:
     """Read the parameters of a query: after which sequence number, or -1, and at most how many events, 100 by default.
 
-    They are as they stand behind the question mark; names that begin with an underscore are Zenoh's own.
+    `parameters` is the text behind the question mark; names that begin with an underscore are Zenoh's own.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A machine that is monitored, as others see it, in this process or from another one."""
+"""A monitored machine as seen from outside its thread, in this process or from another one."""
 
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -17,12 +17,12 @@ from service.recordings.recorder import RecorderStatus
 
 
 class NoAnswerError(RotorwatchError):
-    """Who monitors a machine did not answer, or not in time."""
+    """The process that monitors a machine did not answer, or not in time."""
 
 
 @dataclass(frozen=True, slots=True)
 class MachineStatus:
-    """How the monitoring of a machine is at work; counts since it was started."""
+    """State of the monitoring of a machine; counts are since it was started."""
 
     alive: bool = False  # the thread that evaluates the blocks runs
     errors: int = 0  # blocks lost to an error inside the monitor
@@ -33,13 +33,13 @@ class MachineStatus:
     queue_blocks: int = 0  # blocks that wait for evaluation
     history_waiting: int = 0  # steps that are not in the history yet
     history_trouble: str = ""  # why the history cannot be written; empty if it can
-    restart: str = ""  # how it went on at its start from where it stood
+    restart: str = ""  # what was restored at its start
     tally: Tally = field(default_factory=Tally)
     recorder: RecorderStatus | None = None  # None if it is not recorded
 
 
 def with_flow(health: Health, data_age_s: float | None, accepted_blocks: int) -> Health:
-    """Health with other values of what changes with every block, which is no reason to publish it."""
+    """Health with new values of the fields that change with every block, which is no reason to publish it."""
     stream = health.stream.model_copy(update={"data_age_s": data_age_s})
     quality = health.quality.model_copy(update={"accepted_blocks": accepted_blocks})
     return health.model_copy(update={"stream": stream, "quality": quality})
@@ -57,17 +57,17 @@ class Monitored(Protocol):
 
     @property
     def snapshots(self) -> MachineSnapshots:
-        """What shows a window."""
+        """Makes snapshots of a window."""
 
     @property
     def latest(self) -> LatestData:
-        """What the monitor holds now."""
+        """Latest data of the monitor."""
 
     def health(self) -> Health:
-        """Where the machine stands now."""
+        """State of the machine now."""
 
     def status(self) -> MachineStatus:
-        """How its monitoring is at work."""
+        """State of its monitoring."""
 
     def alarms(self, *, include_normal: bool = False) -> AlarmStates:
         """Return the alarms as they are now."""

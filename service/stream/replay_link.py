@@ -1,8 +1,7 @@
-"""Publishes replayed messages over Zenoh, apart from what is live.
+"""Publishes replayed messages over Zenoh, apart from live ones.
 
-Under a prefix, which is a namespace to those who listen, nobody who watches the live machine can hear them. On the
-original keys a replay is refused as long as a publisher or a monitor of the machine is alive, and stops when one
-appears.
+Under a prefix, a namespace to subscribers, nobody who watches the live machine can receive them. On the original keys a
+replay is refused as long as a publisher or a monitor of the machine is alive, and stops when one appears.
 """
 
 import threading
@@ -59,8 +58,8 @@ class NetworkPlan:
     def prefix_of(self, number: int) -> str:
         """Prefix of a pass.
 
-        The blocks keep their own times, and a monitor refuses to hear the same hour twice: so each pass is, to those
-        who listen, another network.
+        The blocks keep their own times, and a monitor refuses to take the same hour twice: so each pass is a network of
+        its own to subscribers.
         """
         return self.prefix if self.passes == 1 else f"{self.prefix}/{number}"
 
@@ -132,7 +131,7 @@ class ReplayLink:
                 self._undo.callback(session.liveliness().declare_token(self._key(keys.publisher_alive)).undeclare)
 
     def end_pass(self) -> None:
-        """Undeclare it all."""
+        """Undeclare all of the pass."""
         with self._lock:
             self._publishers.clear()
         self._undo.close()
@@ -256,7 +255,7 @@ def replay_to_network(
             if plan.wait_for_subscriber_s:
                 link.wait_for_subscribers(plan.wait_for_subscriber_s, lambda: control.stopped)
             for keys, found in described.items():
-                if found is not None and source.span(keys).start_ns < plan.from_ns:  # else it comes in its place
+                if found is not None and source.span(keys).start_ns < plan.from_ns:  # else it is played in its place
                     link.put(found)
             sent = frozenset(key for keys in plan.machines for key in (keys.stream, keys.descriptor, keys.truth))
             stretch = PlayPlan(None if plan.everything else sent, plan.pace, plan.from_ns, plan.to_ns, number)

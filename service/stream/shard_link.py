@@ -1,4 +1,4 @@
-"""Between processes that share the machines of one monitor: a Zenoh session of their own, which nobody else reaches."""
+"""Link of the processes that share a monitor's machines: a Zenoh session of their own, which nobody else reaches."""
 
 import json
 from collections.abc import Callable
@@ -19,7 +19,7 @@ _ANSWER_S = 15.0
 
 
 class KnownSettings(LinkSettings):
-    """Those of a program that was told a password, which is in no file."""
+    """Settings of a link with a name and a password that are in no file."""
 
     name: str
     secret: str = Field(repr=False)
@@ -34,8 +34,8 @@ class KnownSettings(LinkSettings):
 class ShardLink:
     """The side of the process that monitors machines, on a link that must outlive it.
 
-    Questions are asked under ``process/site/machine``, places are the ``site/machine`` of what it monitors. A
-    `RotorwatchError` in place of an answer is told to whoever asked, with its kind.
+    Questions are asked under ``process/site/machine``; `places` are the ``site/machine`` that it monitors. A
+    `RotorwatchError` raised by `answer` is sent to the caller, with its kind.
     """
 
     def __init__(
@@ -43,14 +43,14 @@ class ShardLink:
     ) -> None:
         self._news = link.session.declare_publisher(_NEWS, congestion_control=zenoh.CongestionControl.BLOCK)
         self._answer = answer
-        self._pool = ThreadPoolExecutor(_THREADS, "answer")  # one that takes long holds up no other
+        self._pool = ThreadPoolExecutor(_THREADS, "answer")  # a slow answer holds up no other
         self._declared = [
             link.session.declare_queryable(f"{process}/{place}", link.guarded(self._asked)) for place in places
         ]
-        ask(link, _HEARS, b"")  # answered by whoever knows by then what was declared here
+        ask(link, _HEARS, b"")  # whoever answers knows by then what was declared here
 
     def tell(self, content: bytes) -> None:
-        """Tell the process that serves the machines."""
+        """Send to the process that serves the machines."""
         self._news.put(content)
 
     def close(self) -> None:
@@ -69,14 +69,14 @@ class ShardLink:
                 content = self._answer(place, b"" if query.payload is None else query.payload.to_bytes())
             except RotorwatchError as error:
                 query.reply_err(str(error), encoding=type(error).__name__)
-            except Exception as error:  # whoever asked must not wait for an answer that does not come
+            except Exception as error:  # the caller must not wait for an answer that does not come
                 query.reply_err(f"{type(error).__name__}: {error}", encoding=RotorwatchError.__name__)
             else:
                 query.reply(query.key_expr, content)
 
 
 def hear(link: Link, callback: Callable[[bytes], None]) -> Callable[[], object]:
-    """Hear what every shard tells, on a thread of Zenoh's; returns what ends it."""
+    """Take what every shard sends, on a thread of Zenoh's; returns a function that ends it."""
 
     def take(sample: zenoh.Sample) -> None:
         callback(sample.payload.to_bytes())
@@ -86,7 +86,7 @@ def hear(link: Link, callback: Callable[[bytes], None]) -> Callable[[], object]:
             query.reply(query.key_expr, b"")
 
     undo = ExitStack()
-    # Indirect: what is heard is a lot to read, and Zenoh's own threads are needed meanwhile.
+    # Indirect, as messages take long to read and Zenoh's own threads are needed meanwhile.
     heard = zenoh.handlers.Callback(link.guarded(take), indirect=True)
     undo.callback(link.session.declare_subscriber(_NEWS, heard).undeclare)
     undo.callback(link.session.declare_queryable(_HEARS, link.guarded(answer)).undeclare)
@@ -96,7 +96,7 @@ def hear(link: Link, callback: Callable[[bytes], None]) -> Callable[[], object]:
 def ask(link: Link, key: str, question: bytes, errors: tuple[type[RotorwatchError], ...] = ()) -> bytes:
     """Ask the process that monitors a machine, under ``process/site/machine``.
 
-    These kinds of error are raised as what they were; others as `RotorwatchError`.
+    Errors of the kinds in `errors` are raised as such, others as `RotorwatchError`.
 
     Raises
     ------

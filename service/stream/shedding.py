@@ -1,4 +1,4 @@
-"""When a machine's worker evaluates: in its turn, and less often where the computer cannot keep up."""
+"""When a machine's worker evaluates: in its turn, and less often if the computer cannot keep up."""
 
 import math
 import threading
@@ -10,18 +10,18 @@ _LASTING_S = 30.0
 _LONGEST_TURN_S = 3.0
 _lock = threading.Lock()
 _turns: deque[threading.Event] = deque()
-"""Of the machine whose turn it is, and of those that wait for theirs; set for whose has come."""
+"""Turns of the machines in order: the first one has begun and is set, the others wait."""
 
 
 @contextmanager
 def in_turn(*, completes_hop: bool) -> Iterator[None]:
-    """Take the blocks that complete a hop one machine of the process after the other, in the order in which they came.
+    """Let the machines of the process complete hops one after the other, in the order in which they ask.
 
-    Python computes in one thread at a time anyway. Workers that evaluate side by side only take it from each other, in
-    the middle of their arithmetic: each holds its intermediate results meanwhile, and finds the processor's caches
-    filled with those of the others. After a stall, all machines have their next window before any has its last one.
+    Python computes in one thread at a time anyway. Workers that evaluate side by side only interrupt each other's
+    arithmetic: each holds its intermediate results meanwhile, and finds the processor's caches filled with those of the
+    others. In turns, all machines have their next window after a stall before any has its last one.
 
-    A turn that lasts longer than `_LONGEST_TURN_S` is over for the others: one that never ends stops none.
+    The others wait for a turn no longer than `_LONGEST_TURN_S`, so that one that never ends stops none.
     """
     if not completes_hop:
         yield
@@ -51,12 +51,12 @@ def _end(turn: threading.Event) -> None:
 
 
 class LoadShedding:
-    """Says which windows are skipped.
+    """Decides which windows are skipped.
 
     A worker is behind if, when it completes a hop, all blocks of the next one wait already. After a stall or a restart
-    they become fewer from hop to hop, and every window is evaluated, unless it stands still once more before that.
-    Where they have not become fewer for `_LASTING_S`, the computer is too small for what it is to do: then every window
-    is skipped at whose end a quarter of the next hop waits, until none has been for as long.
+    the waiting blocks become fewer from hop to hop, and every window is evaluated, unless there is another stall
+    meanwhile. If they have not become fewer for `_LASTING_S`, the computer is too small for its work: then a window is
+    skipped if at least a quarter of the next hop waits at its end, until none has been skipped for `_LASTING_S`.
     """
 
     def __init__(self) -> None:
@@ -67,7 +67,7 @@ class LoadShedding:
     def skips(self, waiting: int, to_hop: int, now_s: float) -> bool:
         """Whether the window that a hop has completed is skipped, at a monotonic time.
 
-        Own blocks that wait (`Inbox.behind`) are compared with how many complete the next hop.
+        The number of `waiting` blocks (`Inbox.behind`) is compared with how many complete the next hop.
         """
         if waiting < to_hop:
             self._fewest, self._fewer_s = math.inf, now_s

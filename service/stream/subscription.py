@@ -1,9 +1,9 @@
-"""Subscribing to sample blocks: what a publisher has kept first, then what comes, in order.
+"""Subscribing to sample blocks: those in a publisher's cache first, then new ones, in order.
 
-Zenoh's advanced subscriber can ask for what is kept, and have fetched again what was lost on the way. One that is to do
-both loses all that is kept if a new block comes between the answers: that is handed on, and what is older counts as
-late (zenoh-ext 1.10, unless a cache holds as much as was asked for). So it does the second only, and each publisher's
-cache is asked from here as Zenoh's own subscriber would, once, when the publisher is first found or heard.
+Zenoh's advanced subscriber can query caches, and fetch again what was lost on the way. If it does both, it loses all
+cached blocks when a new one comes between the answers: it passes on the new one and takes older ones for late
+(zenoh-ext 1.10, unless a cache holds as much as was asked for). Here it only fetches lost blocks, and this module
+queries each publisher's cache as Zenoh's own subscriber would, once, when the publisher is first found or heard.
 """
 
 from collections import deque
@@ -16,33 +16,33 @@ import zenoh
 import zenoh.ext
 
 CACHED_BLOCKS = 1200
-"""Fewer than a queue takes by default: what comes at once after a restart must not overflow it."""
+"""Most blocks taken from a cache: fewer than a queue holds by default, so that a restart does not overflow it."""
 _WAITING_BLOCKS = 4096
-"""Far more than come between two looks of whoever takes them; beyond, the network waits."""
+"""Far more than come between two calls of `BlockSubscription.take`; beyond, the network waits."""
 _HELD_UP_BLOCKS = 256
-"""Where the network waits anyway: more would only take memory."""
+"""The same where the network waits anyway: more would only take memory."""
 _ANSWER_S = 10.0
 _QUESTIONS = 2
-"""Without an answer: a link may break by which it was to come."""
+"""Queries to a cache without an answer: the link by which it was to come may have broken."""
 _PUBLISHERS = 64
-"""That are known; of those that are waited for no longer the latest half. Anybody may claim to be another one."""
+"""Most publishers remembered; of those no longer waited for, the latest half. Anybody may claim to be another one."""
 _CACHES = "/@adv/pub/"
-"""Below the key of the stream: what each publisher has kept, and a token that it is there."""
+"""Below the key of the stream: the cache of each publisher, and its liveliness token."""
 _WITH_HEARTBEATS = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
-# The period is of no use but to have missing blocks fetched at all.
+# The period has no use, but without one missing blocks would not be fetched at all.
 _WITHOUT_HEARTBEATS = zenoh.ext.RecoveryConfig(periodic_queries=timedelta(days=365), heartbeat=None)  # type: ignore[arg-type]  # the stub says seconds
 _BY_TIME = "uhlc"
-"""Stands for the number of a publisher that gives its messages times and no numbers."""
+"""Stands for the number of a publisher whose messages carry times but no numbers."""
 
 
 @dataclass(slots=True)
 class _Kept:
-    """What a publisher has kept, until its new blocks follow on."""
+    """The cached blocks of a publisher, until its new blocks follow on."""
 
     answers: Any = None  # of its cache, in order; None when there are no more
-    new: dict[int, zenoh.Sample] = field(default_factory=dict)  # which came meanwhile
-    reached: int = -1  # the latest of them
-    questions: int = _QUESTIONS  # that are left
+    new: dict[int, zenoh.Sample] = field(default_factory=dict)  # new blocks that came meanwhile, by number
+    reached: int = -1  # number of the latest cached block received
+    questions: int = _QUESTIONS  # queries left
 
 
 class BlockSubscription:
@@ -51,10 +51,10 @@ class BlockSubscription:
     Parameters
     ----------
     on_missed : callable
-        Takes what says how many messages were lost on the way and could not be fetched again.
+        Takes Zenoh's count of messages that were lost on the way and could not be fetched again.
     holds_up : bool
-        Whoever takes the blocks may wait, which holds up the network, and so the publishers. Their heartbeats are not
-        listened to then: one that overtakes blocks that are held up would make Zenoh skip them.
+        Whether the callback of `take` may wait, which holds up the network, and so the publishers. Their heartbeats are
+        ignored then: one that overtakes blocks that are held up would make Zenoh skip these.
     """
 
     def __init__(
@@ -62,9 +62,9 @@ class BlockSubscription:
     ) -> None:
         self._session = session
         self._key = key
-        self._publishers: dict[str, _Kept | None] = {}  # None of those whose new blocks are handed on as they come
+        self._publishers: dict[str, _Kept | None] = {}  # None: new blocks are passed on as they come
         self._found: deque[zenoh.Sample] = deque()
-        # New blocks first: what is kept is asked for when none can be overlooked any more.
+        # Subscribe to new blocks before any cache is queried, so that none is missed in between.
         self._new: zenoh.ext.AdvancedSubscriber[Any] = zenoh.ext.declare_advanced_subscriber(
             session,
             key,
@@ -77,14 +77,14 @@ class BlockSubscription:
         self._there = session.liveliness().declare_subscriber(f"{key}{_CACHES}**", there, history=True)
 
     def take(self, callback: Callable[[zenoh.Sample], None], most: int, *, last: bool = False) -> None:
-        """Call back for every block that has come, some `most` of them; from one thread at a time.
+        """Call back for every block that has come, about `most` at once; from one thread at a time.
 
-        The `last` time blocks wait no longer for what is kept.
+        The `last` time new blocks no longer wait for cached ones.
         """
         while self._found:
             found = self._found.popleft()
             _, _, cache = str(found.key_expr).partition(_CACHES)
-            if found.kind == zenoh.SampleKind.PUT and "*" not in cache:  # which a hostile one may have said
+            if found.kind == zenoh.SampleKind.PUT and "*" not in cache:  # a hostile publisher may send one
                 self._awaited("/".join(cache.split("/")[:2]))
         received = iter(self._new.try_recv, None)
         for _, sample in zip(range(most), received, strict=False):
@@ -96,7 +96,7 @@ class BlockSubscription:
             if (kept := self._awaited(publisher)) is not None:
                 kept.new.setdefault(number, sample)
                 continue
-            if publisher in self._publishers:  # the last to be forgotten
+            if publisher in self._publishers:  # heard last, forgotten last
                 self._publishers[publisher] = self._publishers.pop(publisher)
             callback(sample)
         awaited = [(publisher, kept) for publisher, kept in self._publishers.items() if kept is not None]
@@ -111,19 +111,19 @@ class BlockSubscription:
             del self._publishers[publisher]
 
     def _awaited(self, publisher: str) -> _Kept | None:
-        """What is to be handed on before new blocks of a publisher, which is asked for it if it is not known yet."""
+        """Cached blocks to pass on before a publisher's new ones; the cache of an unknown publisher is queried."""
         if publisher not in self._publishers and len(self._publishers) < _PUBLISHERS:
             self._ask(publisher, _Kept())
         return self._publishers.get(publisher)
 
     def _join(self, publisher: str, kept: _Kept, most: int, *, waits: bool) -> list[zenoh.Sample]:
-        """What can be handed on of a publisher: what it has kept, and from where that meets it what came meanwhile."""
+        """Blocks of a publisher to pass on now: cached ones and, once they meet them, the new ones."""
         joined, numbered = _received(publisher, kept, most), not publisher.endswith(_BY_TIME)
         met = bool(kept.new) and min(kept.new) <= kept.reached + numbered
         if kept.answers is not None and waits and not met:
             return joined
         new = kept.new = {number: sample for number, sample in kept.new.items() if number > kept.reached}
-        # Published while the subscription was on its way to it, or the link broke by which the answers were to come.
+        # Blocks in between were published before the subscription arrived, or their answers were lost with a link.
         if new and numbered and waits and not met and kept.questions:
             self._ask(publisher, kept)
             return joined
@@ -147,19 +147,19 @@ class BlockSubscription:
     def close(self) -> None:
         """Receive nothing any more."""
         self._there.undeclare()  # type: ignore[no-untyped-call]
-        self._publishers.clear()  # and with them what is still answered
+        self._publishers.clear()  # with the answers still to come
         self._missed.undeclare()  # type: ignore[no-untyped-call]
         self._new.undeclare()  # type: ignore[no-untyped-call]
 
 
 def _received(publisher: str, kept: _Kept, most: int) -> list[zenoh.Sample]:
-    """What has been answered since the last time, with the new blocks that its cache no longer held in between."""
+    """Answers of a cache since the last call, with the new blocks in between that the cache no longer held."""
     received: list[zenoh.Sample] = []
     try:
         for _ in range(most):
             if kept.answers is None or (reply := kept.answers.try_recv()) is None:
                 break
-            if reply.ok is None:  # the time for an answer is over
+            if reply.ok is None:  # the query has timed out
                 kept.questions = 0
                 continue
             by, number = _origin(reply.ok) or ("", -1)
@@ -177,7 +177,7 @@ def _received(publisher: str, kept: _Kept, most: int) -> list[zenoh.Sample]:
 
 
 def _origin(sample: zenoh.Sample) -> tuple[str, int] | None:
-    """Where the publisher's cache is, and the number of the message or its time; None of one that gives neither."""
+    """Place of the publisher's cache, and the number of the message or its time; None if it carries neither."""
     if (info := sample.source_info) is not None:
         return f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn
     if sample.timestamp is not None:

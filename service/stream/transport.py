@@ -39,14 +39,15 @@ _JSON = "application/json"
 _CLOUD_EVENT = "application/cloudevents+json"
 _HEARTBEAT_S = 1.0
 _AT_ONCE, _AT_ONCE_HELD_UP = 1000, 64
-"""Blocks of one machine before the others have their turn; fewer where each may have to wait for it."""
+"""Most blocks of one machine before the others have their turn; fewer where each block may have to wait."""
 _CACHED_EVENTS = 200
 _QUERY_TIMEOUT_S = 10.0
 _QUICK_CONNECT_S = 3.0
 _CONNECT_S = 10.0
 _DROPPED_US = 1_000_000
 _HELD_UP_US = 2_000_000
-"""By default five seconds, as long as a silence that is called one: other machines' streams would be called lost."""
+"""How long a subscriber may hold up a link. With Zenoh's default of five seconds, the silence after which a stream is
+called lost, the streams of other machines would be called lost."""
 
 _T = TypeVar("_T")
 _log = logger(part="transport")
@@ -58,7 +59,7 @@ class LinkError(RotorwatchError):
 
 @dataclass(frozen=True, slots=True)
 class MachineCallbacks:
-    """What a machine's link calls, each on a thread of Zenoh's: be short."""
+    """Callbacks of a machine's link, each on a thread of Zenoh's: be short."""
 
     on_block: Callable[[RawBlock], None]  # takes a message of the stream
     # Takes the number of messages that were lost on the way and could not be fetched again.
@@ -68,11 +69,11 @@ class MachineCallbacks:
     # Return the present answer (JSON) to a query.
     health: Callable[[], str]
     alarm_state: Callable[[], str]
-    # Takes a sequence number and a limit, returns (JSON) at most so many alarm events after that number. May take its
-    # time; what it raises is told to whoever asked.
+    # Takes a sequence number and a limit, returns (JSON) at most that many alarm events after the number. May take its
+    # time; a `RotorwatchError` that it raises is sent to the caller.
     alarm_events: Callable[[int, int], str]
-    # Takes whether a replay is announced on the machine's own keys. Anybody may announce one, so the stream is handed
-    # on all the same, but for blocks that say themselves that they are replayed.
+    # Takes whether a replay is announced on the machine's own keys. Anybody may announce one, so the stream goes on all
+    # the same, only without blocks that are marked as replayed.
     on_replay: Callable[[bool], None] = lambda _: None
 
 
@@ -93,7 +94,7 @@ class Link:
         Give up when no endpoint in `connect` answers within three seconds. Otherwise a client tries for ten, and a
         peer for ever, in the background.
     more : mapping
-        Settings of Zenoh's besides, by their paths.
+        Further settings of Zenoh, by their paths.
 
     Raises
     ------
@@ -130,7 +131,7 @@ class Link:
         def call(argument: _T) -> None:
             try:
                 callback(argument)
-            except Exception:  # the last frame of ours: Zenoh prints what escapes, and log and count would miss it
+            except Exception:  # Zenoh would only print what escapes from here
                 self.errors += 1
                 _log.exception("error in a callback")
 
@@ -145,8 +146,7 @@ class Link:
 class MachineLink:
     """Everything declared for one machine, on a link that must outlive it.
 
-    With `wait_when_full`, `on_block` may wait, which slows the publisher down, and all others that take from the same
-    link.
+    With `wait_when_full`, `on_block` may wait, which slows down the publisher and all machines on the same link.
     """
 
     def __init__(self, link: Link, keys: MachineKeys, callbacks: MachineCallbacks, *, wait_when_full: bool) -> None:
@@ -174,7 +174,7 @@ class MachineLink:
         for key, answer in ((keys.alarm_state, self._callbacks.alarm_state), (keys.health, self._callbacks.health)):
             keep(session.declare_queryable(key, guarded(answering(key, answer))).undeclare)
         log = _answering_from_log(keys.alarm_event, self._callbacks.alarm_events)
-        # A thread of its own, because it waits for the database: the others, and Zenoh, go on.
+        # On a thread of its own, as it waits for the database: other callbacks and Zenoh go on.
         events = zenoh.handlers.Callback(guarded(log), indirect=True)
         keep(session.declare_queryable(keys.alarm_event, events).undeclare)
         alive = session.liveliness()
@@ -193,7 +193,7 @@ class MachineLink:
         keep(blocks.close)
         most = _AT_ONCE_HELD_UP if wait_when_full else _AT_ONCE
         keep(self._link.intake.add(partial(guarded(partial(blocks.take, guarded(self._take_block))), most)))
-        # Before there is one of its own.
+        # Before this monitor declares its own token.
         alive.get(keys.monitor_alive, guarded(self._take_other_monitor), timeout=_QUERY_TIMEOUT_S)
         keep(alive.declare_token(keys.monitor_alive).undeclare)
 
@@ -210,7 +210,7 @@ class MachineLink:
         self._undeclare.close()
 
     def _take_other_monitor(self, reply: zenoh.Reply) -> None:
-        if reply.ok is not None:  # with another history: one with the same is refused
+        if reply.ok is not None:  # it has another history: a second monitor on the same history is refused
             _log.warning(
                 "another monitor of this machine is on the network: every alarm is told twice, from two logs",
                 machine=f"{self._keys.site}/{self._keys.machine}",
@@ -236,15 +236,15 @@ class MachineLink:
         alive = sample.kind == zenoh.SampleKind.PUT
         self._callbacks.on_publisher(alive)
         if alive:
-            _ask(self._link, self._keys.descriptor, self._take_descriptor)  # without a cache they answer only queries
+            _ask(self._link, self._keys.descriptor, self._take_descriptor)  # publishers may have no cache
 
 
 def tap(link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], None]) -> Callable[[], None]:
-    """Hand on every message under a machine's keys as it is, whoever published it, this program included.
+    """Pass on every message under a machine's keys unchanged, whoever published it, this program included.
 
-    Messages are taken on a thread of the link's: be short. Descriptors also come as answers to a query, at the start
-    and whenever a publisher appears, so that one announced earlier is known. Returns what ends it; the link must
-    outlive it.
+    `on_message` runs on a thread of the link's: be short. Descriptors also come as answers to a query, at the start
+    and whenever a publisher appears, so that one announced earlier is known. Returns a function that ends it; the link
+    must outlive it.
     """
 
     def take(sample: zenoh.Sample) -> None:
@@ -280,11 +280,11 @@ def tap(link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], N
 def follow(
     settings: LinkSettings, machines: str, topics: tuple[str, ...], callback: Callable[[TopicMessage], None]
 ) -> Iterator[Callable[[], bool]]:
-    """Follow what monitors publish, as a client; yields what says whether it is still connected to anybody.
+    """Follow what monitors publish, as a client; yields a function that says whether it is still connected to anybody.
 
     Machines are ``<site>/<machine>``, where ``*`` stands for any, topics fields of `MachineKeys`, such as ``report`` or
-    ``alarm_event``. Messages are taken on a thread of Zenoh's: latest health and alarm state at once, events and
-    reports from now on.
+    ``alarm_event``. `callback` runs on a thread of Zenoh's: at once for the latest health and alarm state, from now on
+    for events and reports.
 
     Raises
     ------
@@ -312,11 +312,11 @@ def follow(
 
 
 def relay_items(*, waits: bool) -> dict[str, str]:
-    """Zenoh's settings of a router by which streams come to monitors, or to the shards of one.
+    """Zenoh's settings of a router that brings streams to monitors, or to the shards of one.
 
-    What a publisher has kept comes at once, and is waited for. A publisher of several machines waits for the slowest of
-    those who take them. One that takes nothing at all is cut off, unless it `waits` and slows down the source; it gets
-    what it missed when it comes again, from publishers that keep samples.
+    A publisher's cached samples come all at once, so the router waits for their subscribers. A publisher of several
+    machines waits for the slowest subscriber. With `waits`, a subscriber that takes nothing at all slows down the
+    source; otherwise it is cut off, and when it comes again it gets what it missed from publishers with a cache.
     """
     place = "transport/link/tx/queue/congestion_control"
     cut_off = {} if waits else {f"{place}/block/wait_before_close": str(_HELD_UP_US)}
@@ -347,7 +347,7 @@ def _ask(link: Link, key: str, callback: Callable[[zenoh.Sample], None]) -> None
 
 
 def _source(sample: zenoh.Sample) -> str:
-    """The publisher's session and its number there; empty if it numbers nothing."""
+    """The publisher's session and its number there; empty if its messages are not numbered."""
     info = sample.source_info
     return "" if info is None else f"{info.source_id.zid}/{info.source_id.eid}"
 

@@ -1,7 +1,7 @@
-"""One machine's thread: takes blocks out of the inbox, steps the monitor, hands on what comes out.
+"""One machine's thread: takes blocks out of the inbox, steps the monitor, passes on its reports and events.
 
-What a block brought and what the monitor remembers afterwards are committed to the history in one step; only then is
-anything published.
+The results of a block and the monitor's state after it are committed to the history in one step; only then is anything
+published.
 """
 
 import math
@@ -42,7 +42,7 @@ from service.stream.shedding import LoadShedding, in_turn
 from service.terminal.logs import Limiter, logger
 
 _OPERATION_S = 10.0
-_SEEN_S = 0.5  # within which others see what a block changed, if more blocks wait
+_SEEN_S = 0.5  # longest time until other threads see what a block changed, if more blocks wait
 _LATEST = 100
 _LONGEST_ERROR = 500
 
@@ -50,15 +50,15 @@ _LONGEST_ERROR = 500
 class MachineWorker:
     """Monitors one machine in a thread of its own.
 
-    The monitor belongs to the thread. What others may see is an immutable snapshot that the thread replaces with every
-    piece of news and after the last block that waits, and the history, which has its own lock.
+    The monitor belongs to the thread. Other threads see an immutable snapshot, which the thread replaces with every
+    report or event and after the last waiting block, and the history, which has its own lock.
 
     Parameters
     ----------
     installed : Installed
         The machine file, and what was trained and commissioned for it.
     history : MachineStore
-        Where everything is kept; what is there from an earlier run is gone on from.
+        Where everything is kept; an earlier run in it is continued.
     clocks : Clocks
         Say how old the latest data are and when things were recorded, nothing else.
     on_events : callable
@@ -106,8 +106,8 @@ class MachineWorker:
         self._monitor, self.restart = self._restored(installed)
         self._sheds = queue.when_full == "drop" and not self._monitor.watching
         self._snapshot: MachineHealth = self._monitor.health()
-        self.told = self._monitor.next_sequence  # of the first alarm event that `health` does not show yet
-        self._seen_s = -math.inf  # when others were last shown where the monitor stands
+        self.told = self._monitor.next_sequence  # number of the first alarm event that `health` does not show yet
+        self._seen_s = -math.inf  # when the snapshot was last replaced
         self._missed = self._dropped_logged = 0
         self._publisher_alive = self._replay_announced = False
         self._mismatch: tuple[str, ...] = ()
@@ -117,7 +117,7 @@ class MachineWorker:
         self._thread = threading.Thread(target=self._run, name=f"monitor {machine.title}", daemon=True)
 
     def _restored(self, installed: Installed) -> tuple[MachineMonitor, str]:
-        """A monitor that goes on from the history, if there is anything to go on from."""
+        """A monitor that continues from the history if there is a checkpoint, and what was restored, in a sentence."""
         last = self.history.last_sequence()
         checkpoint = self.history.restore()
         if checkpoint is None:
@@ -129,7 +129,7 @@ class MachineWorker:
         self.steps.keeps(tuple(name for name, _ in checkpoint.parts))
         self.history.go_on_from(monitor.next_sequence - 1)
         self._time.slept(checkpoint.head.recorded_ns)
-        # They were committed, but nobody knows whether they were published; whoever heard them leaves them out by id.
+        # They were committed but perhaps not published; subscribers leave out those that they had by their id.
         latest = self.history.events(after=last - _LATEST, limit=_LATEST)
         self._unpublished = tuple(one for one in latest if one.recorded_ns >= checkpoint.head.recorded_ns)
         self._log.info("restart", what=text)
@@ -152,7 +152,7 @@ class MachineWorker:
         """Start the thread; it publishes to `outlet`."""
         self._outlet = outlet
         self._time.begin()
-        self.tick()  # before any block: what time it is so far
+        self.tick()  # before any block, for the data time reached so far
         for event in self._unpublished:
             outlet("alarm_event", event.text)
         self._thread.start()
@@ -190,7 +190,7 @@ class MachineWorker:
         self._mismatch = mismatch
 
     def health(self) -> Health:
-        """Where the machine stands now."""
+        """State of the machine now."""
         snapshot, silent = self._snapshot, self._time.silent
         return conversion.health(
             self.identity,
@@ -212,7 +212,7 @@ class MachineWorker:
         )
 
     def status(self) -> MachineStatus:
-        """How the monitoring is at work."""
+        """State of the monitoring itself."""
         return MachineStatus(
             alive=self._thread.is_alive(),
             errors=self.errors,
@@ -266,7 +266,7 @@ class MachineWorker:
                 events = self._monitor.operate(operation, self._time.next_ns(self._monitor.end_ns))
                 self._conclude((), events)
                 done.set_result(tuple(alarm_cloud_event(self.identity, event) for event in events))
-            except Exception as error:  # belongs to whoever asked; the thread goes on
+            except Exception as error:  # raised for the caller; the thread goes on
                 done.set_exception(error)
 
         if not self.inbox.call(work):
@@ -305,7 +305,7 @@ class MachineWorker:
         return shedding is not None and shedding.skips(self.inbox.behind, to_hop, self._clocks.monotonic_s())
 
     def _catch_up(self, since_ns: int) -> None:
-        """Take from the recording what the window lacks, and what came after the latest step that was committed."""
+        """Refill the window from the recording, and take what was recorded after the latest committed step."""
         for message in recorded_after(self._monitor, self._recorded(since_ns)):
             self._take(RawBlock(message.payload, message.attachment, message.encoding))
             self._time.slept(message.log_time_ns)
@@ -316,10 +316,10 @@ class MachineWorker:
         try:
             if self._recorded_since_ns is not None:
                 self._catch_up(self._recorded_since_ns)
-        except Exception as error:  # what it brought to light must not end the monitoring of the machine
+        except Exception as error:  # a defect that it brings to light must not end the monitoring of the machine
             self._failed(error)
         self._monitor.begin()
-        self._shedding = LoadShedding() if self._sheds else None  # what was recorded has been evaluated
+        self._shedding = LoadShedding() if self._sheds else None  # only now: recorded windows are never skipped
         while (item := self.inbox.get(self._monitor.blocks_to_hop)) is not None:
             try:
                 if isinstance(item, RawBlock):
@@ -329,7 +329,7 @@ class MachineWorker:
             except Exception as error:  # one bad block must not end the monitoring of the machine
                 self._failed(error)
                 self._fault(f"{type(error).__name__}: {error}")
-        # An orderly end keeps where the monitor stands to the last block: going on needs no publisher's cache.
+        # An orderly end saves the state up to the last block, so that a restart needs no publisher's cache.
         self._conclude((), (), whole=True)
 
     def _failed(self, error: Exception) -> None:
@@ -339,12 +339,12 @@ class MachineWorker:
             self._log.error("something was lost to an error in the monitor", withheld=withheld, exc_info=error)
 
     def _fault(self, what: str) -> None:
-        """Let operators hear that something is wrong here, once."""
+        """Raise the alarm on the monitor itself, once."""
         try:
             events = self._monitor.fault(what, self._data_now_ns())
             if events:
                 self._conclude((), events)
-        except Exception as error:  # there is nobody left to tell
+        except Exception as error:  # can only be counted and logged
             self._failed(error)
 
     def _take(self, block: RawBlock) -> None:
@@ -358,7 +358,7 @@ class MachineWorker:
         self._conclude_reports(reports)
 
     def _conclude_reports(self, reports: Sequence[MonitorReport]) -> None:
-        """Conclude what came of one message, in one step: the monitor's state is that after the last of the blocks."""
+        """Conclude all reports on one message in one step: the monitor's state is that after the last block."""
         for report in reports:
             self._explain(report)
             if report.verdict.accepted:
@@ -376,7 +376,7 @@ class MachineWorker:
     def _conclude(
         self, windows: tuple[Report, ...], events: tuple[AlarmEvent, ...], *, always: bool = False, whole: bool = False
     ) -> None:
-        """Commit, then let it be seen and publish."""
+        """Commit windows and events, then replace the snapshot and publish."""
         events += self._monitor.take_events()  # left behind by a defect
         now_s, news = self._clocks.monotonic_s(), bool(windows or events or always or whole)
         if not news and len(self.inbox) and now_s - self._seen_s < _SEEN_S:
@@ -400,7 +400,7 @@ class MachineWorker:
             self._on_events()
         try:
             self._publish([one.text for one in reports], texts)
-        except Exception as error:  # the network's, of whatever kind; who lacks an event asks for it
+        except Exception as error:  # the network's, of whatever kind; subscribers query events that they lack
             self._failed(error)
         if self.steps.refused is not None:
             self._fault(f"the history refuses what happens: {self.steps.refused}")
@@ -408,7 +408,7 @@ class MachineWorker:
     def _commit(
         self, windows: tuple[Report, ...], *, whole: bool
     ) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...]]:
-        """Bring windows, events and the monitor's state into the history, as they are to be published."""
+        """Commit windows, events and the monitor's state; return reports and events as they are to be published."""
         begin_s = self._clocks.monotonic_s()
         reports, told, written = self.steps.commit(self._monitor, windows, self._clocks.utc_ns(), whole=whole)
         if self.steps.refused is not None:
@@ -421,7 +421,7 @@ class MachineWorker:
 
     @property
     def latest(self) -> LatestData:
-        """What the monitor holds, for snapshots; the window is made when somebody looks at it."""
+        """Latest data of the monitor, for snapshots; the window is computed when somebody looks at it."""
         return self._held()
 
     def _publish(self, reports: Iterable[str], events: Iterable[str]) -> None:
@@ -432,7 +432,7 @@ class MachineWorker:
             outlet("report", text)
         for text in events:
             outlet("alarm_event", text)
-        # The latest change of each alarm is in every report; here only what an operator would call news.
+        # Changes of parameters are in every report; alarm states are published only if a state or a delay has changed.
         now = tuple(
             (alarm.name, alarm.version, alarm.beyond_ns is None, alarm.small_ns is None)
             for alarm in self._snapshot.alarms
@@ -459,7 +459,7 @@ class MachineWorker:
 def held_now(
     window: Callable[[], WindowStatistics] | None, health: MachineHealth, blocks: tuple[SampleBlock, ...]
 ) -> LatestData:
-    """What may be looked at of a monitor that goes on."""
+    """Latest data of a running monitor, for snapshots."""
     latest = health.latest
     return LatestData(
         window=None if window is None else window(),
