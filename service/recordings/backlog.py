@@ -6,7 +6,7 @@ from collections import deque
 from models.signals.recording import RecordedMessage
 
 _BATCH_BYTES = 1_000_000
-_MESSAGE_BYTES = 300  # what a message costs beyond its bytes
+_MESSAGE_BYTES = 300  # memory that a message takes beyond its bytes
 
 
 class Backlog:

@@ -39,7 +39,7 @@ _STAMP_FORMAT = "%Y%m%dT%H%M%SZ"
 class Recording(RecordingEntry):
     """One recording of a directory.
 
-    Of an incomplete file, the start that its name states and the time at which it was last written stand for log times.
+    For an incomplete file, the start that its name states and the time of its last write stand in for log times.
     """
 
     path: Path = Field(exclude=True)
@@ -48,7 +48,7 @@ class Recording(RecordingEntry):
 class Catalogue:
     """Recordings below a directory, which need not exist yet.
 
-    What a file's index says is read once and remembered until the file changes. May be asked from several threads.
+    A file's index is read once and remembered until the file changes. May be used from several threads.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -82,7 +82,7 @@ class Catalogue:
         return recording.model_copy(update={"kept_because": kept_reasons(folder).get(match["file"], "")})
 
     def _recording(self, path: Path) -> Recording | None:
-        """Describe a file; None if it is none of this directory's own, or gone."""
+        """Describe a file; None if it does not lie in this directory, or is gone."""
         machine, site = path.parent.name, path.parent.parent.name
         try:
             if path.resolve() != self.directory.resolve() / site / machine / path.name or not path.is_file():
@@ -163,7 +163,7 @@ def kept_reasons(folder: Path) -> dict[str, str]:
 
 
 def _subfolders(folder: Path, name: str | None) -> list[Path]:
-    """Folders that may be a site or a machine, sorted; symbolic links are none."""
+    """Folders that may be a site or a machine, sorted, without symbolic links."""
     entries = [folder / name] if name is not None and _PLACE_ONLY.fullmatch(name) else []
     if name is None:
         entries = _entries(folder)
@@ -171,7 +171,7 @@ def _subfolders(folder: Path, name: str | None) -> list[Path]:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """What is in a folder, sorted; nothing if it is gone or closed to us."""
+    """Entries of a folder, sorted; none if it is gone or cannot be read."""
     try:
         return sorted(folder.iterdir())
     except OSError:
@@ -184,9 +184,9 @@ def recorded_files(folder: Path) -> tuple[Path, ...]:
 
 
 def recent_messages(files: Sequence[Path], key: str, since_ns: int) -> Iterator[RecordedMessage]:
-    """Messages on a key, replays left out, in the order in which they came, of files in this order.
+    """Messages on a key from files in this order, without replayed ones, in the order in which they came.
 
-    What a crash left may be completed, and so get another name, at the same time.
+    A file that a crash left may be completed meanwhile, and so get another name.
     """
     for path in files:
         try:

@@ -12,11 +12,11 @@ from service.recordings.catalogue import PART, SUFFIX
 
 DAMAGED = ".damaged"
 LOCK = ".lock"
-_LONGEST_S = 60.0  # from the last message to the last writing of it: a recorder writes every second
+_LONGEST_S = 60.0  # from the last message to the last write of the file: a recorder writes every second
 
 
 def lock(folder: Path) -> int:
-    """Make sure that only one recorder writes into a folder; closing the descriptor that is returned lets go.
+    """Make sure that only one recorder writes into a folder; closing the returned descriptor releases the folder.
 
     Raises
     ------

@@ -42,7 +42,7 @@ _ASSUMED = "application/json;assumed-from-machine-file"
 
 @dataclass(frozen=True, slots=True)
 class RecorderStatus:
-    """Where a recorder stands; counts since it was started."""
+    """State of a recorder; counts are since it was started."""
 
     site: str
     machine: str
@@ -99,7 +99,7 @@ class MachineRecorder:
         self._catalogue = Catalogue(self.directory)
         self._pending: deque[RecordedMessage] = deque()  # taken out of the backlog, not written yet
         self._unsafe: deque[RecordedMessage] = deque()  # written, in a chunk that is not complete
-        self._at_hand = False  # the first of them is being written
+        self._at_hand = False  # whether the first pending message is being written
         self._descriptor: RecordedMessage | None = None
         self._marks: tuple[AlarmMark, ...] = ()
         self._unread = ""
@@ -130,7 +130,7 @@ class MachineRecorder:
         self._thread.start()
 
     def put(self, message: RecordedMessage) -> None:
-        """Take a message; never waits, and never fails for the disk's sake."""
+        """Take a message; never waits, and never fails because of the disk."""
         self._backlog.put(message)
 
     def stop(self) -> None:
@@ -143,7 +143,7 @@ class MachineRecorder:
                 self._log.error("the disk does not respond; the recording remains incomplete", file=self._file_name())
 
     def status(self) -> RecorderStatus:
-        """Where the recorder stands."""
+        """State of the recorder."""
         name = self._file_name()
         return RecorderStatus(
             site=self.machine.site,
@@ -176,8 +176,8 @@ class MachineRecorder:
             except RecordingError as error:
                 self._fail(str(error))
             except Exception as error:
-                # Nothing narrower: whatever it is must not end the recording of the machine; the message that brought
-                # it to light is left out.
+                # Nothing narrower: no error may end the recording of the machine; the message that caused it is left
+                # out.
                 if self._limiter.admit("defect") is not None:
                     self._log.exception("error in the recorder")
                 self._leave_out()
@@ -234,7 +234,7 @@ class MachineRecorder:
         self._unsafe.append(message)
         writer.write(message)
         if message.key == self.machine.keys.report:
-            writer.flush()  # a monitor that is killed now goes on from what this report was made of
+            writer.flush()  # so that a monitor that is killed now can refill the window of this report
         self._count(writer)
 
     def _open(self, first: RecordedMessage) -> RecordingWriter:
@@ -257,7 +257,7 @@ class MachineRecorder:
         return RecordedMessage(self.machine.keys.descriptor, text.encode(), b"", _ASSUMED, time_ns, time_ns)
 
     def _count(self, writer: RecordingWriter) -> None:
-        """After anything that may have completed a chunk."""
+        """Count safe messages, after anything that may have completed a chunk."""
         if writer.flushed == writer.messages and self._unsafe:
             self._safe += len(self._unsafe)
             self._safe_in_file += len(self._unsafe)
@@ -280,7 +280,7 @@ class MachineRecorder:
         self._synced_s = self._clock()
 
     def _check_there(self, writer: RecordingWriter) -> None:
-        """Look for the file: without a name the system would go on writing into one that nobody can open."""
+        """Raise if the file was deleted: the system would go on writing into it, but nobody could open it."""
         if not writer.part.exists():
             self._lost += self._safe_in_file
             self._safe -= self._safe_in_file
@@ -297,7 +297,7 @@ class MachineRecorder:
         self._log.info("recording closed", file=writer.path.name, messages=writer.messages, bytes=writer.size_bytes)
 
     def _fail(self, problem: str) -> None:
-        """Let go of the file, take back what is not safe in it, and say so."""
+        """Abandon the file, take back the messages that are not safe in it, and log the problem."""
         self._failures += 1
         self._problem = problem
         writer, self._writer = self._writer, None
@@ -328,7 +328,7 @@ class MachineRecorder:
             self._at_hand = False
 
     def _tidy(self) -> None:
-        """Complete what a crash left, and drop what is beyond the limits. Trouble here is no reason not to record."""
+        """Complete files that a crash left, and drop files beyond the limits; errors here do not stop recording."""
         self._tidied_s = self._clock()
         try:
             self._recover()
@@ -360,7 +360,7 @@ class MachineRecorder:
             events = self._committed(oldest_ns - round(self.settings.alarm_after_s * 1e9))
             self._marks = tuple(map(alarm_mark, events))
             self._unread = ""
-        except RotorwatchError as error:  # those that are known hold on
+        except RotorwatchError as error:  # the marks known so far still count
             if str(error) != self._unread:
                 self._log.warning("the history cannot be read: alarms keep no more recordings", why=str(error))
             self._unread = str(error)

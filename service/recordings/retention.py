@@ -2,8 +2,8 @@
 
 Whole files are kept or dropped, the oldest first. A file that reaches into the time around an alarm event falls under
 the limits for alarms, every other one under the ordinary limits. Times are log times: the computer's clock when a
-message arrived, or when the monitor recorded an event. The events are those that a monitor committed to its history;
-what is on the wire anybody may have sent. What was kept once stays so, also if the history is lost.
+message arrived, or when the monitor recorded an event. Only events that a monitor committed to its history count, as
+anybody may send one over the network. A file once kept for an alarm stays so, even if the history is lost.
 
 Only files named as the recorder names them are ever dropped; one that is renamed stays.
 """
@@ -43,7 +43,7 @@ def decide(
 ) -> Decision:
     """Decide which recordings of one machine are kept.
 
-    Incomplete ones are left alone, and so are those with names of somebody else's making.
+    Incomplete ones are left alone, and so are those that are not named as the recorder names them.
     """
     own = [one for one in recordings if one.complete and start_of(one.path.name) is not None]
     reasons = {one.id: reason for one in own if (reason := _reason(one, marks, settings) or one.kept_because)}
@@ -58,7 +58,7 @@ def decide(
 
 
 def alarm_mark(event: StoredEvent) -> AlarmMark:
-    """Say what an alarm event is; one whose text cannot be read counts as an alarm all the same."""
+    """Mark of an alarm event; one whose text cannot be read counts all the same."""
     try:
         said = json.loads(event.text)["data"]["text"]
     except (ValueError, KeyError, TypeError):

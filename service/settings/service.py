@@ -114,7 +114,7 @@ class HistorySettings(BaseModel, extra="forbid", frozen=True):
 
     @property
     def database(self) -> str:
-        """The URL, or the one that holds if it is left out."""
+        """The URL, or the default if it is left out."""
         if self.url is not None:
             return self.url
         folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "rotorwatch"
@@ -122,7 +122,7 @@ class HistorySettings(BaseModel, extra="forbid", frozen=True):
 
     @property
     def in_memory(self) -> bool:
-        """Whether no other program finds what is kept."""
+        """Whether it is kept in memory, where no other program finds it."""
         return self.database.endswith(":memory:")
 
 
@@ -249,7 +249,7 @@ class ServiceSettings(BaseSettings):
 
     @property
     def shown(self) -> dict[str, dict[str, JsonValue]]:
-        """What whoever may configure the monitor may see of them: everything in tables without a secret."""
+        """Settings that a caller who may configure the monitor may see: all tables without a secret."""
         return self.model_dump(mode="json", include=_SHOWN)
 
     @classmethod
@@ -285,7 +285,7 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
         Naming the file or environment variable, the field and the value found, one fault per line.
     """
     fields = {} if path is None else read_toml(path)
-    if path is not None and not fields:  # of an editor that found the disk full, for example
+    if path is not None and not fields:  # left by an editor on a full disk, for example
         raise MachineFileError(f"{path}: is empty, expected settings (TOML)")
     place = Path("default settings") if path is None else path
     told = [f"{place}: {text}" for text in unseen_mistakes(fields, ServiceSettings)]

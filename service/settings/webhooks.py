@@ -1,4 +1,4 @@
-"""Settings of webhooks: who receives alarm events, of which, and how patiently."""
+"""Settings of webhooks: who receives which alarm events, and how long attempts and pauses may last."""
 
 from pathlib import Path
 from typing import Any, Self

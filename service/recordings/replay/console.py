@@ -28,7 +28,7 @@ _ARROWS = {b"\x1b[C": _STEP_S, b"\x1b[D": -_STEP_S, b"\x1bOC": _STEP_S, b"\x1bOD
 
 @contextmanager
 def show(kind: Literal["auto", "json", "none"]) -> Iterator[Show]:
-    """Show the progress that it is told, as often as one likes, now and then and at the end."""
+    """Yield a function that shows progress, at most every `_EVERY_S` seconds and at the end; call it at any rate."""
     if kind == "json":
         with _seldom(_print_line) as take:
             yield take
@@ -48,10 +48,11 @@ def show(kind: Literal["auto", "json", "none"]) -> Iterator[Show]:
 
 @contextmanager
 def orders(control: Control, *, lines: bool, keyboard: bool) -> Iterator[None]:
-    """Obey what comes on standard input, until the block is left.
+    """Obey orders on standard input, until the block is left.
 
-    With `lines` each is an order, see `obey`; when the input ends, because whoever gave the orders is gone, the replay
-    stops. With `keyboard`, if standard input is a terminal, space pauses and goes on, arrows seek, q stops.
+    With `lines` each line is an order, see `obey`; when the input ends, because the program that gave the orders is
+    gone, the replay stops. With `keyboard`, if standard input is a terminal, space pauses and goes on, arrows seek, q
+    stops.
     """
     if lines:
         threading.Thread(target=_read_lines, args=(control,), name="orders", daemon=True).start()
@@ -94,7 +95,7 @@ def obey(control: Control, order: str) -> bool:
 
 @contextmanager
 def _seldom(take: Show) -> Iterator[Show]:
-    """Hand on what is said at most every so often, and the last."""
+    """Pass on progress at most every `_EVERY_S` seconds, and always the last."""
     latest: list[ReplayProgress] = []
     due_s = 0.0
 
@@ -102,7 +103,7 @@ def _seldom(take: Show) -> Iterator[Show]:
         nonlocal due_s
         latest[:] = [progress]
         now_s = time.monotonic()
-        if now_s >= due_s or progress.paused:  # nothing may come after that for long
+        if now_s >= due_s or progress.paused:  # nothing may follow a pause for long
             due_s = now_s + _EVERY_S
             take(progress)
             latest.clear()
@@ -148,7 +149,7 @@ def _read_keys(control: Control, done: threading.Event) -> None:
 
 @contextmanager
 def _single_keys() -> Iterator[None]:
-    """Keys arrive one by one and are not shown."""
+    """Make keys arrive one by one, without being shown."""
     number = sys.stdin.fileno()
     before = termios.tcgetattr(number)
     tty.setcbreak(number)

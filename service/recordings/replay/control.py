@@ -4,14 +4,14 @@ import threading
 import time
 from collections.abc import Callable
 
-# The main thread must do something now and then: Python runs signal handlers nowhere else.
+# The main thread must wake up now and then: Python runs signal handlers nowhere else.
 _SLICE_S = 0.25
 
 
 class Control:
-    """What somebody wants of a running replay; safe to use from several threads.
+    """Orders to a running replay; safe to use from several threads.
 
-    The one that replays asks: `wait_until` before each message, `take_seek` afterwards.
+    The thread that replays calls `wait_until` before each message, and `take_seek` afterwards.
     """
 
     def __init__(self) -> None:
@@ -93,7 +93,7 @@ class Control:
             return False
 
     def take_seek(self) -> int | None:
-        """Where to go on, once: the wish is forgotten."""
+        """Data time from which to go on, None for no change; the order is then forgotten."""
         with self._changed:
             wish, self._seek_ns = self._seek_ns, None
             return wish

@@ -1,8 +1,8 @@
 """When the data in a recording were taken, which is not when they were recorded.
 
 A stream that comes faster than real time is recorded in less time than it lasts, and a recording that is imported was
-taken long before. What a person asks for, an hour or the latest 20 s, is meant in the time of the data: that of the
-blocks, or, where the samples were not kept, of the window reports.
+taken long before. A person who asks for an hour, or for the latest 20 s, means the time of the data: that of the blocks
+or, where the samples were not kept, of the window reports.
 """
 
 import json
@@ -27,15 +27,15 @@ class DataSpan:
     # Beginning of the earliest and end of the latest data.
     start_ns: int
     end_ns: int
-    # Beginning of what was recorded first, and end of what was recorded last; others than the earliest and latest where
-    # the publisher was started again at an earlier time, or its clock was set.
+    # Beginning of the data recorded first, and end of those recorded last; they differ from the above if the publisher
+    # was started again at an earlier time, or its clock was set.
     first_ns: int
     newest_ns: int
 
 
 @dataclass(frozen=True, slots=True)
 class _Taken:
-    """When one message's data were taken; sequence and run are None for what has none."""
+    """When one message's data were taken; sequence and run are None for a report."""
 
     start_ns: int
     end_ns: int
@@ -44,7 +44,7 @@ class _Taken:
 
 
 def place_of(key: str) -> str:
-    """Beginning of the keys of a machine, empty for a key that is of none.
+    """Common beginning of the keys of a machine; empty for a key that belongs to none.
 
     Examples
     --------
@@ -56,20 +56,20 @@ def place_of(key: str) -> str:
 
 
 def clock_key(keys: Collection[str], place: str) -> str | None:
-    """Key, of those there are, whose messages say when a machine's data were taken."""
+    """The one of these keys whose messages say when a machine's data were taken; None if there is none."""
     return next((key for key in (f"{place}/stream", f"{place}/report") if place and key in keys), None)
 
 
 def data_start_ns(message: RecordedMessage) -> int | None:
-    """Time of a block's first sample, or of the last one in a report; None for what cannot be read."""
+    """Time of a block's first sample, or of the last one in a report; None if the message cannot be read."""
     taken = _taken(message)
     return None if taken is None else taken.start_ns
 
 
 def span_of(path: Path, summary: RecordingSummary, key: str) -> DataSpan | None:
-    """Which data the messages of a key are of; None if none can be read.
+    """Time span of the data in the messages of a key; None if none can be read.
 
-    Of a run that went on without a gap only the two ends are read.
+    If one run went on without a gap, only the two ends are read.
 
     Raises
     ------

@@ -45,11 +45,11 @@ class JobPlan:
     job: ReplayJob  # what the API says of it; id, state, times and results are filled in
     arguments: tuple[str, ...]  # of ``rotorwatch replay``: files and options other than those below
     machine_file: str = ""  # text of a machine file that was sent
-    bundle: str | None = None  # networks, or what was commissioned, that it is evaluated with
+    bundle: str | None = None  # bundle of networks, or of what was commissioned, that it is evaluated with
 
 
 class ReplayJobs:
-    """Starts, watches and ends the processes: `limit` at once, as nice as told.
+    """Starts, watches and ends the processes: at most `limit` at once, at niceness `nice`.
 
     Results go to a folder per job in `folder`; without it there are no jobs. Beyond `kept`, the oldest are removed.
     """
@@ -124,7 +124,7 @@ class ReplayJobs:
 
 
 class RunningJob:
-    """One process and the thread that listens to it; goes on to tell what came of it when that has ended."""
+    """One process and the thread that reads its output; its result stays here when the process has ended."""
 
     def __init__(self, plan: JobPlan, folder: Path, nice: int) -> None:
         self.folder = folder
@@ -132,7 +132,7 @@ class RunningJob:
         self._lock = threading.Lock()
         self._stop_asked = False
         self.view = plan.job  # what the API says of the job
-        # Machine file that was sent with it, where it was put, with what it is evaluated with; None if none was.
+        # Path of the machine file that was sent with it, with its bundle as FILE@BUNDLE; None if none was sent.
         bundle = "" if plan.bundle is None else f"@{plan.bundle}"
         self.machine_file = f"{folder / _MACHINE}{bundle}" if plan.machine_file else None
         with (folder / _MESSAGES).open("wb") as messages:
@@ -148,11 +148,11 @@ class RunningJob:
 
     @property
     def running(self) -> bool:
-        """Whether the process is there."""
+        """Whether the process has not ended yet."""
         return self.view.state in ("running", "paused")
 
     def order(self, order: str) -> None:
-        """Hand an order to the process, see `service.recordings.replay.console`; one that has ended hears none."""
+        """Send an order to the process, see `service.recordings.replay.console`; ignored if it has ended."""
         with self._lock:
             if not self.running or self._process.stdin is None:
                 return
@@ -172,7 +172,7 @@ class RunningJob:
                     self._process.stdin.close()
 
     def end(self) -> None:
-        """Ask the process to end, and after a while make it."""
+        """Ask the process to end, and kill it if it does not in time."""
         self.ask_to_end()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(_STOP_S)
@@ -215,7 +215,7 @@ class RunningJob:
             self.view = self.view.model_copy(update=update)
 
     def _last_words(self) -> str:
-        """End of what the process said on standard error; nothing of the inside."""
+        """End of what the process wrote to standard error; a traceback goes to the log instead."""
         try:
             text = (self.folder / _MESSAGES).read_text(encoding="utf-8", errors="replace")
         except OSError:

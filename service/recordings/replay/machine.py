@@ -15,8 +15,8 @@ _LONGEST_LINE = 500
 def choose_machine(keys: MachineKeys, wanted: str | None, changes: str = "") -> Installed:
     """Load the machine file, and what was trained or commissioned, for a recorded machine.
 
-    Those `wanted` are ``FILE`` or ``FILE@BUNDLE``, shipped names or paths. Without it, the shipped machine with the
-    recorded site and name is taken, with its shipped networks. `changes` are TOML that goes over the machine file.
+    `wanted` is ``FILE`` or ``FILE@BUNDLE``, shipped names or paths. Without it, the shipped machine with the recorded
+    site and name is taken, with its shipped networks. `changes` are TOML that overrides fields of the machine file.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Recordings straight through the monitor's data path, at full speed, without network or clock.
+"""Runs recordings through the monitor's data path, at full speed, without network or clock.
 
 The blocks meet the same `MachineMonitor` as they would live, so the reports are the same to the last bit. Windows that
 the live monitor skipped, because it could not keep up, are skipped here as well: its recorded reports say which.
@@ -26,7 +26,7 @@ from service.recordings.replay.source import RecordingSource
 
 
 def result_lines(identity: Identity, keys: MachineKeys, report: MonitorReport) -> list[str]:
-    """JSON lines of what one block brought: topic and message, in the order of their data time, report before alarm."""
+    """JSON lines of one block's results: topic and message, in the order of their data time, report before alarm."""
     timed = [(window.end_ns, 0, keys.report, window.model_dump_json()) for window in report.windows]
     timed += [
         (event.time_ns, 1, keys.alarm_event, alarm_cloud_event(identity, event).model_dump_json())
@@ -39,7 +39,7 @@ def result_lines(identity: Identity, keys: MachineKeys, report: MonitorReport) -
 def skipped_windows(source: RecordingSource, keys: MachineKeys) -> frozenset[int]:
     """Ends of the windows that the monitor skipped when they were recorded, as far as its reports can be read."""
     found: set[int] = set()
-    with suppress(RecordingError):  # what is damaged is told where its blocks are read
+    with suppress(RecordingError):  # damage is reported where the blocks are read
         for message in source.messages({keys.report}):
             if b'"skipped":true' in message.payload:
                 with suppress(ValueError):  # anybody may have sent it

@@ -1,4 +1,4 @@
-"""Recorded messages handed out at their recorded pace; who takes them is somebody else's business."""
+"""Plays recorded messages, at their recorded pace or another one, to a function that takes them."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -32,10 +32,10 @@ def play(
     control: Control,
     on_progress: Callable[[ReplayProgress], None] = lambda _: None,
 ) -> int:
-    """Hand out the messages of one pass, byte for byte, until its end or until `control` says stop.
+    """Pass the messages of one pass to `put`, byte for byte, until its end or until `control` says stop.
 
-    Messages go out at the distances in time at which their data were taken, divided by the pace. After a seek, a pause
-    of more than an hour, or where data are earlier than what went before, the replay goes on at once.
+    The time between messages is that between their data, divided by the pace. After a seek, after a pause of more than
+    an hour, or where data are earlier than those before, the replay goes on at once.
 
     Raises
     ------
@@ -99,7 +99,7 @@ class _Timetable:
     def due_s(self, time_ns: int) -> float:
         """When a message with this time of the data is due, as `Control.now_s` counts."""
         ahead_ns = time_ns - self._front_ns
-        # One block that comes again, or late, is no other time; a dozen in a row are.
+        # A few blocks that come again, or late, do not set the time back; more than `_BELIEVED` in a row do.
         self._behind = self._behind + 1 if ahead_ns < 0 else 0
         if 0 < ahead_ns <= _LONGEST_PAUSE_NS:
             self._due_s += ahead_ns / 1e9 / self._pace

@@ -76,7 +76,7 @@ class RecordingSource:
     def machine(self, wanted: str | None = None, *, reports: bool = False) -> MachineKeys:
         """Keys of the machine ``SITE/MACHINE``, which may be left out if the recordings hold one machine.
 
-        With `reports`, these will do where the samples were not kept.
+        With `reports`, a machine with reports counts too, even if its samples were not kept.
 
         Raises
         ------
@@ -100,7 +100,7 @@ class RecordingSource:
         return there[name]
 
     def span(self, *machines: MachineKeys) -> DataSpan:
-        """Which data there are of some machines; without any, of all.
+        """Time span of the data of some machines; of all if none is given.
 
         Raises
         ------
@@ -118,7 +118,7 @@ class RecordingSource:
         )
 
     def between(self, from_: str | None, to: str | None, *machines: MachineKeys) -> tuple[int, int]:
-        """From when up to, and without, when ``--from`` and ``--to`` ask for data of these machines, or of all.
+        """Start, and end (exclusive), of the data that ``--from`` and ``--to`` ask for, of these machines or of all.
 
         Raises
         ------
@@ -161,9 +161,9 @@ class RecordingSource:
     def timed(
         self, keys: Collection[str] | None = None, *, from_ns: int | None = None, to_ns: int | None = None
     ) -> Iterator[tuple[int, RecordedMessage]]:
-        """Read messages from `from_ns` up to, and without, `to_ns`, each with the time that the data had reached.
+        """Read messages from `from_ns` up to, and without, `to_ns`, each with the data time that had been reached.
 
-        A block is where its first sample is; what was recorded between two blocks of a machine goes with the first.
+        A block has the time of its first sample; messages recorded between two blocks of a machine that of the first.
 
         Raises
         ------
@@ -219,7 +219,7 @@ class RecordingSource:
         return since_ns
 
     def _overlapping(self) -> Iterator[list[_File]]:
-        """Files in groups that share no stretch of time with each other; few are open at a time."""
+        """Groups of files that do not overlap in time with other groups, so that few files are open at a time."""
         group: list[_File] = []
         end_ns = 0
         for file in self._files:
@@ -238,7 +238,7 @@ def _places(file: _File, keys: frozenset[str] | None) -> set[str]:
 
 
 def _recorded(file: _File) -> DataSpan:
-    """Times of recording, where the data say nothing."""
+    """Times of recording, for files whose data give no time."""
     start_ns, end_ns = file.summary.start_ns, file.summary.end_ns
     return DataSpan(start_ns, end_ns, start_ns, end_ns)
 
@@ -275,7 +275,7 @@ def parse_moment(text: str, start_ns: int, option: str) -> int:
     Raises
     ------
     MachineFileError
-        If it is neither.
+        If it is none of these.
 
     Examples
     --------
