@@ -1,11 +1,11 @@
-"""By which time what is kept grows old: the computer's, unless that was just set forward."""
+"""The time by which the age of kept data is measured: the computer's, unless that was just set forward."""
 
 import time
 from collections.abc import Callable
 
 import structlog
 
-_FORWARD_NS = 3600 * 10**9  # what summer time or a correction at the start may be
+_FORWARD_NS = 3600 * 10**9  # largest step believed at once, such as summer time or a correction at the start
 _BELIEVED_S = 86_400.0
 
 _SUSPENDED_TOO: int | None = getattr(time, "CLOCK_BOOTTIME", None)
@@ -14,14 +14,14 @@ _log = structlog.get_logger("rotorwatch", part="history")
 
 
 def running_s() -> float:
-    """Seconds that only pass, on Linux also while the computer is suspended."""
+    """Monotonic time in seconds, on Linux counted also while the computer is suspended."""
     return time.monotonic() if _SUSPENDED_TOO is None else time.clock_gettime(_SUSPENDED_TOO)
 
 
 class AgeClock:
-    """The computer's time of day; set forward by more than an hour, it counts once it has stayed so for a day.
+    """The computer's time of day; a step forward of more than an hour counts once it has lasted for a day.
 
-    A time server or a clock that is wrong for some minutes would otherwise have everything deleted that is kept for
+    Otherwise a time server or a clock that is wrong for some minutes would have everything deleted that is kept for
     days.
 
     Parameters
@@ -29,7 +29,7 @@ class AgeClock:
     now_ns : callable
         Time of day, nanoseconds since 1970-01-01 UTC.
     monotonic_s : callable
-        Seconds that only pass.
+        Monotonic time in seconds.
     """
 
     def __init__(self, now_ns: Callable[[], int] = time.time_ns, monotonic_s: Callable[[], float] = running_s) -> None:

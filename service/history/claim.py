@@ -4,8 +4,8 @@
 
     commit --> waiting (all steps since, as one) --> attempt (numbered, as it is, until the database has it)
 
-While the database fails, what waits is bounded: the oldest reports and readings are let go first, of checkpoints only
-the newest state is needed, and alarm events are never dropped.
+While the database fails, what waits is bounded: the oldest reports and readings are dropped first, only the newest
+checkpoint is kept, and alarm events are never dropped.
 """
 
 import math
@@ -22,11 +22,11 @@ from service.history.records import CheckpointHead, Step, StoredEvent, StoredRea
 
 _LARGEST = 2**63
 _LEVEL = 15
-# Never changed: every report that was ever written is read with it, those of before it existed too.
+# Never change it: every report that was ever written is read with it, also those from before it existed.
 _LIKE_REPORTS = zstandard.ZstdCompressionDict(
     Path(__file__).with_name("reports.dictionary").read_bytes(), dict_type=zstandard.DICT_TYPE_RAWCONTENT
 )
-_LIKE_REPORTS.precompute_compress(_LEVEL)  # once, and not for every report, which takes as long again
+_LIKE_REPORTS.precompute_compress(_LEVEL)  # once: for every report it would double the time
 
 
 class PackedReport(NamedTuple):
@@ -39,7 +39,7 @@ class PackedReport(NamedTuple):
 
 @dataclass(slots=True)
 class StepBundle:
-    """Steps of one machine as one step: in order, written whole or not at all."""
+    """Steps of one machine combined into one: in order, written whole or not at all."""
 
     reports: deque[PackedReport] = field(default_factory=deque)
     readings: deque[tuple[int, tuple[StoredReading, ...]]] = field(default_factory=deque)
@@ -51,7 +51,7 @@ class StepBundle:
     heard: list[Future[bool]] = field(default_factory=list)
 
     def settle(self, error: StoreError | None, written: bool) -> None:
-        """Tell those who wait what became of it."""
+        """Give the result to the callers that wait for it."""
         for future in self.heard:
             if error is None:
                 future.set_result(written)
@@ -64,7 +64,7 @@ class StepBundle:
 class Claim:
     """The right to write one machine, and what it has to write.
 
-    What waits, the attempt included, is changed only by whoever holds the writer's lock.
+    What waits, the attempt included, is changed only while the writer's lock is held.
     """
 
     site: str
@@ -75,7 +75,7 @@ class Claim:
     written: int = 0  # number of the latest attempt that is known to be in the database
     locked: bool = True  # whether the lock in PostgreSQL is held, as far as is known
     lost: StoreError | None = None  # why this monitor must not write the machine any more
-    trouble: str = ""  # why the database, which works, does not take what waits; empty if it does
+    trouble: str = ""  # why the database does not take what waits although it works; empty if it does
     retry_s: float = 0.0  # when that is tried again, by the monotonic clock
     generation: int = 0  # goes up when the history continues in another file, which may lack what was written before
     waiting: StepBundle = field(default_factory=StepBundle)
@@ -122,13 +122,13 @@ class Claim:
             self.dropped_readings += len(waiting.readings.popleft()[1])
 
     def take(self) -> bool:
-        """Attempt what was tried before, unchanged, or else everything that waits; whether there is anything."""
+        """Keep an earlier attempt unchanged, or else attempt all that waits; return whether there is anything."""
         if not self.attempt.steps:
             self.attempt, self.waiting = self.waiting, StepBundle()
         return self.attempt.steps > 0
 
     def put_off(self) -> None:
-        """Let nobody wait for what is not written yet."""
+        """Tell callers that wait that their steps are not written yet."""
         for bundle in (self.attempt, self.waiting):
             bundle.settle(None, written=False)
 

@@ -1,7 +1,7 @@
 """The database behind the history: its address, its connections, and what is done when one does not answer.
 
-Whoever asks uses a connection from the pool in a thread of its own, in `Database.reading` and `Database.writing`. One
-thread looks after them all: it breaks off what takes too long.
+Callers use connections from the pool in their own threads, with `Database.reading` and `Database.writing`. One thread
+watches them all and breaks off what takes too long.
 """
 
 import importlib
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
 _BUSY_S = 0.02
 _ANSWER_S = 60.0  # at least; a query over a long time may take a while
-_FINISH_S = 2.0  # for what others have asked for when the history is closed
+_FINISH_S = 2.0  # for queries that run when the history is closed
 _JOIN_S = 10.0
 _WATCH_S = 0.5
 _IMMEDIATE = "rotorwatch_immediate"
 _NEEDED = ("machines", "alarm_events", "checkpoints", "checkpoint_parts", "series", "tokens", "webhook_cursors")
-"""Tables without which a monitor cannot go on; to look through the others would take minutes."""
+"""Tables without which a monitor cannot go on; to check the others would take minutes."""
 _POSTGRESQL = {"application_name": "rotorwatch", "client_encoding": "UTF8", "tcp_user_timeout": 25_000} | {
     "keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 3
 }  # fmt: skip
@@ -50,7 +50,7 @@ _FORMS = "expected sqlite:////folder/file, sqlite:///:memory: or postgresql://us
 
 @dataclass(slots=True, eq=False)
 class _Use:
-    """Somebody who uses a connection: until when, and why it was broken off."""
+    """One use of a connection: its deadline, and why it was broken off."""
 
     until_s: float
     driver: Any = None
@@ -58,7 +58,7 @@ class _Use:
 
 
 class Database:
-    """Connections to one database, of the URL and time limit of a `service.history.store.Store`; for any thread.
+    """Connections to one database, with URL and time limit of a `service.history.store.Store`; for any thread.
 
     Raises
     ------
@@ -74,9 +74,9 @@ class Database:
         self.file = HistoryFile(Path(self._url.database or "")) if self.is_sqlite and not self.in_memory else None
         self.shown = self._url.render_as_string(hide_password=True)  # the address without the password
         self.answer_s = max(_ANSWER_S, 10.0 * timeout_s)
-        self.generation = 0  # goes up each time the history is gone on with in another file than before
+        self.generation = 0  # goes up each time the history continues in another file than before
         self.news = ""  # what happened to the file then
-        self.lost = ""  # the same, where something of the history is not in the present file; empty if all of it is
+        self.lost = ""  # the same if something of the history is not in the present file; empty if all of it is
         self._engine: Engine | None = None
         self._uses: set[_Use] = set()
         self._changed = threading.Condition()
@@ -107,7 +107,7 @@ class Database:
         threading.Thread(target=self._watch, name="history-watch", daemon=True).start()
 
     def stop(self) -> None:
-        """Answer everybody who has asked, breaking off what takes too long, and disconnect; twice is once."""
+        """Finish running queries, breaking off what takes too long, and disconnect; a second call does nothing."""
         with self._changed:
             engine, self._engine = self._engine, None
             if engine is None:
@@ -121,7 +121,7 @@ class Database:
 
     @property
     def is_open(self) -> bool:
-        """Whether it can be asked."""
+        """Whether the history is open."""
         return self._engine is not None
 
     @property
@@ -144,7 +144,7 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """A connection to read with, all of it at one point in time; raises as `rows` does."""
+        """A connection that reads everything as of one point in time; raises as `rows` does."""
         with self.plainly(), self.alone() if self.in_memory else nullcontext(), self.using(self.answer_s) as connection:
             if not self.is_sqlite:
                 connection.execution_options(isolation_level="REPEATABLE READ")
@@ -166,12 +166,12 @@ class Database:
 
     @contextmanager
     def using(self, limit_s: float, connection: Connection | None = None) -> Iterator[Connection]:
-        """A connection that is watched: what takes longer than the limit is broken off, and so is it at the end.
+        """A watched connection: what takes longer than the limit, or too long when the history closes, is broken off.
 
         Parameters
         ----------
         connection : Connection, optional
-            Otherwise one from the pool.
+            The one to watch; by default one from the pool.
 
         Raises
         ------
@@ -204,7 +204,7 @@ class Database:
 
     @contextmanager
     def alone(self, limit_s: float | None = None) -> Iterator[None]:
-        """Keep others of this process from writing to SQLite at the same time; nothing in PostgreSQL."""
+        """Keep other threads from writing to SQLite at the same time; does nothing in PostgreSQL."""
         if self.is_sqlite and not self._one_writer.acquire(timeout=limit_s or 2 * self.timeout_s):
             raise TimeoutError
         try:
@@ -237,7 +237,7 @@ class Database:
         return StoreError(f"{self.shown}: {reason}")
 
     def to_write(self, connection: Connection) -> None:
-        """Let transactions of a connection wait for their turn at the beginning, in SQLite."""
+        """In SQLite, have transactions of a connection wait for the right to write when they begin."""
         connection.execution_options(**{_IMMEDIATE: True})
 
     def insert(self, table: "Table") -> "sqlite.Insert | postgresql.Insert":
@@ -247,7 +247,7 @@ class Database:
         return made
 
     def astray(self) -> str:
-        """Why what is written would not be found at the address any more; empty if it would."""
+        """Why what is written now would no longer be found at the address; empty if it would."""
         why = "" if self.file is None else self.file.astray()
         return f"{self.shown}: {why}" if why else ""
 
@@ -259,14 +259,14 @@ class Database:
         return True
 
     def begin_anew(self, why: str, source: Connection | None) -> None:
-        """Go on in the file that is at the path now, or in a new one; `lost` says what is not in it.
+        """Continue in the file that is at the path now, or in a new one; `lost` says what is not in it.
 
-        `why` is from `astray`. All of a file that was deleted is saved by `source`, a connection to it.
+        `why` is from `astray`. The contents of a deleted file are saved through `source`, a connection to it.
 
         Raises
         ------
         StoreError, SQLAlchemyError, OSError
-            If that fails; readers have the former file still.
+            If that fails; readers still have the former file.
         """
         former, generation = self.engine, self.generation
         rescued = self.file is not None and self.file.rescue(source)
@@ -274,7 +274,7 @@ class Database:
             self.file.set_aside("deleted", only_opened=True)
         self._engine = self._connect(set_aside=True)
         former.dispose()
-        if self.generation == generation:  # not set aside
+        if self.generation == generation:  # no damaged file was set aside
             self.generation += 1
             self.news = f"{why} while it was in use; " + (
                 "its contents are in a new one" if rescued else "what was recorded before is not in it"
@@ -304,7 +304,7 @@ class Database:
                 self.to_write(connection)
                 with connection.begin():
                     self._bring_up_to_date(connection)
-            if self.is_sqlite:  # kept in the file, so not before that is known to be ours
+            if self.is_sqlite:  # the file keeps this setting, so only once it is known to be ours
                 with closing(engine.raw_connection()) as raw, closing(raw.cursor()) as cursor:
                     end_s = time.monotonic() + self.timeout_s
                     while True:  # SQLite does not wait here for others who open the file at the same time
@@ -315,7 +315,7 @@ class Database:
                             if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > end_s:
                                 raise
                             time.sleep(_BUSY_S)
-                    cursor.execute("PRAGMA schema_version")  # the log is made by whoever reads
+                    cursor.execute("PRAGMA schema_version")  # reading makes the log file
             if self.file is not None:
                 self.file.opened()
         except BaseException:
@@ -360,13 +360,13 @@ class Database:
         def limit(connection: Any, record: object) -> None:
             _ = record
             encoding = connection.info.parameter_status("server_encoding")
-            if encoding != "UTF8":  # a reason or a name that it cannot hold would stop all that is written
+            if encoding != "UTF8":  # a reason or a name that it cannot hold would stop all writing
                 raise StoreError(
                     f"{self.shown}: the encoding of the database is {encoding}, expected UTF8 (createdb -E)"
                 )
-            # The server ends by itself what `_break_off` has turned away from.
+            # So that the server itself ends what `_break_off` has abandoned.
             connection.execute(f"SET statement_timeout = {round(1000 * self.answer_s)}")
-            # So that it lets go of the locks of a computer that was lost; without effect on a socket of its own.
+            # So that it releases the locks of a computer that was lost; without effect on a Unix socket.
             for name, value in _SERVER_KEEPALIVES.items():
                 connection.execute(f"SET {name} = {value}")
             connection.commit()
@@ -374,7 +374,7 @@ class Database:
         @event.listens_for(engine, "checkout")
         def still_there(connection: Any, record: object, proxy: object) -> None:
             _ = record, proxy
-            # Not a ping, which waits for a server that hangs: one that has closed the connection has sent its end.
+            # Not a ping, which waits for a server that hangs: after a closed connection there is its end to read.
             line = select.poll()
             line.register(connection.fileno(), select.POLLIN)
             if line.poll(0):
@@ -388,7 +388,7 @@ class Database:
                 for use in self._uses:
                     if use.driver is not None and use.until_s < time.monotonic():
                         use.broken_off = "the history was closed" if self._engine is None else "no answer in time"
-                        with suppress(Exception):  # it has come to an end by itself
+                        with suppress(Exception):  # it may just have ended by itself
                             self._break_off(use.driver)
                 self._changed.wait(_WATCH_S)
 
@@ -396,18 +396,18 @@ class Database:
         if self.is_sqlite:
             driver.interrupt()
             return
-        # Not an order to cancel, to which a server that hangs does not listen.
+        # Not a request to cancel, which a server that hangs ignores.
         with socket.socket(fileno=os.dup(driver.fileno())) as line:
             line.shutdown(socket.SHUT_RDWR)
 
 
 def checked_url(url: str) -> URL:
-    """The address, taken apart.
+    """Parse the URL of a database.
 
     Raises
     ------
     StoreError
-        If it is of no known form; without its password.
+        If it is of no known form; the message does not show its password.
     """
     try:
         made = make_url(url)
@@ -429,8 +429,8 @@ def checked_url(url: str) -> URL:
 def _prepare_sqlite(connection: Any, record: object) -> None:
     _ = record
     connection.isolation_level = None  # the transactions below, not those that the driver would begin
-    # Every page that a step touches is written whole, and few pages hold more than one thing that a step changes. Those
-    # that every step touches go from the log into the file only every few hundred steps.
+    # Small pages: each page that a step touches is written whole, and few hold more than one thing that it changes.
+    # Pages that every step touches go from the log into the file only every few hundred steps.
     small = ("page_size = 512", "wal_autocheckpoint = 32000")
     for setting in (*small, "synchronous = FULL", "foreign_keys = ON"):
         connection.execute(f"PRAGMA {setting}")

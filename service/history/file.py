@@ -1,4 +1,4 @@
-"""The SQLite file of a history: whether it is the one that was opened, what is done if not, and copies of it."""
+"""The SQLite file of a history: whether it is still the one that was opened, what is done if not, and backups."""
 
 import fcntl
 import glob
@@ -24,7 +24,7 @@ class HistoryFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.damage = ""  # what SQLite found wrong with it while it was in use; whoever finds it sets it
+        self.damage = ""  # what SQLite found wrong with it while it was in use; set by the code that finds it
         self._opened: dict[str, tuple[int, int] | None] = {}
 
     def make(self) -> None:
@@ -33,7 +33,7 @@ class HistoryFile:
         Raises
         ------
         StoreError
-            If a file is there that never was a history: text, and neither a header nor zeros in its place.
+            If a file is there that never was a history: it begins with text, not with a header or zeros.
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
         _make(self.path)
@@ -50,7 +50,7 @@ class HistoryFile:
         self.damage = ""
 
     def astray(self) -> str:
-        """Why what is written would not be found at the path any more; empty if it would."""
+        """Why what is written now would no longer be found at the path; empty if it would."""
         if not self._opened:
             return ""
         found = _identity(self.path)
@@ -61,7 +61,7 @@ class HistoryFile:
         return f"the file is damaged: {self.damage}" if self.damage else ""
 
     def rescue(self, source: Connection | None) -> bool:
-        """Write what a deleted file holds into a new one at its path; say whether that is done.
+        """Write the contents of a deleted file into a new one at its path; return whether that was possible.
 
         `source` was connected to it before it was deleted.
         """
@@ -82,7 +82,7 @@ class HistoryFile:
         return True
 
     def set_aside(self, why: str, *, only_opened: bool = False) -> Path:
-        """Rename the file and what SQLite keeps beside it, or only what was opened of them; return the new name."""
+        """Rename the file and what SQLite keeps beside it, or only those that were opened; return the new name."""
         kept = self._beside(f".{why}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}")
         for end in _COMPANIONS:
             found = _identity(self._beside(end))
@@ -103,7 +103,7 @@ def is_damage(error: BaseException) -> bool:
 def lock_file(path: Path) -> int | None:
     """Lock the file beside the database that stands for one machine; None if another has it.
 
-    The system lets go of it when the process ends, however it ends.
+    The system releases the lock when the process ends, however it ends.
     """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
@@ -118,7 +118,7 @@ def lock_file(path: Path) -> int | None:
 
 
 def _identity(file: Path) -> tuple[int, int] | None:
-    """What a file is known by, whatever its name; None if there is none that can be reached."""
+    """Device and inode, which identify a file whatever its name; None if it cannot be reached."""
     try:
         found = file.stat()
     except OSError:
@@ -205,7 +205,7 @@ def restore(into: HistoryFile, backup: Path) -> Path | None:
 
 
 def _opened(file: Path) -> sqlite3.Connection:
-    if not file.is_file():  # of which SQLite says less
+    if not file.is_file():  # SQLite's own message says less
         raise StoreError(f"{file}: {'is a folder, expected a file' if file.is_dir() else 'no such file'}")
     try:
         return sqlite3.connect(f"file:{quote(str(file))}?mode=ro", uri=True)

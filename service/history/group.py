@@ -1,4 +1,4 @@
-"""Writes what several machines brought in one transaction."""
+"""Writes steps of several machines in one transaction."""
 
 import math
 from collections import ChainMap, defaultdict
@@ -19,9 +19,9 @@ from service.history.windows import READING, fill_buckets, packed
 SeriesNumbers = dict[tuple[int, str, str], int]
 _Rows = defaultdict[Table, list[dict[str, Any]]]
 
-# Put together once: to do so for every step takes nearly as long as to carry them out.
+# Built once: building them for every step takes nearly as long as executing them.
 _newest = (windows.c.machine_id == machines.c.machine_id) & (windows.c.number == machines.c.windows)
-# Locked in one order, whoever writes: two on one server must not wait for each other.
+# Every writer locks in this order: two on one server must not wait for each other.
 _MACHINES = (
     select(machines, windows.c.end_ns)
     .outerjoin(windows, _newest)
@@ -84,7 +84,7 @@ def write_group(
         _add_series(connection, claim.machine_id, bundle, numbers)
         new = _new_windows(claim.machine_id, bundle, machine.windows + 1, numbers)
         rows[windows] += new
-        # Windows wait for the bucket of their time to be complete, which it is when one of another time comes.
+        # Windows wait until the bucket of their time is complete, which is when a window of another bucket comes.
         places = [(machine.end_ns or 0) // bucket_ns, *(row["end_ns"] // bucket_ns for row in new)]
         others = [number for number, place in enumerate(places, machine.windows) if place != places[-1]]
         bucketed = max(others, default=machine.bucketed)
@@ -146,7 +146,7 @@ def _add_series(
 def _new_windows(
     machine_id: int, bundle: StepBundle, number: int, numbers: Mapping[tuple[int, str, str], int]
 ) -> list[dict[str, Any]]:
-    """Readings of one time are a window, numbered from `number` on; one of a series that is in it begins another."""
+    """Group readings of one time as windows, numbered from `number` on; a series that recurs begins another one."""
     made: list[tuple[dict[str, int], dict[int, tuple[float, float]]]] = []
     for recorded_ns, reading in ((recorded_ns, each) for recorded_ns, step in bundle.readings for each in step):
         series_id = numbers[machine_id, reading.quantity, reading.name]

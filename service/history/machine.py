@@ -36,8 +36,8 @@ _HEAD = [checkpoints.c[name] for name in CheckpointHead.__dataclass_fields__]
 class MachineStore:
     """The history of one machine, with the sole right to write it; from `Store.machine`.
 
-    `commit` is for the machine's own thread, everything else for any. All that read raise `StoreError` if the database
-    fails; they see what is committed.
+    `commit` is for the machine's own thread, everything else for any. All methods that read raise `StoreError` if the
+    database fails; they see what is committed.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class MachineStore:
 
     @property
     def trouble(self) -> str:
-        """Why the database, which works, does not take what waits; empty if it does."""
+        """Why the database does not take what waits although it works; empty if it does."""
         return self._claim.trouble
 
     @property
@@ -71,11 +71,11 @@ class MachineStore:
 
     @property
     def news(self) -> str:
-        """What happened to the file then."""
+        """What happened to the file when the generation last went up."""
         return self._database.news
 
     def go_on_from(self, sequence: int) -> None:
-        """Number the next alarm event after this one, where the log of a file that was begun anew has fewer."""
+        """Number the next alarm event after this one, even if the log of a file that was begun anew has fewer."""
         self._last_sequence = max(self._last_sequence, sequence)
 
     def last_sequence(self) -> int:
@@ -83,7 +83,7 @@ class MachineStore:
         return self._last_sequence
 
     def commit(self, step: Step) -> bool:
-        """Write what one block brought, whole or not at all, in order.
+        """Write the results of one block, whole or not at all, in order.
 
         Parameters
         ----------
@@ -125,14 +125,14 @@ class MachineStore:
                 return None
             query = select(parts.name, parts.data).where(parts.machine_id == machine_id).order_by(parts.name)
             rows = connection.execute(query).all()
-        with suppress(StoreError):  # without alarms, whoever restores them finds out and says so
+        with suppress(StoreError):  # if they are damaged, restoring the alarms fails and says so
             alarms = ""
             alarms = unpack(head.alarms)
         kept = CheckpointHead(**head._asdict() | {"alarms": alarms})
         return Checkpoint(kept, tuple((row.name, row.data) for row in rows))
 
     def evidence(self, alarm: str, occurrence: int | None = None) -> str | None:
-        """What an occurrence of an alarm rests on, or its latest one; None if nothing was kept."""
+        """Evidence of an occurrence of an alarm, or of its latest one; None if nothing was kept."""
         kept = evidence.c
         query = select(kept.text).where(kept.machine_id == self._claim.machine_id, kept.alarm == alarm)
         if occurrence is not None:
@@ -141,7 +141,7 @@ class MachineStore:
         return zstandard.decompress(rows[0].text).decode() if rows else None
 
     def keep_evidence(self, alarm: str, occurrence: int, text: str) -> None:
-        """Keep what an occurrence of an alarm rests on, in place of what was kept of it; the oldest of many go."""
+        """Keep the evidence of an occurrence of an alarm, replacing what was kept; beyond 500, the oldest go."""
         kept, own = evidence.c, evidence.c.machine_id == self._claim.machine_id
         values = {"recorded_ns": self._now_ns(), "text": zstandard.compress(text.encode())}
         key = {"machine_id": self._claim.machine_id, "alarm": alarm, "occurrence": occurrence}
@@ -231,7 +231,7 @@ class MachineStore:
         return tuple(found[:limit])
 
     def names_of(self, quantity: str) -> frozenset[str]:
-        """Everything that was ever read as this quantity, that of an earlier machine file too."""
+        """All names that were ever read as this quantity, also with an earlier machine file."""
         of = series.c
         query = select(of.name).where(of.machine_id == self._claim.machine_id, of.quantity == quantity)
         return frozenset(name for (name,) in self._database.rows(query))
@@ -245,18 +245,18 @@ class MachineStore:
         until_ns: int | None = None,
         points: int = 300,
     ) -> tuple[StoredBucket, ...]:
-        """Readings reduced to at most so many buckets of equal length for each name, by name and time.
+        """Readings reduced to at most `points` buckets of equal length for each name, by name and time.
 
         Parameters
         ----------
         names : sequence of str, optional
-            Which; all if left out.
+            Names to reduce; all if left out.
         since_ns, until_ns : int, optional
-            Windows with since_ns ≤ end_ns < until_ns; all if left out. Buckets begin with the first of them. Over more
-            than 20 000 windows, over more than 2000 where `points` asks for half a stored bucket or more, or where
-            readings have been dropped, stored buckets are taken; those returned are multiples of them in length then
-            and begin at multiples of that, so the first may begin before `since_ns`. Only where readings have been
-            dropped, a stored bucket counts as a whole, if its beginning is within.
+            Windows with since_ns ≤ end_ns < until_ns; all if left out. Buckets begin with the first of them. Stored
+            buckets are taken for more than 20 000 windows, for more than 2000 if `points` asks for at least half the
+            length of a stored bucket, and where readings have been dropped. Buckets are then multiples of stored ones
+            in length and begin where a stored one would, so the first may begin before `since_ns`. Where readings have
+            been dropped, and only there, a stored bucket counts as a whole if it begins within the time.
         points : int
             At most this many buckets for each name; those without a reading are left out.
         """
@@ -275,7 +275,7 @@ class MachineStore:
             return trend(*of, quantity, [name], since_ns, None, _checked(points))
 
     def _follow(self, events: Sequence[StoredEvent]) -> int:
-        """The last sequence after these events."""
+        """The last sequence after these events; raises `StoreError` at a gap or a repeated id."""
         last = self._last_sequence
         for event in events:
             if event.sequence > last + 1:

@@ -1,4 +1,4 @@
-"""What the history keeps, as it goes in and comes out, how long, and what goes wrong with it.
+"""The records that the history takes and returns, how long it keeps them, and its errors.
 
 All times are nanoseconds since 1970 UTC. ``recorded_ns``, ``at_ns``, ``created_ns``, ``expires_ns`` and ``revoked_ns``
 are the computer's time, all others data time.
@@ -59,10 +59,10 @@ class StoredReading:
 
 @dataclass
 class StoredBucket:
-    """Readings of one name over a stretch of time: what a `ReadingBucket` tells, made in a fraction of the time.
+    """Readings of one name over a stretch of time: the fields of a `ReadingBucket`, but made in a fraction of the time.
 
-    Neither frozen nor with slots: there are twenty thousand in an answer, and that is how they are made and told most
-    quickly.
+    Neither frozen nor with slots: there are twenty thousand in an answer, and this way they are made and written
+    fastest.
     """
 
     name: str
@@ -95,7 +95,7 @@ class CheckpointHead:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """What a monitor goes on from: head and parts, each with its name."""
+    """The state from which a monitor continues: head, and parts with their names."""
 
     head: CheckpointHead
     parts: tuple[tuple[str, bytes], ...]
@@ -115,7 +115,7 @@ class CheckpointStep:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What one block brought; written whole or not at all."""
+    """The results of one block; written whole or not at all."""
 
     reports: tuple[StoredReport, ...] = ()
     readings: tuple[StoredReading, ...] = ()
@@ -150,7 +150,7 @@ class StoreError(RotorwatchError):
 
 
 class DamagedError(StoreError):
-    """The file is there and is no usable database; the message says what SQLite found."""
+    """The file is there but is no usable database; the message says what SQLite found."""
 
 
 class Retention(BaseModel, extra="forbid", frozen=True):

@@ -40,7 +40,7 @@ class Reduction:
         self._thread.join(self._database.answer_s)
 
     def run(self, now_ns: int) -> Dropped:
-        """Drop and reduce what is too old at a time of the computer; happens by itself every few minutes.
+        """Drop what is too old at a time of the computer, readings once they are in buckets; runs every few minutes.
 
         Raises
         ------
@@ -89,10 +89,10 @@ class Reduction:
             return connection.execute(delete(table).where(table.c.recorded_ns <= (boundary_ns or -1))).rowcount
 
     def _drop_first(self, connection: Connection, table: Table, machine_id: int, until_ns: int, most: int) -> int:
-        """Drop what one machine has had longest, up to the last old one of so many; return how many.
+        """Drop one machine's first rows, up to the last one among `most` that is too old; return how many.
 
-        Numbers say what came first. Where the computer's clock was ahead, its times do not: what such rows stand before
-        was recorded later, and they go with it.
+        Numbers give the order of recording; times do not where the computer's clock was ahead. Rows with such times go
+        with a later row that is too old.
         """
         row, last, now_ns = table.c, -1, self._now_ns()
         while True:

@@ -1,4 +1,4 @@
-"""What no single machine has the right to: tokens, audit log, cursors of webhooks; and alarms and reports to read."""
+"""What belongs to no single machine: tokens, audit log, cursors of webhooks; and alarms and reports to read."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ _TIMEOUT_S = 5.0
 
 
 def alarms_since(database: Database, site: str, name: str, recorded_ns: int) -> tuple[StoredEvent, ...]:
-    """The latest events that a monitor committed to a machine's log, if any, at most 10 000, by their sequence.
+    """The latest events committed to a machine's log since a time of recording, at most 10 000, in order.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def alarms_since(database: Database, site: str, name: str, recorded_ns: int) -> 
 
 
 def committed_events(url: str, site: str, name: str, recorded_ns: int) -> tuple[StoredEvent, ...]:
-    """`alarms_since` of a history that another program writes, which is opened for the moment and left as it is.
+    """`alarms_since` of a history that another program writes: it is opened read-only and closed again.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def committed_events(url: str, site: str, name: str, recorded_ns: int) -> tuple[
 
 
 class ReportLog:
-    """Reports that monitors committed, of one machine; for any thread. Both methods raise `StoreError`."""
+    """Committed reports of one machine; for any thread. Both methods raise `StoreError`."""
 
     def __init__(self, database: Database, site: str, name: str) -> None:
         self._database = database
@@ -61,7 +61,7 @@ class ReportLog:
         return None if first is None else (first, last)
 
     def texts(self, since_ns: int, until_ns: int, most: int) -> list[str]:
-        """Reports of windows with since_ns ≤ end_ns < until_ns, oldest first; every so many, if there are more."""
+        """Reports of windows with since_ns ≤ end_ns < until_ns, oldest first; every n-th of more than `most`."""
         where = (*self._own, reports.c.end_ns >= since_ns, reports.c.end_ns < until_ns)
         ((count,),) = self._database.rows(select(func.count()).select_from(reports).where(*where))
         every = -(-count // most) or 1
@@ -110,7 +110,7 @@ class AuditLog:
 
 
 def _storable(text: str) -> str:
-    """A text without what a stranger can put into a request and no database takes."""
+    """A text with those characters escaped that a request may hold but no database takes."""
     return text.replace("\0", "\\0").encode("utf-8", "backslashreplace").decode()
 
 
@@ -163,7 +163,7 @@ def _record(token_id: str, name: str, scopes: str, *rest: Any) -> TokenRecord:
 
 
 class WebhookCursors:
-    """The alarm event that each webhook is to have next of each machine; for any thread.
+    """Which alarm event of each machine each webhook is to get next; for any thread.
 
     Both methods raise `StoreError` if the database fails.
     """

@@ -8,8 +8,8 @@
     whoever asks, in its own thread --> SQLite or PostgreSQL <-- the Reduction's thread drops what is old
 
 The way of a step: `MachineStore.commit` checks and packs it, `Writer.submit` adds it to what waits in the machine's
-`Claim`, the Writer's thread takes what there is of all machines, `write_group` makes rows of it, and
-whoever waits is told.
+`Claim`, the Writer's thread takes what waits of all machines, `write_group` makes rows of it, and callers that wait
+get the result.
 """
 
 import time
@@ -109,7 +109,7 @@ class Store:
         return self._database.lost
 
     def unreachable(self) -> str:
-        """Why the database takes no transaction now; empty if it does, also while nothing has to be written."""
+        """Why the database takes no transaction now, even if nothing has to be written; empty if it takes one."""
         if astray := self._database.astray():
             return astray
         try:
@@ -135,12 +135,12 @@ class Store:
             self.reduction.start()
 
     def close(self) -> None:
-        """Write what waits, if the database takes it, let go of all machines and disconnect.
+        """Write what waits, if the database takes it, release all machines and disconnect.
 
         Raises
         ------
         StoreError
-            Saying what is lost, if the database does not take it; everything is let go of all the same.
+            If the database does not take it, saying what is lost; everything is released all the same.
         """
         if not self._database.is_open:
             return

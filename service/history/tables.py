@@ -1,14 +1,14 @@
-"""The tables of the history; `migrations` makes them of what older versions have left.
+"""The tables of the history; `migrations` makes them from the tables of older versions.
 
 ::
 
     machines --< alarm_events                      the log of alarms; triggers refuse to change it
              --< reports                           the newest, whole and compressed
              --< windows                           each with its readings in one value: see `windows.py`
-             --< buckets                           the same of many windows, reduced, and kept longer
-             --< series                            what the numbers in both stand for
-             --< evidence                          what alarms rest on
-             --- checkpoints --< checkpoint_parts  where a monitor goes on from
+             --< buckets                           readings of many windows, reduced, and kept longer
+             --< series                            quantity and name for the numbers of series in both
+             --< evidence                          pictures that are kept with alarms
+             --- checkpoints --< checkpoint_parts  the state from which a monitor continues
     tokens    audit_log    webhook_cursors
 """
 
@@ -49,7 +49,7 @@ machines = sa.Table(
     sa.Column("machine_id", Integer, primary_key=True),
     # Who may write: a monitor that finds another's mark in `owner` has been replaced.
     *_filled(Text, "site", "name", "owner"),
-    # How many there have been; a step that is sent twice is known by its number.
+    # How many there have been; a step that is sent twice is recognised by its number.
     *_filled(BigInteger, "steps", "reports", "windows"),
     # The readings of windows up to this number are in buckets.
     sa.Column("bucketed", BigInteger, nullable=False, server_default=sa.text("0")),
@@ -99,7 +99,7 @@ series = sa.Table(
     sa.Column("series_id", Integer, primary_key=True),
     _machine_id(),
     *_filled(Text, "quantity", "name"),
-    # End of the latest window whose reading has been dropped, so that only buckets know of it; -1 if there is none.
+    # End of the latest window whose reading has been dropped, so that it is in buckets alone; -1 if there is none.
     sa.Column("dropped_ns", BigInteger, nullable=False, server_default=sa.text("-1")),
     sa.UniqueConstraint("machine_id", "quantity", "name"),
 )
@@ -136,7 +136,7 @@ checkpoints = sa.Table(
     *_filled(LargeBinary, "alarms", "state"),
 )
 
-# What is large in a checkpoint and stays the same for many hops.
+# Large parts of a checkpoint, which stay the same for many hops.
 checkpoint_parts = sa.Table(
     "checkpoint_parts",
     metadata,
@@ -177,7 +177,7 @@ webhook_cursors = sa.Table(
 )
 
 _KEPT = ("alarm_events", "audit_log")
-"""What is written there stays as it is."""
+"""Append-only tables."""
 
 _SQLITE_TRIGGERS = (
     *(
@@ -207,7 +207,7 @@ _POSTGRESQL_TRIGGERS = (
 
 
 def bring_up_to_date(connection: sa.Connection) -> None:
-    """Make the tables in an empty database, and the present ones of those that an older version has made.
+    """Make the tables in an empty database, or turn those of an older version into the present ones.
 
     Raises
     ------
@@ -217,7 +217,7 @@ def bring_up_to_date(connection: sa.Connection) -> None:
     if _revisions(connection) == [REVISION]:
         return
     if connection.dialect.name == "postgresql":
-        # A large history may take minutes, another's too. One at a time; SQLite's transaction keeps the others out.
+        # Migrating may take minutes, and so may waiting for another's migration; in SQLite the transaction does that.
         connection.execute(sa.text("SET LOCAL statement_timeout = 0"))
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(*MIGRATING)))
     found = _revisions(connection)

@@ -13,9 +13,9 @@ from service.history.tables import buckets, machines, series, windows
 from service.history.windows import BUCKET, READING, Parts, add_up, finite, singles, stored_parts, unpacked
 
 _SINGLE = 20_000
-"""Windows whose single readings are reduced when a trend is asked for; over more of them the stored buckets are."""
+"""Most windows whose single readings are reduced for a trend; for more, stored buckets are taken."""
 _SINGLE_FOR_COARSE = 2_000
-"""The same where stored buckets are at most twice as long as what is asked for; they cost a tenth."""
+"""The same where stored buckets are at most twice as long as those asked for; they cost a tenth."""
 _END = 2**63 - 1
 _Timed = tuple[npt.NDArray[np.int64], Parts]
 """Buckets, and when each begins."""
@@ -31,11 +31,11 @@ def trend(  # noqa: PLR0913  # each narrows it
     until_ns: int | None,
     points: int,
 ) -> tuple[StoredBucket, ...]:
-    """Reduce readings, and what older ones have been reduced to, to at most `points` buckets; see `MachineStore`.
+    """Reduce readings, single or in stored buckets, to at most `points` buckets; see `MachineStore.downsampled`.
 
-    Every reading is in a stored bucket, or will be in the one that is being filled. Where all windows that are asked
-    for are there themselves, and not too many, they are taken; otherwise the buckets, and single readings only where
-    since or until lie within a bucket.
+    Every reading is in a stored bucket, or will be in the one that is being filled. If all windows that are asked for
+    are still there, and not too many, their single readings are taken; otherwise stored buckets are, and single
+    readings only where since or until lie within a bucket.
     """
     known = series.c
     query = select(known.series_id, known.name, known.dropped_ns).where(
@@ -49,7 +49,7 @@ def trend(  # noqa: PLR0913  # each narrows it
     since, until = since_ns or 0, _END if until_ns is None else until_ns
     window = windows.c
     asked = select(window.end_ns).where(window.machine_id == machine_id, window.end_ns >= since, window.end_ns < until)
-    # One after the other: each is found at an end of the index then, and not by looking through it.
+    # One query each: it finds its end of the index at once, where one for both would look through the index.
     oldest, newest = (
         connection.scalar(asked.order_by(order).limit(1)) for order in (window.end_ns.asc(), window.end_ns.desc())
     )
@@ -70,7 +70,7 @@ def trend(  # noqa: PLR0913  # each narrows it
     if single:
         parts = [_single(connection, machine_id, list(titles), window.end_ns, start, end)]
     else:
-        # Parts of buckets at both ends, as far as the readings themselves are there.
+        # Parts of buckets at both ends, from single readings as far as these are still there.
         first, last = since, until
         if since_ns is not None and since > dropped_ns and since % unit:
             first = start + unit
@@ -81,7 +81,7 @@ def trend(  # noqa: PLR0913  # each narrows it
         parts += [_between(each, first, last) for each in stored]
     times = np.concatenate([each for each, _ in parts])
     places, made = add_up(Parts.together([each for _, each in parts]), (times - start) // length)
-    # By name, and of each name in the order of time, which they are in.
+    # By name, and within a name in the order of time, which they already have.
     rank = {series_id: place for place, series_id in enumerate(sorted(titles, key=titles.__getitem__))}
     order = np.argsort([rank[series_id] for series_id in made["series_id"].tolist()], kind="stable")
     places, made = places[order], made[order]
@@ -105,7 +105,7 @@ def trend(  # noqa: PLR0913  # each narrows it
 def _stored(
     connection: Connection, machine_id: int, series_ids: list[int], since: int, until: int, bucket_ns: int
 ) -> tuple[int, list[_Timed]]:
-    """Buckets that begin within a time, those that are being filled at the end; and the length of the longest."""
+    """Length of the longest bucket, and the buckets that begin within a time, those that are being filled last."""
     stored = buckets.c
     query = select(stored.start_ns, stored.length_ns, stored.readings).order_by(stored.start_ns)
     query = query.where(stored.machine_id == machine_id, stored.start_ns >= since, stored.start_ns < until)

@@ -1,7 +1,7 @@
-"""The readings of a window in one value, and what windows are reduced to: the same numbers of many, added up.
+"""The readings of a window as one value of the database, and buckets: the readings of many windows, added up.
 
-Both are arrays with a record for each series, compressed; in them the numbers of series are differences, which halves
-what compressing leaves of them.
+Both are compressed arrays with a record for each series. The numbers of series are stored as differences, which halves
+the size after compression.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from service.history.tables import buckets, windows
 
 Records: TypeAlias = npt.NDArray[np.void]
 READING = np.dtype([("series_id", "<i4"), ("value", "<f8"), ("standard_error", "<f8")])
-"""A standard error that there is none of is NaN."""
+"""A missing standard error is NaN."""
 BUCKET = np.dtype(
     [
         ("series_id", "<i4"), ("count", "<i4"), ("minimum", "<f8"), ("maximum", "<f8"), ("total", "<f8"),
@@ -28,19 +28,19 @@ BUCKET = np.dtype(
 )  # fmt: skip
 _FIELDS: tuple[str, ...] = BUCKET.names or ()
 _ALL = slice(None)
-_FEW = 4  # places to count in, for each number
+_FEW = 4  # counters for each number, up to which `_distinct` counts and does not sort
 _log = structlog.get_logger("rotorwatch", part="history")
 
 
 def packed(records: Records) -> bytes:
-    """Make one value of records."""
+    """Compress records into one value."""
     stored = records.copy()
     stored["series_id"][1:] -= records["series_id"][:-1]
     return zstandard.compress(stored.tobytes())
 
 
 def unpacked(values: Sequence[bytes], kind: np.dtype[np.void]) -> tuple[npt.NDArray[np.intp], Records]:
-    """Records of many values, each with the place of the value that it was in; one that is damaged has none."""
+    """Records of many values, each with the place of the value it was in; a damaged value has no records."""
     opened, decompressor = [], zstandard.ZstdDecompressor()
     for each in values:
         try:
@@ -57,7 +57,7 @@ def unpacked(values: Sequence[bytes], kind: np.dtype[np.void]) -> tuple[npt.NDAr
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """The fields of buckets, each by itself: of a million readings these are added up much faster than records."""
+    """Buckets as one array for each field: a million readings are added up much faster than as records."""
 
     series_id: npt.NDArray[np.int32]
     count: npt.NDArray[np.int32]
@@ -68,12 +68,12 @@ class Parts:
     errors_total: npt.NDArray[np.float64]
 
     def of(self, chosen: npt.NDArray[np.bool_]) -> "Parts":
-        """Some of them."""
+        """Only the chosen buckets."""
         return self if chosen.all() else Parts(*(getattr(self, name)[chosen] for name in _FIELDS))
 
     @classmethod
     def together(cls, parts: Sequence["Parts"]) -> "Parts":
-        """All of them, in this order."""
+        """All buckets of several, in this order."""
         return cls(*(np.concatenate([getattr(each, name) for each in parts]) for name in _FIELDS))
 
 
@@ -86,17 +86,17 @@ def singles(readings: Records, chosen: npt.NDArray[np.intp] | slice = _ALL) -> P
 
 
 def stored_parts(stored: Records, chosen: npt.NDArray[np.intp] | slice = _ALL) -> Parts:
-    """Buckets that were stored."""
+    """Stored buckets, field by field."""
     return Parts(*(stored[name][chosen] for name in _FIELDS))
 
 
 def finite(parts: Parts) -> npt.NDArray[np.bool_]:
-    """Which have a mean."""
+    """Which buckets have a finite mean."""
     return np.isfinite(parts.total) & np.isfinite(parts.errors_total)
 
 
 def _distinct(numbers: npt.NDArray[np.integer[Any]]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Which numbers there are, and the place of each among them: `np.unique`, without sorting where they are small."""
+    """Distinct numbers in order, and the place of each number among them; `np.unique` without sorting small numbers."""
     if not len(numbers) or numbers.min() < 0 or numbers.max() > _FEW * len(numbers) + 1000:
         found, places = np.unique(numbers, return_inverse=True)
         return found.astype(np.int64), places
@@ -105,7 +105,7 @@ def _distinct(numbers: npt.NDArray[np.integer[Any]]) -> tuple[npt.NDArray[np.int
 
 
 def add_up(parts: Parts, places: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], Records]:
-    """Buckets, those at the same place and of the same series in one, by place and series; and their places."""
+    """Merge buckets of the same place and series; return the places and the buckets, ordered by place and series."""
     series_ids, column = _distinct(parts.series_id)
     width = max(1, len(series_ids))
     keys, group = _distinct(places * width + column)
@@ -123,7 +123,7 @@ def add_up(parts: Parts, places: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.
 def fill_buckets(
     database: Database, connection: Connection, machine_id: int, after: int, last: int, bucket_ns: int
 ) -> None:
-    """Add the windows from one number, exclusive, to another to the buckets; the machine's row must be locked."""
+    """Add the windows with after < number ≤ last to the buckets; the machine's row must be locked."""
     window, stored = windows.c, buckets.c
     query = select(window.end_ns, window.recorded_ns, window.readings).order_by(window.number)
     query = query.where(window.machine_id == machine_id, window.number > after, window.number <= last)

@@ -1,4 +1,4 @@
-"""Commits what the machines bring, as many at a time as wait, and tries again while the database fails."""
+"""Commits the steps of machines, all that wait at a time, and tries again while the database fails."""
 
 import os
 import secrets
@@ -22,8 +22,8 @@ from service.history.tables import machines
 
 _LOCK = 0x726F746F  # first number of PostgreSQL's advisory locks; the second is the machine's
 _LOOK_S = 2.0  # between looks whether the database is still where it should be
-_LETS_GO_S = 2.0  # PostgreSQL notices within it that a monitor that was killed has gone
-_ENDS_S = 6.0  # until a process that shares the machines has ended that lost its monitor
+_LETS_GO_S = 2.0  # within this time PostgreSQL notices that a killed monitor is gone
+_ENDS_S = 6.0  # until a process that shares the machines ends after it has lost its monitor
 _AGAIN_S = 0.05
 _PATIENCE = 4.0  # times the database's timeout: others may be before this step
 _log = structlog.get_logger("rotorwatch", part="history")
@@ -32,8 +32,8 @@ _log = structlog.get_logger("rotorwatch", part="history")
 class Writer:
     """One thread and one connection, over which all machines of this monitor are written.
 
-    In PostgreSQL the same connection holds the locks on the machines, so that they are let go when it breaks; then
-    the mark of the owner in the table says whether another monitor has come in between.
+    In PostgreSQL the same connection holds the locks on the machines, so that they are released when it breaks; then
+    the owner's mark in the table says whether another monitor has come in between.
     """
 
     def __init__(
@@ -48,8 +48,8 @@ class Writer:
         self._files = ExitStack()
         self._series: SeriesNumbers = {}
         self._connection: Connection | None = None
-        self._turn = threading.Lock()  # on the connection; taken first where both are
-        self._lock = threading.RLock()  # on what waits and on what is said of it; never held while the database works
+        self._turn = threading.Lock()  # on the connection; taken before `_lock` if both are
+        self._lock = threading.RLock()  # on waiting steps and their trouble; never held while the database works
         self._wake = threading.Event()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="history-writer", daemon=True)
@@ -60,15 +60,15 @@ class Writer:
         self._thread.start()
 
     def stop(self) -> None:
-        """Write what waits, if the database takes it, and let go of all machines.
+        """Write what waits, if the database takes it, and release all machines.
 
         Raises
         ------
         StoreError
-            Saying what is lost, if the database does not take it.
+            If the database does not take it, saying what is lost.
         """
         with self._lock:
-            self._stopping.set()  # whoever has submitted a step before has submitted it in time
+            self._stopping.set()  # steps submitted before this are still written
         self._wake.set()
         self._thread.join(self._database.answer_s)
         if not self._thread.is_alive():
@@ -137,7 +137,7 @@ class Writer:
                 pass  # until nothing waits any more, or something goes wrong
 
     def _ready(self, at_once: bool) -> list[Claim]:
-        """Machines of which something is to be written now; what the database did not take has to wait."""
+        """Machines with something to write now; those whose step the database did not take wait, unless `at_once`."""
         now_s = time.monotonic()
         with self._lock:
             due = [claim for claim in self._claims if at_once or not claim.trouble or claim.retry_s <= now_s]
@@ -154,7 +154,7 @@ class Writer:
             if self._database.found_damaged(error) or _is_operational(error):
                 self._fail(ready, why)
             elif len(ready) > 1:
-                # The database is well, one machine's step is not: the others shall not wait for it.
+                # The database works, but one machine's step is at fault: the others must not wait for it.
                 taken = [self._write([claim]) for claim in ready]
                 return all(taken)
             else:
@@ -251,7 +251,7 @@ class Writer:
 
     @contextmanager
     def _connected(self) -> Iterator[Connection]:
-        """The connection, for one thread at a time; after an error the next one is another."""
+        """The connection, for one thread at a time; after an error a new one is made."""
         with self._turn, self._database.alone():
             try:
                 if self._connection is None:
@@ -264,12 +264,12 @@ class Writer:
                     yield connection
             except StoreError:
                 raise
-            except Exception:  # whatever broke off in the middle leaves the connection in a state that nobody knows
+            except Exception:  # of any kind: it leaves the connection in an unknown state
                 self._disconnect(broken=True)
                 raise
 
     def _lock_again(self, connection: Connection) -> None:
-        """Take the locks in PostgreSQL that went with a former connection."""
+        """Take again the locks in PostgreSQL that were lost with a former connection."""
         unlocked = [claim for claim in self._claims if not claim.locked and claim.lost is None]
         if unlocked and not self._database.is_sqlite:
             with connection.begin():
@@ -278,7 +278,7 @@ class Writer:
                     claim.locked = _lock_row(connection, claim.machine_id)
 
     def _let_go(self) -> None:
-        """Release the locks in PostgreSQL: the server notices the end of a connection in its own time."""
+        """Release the locks in PostgreSQL, as the server may notice the end of a connection late."""
         if self._connection is not None and not self._database.is_sqlite:
             with suppress(StoreError, SQLAlchemyError, OSError), self._connected() as connection:
                 connection.execute(text("SELECT pg_advisory_unlock_all()"))
@@ -303,7 +303,7 @@ class Writer:
                 claim.put_off()
 
     def _refuse(self, claim: Claim, trouble: str) -> None:
-        """The database does not take one machine's step: that machine's trouble, and tried again after a while."""
+        """Note that the database does not take one machine's step, which is tried again after a while."""
         with self._lock:
             if trouble != claim.trouble:
                 _log.error("the history does not accept what happens", machine=claim.title, why=trouble)

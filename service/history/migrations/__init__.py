@@ -1,4 +1,4 @@
-"""How tables of an older version become the present ones; `migrate` runs what a database does not have yet."""
+"""How tables of an older version become the present ones; `migrate` runs the migrations that a database lacks."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The tables of version 0.1.0, which `service.history.tables` makes: where later versions go on from."""
+"""The tables of version 0.1.0, which `service.history.tables` makes: the starting point of later migrations."""
 
 revision = "0004"
 down_revision: str | None = None

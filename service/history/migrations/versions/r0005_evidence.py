@@ -1,4 +1,4 @@
-"""A table for what alarms rest on."""
+"""A table for the evidence of alarms."""
 
 from alembic import op
 
