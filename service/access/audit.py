@@ -31,7 +31,7 @@ _log = logger(part="access")
 
 @dataclass(frozen=True, slots=True)
 class AuditNote:
-    """What a route says of what it does, as ``request.state.audit``."""
+    """What a route says about its action, in ``request.state.audit``."""
 
     action: str = ""  # in one word, such as ``acknowledge``
     # What it is done to: ``site/machine``, and the alarm's name.
@@ -53,7 +53,7 @@ class Visit:
 
 
 class AuditTrail:
-    """Writes the audit log; of refused requests so many of an address in a minute."""
+    """Writes the audit log; of refused requests, at most `refusals_per_minute` of one address."""
 
     def __init__(
         self, log: AuditLog, refusals_per_minute: int, *, monotonic: Callable[[], float] = time.monotonic
@@ -86,7 +86,7 @@ class AuditTrail:
         visit.started = True
 
     def finish(self, visit: Visit, status: int, note: AuditNote) -> None:
-        """Write down what came of it; trouble is logged, because it cannot be undone."""
+        """Write down the outcome; if that fails, it is only logged, as the action cannot be undone."""
         try:
             self._write(visit, status, note)
         except RotorwatchError as error:

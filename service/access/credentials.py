@@ -12,7 +12,7 @@ from service.access.origin import SAFE_METHODS
 from service.access.scopes import Caller
 
 COOKIE = "rotorwatch_token"
-"""In which a browser keeps the token of who has signed in."""
+"""Name of the cookie in which a browser keeps the token of a signed-in user."""
 
 NEEDED = "an access token is needed; programs send it as header Authorization: Bearer rw_…"
 BEARER = 'Bearer realm="rotorwatch"'
@@ -26,7 +26,7 @@ def address_of(request: Request) -> str:
 
 
 def network_of(address: str) -> str:
-    """What is counted as one address: of IPv6 the first 64 bits, because a caller has the others to itself."""
+    """What counts as one address: for IPv6 the first 64 bits, because a caller has the others to itself."""
     try:
         parsed = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:
@@ -39,14 +39,14 @@ def network_of(address: str) -> str:
 
 
 def key_of(caller: Caller) -> str:
-    """Under which a caller's requests and streams are counted."""
+    """Key under which a caller's requests and streams are counted."""
     return caller.token_id or network_of(caller.address)
 
 
 def presented_text(headers: Headers, method: str) -> str | None:
-    """Token in the header ``Authorization``, or in the cookie of who has signed in.
+    """Token in the header ``Authorization``, or in the cookie of a signed-in user.
 
-    The password of HTTP Basic counts only where nothing can be changed.
+    The password of HTTP Basic counts only for methods that change nothing.
     """
     kept = kept_text(headers)
     if kept is not None:
@@ -64,9 +64,9 @@ def presented_text(headers: Headers, method: str) -> str | None:
 
 
 def kept_text(headers: Headers) -> str | None:
-    """Token of who has signed in, which the browser adds by itself; None where a program gives its own.
+    """Token of a signed-in user, in the cookie that the browser adds by itself; None if a program sends its own token.
 
-    A password does not count beside it: a browser that was once given one goes on adding it, to look only.
+    A password beside it does not count: a browser that was once given one goes on sending it, though it only reads.
     """
     if headers.get("authorization", "basic").partition(" ")[0].lower() != "basic":
         return None
@@ -84,7 +84,7 @@ def challenges(request: Request) -> tuple[str, ...]:
 
 
 def unauthenticated(request: Request) -> str:
-    """Why a request has no caller; a token that is not valid is not told whether it ever was."""
+    """Why a request has no caller; does not reveal whether an invalid token was ever valid."""
     if kept_text(request.headers) is not None:
         return "you are no longer signed in: the token has expired or was revoked"
     if "authorization" not in request.headers:

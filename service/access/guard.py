@@ -1,4 +1,4 @@
-"""Who may call which route, and that no route forgets to say so.
+"""Checks who may call which route, and that every route declares it.
 
 ::
 
@@ -68,7 +68,7 @@ class Guard:
     tokens : TokenStore
         Looked up at every request, so that a token that is revoked is refused at the next one.
     host : str
-        Address that is listened on; a name of the service's.
+        Address that is listened on; it counts as a name of the service.
 
     Attributes
     ----------
@@ -111,12 +111,12 @@ class Guard:
         self._known: OrderedDict[bytes, tuple[TokenRecord, float]] = OrderedDict()  # valid ones, and when looked up
 
     def protect(self, app: FastAPI) -> None:
-        """Put the middleware around an application all of whose routes are there, and serve its ``/openapi.json``.
+        """Put the middleware around an application that has all its routes, and serve its ``/openapi.json``.
 
         Raises
         ------
         AccessError
-            If there is a route that the gate does not stand before.
+            If a route is not behind the gate.
         """
 
         @app.get("/openapi.json", include_in_schema=False, dependencies=[self.read])
@@ -139,7 +139,7 @@ class Guard:
         )
 
     async def admit(self, request: Request) -> Caller:
-        """Find out who calls, and whether that is welcome at all.
+        """Identify the caller, and refuse a request by token, rate or origin.
 
         Raises
         ------
@@ -170,7 +170,7 @@ class Guard:
         return caller
 
     def pass_gate(self, request: Request) -> None:
-        """Refuse what the route's caller may not do, or nobody; write down what is about to be done.
+        """Refuse what the caller, or anybody, may not do; write into the audit log what is about to be done.
 
         Raises
         ------
@@ -214,7 +214,7 @@ class Guard:
     async def _authenticated(self, request: Request, address: str) -> Caller | None:
         """Return the owner of the token that is presented; None if none is presented or it is not valid."""
         text = presented_text(request.headers, request.method)
-        # Of what was presented only its digest is kept, and nobody can tell from it what it was.
+        # Only a digest of what was presented is kept, from which nobody can recover it.
         given = kept_text(request.headers) or "\n".join(request.headers.getlist("authorization"))
         if not given:
             return None
@@ -228,7 +228,7 @@ class Guard:
             if presented is not None:
                 self._known.pop(presented.secret_hash, None)
             self._failures.hit(identity)
-            # Only after the look-up: who shares an address with somebody who tries tokens out is not locked out.
+            # Only after the look-up, so that nobody is locked out by others who try out tokens from the same address.
             if wait_s := self._failures.hit(network_of(address)):
                 raise _too_many("too many attempts with a wrong token from this address", wait_s)
             return None
@@ -245,7 +245,7 @@ class Guard:
             # Just when the database fails, operators want to look at their machines.
             if known is not None and method in SAFE_METHODS and now_s - known[1] <= _WITHOUT_DATABASE_S:
                 return known[0]
-            # Who asks is not known, and where the database is only concerns those who read the log.
+            # The caller is not known and must not learn where the database is, which the error says: log it.
             self._limiter.say("look-up", _log.error, "tokens cannot be looked up", why=str(error))
             raise HTTPException(
                 503, "tokens cannot be looked up in the history: nothing was done; the log says why"

@@ -1,4 +1,4 @@
-"""Around the whole application: who calls, how much they send, what the audit log says of it, and safe headers.
+"""Around the whole application: identifies callers, limits bodies, writes the audit log, and sets safe headers.
 
 Written against ASGI itself, so that event streams pass through piece by piece.
 """
@@ -21,7 +21,7 @@ from service.access.scopes import Caller
 from service.terminal.logs import Limiter, logger
 
 VISIT = "access_visit"
-"""Where the request on its way is kept, in ``request.state``."""
+"""Attribute of ``request.state`` that keeps the request's `Visit`."""
 
 _UNAUTHENTICATED = 401
 _TOO_LARGE = 413
@@ -75,9 +75,9 @@ class AccessMiddleware:
             nonlocal answered
             if message["type"] == "http.response.start":
                 if received > self._body_bytes and message["status"] != _TOO_LARGE:
-                    return  # what others made of the body's end
+                    return  # an answer that others gave to the body as it was cut off
                 answered = True
-                # Before the answer: whoever has it can find it in the log.
+                # Before the answer, so that whoever gets it finds it in the log.
                 await self._record(visit, message["status"], request)
                 headers = MutableHeaders(scope=message)
                 for name, value in _HEADERS.items():

@@ -1,8 +1,8 @@
-"""What a page from elsewhere could make a browser send is refused.
+"""Refuses requests that a page from elsewhere could make a browser send.
 
-A browser adds by itself whatever lets its user in: the address of a loopback service, a password it has kept. So no
-request that could change anything is taken from another page, and where no token is needed none under a name that is
-not this service's: somebody else's name that leads here would make their page one of ours.
+A browser admits such a page with what belongs to its user: access to a loopback service, a password that it has kept.
+So no request that could change anything is accepted from another page. Where no token is needed, none at all is
+accepted under a name that is not this service's: a foreign name that leads here would make its page one of ours.
 """
 
 from urllib.parse import urlsplit
@@ -23,16 +23,16 @@ _FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip")
 def check_origin(
     headers: Headers, method: str, *, listens_on: str, hosts: tuple[str, ...], open_to_all: bool, kept: bool
 ) -> None:
-    """Refuse what may come from a page of somebody else's.
+    """Refuse a request that may come from somebody else's page.
 
     Parameters
     ----------
     hosts : tuple of str
         Other names under which browsers reach the service.
     open_to_all : bool
-        Whether callers need no token; then the service's name is looked at, and nothing is taken from a proxy.
+        Whether callers need no token; then the host name is checked, and nothing is accepted from a proxy.
     kept : bool
-        Whether the caller is known by what a browser adds by itself: then it must say which page asks.
+        Whether the caller is known by a cookie, which a browser adds by itself: then it must say which page asks.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def check_origin(
 
 
 def check_body_type(headers: Headers, method: str) -> None:
-    """Refuse what a form of somebody else's page could send to a route that takes a body.
+    """Refuse what a form on somebody else's page could send to a route that takes a body.
 
     A form can send neither JSON nor other methods; a script from elsewhere would have to ask first.
 

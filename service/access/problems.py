@@ -1,4 +1,4 @@
-"""Errors of the HTTP API as problem details (RFC 9457), and how OpenAPI tells of them."""
+"""Errors of the HTTP API as problem details (RFC 9457), and their description in OpenAPI."""
 
 from difflib import SequenceMatcher
 from http import HTTPStatus
@@ -60,7 +60,7 @@ def responses(
     Parameters
     ----------
     *problems : int
-        Besides those that any request may meet.
+        Statuses besides those that any request may meet.
     shown : object, optional
         Example, if not the one made of the examples of the model's fields.
     """
@@ -71,7 +71,7 @@ def responses(
 
 
 def written(model: type[BaseModel], *problems: int) -> dict[str, Any]:
-    """Arguments of a route whose answer is written already when FastAPI sees it, for OpenAPI to tell of it."""
+    """Arguments that let OpenAPI describe a route whose answer is JSON text before FastAPI sees it."""
     return {"responses": responses(model, *problems), "response_model": model}
 
 
@@ -154,7 +154,7 @@ def _methods(request: Request) -> list[str]:
 
 
 def _nearest(request: Request) -> str | None:
-    """Path that was perhaps meant: as many parts, each like its own, the beginning ``/api/v1`` left out or not."""
+    """Path that was perhaps meant: with as many similar parts, ``/api/v1`` left out or not; None if there is none."""
     asked = request.url.path.strip("/").split("/")
     best, found = _LIKENESS, None
     for context in iter_route_contexts(request.app.routes):
@@ -171,14 +171,14 @@ def _nearest(request: Request) -> str | None:
 
 
 def _field(place: tuple[str | int, ...]) -> str:
-    """Innermost name of where a fault is; numbers count the values of a field."""
+    """Innermost field name in the place of a fault, where numbers count the values of a field."""
     return next(part for part in reversed(place) if isinstance(part, str))
 
 
 class _LastResort:
-    """Answers what nobody answered.
+    """Answers requests that ended in an error that nobody handled.
 
-    A handler for Exception would let it through to the server after answering, which then drops the connection.
+    A handler for Exception would, after answering, pass the error on to the server, which then drops the connection.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -197,7 +197,7 @@ class _LastResort:
 
         try:
             await self._app(scope, receive, watched)
-        except Exception:  # an error of any kind behind any path must be a 500 that tells nothing of the inside
+        except Exception:  # an error of any kind behind any path must be a 500 that reveals nothing of the inside
             request = Request(scope, receive)
             _log.exception("request failed", path=request.url.path)
             if begun:

@@ -1,4 +1,4 @@
-"""How often, and how many at once: moving windows and seats for event streams.
+"""Limits on how often, and on how many at once: moving windows, and seats for event streams.
 
 Counted on the monotonic clock, so that setting the time of day back locks nobody out, and for a bounded number of keys,
 so that many addresses do not fill the memory. Both are used by the event loop alone.
@@ -60,11 +60,11 @@ class MovingWindow:
 
 
 class TooManyStreamsError(RotorwatchError):
-    """No seat is left; the message says of whose there are too many."""
+    """No seat is left; the message says whether the caller has too many streams or the service."""
 
 
 class StreamSeats:
-    """Open event streams: at most so many of one caller, and so many in all."""
+    """Open event streams: at most `per_caller` of one caller, and `total` in all."""
 
     def __init__(self, per_caller: int, total: int) -> None:
         self._per_caller = per_caller

@@ -1,4 +1,4 @@
-"""That a route's caller has a scope, as a dependency that OpenAPI shows; and which scope each route declares."""
+"""Dependency that a route's caller has a scope, as OpenAPI shows it; and which scopes each route declares."""
 
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -18,17 +18,17 @@ PUBLIC_PATHS = frozenset(("/", "/healthz"))
 """Paths that anybody may GET: the page knows nothing until somebody has signed in there."""
 
 PAGE_FILES = "/page/"
-"""How paths begin that anybody may GET besides."""
+"""Beginning of further paths that anybody may GET."""
 
 PROBE_PATHS = frozenset(("/healthz", "/readyz"))
 """Paths by which others decide whether to restart the service; however many ask, they are answered."""
 
 CALLER = "access_caller"
-"""Where the middleware leaves the caller, in ``request.state``."""
+"""Attribute of ``request.state`` in which the middleware leaves the caller."""
 
 
 class Requirement:
-    """Gives the caller of a route, who has a scope."""
+    """Gives the caller of a route, if that has a scope."""
 
     def __init__(self, scope: Scope) -> None:
         self.scope = scope
@@ -42,7 +42,7 @@ class Requirement:
             401 without a caller, 403 if the scope is missing.
         """
         caller = getattr(request.state, CALLER, None)
-        if not isinstance(caller, Caller):  # it came past the middleware
+        if not isinstance(caller, Caller):  # the request did not pass the middleware
             raise HTTPException(401, NEEDED, {"WWW-Authenticate": BEARER})
         if self.scope not in caller.scopes:
             granted = ", ".join(scope for scope in Scope if scope in caller.scopes)
@@ -53,7 +53,7 @@ class Requirement:
 
 
 class _Shown(SecurityBase):
-    """A way to present a token as OpenAPI shows it; looking at the token is the middleware's affair."""
+    """A way to present a token as OpenAPI shows it; the middleware checks the token."""
 
     def __init__(self, model: HTTPBase, scheme_name: str) -> None:
         self.model = model
@@ -70,7 +70,7 @@ _BASIC = _Shown(
 
 
 def requires(scope: Scope, *, in_browsers: bool = False) -> Any:
-    """Dependency that gives a `Caller` with a scope; OpenAPI shows if the token may be a password, `in_browsers`."""
+    """Dependency that gives a `Caller` with a scope; OpenAPI shows if `in_browsers` the token may be a password."""
     requirement = Requirement(scope)
 
     def with_token(
@@ -90,7 +90,7 @@ def requires(scope: Scope, *, in_browsers: bool = False) -> Any:
 
 
 def declared_scopes(app: FastAPI, endpoint: Callable[..., Any] | None) -> frozenset[Scope]:
-    """Scopes that whoever reaches `endpoint` must have; none if one of its routes declares none."""
+    """Scopes that a caller of `endpoint` must have; none if one of its routes declares none."""
     found: set[Scope] = set()
     for context in iter_route_contexts(app.routes):
         if context.endpoint is endpoint and endpoint is not None:
@@ -102,7 +102,7 @@ def declared_scopes(app: FastAPI, endpoint: Callable[..., Any] | None) -> frozen
 
 
 def unguarded_routes(app: FastAPI, gate: Callable[..., Any]) -> list[str]:
-    """Routes before which `gate` does not stand: static files, sockets, mounted programs, or routes without it."""
+    """Routes that are not behind `gate`: static files, sockets, mounted programs, or routes without it."""
     return sorted(
         _title(context)
         for context in iter_route_contexts(app.routes)

@@ -22,7 +22,7 @@ def server_arguments(access: AccessSettings) -> dict[str, Any]:
         If certificate or key cannot be used.
     """
     arguments: dict[str, Any] = {
-        # Whoever is not a named proxy could write any address into the audit log.
+        # Only named proxies: anybody else could write any address into the audit log.
         "proxy_headers": bool(access.proxies),
         "forwarded_allow_ips": list(access.proxies),
         "server_header": False,
@@ -66,7 +66,7 @@ def tls_context(tls: HttpTlsSettings) -> ssl.SSLContext:
 
 
 def lapses(settings: ServiceSettings) -> list[str]:
-    """Certificates of a monitor that have expired, or do so within a month: whoever connects refuses them then."""
+    """Certificates of a monitor that have expired, or do so within a month: clients refuse them then."""
     given = (settings.access.tls, settings.link.tls, None if settings.fleet is None else settings.fleet.tls)
     files = {one.certificate: None for one in given if one is not None and one.certificate is not None}
     return [*filter(None, map(_lapse, files))]
@@ -74,7 +74,7 @@ def lapses(settings: ServiceSettings) -> list[str]:
 
 def _lapse(certificate: Path) -> str:
     try:
-        # No public way reads a certificate that is no authority's. Where a later Python has none, nothing is said.
+        # No public function reads a certificate that is not an authority's. Without this one, say nothing.
         decoded = ssl._ssl._test_decode_cert(str(certificate))  # type: ignore[attr-defined]
         end_s = ssl.cert_time_to_seconds(decoded["notAfter"])
     except (OSError, ValueError, AttributeError):

@@ -53,7 +53,7 @@ def new_token(name: str, scopes: Iterable[Scope], *, now_ns: int, days: int | No
     record : TokenRecord
         What is stored.
     text : str
-        The token. It cannot be had again.
+        The token. It cannot be retrieved again.
 
     Raises
     ------

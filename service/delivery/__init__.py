@@ -1,1 +1,1 @@
-"""Whoever is told of what happens: event streams over HTTP, webhooks, and metrics for Prometheus."""
+"""Notification: event streams over HTTP, webhooks, and metrics for Prometheus."""

@@ -1,11 +1,11 @@
-"""News of all machines for whoever listens over HTTP: alarm events out of the history, and changes of health.
+"""News of all machines for listeners over HTTP: alarm events from the history, and changes of health.
 
 ::
 
     worker -- committed --> wake() ---.
     supervisor ---------> health() ---+--> every stream looks into the history after its own cursor
 
-A stream keeps nothing but how far it has come, so a reader who is slow, or stops reading, holds up nobody else and
+A stream keeps nothing but its cursor, so a reader that is slow, or stops reading, holds up nobody else and
 costs no memory. What is in the history is delivered once, in the order of each machine's log.
 """
 
@@ -37,7 +37,7 @@ _LAST_S = 2.0
 _RETRY_MS = 2000
 _ENTRY = r"([A-Za-z0-9][A-Za-z0-9_-]{0,63}/[A-Za-z0-9][A-Za-z0-9_-]{0,63})=(-1|[0-9]{1,18})"
 CURSOR_PATTERN = f"^({_ENTRY}(,{_ENTRY})*)?$"
-"""What the id of an event looks like; each ``site/machine`` is there once."""
+"""Form of the id of an event; each ``site/machine`` is there once."""
 
 
 class CursorError(RotorwatchError):
@@ -99,7 +99,7 @@ class _Listener:
 
 @dataclass(frozen=True, eq=False)
 class _Said:
-    """The latest health of a machine, made into text once for all who listen."""
+    """The latest health of a machine, converted to text once for all listeners."""
 
     number: int
     health: Health
@@ -140,7 +140,7 @@ class EventFeed:
                 listener.wake()
 
     def close(self) -> None:
-        """End every stream once it has told what is committed; whoever reads slowly is waited for only so long."""
+        """End every stream once it has sent what is committed; slow readers are waited for `_LAST_S` at most."""
         self.closed = True
         self.wake()
         with self._lock:
@@ -161,13 +161,13 @@ class EventFeed:
         logs : mapping of str to MachineStore
             Logs of the machines that are listened to, by ``site/machine``.
         cursor : dict
-            How far each has been heard, for all of `logs`.
+            Latest event that the listener has had of each of `logs`.
         admitted : callable
-            Whether the listener still may; asked every now and then.
+            Whether the listener still has access; asked every now and then.
         health : callable
-            A machine's health as it is now: what was said last may be old, and with it the age of the data.
+            Returns a machine's health as it is now: the one published last may be old, and with it the age of the data.
         whole : container of str, optional
-            Machines whose health is told as it is, and not as an overview; by default all.
+            Machines whose health is sent in full, and not as an overview; by default all.
         """
         listener = _Listener(asyncio.get_running_loop())
         with self._lock:
@@ -210,7 +210,7 @@ class EventFeed:
                 self._lock.notify_all()
 
     def _said_after(self, number: int) -> list[tuple[str, _Said]]:
-        """What was said since, in that order."""
+        """Health published after this number, in that order."""
         with self._lock:
             newer = itertools.takewhile(lambda one: one[1].number > number, reversed(self._health.items()))
             return list(newer)[::-1]
@@ -218,7 +218,7 @@ class EventFeed:
     async def _changed(
         self, place: str, said: _Said, health: Callable[[str], Health], told: dict[str, int], *, in_full: bool
     ) -> AsyncIterator[str]:
-        """Health of a machine as it was said last, unless that was told; the first time as it is now."""
+        """Latest published health of a machine, unless it was sent already; the first time, as it is now."""
         first, latest = place not in told, self._health.get(place, said)
         if told.get(place) == latest.number:
             return
@@ -229,7 +229,7 @@ class EventFeed:
             yield latest.whole if in_full else latest.overview
 
     async def _committed(self, place: str, log: MachineStore, cursor: Cursor) -> AsyncIterator[str]:
-        """What is in the log after the cursor, which moves along; nothing while the history cannot be read."""
+        """Events in the log after the cursor, which moves along; none while the history cannot be read."""
         while cursor[place] < log.last_sequence():
             try:
                 page = await run_in_threadpool(log.events, after=cursor[place], limit=_PAGE)

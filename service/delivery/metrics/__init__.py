@@ -1,1 +1,1 @@
-"""What the monitor does in numbers, for Prometheus; read out of snapshots when somebody asks."""
+"""Metrics of the monitor for Prometheus, read from snapshots when somebody asks."""

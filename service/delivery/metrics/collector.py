@@ -1,6 +1,6 @@
 """All metrics, when somebody asks for them.
 
-Nothing is counted on the way of a block: what the monitor keeps anyhow is read at the moment of asking.
+Nothing is counted for them while blocks are processed: what the monitor keeps anyway is read when somebody asks.
 """
 
 import platform
@@ -44,7 +44,7 @@ class Metrics:
     def __init__(self, service: MeasuredService, requests: RequestCounts) -> None:
         self._service = service
         self._requests = requests
-        self._events: dict[str, tuple[int, Counter[str]]] = {}  # up to which one they are counted, and how many by kind
+        self._events: dict[str, tuple[int, Counter[str]]] = {}  # latest event counted, and numbers of events by kind
         self._one_at_a_time = threading.Lock()
         self._registry = CollectorRegistry()
         self._registry.register(self)
@@ -60,7 +60,7 @@ class Metrics:
             return generate_latest(self._registry)
 
     def collect(self) -> Iterator[Metric]:
-        """Every metric, as the library wants them."""
+        """Every metric, as the library expects them."""
         readiness = self._service.readiness()
         observed = [Observed(one, one.health(), one.status(), self._counted(one)) for one in self._service.machines()]
         yield from machine_families(observed)

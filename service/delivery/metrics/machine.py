@@ -72,7 +72,7 @@ def _state(machine: Observed) -> _Values:
 
 
 def _lag_s(machine: Observed) -> float:
-    """Blocks that wait, of the mean length of those that were accepted."""
+    """Length of the blocks that wait, by the mean length of accepted ones."""
     status, accepted = machine.status, machine.health.quality.accepted_blocks
     return status.queue_blocks * status.tally.data_s / max(1, accepted)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 NO_ROUTE = "-"
-"""Route of a request that was refused before one was looked for, or whose path is none."""
+"""Route of a request that was refused before its route was looked for, or that has none."""
 
 _METHODS = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"))
 
@@ -29,7 +29,7 @@ class RequestCounts:
         """Requests that were refused: without a valid token, without the scope, for their origin, or too many."""
         refused = dict.fromkeys(("token", "scope", "origin", "rate"), 0)
         for (_, route, status), count in self.answered().items():
-            # Scopes are looked at when the route is known, where a request comes from before that.
+            # Scopes are checked once the route is known, the origin before that.
             reasons = {"401": "token", "403": "origin" if route == NO_ROUTE else "scope", "429": "rate"}
             if status in reasons:
                 refused[reasons[status]] += count
@@ -37,7 +37,7 @@ class RequestCounts:
 
 
 class RequestMeter:
-    """Middleware around all others; what it counts are answers as they leave."""
+    """Middleware around all others, which counts answers as they leave."""
 
     def __init__(self, app: ASGIApp, counts: RequestCounts) -> None:
         self._app = app

@@ -64,7 +64,7 @@ def pause_s(answer: Answer, failures: int, longest_s: float, chance: float) -> f
     longest_s : float
         Longest pause; only the receiver itself may ask for more, up to an hour.
     chance : float
-        0 to 1, so that not everybody comes back at the same moment: 1 is the whole pause, 0 half of it.
+        Random number from 0 (half the pause) to 1 (all of it), so that not all come back at the same moment.
 
     Examples
     --------

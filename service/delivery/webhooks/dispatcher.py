@@ -7,7 +7,7 @@
                      |                    |--refused--> long pause for this one    (other 4xx, redirects)
                      '------ again -------'--gone-----> disabled                   (410)
 
-The cursor is saved after the delivery: whoever is killed in between delivers once more, with the same id.
+The cursor is saved after the delivery: a monitor that is killed in between delivers the event again, with the same id.
 """
 
 import threading
@@ -57,10 +57,10 @@ class Dispatcher:
     Parameters
     ----------
     logs : mapping of str to MachineStore
-        Of all machines, by ``site/machine``. A webhook that is new is told what comes after this moment.
+        Logs of all machines, by ``site/machine``. A new webhook gets the events that come after this moment.
     cursors : WebhookCursors
-        What is remembered is the sequence of the next event, so that a webhook that begins with an empty log (0) can be
-        told from a new one (-1).
+        Hold the sequence of the next event, so that a webhook that begins with an empty log (0) can be told from a new
+        one (-1).
     now_ns : callable
         Time of day, nanoseconds since 1970 UTC; only for the status.
     """
@@ -117,7 +117,7 @@ class Dispatcher:
         self._news.set()
 
     def status(self) -> WebhookStatus:
-        """How it goes; for any thread."""
+        """State of the webhook; for any thread."""
         settings = self.settings
         failing = bool(self._failures or any(lane.failures for lane in self._lanes))
         pending = sum(max(0, lane.log.last_sequence() + 1 - lane.next) for lane in self._lanes if lane.next is not None)
@@ -138,7 +138,7 @@ class Dispatcher:
         )
 
     def turn(self) -> float:
-        """Make the next attempt, if one is due; seconds until there is something to do, 0 if there may be at once."""
+        """Make the next attempt, if one is due; return the seconds until there may be something to do, perhaps 0."""
         now_s = self._clock()
         if self._disabled:
             return _QUIET_S
@@ -163,7 +163,7 @@ class Dispatcher:
                 try:
                     pause_s = self.turn()
                 except Exception as error:
-                    # Nothing narrower: an error in one attempt must not be the end of telling anybody of alarms.
+                    # Nothing narrower: an error in one attempt must not end the delivery of alarms.
                     self._failures += 1
                     pause_s, self._due_s = _QUIET_S, self._clock() + _QUIET_S
                     self._note(f"an error inside the service: {type(error).__name__}")
@@ -174,7 +174,7 @@ class Dispatcher:
             self._receiver.close()
 
     def _pause_s(self, now_s: float) -> float:
-        """Until something is due; what is not committed yet, or not saved, is looked after every second."""
+        """Seconds until something is due; events not committed and cursors not saved are looked after every second."""
         pauses = [self._due_s - now_s]
         for lane in self._lanes:
             behind = lane.next is None or lane.next <= lane.log.last_sequence() or lane.saved != lane.next

@@ -90,7 +90,7 @@ class Receiver:
         answer: Answer | None = None
         why = ""
         try:
-            # Of the attempt as a whole: httpx's own time-outs begin anew with every byte that drips in.
+            # For the attempt as a whole: httpx's own timeouts begin anew with every byte that comes in.
             async with asyncio.timeout(self._settings.timeout_s):
                 async with self._opened().stream(
                     "POST", self._url, content=body, headers=self._headers(identifier, body)
@@ -106,7 +106,7 @@ class Receiver:
         finally:
             if self._client is not None:
                 self._client.cookies.clear()
-        # What matters is the status: whoever has answered has the event, however the rest of the answer fares.
+        # Only the status matters: a receiver that has answered has the event, whatever becomes of the rest.
         return Answer(Meaning.TROUBLE, why) if answer is None else answer
 
     def _opened(self) -> httpx.AsyncClient:
@@ -131,7 +131,7 @@ class Receiver:
 
 
 async def _drained(response: httpx.Response) -> None:
-    """Read the rest of a short answer, so that the connection can be used again; nobody looks at it."""
+    """Read and discard the rest of a short answer, so that the connection can be used again."""
     read = 0
     async for part in response.aiter_raw():
         read += len(part)

@@ -76,7 +76,7 @@ def signing_keys(settings: WebhookSettings) -> tuple[bytes, ...]:
 def signature(keys: Sequence[bytes], identifier: str, timestamp_s: int, body: bytes) -> str:
     """Value of the header ``webhook-signature``, with one signature for each key.
 
-    Of ``webhook-id``, ``webhook-timestamp`` (seconds since 1970 UTC) and the body.
+    Signed are ``webhook-id``, ``webhook-timestamp`` (seconds since 1970 UTC) and the body.
     """
     signed = f"{identifier}.{timestamp_s}.".encode() + body
     digests = (hmac.new(key, signed, hashlib.sha256).digest() for key in keys)

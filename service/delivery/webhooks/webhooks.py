@@ -17,7 +17,7 @@ from service.settings.webhooks import WebhookSettings
 
 
 class Webhooks:
-    """Starts and stops webhooks and says how they stand.
+    """Starts and stops webhooks and reports their states.
 
     Raises
     ------
@@ -43,7 +43,7 @@ class Webhooks:
             dispatcher.wake()
 
     def statuses(self) -> WebhookList:
-        """How they stand."""
+        """State of every webhook."""
         return WebhookList(webhooks=tuple(dispatcher.status() for dispatcher in self._dispatchers))
 
     def failing(self) -> tuple[str, ...]:
