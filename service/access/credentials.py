@@ -66,7 +66,7 @@ def presented_text(headers: Headers, method: str) -> str | None:
 def kept_text(headers: Headers) -> str | None:
     """Token of a signed-in user, in the cookie that the browser adds by itself; None if a program sends its own token.
 
-    A password beside it does not count: a browser that was once given one goes on sending it, though it only reads.
+    A password beside it does not count: a browser that was once given one, which is for reading, goes on sending it.
     """
     if headers.get("authorization", "basic").partition(" ")[0].lower() != "basic":
         return None

@@ -139,7 +139,7 @@ class Guard:
         )
 
     async def admit(self, request: Request) -> Caller:
-        """Identify the caller, and refuse a request by token, rate or origin.
+        """Identify the caller, and refuse a request for its token, rate or origin.
 
         Raises
         ------

@@ -1,8 +1,8 @@
 """Refuses requests that a page from elsewhere could make a browser send.
 
-A browser admits such a page with what belongs to its user: access to a loopback service, a password that it has kept.
-So no request that could change anything is accepted from another page. Where no token is needed, none at all is
-accepted under a name that is not this service's: a foreign name that leads here would make its page one of ours.
+A browser by itself adds what admits its user: it reaches a loopback service, and sends a password that it has kept. So
+no request that could change anything is accepted from another page. Where no token is needed, none at all is accepted
+under a name that is not this service's: a foreign name that leads here would make its page one of ours.
 """
 
 from urllib.parse import urlsplit

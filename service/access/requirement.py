@@ -70,7 +70,7 @@ _BASIC = _Shown(
 
 
 def requires(scope: Scope, *, in_browsers: bool = False) -> Any:
-    """Dependency that gives a `Caller` with a scope; OpenAPI shows if `in_browsers` the token may be a password."""
+    """Dependency that gives a `Caller` with a scope; with `in_browsers`, OpenAPI offers the token as password too."""
     requirement = Requirement(scope)
 
     def with_token(

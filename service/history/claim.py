@@ -168,7 +168,7 @@ def unpack(text: bytes) -> str:
 
 
 def _check(machine: str, of: str, record: StoredReport | StoredReading | StoredEvent | CheckpointHead) -> None:
-    for name in record.__slots__:  # of readings there are a hundred in a step
+    for name in record.__slots__:  # there are a hundred readings in a step
         value = getattr(record, name)
         if isinstance(value, float):
             if math.isnan(value):

@@ -374,7 +374,7 @@ class Database:
         @event.listens_for(engine, "checkout")
         def still_there(connection: Any, record: object, proxy: object) -> None:
             _ = record, proxy
-            # Not a ping, which waits for a server that hangs: after a closed connection there is its end to read.
+            # Not a ping, which waits for a server that hangs: a connection that the server has closed can be read.
             line = select.poll()
             line.register(connection.fileno(), select.POLLIN)
             if line.poll(0):

@@ -217,7 +217,7 @@ def bring_up_to_date(connection: sa.Connection) -> None:
     if _revisions(connection) == [REVISION]:
         return
     if connection.dialect.name == "postgresql":
-        # Migrating may take minutes, and so may waiting for another's migration; in SQLite the transaction does that.
+        # Migrating may take minutes, and so may waiting for another's migration; in SQLite the transaction waits.
         connection.execute(sa.text("SET LOCAL statement_timeout = 0"))
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(*MIGRATING)))
     found = _revisions(connection)

@@ -88,10 +88,10 @@ class Evaluation:
         return self.deciding.unexplained != "" or (self.deciding.misfit_z or 0.0) > _INSIDE
 
     def rivals(self, foreign: Foreign) -> tuple[str, ...]:
-        """Stiffness and damping of a place, if one of them explains the window as well as a wrong gain there.
+        """Stiffness and damping of a place, if a change of one explains the window as well as a wrong gain there.
 
-        A wrong gain scales the stiffness and damping read by one factor, and 1x as `left_of_1x` says. A bearing below
-        its resonance looks the same if its damping is not known well.
+        A wrong gain scales the readings of both by one factor, and 1x as `left_of_1x` says. A bearing below its
+        resonance looks the same if its damping is not known well.
         """
         names = tuple(f"{of}_b{foreign.direction}" for of in "kc")
         left = self.deciding.left_by(names) if foreign.direction else None

@@ -86,7 +86,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         self._others = tuple(others)
 
     def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
-        """Also leave out sensors without a signal while most are left, as the theory holds for any of them.
+        """Also leave out sensors without a signal while most are left, as the theory holds for any set of sensors.
 
         Not if the speed is found in the vibration: the strength of its line depends on which sensors are left.
         """

@@ -119,7 +119,7 @@ class LevelWatch:
                 apart |= np.isnan(speeds)
             if apart.any():  # the next hop may have begun at the other speed
                 self._moved_ns = hops[min(int(np.flatnonzero(apart)[-1]) + 1, len(hops) - 1)].end_ns
-            elif self._moved_ns <= hops[-1].end_ns:  # those that were not known were at this speed but for the oldest
+            elif self._moved_ns <= hops[-1].end_ns:  # hops of unknown speed were at this one, except the oldest
                 self._moved_ns = min(self._moved_ns, hops[0].end_ns)
         if self.reference is not None and self.reference.at(found.speed_rad_s)[0].varied:
             return False

@@ -226,7 +226,7 @@ class MachineMonitor:
             self._test.clear()
             self._alarms.clock_stepped(block.start_ns, round(verdict.clock_step_s * 1e9))
         elif self.end_ns is None and self._reached_ns is not None:
-            # Until now shelving ran on the time of day; it goes on by the time of the data.
+            # Until now shelving ran on the time of day; from now on it runs on the time of the data.
             self._alarms.clock_stepped(block.start_ns, block.start_ns - self._reached_ns)
         self._alarms.passed(block.start_ns)
         self._fault = self._data_path.accepted(verdict, block.start_ns, dropped) or self._fault
@@ -339,7 +339,7 @@ class MachineMonitor:
         self.end_ns = end_ns if self.end_ns is None else self.end_ns
 
     def health(self) -> MachineHealth:
-        """Where the machine stands now."""
+        """State of the machine now."""
         calm = HealthState.NOT_EVALUABLE if self._fault else self._reporter.calm
         return MachineHealth(
             self._reporter.state(calm),  # what operators did counts at once

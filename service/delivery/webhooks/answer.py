@@ -13,7 +13,7 @@ _MOST_DOUBLINGS = 30
 
 
 class Meaning(Enum):
-    """What an attempt came to."""
+    """What the outcome of an attempt means for the next one."""
 
     DELIVERED = auto()
     """The event is taken."""

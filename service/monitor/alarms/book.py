@@ -169,7 +169,7 @@ class AlarmBook:
             # Outside the model no candidate need be right, which alarm `model` says; and one cause has one alarm.
             told = verdict.outside_model or any(self.present(name) for name in probability)
             unsure = [] if sure or told else named
-            rival = [suspect] if hidden and suspect else []  # told however little the parameter would have changed
+            rival = [suspect] if hidden and suspect else []  # stated however little the parameter would have changed
             changes = [
                 (abs(one.relative_change or 0.0), self._settings.for_parameter(one.name))
                 for one in verdict.current
@@ -344,7 +344,7 @@ class AlarmBook:
     # Surviving a restart
 
     def checkpoint(self) -> str:
-        """Everything as JSON."""
+        """The complete state as JSON."""
         return _PAGE.dump_json(_Page(self.alarms, self.next_sequence)).decode()
 
     def restore(self, text: str, next_sequence: int | None = None) -> None:

@@ -15,7 +15,7 @@ from rotorwatch.records.windows import SensorFault
 from service.monitor.alarms.book import AlarmBook
 
 _MOST_HOPS = 4
-"""Hops' time without a whole hop from which gaps are too frequent: after a single gap a hop is whole within three."""
+"""Time without a whole hop, in hops, from which gaps are too frequent: after a single gap it takes three at most."""
 
 
 class DataPathAlarms:
@@ -33,7 +33,7 @@ class DataPathAlarms:
         self._unseen_windows, self._unseen_blocks, self._unseen_s = 0, 0, 0.0
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """Everything as named arrays."""
+        """The complete state as named arrays."""
         whole_ns = [] if self._whole_ns is None else [self._whole_ns]
         unseen = [self._unseen_windows, self._unseen_blocks, self._unseen_s]
         return {
@@ -44,7 +44,7 @@ class DataPathAlarms:
         }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called, see `models.checkpoint`."""
+        """Continue from where `checkpoint` was called, see `models.checkpoint`."""
         windows, blocks, self._unseen_s = checked(arrays, "unseen", np.float64, (3,)).tolist()
         self._unseen_windows, self._unseen_blocks = int(windows), int(blocks)
         self._whole_ns = next(iter(checked(arrays, "whole_ns", np.int64, (None,)).tolist()), None)
@@ -158,7 +158,7 @@ class DataPathAlarms:
         self._book.suppress(None, due_ns)
 
     def _found_again_ns(self, start_ns: int) -> int:
-        """When the silence ended: late data without a gap are older than the alarm, so its own time is taken."""
+        """When the silence ended: the time of its alarm, if late data without a gap are older than that."""
         raised_ns = next((one.raised_ns for one in self._book.alarms if one.name == STREAM_LOST), None)
         late = raised_ns is not None and 0 <= raised_ns - start_ns <= self._silence_ns
         return raised_ns if raised_ns is not None and late else start_ns

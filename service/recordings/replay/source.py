@@ -163,7 +163,7 @@ class RecordingSource:
     ) -> Iterator[tuple[int, RecordedMessage]]:
         """Read messages from `from_ns` up to, and without, `to_ns`, each with the data time that had been reached.
 
-        A block has the time of its first sample; messages recorded between two blocks of a machine that of the first.
+        A block has the time of its first sample; messages between two blocks of a machine have that of the earlier one.
 
         Raises
         ------
