@@ -1,4 +1,4 @@
-"""What arrives of a machine's stream, looked at without a monitor."""
+"""Examines a machine's stream as it arrives, without a monitor."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -22,19 +22,19 @@ from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.levels import LevelWatch
 
 _MOST_BREAKS = 3
-"""Told one by one."""
+"""Most breaks in the stream that are reported individually."""
 
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """What was seen."""
+    """Findings about the messages of one machine."""
 
     lines: tuple[str, ...]  # what arrives, in words
     troubles: tuple[str, ...]  # what is missing or differs from the machine file
 
 
 def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arrival:
-    """Look at the messages that arrived under a machine's keys, in the order of their arrival."""
+    """Examine the messages that arrived under a machine's keys, given in order of arrival."""
     place, keys = machine.title, machine.keys
     troubles: list[str] = []
     announced = [one.payload for one in messages if one.key == keys.descriptor]
@@ -93,7 +93,7 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
 
 
 def _of_samples(machine: MachineFile, blocks: Sequence[SampleBlock], troubles: list[str]) -> list[str]:
-    """Length, keyphasor and levels of blocks that follow each other."""
+    """Describe duration, speed and levels of consecutive blocks; append what is wrong with them to `troubles`."""
     plan = plan_for(machine, levels=True)
     samples = plan.to_si(np.concatenate([block.samples for block in blocks]))
     duration_s = (blocks[-1].end_ns - blocks[0].start_ns) / 1e9

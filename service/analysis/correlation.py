@@ -1,4 +1,4 @@
-"""Correlations of one window against what the trained networks predict, equation by equation."""
+"""Correlation functions of one window, compared with the predictions of the trained networks for each equation."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,39 +23,39 @@ from service.monitor.descriptor import descriptor_mismatch
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """One reference's correlation."""
+    """Correlation of the response with one reference channel (or, for the synchronous equation, in one plane)."""
 
     label: str  # reference channel's state, or plane
-    # (n_points,), target as estimated in the window, and by the network from the other correlations; over the target's
-    # rms.
+    # (n_points,), target over its rms: as estimated in the window, and as the network predicts it from the other
+    # correlations.
     measured: FloatArray
     predicted: FloatArray
 
     @property
     def residual(self) -> FloatArray:
-        """Measured less predicted."""
+        """Measured minus predicted."""
         return np.asarray(self.measured - self.predicted, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One equation."""
+    """Curves and reading of one compatibility equation."""
 
     target: str  # name of its target correlation
     over: str  # ``lag`` or ``angle``: what `x` is
     x: FloatArray  # (n_points,), lags, s; or shaft angles, rad
     curves: tuple[Curve, ...]  # empty if it cannot be evaluated
-    # What the monitor reports of it: mean squared deviation, that of healthy windows, parameters, or the reason.
+    # What the monitor reports: MSD here and in healthy windows, readings of the parameters, or why there are none.
     reading: EquationReading
 
 
 def latest_window(data: Recorded, machine: MachineFile) -> WindowStatistics:
-    """The latest full window of what was recorded, as a monitor that hears it from its start on has it.
+    """The latest full window in a recording, as a monitor that received it from its start would hold it.
 
     Raises
     ------
     RotorwatchError
-        If there is none; the message says what is there.
+        If there is no full window; the message says how much usable data there is.
     """
     window, gate = SlidingWindow(plan_for(machine)), Gate(machine)
     latest: WindowStatistics | None = None
@@ -81,7 +81,7 @@ def latest_window(data: Recorded, machine: MachineFile) -> WindowStatistics:
 
 
 def correlations_of(window: WindowStatistics, machine: Machine, bundle: Bundle) -> tuple[Panel, ...]:
-    """Every equation in a window: the figures of the monitor's report, and the curves they come from."""
+    """All equations in a window: the numbers of the monitor's report, and the curves from which they are computed."""
     trained = {network.equation.number: network for network in bundle.networks}
     return tuple(_panel(equation, trained.get(equation.number), window, machine) for equation in EQUATIONS)
 
@@ -107,7 +107,7 @@ def _panel(
         n_points = measured.size // len(labels)
         x = np.asarray(np.arange(n_points) * (2 * np.pi / n_points), dtype=np.float64)
         columns = (measured.reshape(-1, n_points), predicted.reshape(-1, n_points))
-    else:  # at each lag all references, which the equation's channels begin with, each with its rate
+    else:  # rows run over lags, then references; the equation's channels begin with the references, each with its rate
         n_points = view.correlation.shape[0]
         x = window.lags_s[-n_points:]
         columns = (measured.reshape(n_points, -1).T, predicted.reshape(n_points, -1).T)
@@ -117,9 +117,9 @@ def _panel(
 
 
 def _blocks(data: Recorded, machine: MachineFile) -> Iterator[tuple[SampleBlock, str]]:
-    """Blocks as the gate wants them; undecodable ones are left out.
+    """Decoded blocks, each with the schema hash that the gate shall check; undecodable blocks are left out.
 
-    The schema hash covers site and name: where only these differ from the machine file it says nothing.
+    The hash covers site and name. If only these differ from the machine file, it is given as empty, i.e. not checked.
     """
     descriptor = data.source.descriptor(data.keys, data.from_ns)
     differences = () if descriptor is None else descriptor_mismatch(descriptor.payload, machine)
@@ -135,21 +135,21 @@ def _blocks(data: Recorded, machine: MachineFile) -> Iterator[tuple[SampleBlock,
 
 @dataclass(frozen=True, slots=True)
 class MeasuredCorrelations:
-    """Correlation functions of some pairs, SI."""
+    """Correlation functions of pairs of channels, SI."""
 
     lags_s: FloatArray  # (n_lags,)
     # (n_lags, n_pairs), R_ij(τ) and its standard error.
     values: FloatArray
     errors: FloatArray
-    band_hz: tuple[float, float] | None  # what they are limited to; None where they come from the samples
-    # (n_pairs,), what that leaves out at lag zero, over the product of the rms; nan where they come from the samples.
+    band_hz: tuple[float, float] | None  # band of the spectra they were computed from; None if from the samples
+    # (n_pairs,), covariance outside that band over the product of both rms; NaN if computed from the samples.
     outside_band: FloatArray
 
 
 def measured_correlations(
     machine: MachineFile, window: WindowStatistics, pairs: list[tuple[int, int]]
 ) -> MeasuredCorrelations:
-    """Correlation functions of pairs of columns (reference, response), from spectra if a window has lag zero alone."""
+    """Correlation functions of column pairs (reference, response); from the spectra if the window only has lag zero."""
     reference, response = (np.array(column, dtype=np.intp) for column in zip(*pairs, strict=True))
     if window.lags_s.size > 1:
         hops = window.hop_correlation[:, :, reference, response]
@@ -167,7 +167,7 @@ def measured_correlations(
     )
     zero = window.correlation[0]
     rms = np.sqrt(zero[reference, reference] * zero[response, response])
-    with np.errstate(invalid="ignore", divide="ignore"):  # a channel that does not move has no share
+    with np.errstate(invalid="ignore", divide="ignore"):  # a channel without motion gives NaN
         outside = (zero[reference, response] - values[0]) / rms
     errors = _bartlett_errors(window, reference, response, turn, spacing_hz)
     return MeasuredCorrelations(lags_s, values, errors, (float(band_hz[0]), float(band_hz[1])), outside)
@@ -180,11 +180,11 @@ def _bartlett_errors(
     turn: ComplexArray,
     spacing_hz: float,
 ) -> FloatArray:
-    """Standard errors of correlations of a Gaussian process that is T seconds long.
+    """Standard errors of correlation functions estimated from T seconds of a Gaussian process.
 
     Var R̂_ij(τ) = (2/T) ∫ S_ii S_jj + Re{S_ij² e^{-4πjfτ}} df over positive frequencies (M. S. Bartlett, Supplement to
-    the J. Roy. Statist. Soc. 8 (1946), for one channel). A product of estimated spectra is larger than that of the true
-    ones by one over the number of averages.
+    the J. Roy. Statist. Soc. 8 (1946), for one channel). With n averages, the product of two estimated spectra exceeds
+    that of the true spectra by the factor 1 + 1/n, which is divided out.
     """
     spectrum = window.spectrum
     own = spectrum[:, reference, reference].real * spectrum[:, response, response].real
@@ -194,6 +194,6 @@ def _bartlett_errors(
 
 
 def _hann_fade(part: FloatArray) -> FloatArray:
-    """By how much a Hann-windowed segment weakens a correlation at a lag that is a part of its length."""
+    """Factor by which Hann windowing reduces a correlation at a lag given as a fraction of the segment's length."""
     angle = 2 * np.pi * part
     return np.asarray((1 - part) * (2 + np.cos(angle)) / 3 + np.sin(angle) / (2 * np.pi), dtype=np.float64)

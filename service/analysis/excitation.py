@@ -1,6 +1,6 @@
-"""The excitation of a window: what shakes the machine, given its parameters.
+"""Estimates the excitation of a machine in one window, given the machine's parameters.
 
-Nobody measures it, and every prediction needs it. It is the one that the likelihood would find with the rotor's
+The excitation is not measured, but every prediction needs it. It is estimated by the likelihood with the rotor's
 parameters held: a level matrix of all forces, a low-pass, a smooth colour of each force, and the noise of each sensor
 (`models.diagnosis.likelihood.spectral_model`).
 """
@@ -22,32 +22,32 @@ from models.physics.rotor import COORDINATES, RotorParameters
 from models.signals.block import FloatArray
 
 LEFT_OUT_BINS = 3
-"""Lines on either side of the rotation that are not compared: what is left of 1× there is not stochastic."""
+"""Lines on either side of 1× that are excluded: the remainder of 1× there is not stochastic."""
 _GROUPS = 150
 _HELD = 1e9
 _STEPS, _NEAR, _GAIN = 60, 0.15, 3.0
 _SMOOTH = 2000.0
-"""The search begins with forces of one colour, and the window says how far they differ."""
+"""Ridge strength on the forces' own colours: keeps them close to one common colour unless the window says otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
 class Excitation:
     """Forces and sensor noise of one window."""
 
-    machine: Machine  # whose rotor they were found with
+    machine: Machine  # with the rotor for which the forces were estimated
     motions: Motions  # what was measured
-    theta: FloatArray  # point of `SpectralModel` with all structural ratios at nought
-    force_scale: float  # its unit of force, N/√Hz
+    theta: FloatArray  # parameters of `SpectralModel`, with all structural ratios at 0
+    force_scale: float  # the model's unit of force, N/√Hz
     speed_rad_s: float  # speed of the gyroscopic terms
-    # Parameters of every sensor's noise (`service.analysis.excitation`), by state; an accelerometer's as that of the
-    # velocity it was integrated to.
+    # ln d₀ and b of every sensor's noise (see `_noise_density`), by state; an accelerometer's noise is given as that of
+    # the velocity to which it was integrated.
     noise: dict[str, FloatArray]
 
     def spectra(self, rotor: RotorParameters, states: tuple[str, ...], frequencies_hz: FloatArray) -> ComplexArray:
-        """Cross-spectra that this excitation gives a rotor, two-sided, SI²/Hz, shape (n_frequencies, n, n).
+        """Cross-spectra of a rotor's states under this excitation, two-sided, SI²/Hz, shape (n_frequencies, n, n).
 
-        Of measured states and accelerations, sensor noise included. Outside the window's band the forces' low-pass goes
-        on; their colour and the noise stay as at its edge.
+        The states may be measured states and accelerations; sensor noise is included. Outside the window's band the
+        forces' low-pass continues, while their colour and the noise keep the values at the band's edge.
         """
         low_hz, high_hz = self.machine.window.band_hz
         size = frequencies_hz.size
@@ -73,7 +73,7 @@ class Excitation:
         return np.asarray(spectra, dtype=np.complex128)
 
     def _noise(self, state: str, frequencies_hz: FloatArray) -> FloatArray:
-        """Density of one sensor's noise; none where the likelihood left the sensor out."""
+        """Noise density of one sensor, SI²/Hz; zero if the likelihood did not use the sensor."""
         low_hz, high_hz = self.machine.window.band_hz
         within_hz = np.clip(frequencies_hz, low_hz, high_hz)
         if state in self.noise:
@@ -85,12 +85,12 @@ class Excitation:
 
 
 def excitation_of(machine: Machine, window: WindowStatistics) -> Excitation:
-    """Find the excitation with which a machine, its rotor taken as it is, explains a window best.
+    """Estimate the excitation with which a machine best explains a window, its rotor parameters held.
 
     Raises
     ------
     EstimationError
-        If a channel does not move, or no excitation is the best one.
+        If a channel shows no fluctuation, or the search finds no finite excitation.
     """
     window = integrated(window)
     speed = float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else machine.operation.speed_rad_s
@@ -111,7 +111,7 @@ def excitation_of(machine: Machine, window: WindowStatistics) -> Excitation:
     search = FisherScoring(model, observed, window.n_segments, speed, usual_cutoff_hz, _SMOOTH)
     search.weights.ridge[: model.cutoff_at] = _HELD
     try:
-        # Trial points may lie far out; what comes of them is checked, not warned of.
+        # Trial points may overflow: the result is checked below, so no warnings are needed.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             start = starting_point(model, observed, search.weights.centre, speed)
             theta = search.maximise(start, _STEPS, _NEAR, _GAIN).theta
@@ -130,7 +130,7 @@ def excitation_of(machine: Machine, window: WindowStatistics) -> Excitation:
 def _noise_of(
     machine: Machine, model: SpectralModel, theta: FloatArray, window: WindowStatistics, speed: float
 ) -> dict[str, FloatArray]:
-    """Noise of every sensor, beside what the excitation lets it see."""
+    """Noise parameters of every sensor: its measured density less the response to the excitation."""
     groups, point = model.groups, model.at(theta, speed)
     dofs = [_dof(state) for state in window.states]
     seen = point.H[:, :, dofs]
@@ -152,20 +152,20 @@ def _dof(state: str) -> int:
 
 
 def _order(state: str) -> int:
-    """How often the coordinate is differentiated."""
+    """Number of time derivatives of the coordinate in a state."""
     return {"": 0, "dot": 1, "ddot": 2}[state.partition("_")[2]]
 
 
 _NOISE_STEPS, _LONGEST, _CLOSE = 30, 1.5, 0.01
 _STEEPEST = 4.0
 _LEAST, _USUAL = 1e-7, 1e-3
-"""Density over the channel's mean density: the least that is looked for, and where the search begins."""
+"""Noise density over the channel's mean density: lower bound of the search, and starting point."""
 _PULL = np.array([0.05, 1.0])
-"""Weak pull of level and colour to what is usual, for sensors whose noise does not show."""
+"""Prior precision of ln d₀ and b about their usual values: weak, for sensors whose noise is not visible."""
 
 
 def _noise_density(parameters: FloatArray, frequencies_hz: FloatArray, high_hz: float) -> FloatArray:
-    """d(f) of a sensor with these ln d₀ and b, in a band that ends at `high_hz`, SI²/Hz."""
+    """Noise density d(f) of a sensor with parameters ln d₀ and b, in a band that ends at `high_hz`, SI²/Hz."""
     return np.asarray(np.exp(parameters[0] + parameters[1] * _colour(frequencies_hz, high_hz)), dtype=np.float64)
 
 
@@ -174,16 +174,16 @@ def _colour(frequencies_hz: FloatArray, high_hz: float) -> FloatArray:
 
 
 def _sensor_noise(measured: FloatArray, theory: FloatArray, averages: FloatArray, shape: FloatArray) -> FloatArray:
-    """Find ln d₀ and b of one sensor, shape (2,).
+    """Estimate ln d₀ and b of one sensor's noise, shape (2,).
 
-    From densities as estimated of so many independent averages, and as theory has them without noise, SI²/Hz; `shape`
-    is the colour of their frequencies. All have shape (n_groups,).
+    `measured` are densities, each the mean of `averages` independent estimates; `theory` are those without noise, both
+    SI²/Hz. `shape` is `_colour` at their frequencies. All have shape (n_groups,).
     """
     level = float(np.log(averages @ measured / averages.sum()))
     usual = np.array([level + np.log(_USUAL), 0.0])
 
     def seen(point: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        """Noise, expected density, and the log-likelihood with the pulls."""
+        """Noise density, expected density, and the log-likelihood plus log-prior."""
         noise = np.exp(point[0] + point[1] * shape)
         expected = theory + noise
         fits = -float(averages @ (np.log(expected) + measured / expected))

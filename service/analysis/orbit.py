@@ -1,4 +1,4 @@
-"""Orbits: the shaft's path across its axis, raw and at running speed alone, against the keyphasor."""
+"""Orbits: the path of the shaft's centre in the plane across its axis, unfiltered and at 1x, with keyphasor marks."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,21 +17,20 @@ from service.analysis.vectors import vectors_of
 
 _Value = TypeVar("_Value", np.float64, np.complex128)
 MODELLED = ("bearing", "disc")
-"""Places of the model of the rotor."""
+"""Locations that the rotor model has."""
 _UM = 1e6
 _LONGEST_S = 3600.0
 _AT_1X = 1
-"""Place of running speed among the orders of `Vectors`."""
+"""Index of 1x among the orders of `Vectors`."""
 _AT_ONCE = 2
-"""Revolutions that vectors are taken of: in as many, orders do not disturb each other."""
+"""Revolutions per vector: in two, the orders (from 0.5x on) do not leak into each other."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ellipse:
     """Orbit y = Re{y e^{jθ}}, z = Re{z e^{jθ}} over the shaft angle θ.
 
-    In the plane y + jz it is a part that goes round with the shaft and one that goes against it:
-    y(θ) + j z(θ) = F e^{jθ} + B e^{-jθ}.
+    In the plane y + jz it is the sum of a forward and a backward circle: y(θ) + j z(θ) = F e^{jθ} + B e^{-jθ}.
 
     Examples
     --------
@@ -40,7 +39,7 @@ class Ellipse:
     (2.0, 2.0, 'forward')
     """
 
-    # Vectors, both in one unit; so are all lengths below.
+    # 1x vectors, both in one unit, which is also that of the axes below.
     y: complex
     z: complex
 
@@ -64,18 +63,18 @@ class Ellipse:
 
     @property
     def precession(self) -> str:
-        """``forward``: round the orbit as θ grows from y to z; ``backward``: against it."""
+        """``forward`` if the orbit is traversed from y to z as θ grows, else ``backward``."""
         return "forward" if abs(self._forward) >= abs(self._backward) else "backward"
 
     @property
     def tilt_deg(self) -> float:
-        """Angle from y, towards z, to the long axis, above -90 and up to 90°."""
+        """Angle from y, towards z, to the long axis, in (-90°, 90°]."""
         turned = np.degrees(np.angle(self._forward) + np.angle(self._backward)) / 2
         return float(90 - (90 - turned) % 180)
 
 
 def phase_lag_deg(vector: complex, direction: int) -> float:
-    """How far the shaft turns from the reference (angle 0) to the positive peak of Re{vector e^{jθ}}, 0 to 360°.
+    """Phase lag: rotation from shaft angle 0 to the positive peak of Re{vector e^{jθ}}, 0 to 360°.
 
     Parameters
     ----------
@@ -87,22 +86,22 @@ def phase_lag_deg(vector: complex, direction: int) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Orbit:
-    """The orbit at one place."""
+    """The orbit at one location."""
 
     location: str  # ``bearing`` or ``disc``
-    names: tuple[str, str]  # of y and z: the channels', or what two at an angle are turned to
+    names: tuple[str, str]  # of y and z: the channels' own, or names of the axes to which they are turned
     ellipse: Ellipse  # the part at running speed, µm
-    # (n,), as measured, about the mean.
+    # (n,), unfiltered, mean removed.
     y_um: FloatArray
     z_um: FloatArray
-    marks_um: FloatArray  # (n_pulses, 2), where the shaft was at each pulse of the keyphasor
+    marks_um: FloatArray  # (n_pulses, 2), y and z at each pulse of the keyphasor
 
 
 @dataclass(frozen=True, slots=True)
 class Orbits:
-    """Orbits of the same revolutions at all places where both directions are measured."""
+    """Orbits of the same revolutions at all locations where both directions are measured."""
 
-    # First and last pulse of the keyphasor.
+    # Times of the first and the last keyphasor pulse.
     start_ns: int
     end_ns: int
     revolutions: int
@@ -116,7 +115,7 @@ class Orbits:
 
 
 def orbit_pairs(channels: Iterable[Channel]) -> list[tuple[Channel, Channel]]:
-    """Displacements in y and z, or at an angle and to be turned to them, at each place; those of the model first."""
+    """Pairs of displacement sensors at one location, in y and z or inclined to them; locations of the model first."""
     known = [one for one in channels if one.quantity is Quantity.DISPLACEMENT]
     turned = {known[first].location: (known[first], known[second]) for first, second in turned_pairs(known)}
     pairs = [(known[first], known[second]) for first, second in level_plan(known, 1.0, (0.0, 1.0)).pairs]
@@ -126,18 +125,18 @@ def orbit_pairs(channels: Iterable[Channel]) -> list[tuple[Channel, Channel]]:
 
 @dataclass(frozen=True, slots=True)
 class Planes:
-    """Two sensors of one place as sensors in y and z."""
+    """Transformation of two sensors at one location to y and z."""
 
-    names: tuple[str, str]  # of y and z: the channels' own, or what they are turned to
-    turn: FloatArray | None  # (2, 2), from what they show to y and z; None where they are in y and z
+    names: tuple[str, str]  # of y and z: the channels' own, or names of the axes to which they are turned
+    turn: FloatArray | None  # (2, 2), matrix from the sensors' values to y and z; None if the sensors are in y and z
 
     def turned(self, values: npt.NDArray[_Value]) -> npt.NDArray[_Value]:
-        """Values of both, shape (2, ...), in y and z."""
+        """Transform values of both sensors, shape (2, ...), to y and z."""
         return values if self.turn is None else np.asarray(self.turn @ values, dtype=values.dtype)
 
 
 def planes_of(pair: tuple[Channel, Channel]) -> Planes:
-    """How two sensors of one place tell y and z."""
+    """Names and transformation matrix that turn two sensors at one location to y and z."""
     first, second = pair
     seen = np.array([first.axis, second.axis])
     if np.array_equal(seen, np.eye(2)):
@@ -147,7 +146,7 @@ def planes_of(pair: tuple[Channel, Channel]) -> Planes:
 
 
 def in_planes(samples: FloatArray, pairs: Iterable[tuple[Channel, Channel]]) -> tuple[FloatArray, FloatArray]:
-    """Motion in y and in z, µm, shape (n_samples, n_pairs) each, of samples of the pairs' channels, pair by pair."""
+    """Motion in y and in z, µm, shape (n_samples, n_pairs) each; columns of `samples` are the channels pair by pair."""
     found = [
         planes_of(pair).turned(samples[:, 2 * at : 2 * at + 2].T * _UM * np.array([[one.to_si] for one in pair]))
         for at, pair in enumerate(pairs)
@@ -157,20 +156,20 @@ def in_planes(samples: FloatArray, pairs: Iterable[tuple[Channel, Channel]]) -> 
 
 
 def no_pair(channels: Iterable[Channel]) -> str:
-    """What is said where `orbit_pairs` finds none."""
+    """Error message for a machine in which `orbit_pairs` finds no pair."""
     there = ", ".join(channel.name for channel in channels if channel.quantity is Quantity.DISPLACEMENT) or "none"
     return f"an orbit needs the displacements in y and z at one place; measured displacements: {there}"
 
 
 def recorded_pairs(data: Described, place: str | None = None) -> list[tuple[Channel, Channel]]:
-    """Pairs of the channels of some data, all or those at one place, of which both have numbers.
+    """Pairs of channels, at all locations or at one, of which both have numbers.
 
     Raises
     ------
     MachineFileError
-        If there are none.
+        If no pair is measured, or none at `place`.
     RotorwatchError
-        If of every pair one has no numbers.
+        If in every pair a channel has no numbers.
     """
     pairs = orbit_pairs(data.descriptor.channels)
     if not pairs:
@@ -188,14 +187,14 @@ def recorded_pairs(data: Described, place: str | None = None) -> list[tuple[Chan
 
 
 def read_orbits(data: Recorded, revolutions: int) -> Orbits:
-    """Orbits of the latest revolutions that were recorded.
+    """Orbits of the latest recorded revolutions.
 
     Raises
     ------
     MachineFileError
-        If the shaft angle is not measured, or at no place both y and z.
+        If the shaft angle is not measured, or no location has both y and z.
     RotorwatchError
-        If there are not so many revolutions without a gap before the end.
+        If fewer revolutions without a gap were recorded before the end.
     """
     if not data.has_angle:
         raise MachineFileError(
@@ -222,7 +221,7 @@ def orbits_of(excerpt: Excerpt, pairs: list[tuple[Channel, Channel]], revolution
     Raises
     ------
     RotorwatchError
-        If the shaft does not turn so often in it.
+        If the excerpt has fewer revolutions.
     """
     found = newest_revolutions(excerpt, revolutions)
     path = found.excerpt

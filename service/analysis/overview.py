@@ -1,4 +1,4 @@
-"""Health of a machine as an overview of the plant needs it: of the latest window only the reading that matters most."""
+"""Reduces a machine's health to what the plant overview shows: of the latest window, only the most critical reading."""
 
 from collections.abc import Iterable
 
@@ -10,10 +10,9 @@ _BEYOND = {"normal": 0.0, "alert": 10.0, "danger": 20.0}
 
 
 def overview(health: Health) -> Health:
-    """Leave out most of the report.
+    """Reduce the report to the parameters and channels that raised alarms are about.
 
-    What stays are the parameters and channels that raised alarms are about; without any, the one nearest to what would
-    be seen, or to its limit.
+    Without any, keep the parameter nearest to its minimum detectable change or the channel nearest to its limit.
     """
     report = health.report
     if report is None:
@@ -38,9 +37,9 @@ def overview(health: Health) -> Health:
 
 
 def nearness(report: Report) -> dict[str, float]:
-    """How near each reading is to what would be seen, and each channel to its limit, 1 there.
+    """Ratio of each reading to its minimum detectable change, and of each channel's level to its limit, by alarm name.
 
-    By the names of their alarms; what a page shows of a machine is chosen by the same rule (``monitor/states.js``).
+    The page chooses what it shows of a machine by the same rule (``monitor/states.js``).
     """
     near = {one.name: _parameter_nearness(report, one) for one in _readings(report)}
     return near | {f"level:{one.channel}": _level_nearness(one) for one in report.levels}
@@ -51,7 +50,7 @@ def _named(parameters: Iterable[Parameter], names: set[str]) -> tuple[Parameter,
 
 
 def _readings(report: Report) -> tuple[Parameter, ...]:
-    """Readings of the machine as it is now, as far as there are any."""
+    """Readings of the machine's current state that have a value and a standard error."""
     if report.verdict is None:
         return ()
     current = report.parameters if report.verdict.settled else report.verdict.current
@@ -59,7 +58,7 @@ def _readings(report: Report) -> tuple[Parameter, ...]:
 
 
 def _parameter_nearness(report: Report, read: Parameter) -> float:
-    """Change over the smallest that would be seen; 0 without one."""
+    """Relative change over the minimum detectable change; 0 if there is none."""
     change = read.relative_change or 0.0
     seen = next((one for one in report.detectable if one.name == read.name), None)
     least = 0.0 if seen is None else seen.loss if change < 0 else seen.gain
@@ -67,7 +66,7 @@ def _parameter_nearness(report: Report, read: Parameter) -> float:
 
 
 def _level_nearness(levels: ChannelLevels) -> float:
-    """The level of a channel that is nearest to its alert limit, over that; whatever is beyond one comes first."""
+    """Largest ratio of a channel's levels to their alert limits, plus 10 in state alert and 20 in danger."""
 
     def of_limit(limit: LevelLimits) -> float:
         value = getattr(levels, limit.measure, None)

@@ -1,4 +1,4 @@
-"""What the history of a monitor holds of one machine: reports, each with the levels of its window."""
+"""Reads one machine's reports, each with the levels of its window, from the history of a monitor."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -24,7 +24,7 @@ _LATEST_NS = 2**63 - 1
 
 @dataclass(frozen=True, slots=True)
 class Past(Described):
-    """Reports of one machine, oldest first; every so many of a long time."""
+    """Reports of one machine, oldest first, thinned out if there are many."""
 
     machine: MachineFile
     name: str
@@ -34,12 +34,12 @@ class Past(Described):
 
     @property
     def descriptor(self) -> ChannelDescriptor:
-        """Names and units of the channels, as the machine file has them now."""
+        """Names and units of the channels, from the current machine file."""
         return self.machine.descriptor
 
     @classmethod
     def of(cls, machine: MachineFile, log: ReportLog, since_ns: int | None, until_ns: int | None, most: int) -> "Past":
-        """Read the history of a monitored machine, without its alarms: every so many reports, if there are many.
+        """Read the history of a monitored machine without its alarms, thinned out to about `most` reports.
 
         Raises
         ------
@@ -55,12 +55,12 @@ class Past(Described):
 
     @classmethod
     def find(cls, settings: Path, key: str | None, between: tuple[str | None, str | None]) -> "Past":
-        """Read the history that a monitor's settings name; the monitor may be running.
+        """Read the history named in a monitor's settings; the monitor may be running.
 
         Parameters
         ----------
         key : str or None
-            ``SITE/MACHINE``, where the settings name several machines.
+            ``SITE/MACHINE``, required if the settings name several machines.
         between : (str or None, str or None)
             From and to: seconds after the end of the oldest window, or times.
 
@@ -101,7 +101,7 @@ class Past(Described):
 
 
 def parsed_reports(texts: Iterable[str | bytes]) -> Iterator[Report]:
-    """Reports as they were published, in their order; those that cannot be read are left out."""
+    """Parse published reports in order; unreadable ones are left out."""
     for text in texts:
-        with suppress(ValidationError):  # of another version of the program
+        with suppress(ValidationError):  # from another version of the program
             yield Report.model_validate_json(text)

@@ -1,8 +1,8 @@
-"""What theory predicts of a window: for the machine as nominal, and as it is estimated now.
+"""Theory for one window: spectra and correlation functions of the nominal machine, and of the machine as estimated.
 
-Both under one excitation, that of the window with the machine as estimated, or as nominal where there is no estimate.
-So the difference between the two is what the parameters have changed, and nothing else. Spectra are averaged under the
-kernel of the segments, as the measured ones are. Correlation functions are their Fourier transforms (Eq. 18),
+Both use the same excitation, which is estimated from the window with the estimated machine (with the nominal one if
+there is no estimate), so they differ by the effect of the parameters alone. Spectra are averaged with the spectral
+kernel of the segments, as the measured spectra are. Correlation functions are their Fourier transforms (Eq. 18),
 
     R_ij(τ) = 2 Re ∫ S_ij(f) e^{-2πjfτ} df,
 
@@ -28,9 +28,9 @@ NOTHING_READ = "no parameter was read in this window"
 NO_PARAMETERS = "the machine's parameters are not known, so there is no theory to predict from"
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 _HALF_WIDTHS = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0])
-"""Edges of panels on either side of a natural frequency, in units of half its half-power bandwidth."""
+"""Panel edges on either side of a natural frequency, in units of half its half-power bandwidth."""
 _CYCLES = 1.2
-"""Most periods of the longest lag in one panel."""
+"""Largest width of a panel times the longest lag, i.e. periods of e^{-2πjfτ} in one panel."""
 _GROWTH = 0.05
 _OVER_BAND = 4.0
 
@@ -42,18 +42,18 @@ class Prediction:
     machine: Machine | None  # as nominal
     excitation: Excitation | None
     changes: dict[str, float]  # relative changes of the machine as estimated
-    # Why there is no prediction for the machine as nominal, or as estimated; empty where there is one.
+    # Why there is no prediction for the nominal or the estimated machine; empty if there is one.
     nominal_reason: str
     estimated_reason: str
 
     @property
     def nominal(self) -> RotorParameters | None:
-        """Rotor as nominal, where a prediction can be made for it."""
+        """The nominal rotor, or None if there is no prediction for it."""
         return None if self.machine is None or self.nominal_reason else self.machine.rotor
 
     @property
     def estimated(self) -> RotorParameters | None:
-        """Rotor as now estimated, where a prediction can be made for it."""
+        """The rotor as estimated, or None if there is no prediction for it."""
         if self.machine is None or self.estimated_reason:
             return None
         return changed(self.machine.rotor, self.changes)
@@ -61,7 +61,7 @@ class Prediction:
     def spectra(
         self, states: tuple[str, ...], frequencies_hz: FloatArray
     ) -> tuple[ComplexArray | None, ComplexArray | None]:
-        """Cross-spectra as segments are expected to show them, two-sided, SI²/Hz, shape (n_lines, n, n).
+        """Expected cross-spectra of the segments, two-sided, SI²/Hz, shape (n_lines, n, n).
 
         Parameters
         ----------
@@ -71,7 +71,7 @@ class Prediction:
         Returns
         -------
         nominal, estimated : ndarray or None
-            None where there is no prediction.
+            None if there is no prediction.
         """
         if self.excitation is None or self.machine is None:
             return None, None
@@ -95,10 +95,9 @@ class Prediction:
         lags_s: FloatArray,
         within_hz: tuple[float, float] | None = None,
     ) -> tuple[FloatArray | None, FloatArray | None]:
-        """Correlation functions R_ij(τ), SI, shape (n_lags, n_pairs), nominal and estimated; None where there is none.
+        """Correlation functions R_ij(τ), SI, shape (n_lags, n_pairs), nominal and estimated; None without a prediction.
 
-        Of pairs of places in `states`, reference and response; `within_hz` leaves out what does not lie between these
-        frequencies.
+        `pairs` are indices into `states`, reference and response; `within_hz` limits the integral to a band.
         """
         if self.excitation is None or self.machine is None:
             return None, None
@@ -117,7 +116,7 @@ class Prediction:
 
 
 def _highest_hz(machine: Machine, states: tuple[str, ...]) -> float:
-    """Where what is measured ends, or what is left is next to nothing."""
+    """Upper limit of the quadrature: the Nyquist frequency, or less if the spectra are negligible above it."""
     nyquist_hz = machine.rate_hz / 2
     if any(state.endswith("_ddot") for state in states):
         return nyquist_hz
@@ -129,7 +128,7 @@ def _highest_hz(machine: Machine, states: tuple[str, ...]) -> float:
 def _nodes(
     excitation: Excitation, rotor: RotorParameters, low_hz: float, high_hz: float, longest_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Frequencies and weights of the quadrature."""
+    """Frequencies, Hz, and weights of the quadrature."""
     poles = np.linalg.eigvals(system_A(rotor, excitation.speed_rad_s))
     poles = poles[poles.imag > 0]
     modes_hz, half_hz = poles.imag / (2 * np.pi), np.maximum(-poles.real / (2 * np.pi), 1e-9)
@@ -151,12 +150,12 @@ def _nodes(
 def predict(
     known: Machine | None, window: WindowStatistics, readings: Iterable[Parameter], why_not: str = ""
 ) -> Prediction:
-    """Theory for a window; what stands against it is stated in it, never raised.
+    """Predict a window from theory; if that is impossible, the result states the reason, and nothing is raised.
 
     Parameters
     ----------
     readings : iterable of Parameter
-        Of this window, by the diagnostician that decides; empty if it was not evaluated.
+        Readings of this window by the diagnostician that decides; empty if it was not evaluated.
     """
     if known is None:
         return Prediction(None, None, {}, NO_PARAMETERS, NO_PARAMETERS)
@@ -171,6 +170,6 @@ def predict(
 
 
 def read_changes(readings: Iterable[Parameter]) -> dict[str, float]:
-    """Relative changes of the parameters that were read; a total loss is one of 99 %, for nothing stands without."""
+    """Relative changes of the parameters that were read, -0.99 at least: theory needs a remainder of each parameter."""
     read = {reading.name: reading.relative_change for reading in readings if reading.relative_change is not None}
     return {name: max(read[name], -0.99) for name in PARAMETERS if name in read}

@@ -1,4 +1,4 @@
-"""What was recorded of one machine in a stretch of time, or is live: channels by name, and samples without a gap."""
+"""Access to one machine's recorded or live data in a stretch of time: channels by name, and samples without a gap."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -27,7 +27,7 @@ _SOON_NS = 10_000_000_000
 
 
 def begins_again(end_ns: int, start_ns: int) -> bool:
-    """Whether data that follow others in a recording are earlier than these: of a new run, or after a clock was set."""
+    """Whether data start before the end of those recorded before them: a new run, or the clock was set back."""
     return start_ns < end_ns - _TOLERANCE_S * 1e9
 
 
@@ -35,7 +35,7 @@ class Described(ABC):
     """Data of one machine whose channels are known."""
 
     name: str  # ``site/machine``
-    place: str  # where they are
+    place: str  # where the data are, in words, for messages
 
     @property
     @abstractmethod
@@ -48,12 +48,12 @@ class Described(ABC):
         return "theta" in self.descriptor.states
 
     def sent(self, channels: Sequence[Channel]) -> tuple[Channel, ...]:
-        """Those of some channels that have numbers."""
+        """The given channels that have numbers."""
         return tuple(channels)
 
     @property
     def lacking(self) -> str:
-        """What is said of channels that have no numbers; empty if all have."""
+        """Message on channels that have no numbers; empty if all have."""
         there = self.descriptor.channels
         return no_data([one.name for one in there if one not in self.sent(there)])
 
@@ -76,14 +76,14 @@ class Described(ABC):
         return tuple(there[name] for name in dict.fromkeys(names))
 
     def chosen(self, names: Sequence[str]) -> tuple[Channel, ...]:
-        """Channels by name; without names all of the first quantity measured, displacements before velocities.
+        """Channels by name; without names, all of the first quantity measured (displacements before velocities).
 
         Raises
         ------
         MachineFileError
-            If there is no such channel, or none but the shaft angle.
+            If there is no such channel, or only the shaft angle.
         RecordingError
-            If one that is named has no numbers, or none has.
+            If a named channel has no numbers, or no channel has.
         """
         asked = self.channels(names)
         there = self.sent(asked or self.descriptor.channels)
@@ -98,21 +98,21 @@ class Sampled(Described):
 
     from_ns: int
     to_ns: int
-    end_ns: int  # of the newest data before `to_ns`
+    end_ns: int  # end of the newest data before `to_ns`
 
     @property
     @abstractmethod
     def newest(self) -> npt.NDArray[np.floating]:
-        """The newest sample of every channel; empty without any."""
+        """The newest sample of every channel; empty if there is none."""
 
     @property
     def has_angle(self) -> bool:
-        """Whether the shaft angle is measured, and is there."""
+        """Whether the shaft angle is measured and has numbers."""
         there = self.descriptor.channels
         return any(one.quantity is Quantity.SHAFT_ANGLE for one in self.sent(there))
 
     def sent(self, channels: Sequence[Channel]) -> tuple[Channel, ...]:
-        """Those of some channels that have numbers in the newest sample."""
+        """The given channels that have numbers in the newest sample."""
         names, found = [one.name for one in self.descriptor.channels], self.newest
         return tuple(one for one in channels if not found.size or np.isfinite(found[names.index(one.name)]))
 
@@ -120,7 +120,7 @@ class Sampled(Described):
     def stretches(
         self, channels: Sequence[Channel], longest_s: float | None = None, from_ns: int | None = None
     ) -> Iterator[Excerpt]:
-        """Samples of some channels, cut at gaps and, if given, after `longest_s`; what a gap leaves is shorter."""
+        """Samples of the given channels, cut at gaps and, if given, after `longest_s`; gaps leave shorter pieces."""
 
     def latest(self, channels: Sequence[Channel], length_s: float) -> list[Excerpt]:
         """The newest `length_s` of data, in pieces if there are gaps."""
@@ -158,13 +158,13 @@ class Recorded(Sampled):
         Parameters
         ----------
         key : str or None
-            ``SITE/MACHINE``, where the recordings hold several.
+            ``SITE/MACHINE``, required if the recordings hold several machines.
         between : (str or None, str or None)
-            From and to, times of the data as `parse_moment` takes them.
+            Start and end, in the notation of `parse_moment`.
         at : str or None
-            Where the latest data end.
+            Time at which the latest data end.
         reports : bool
-            Whether a machine of which only reports were recorded will do.
+            Whether to accept a machine of which only reports were recorded.
 
         Raises
         ------
@@ -209,15 +209,15 @@ class Recorded(Sampled):
         return found[-1].samples[-1] if found else np.empty(0)
 
     def messages(self, key: str) -> Iterator[RecordedMessage]:
-        """What was recorded under a key."""
+        """Messages recorded under a key."""
         return self.source.messages({key}, from_ns=self.from_ns, to_ns=self.to_ns)
 
     def stretches(
         self, channels: Sequence[Channel], longest_s: float | None = None, from_ns: int | None = None
     ) -> Iterator[Excerpt]:
-        """Samples of some channels, see `Sampled`.
+        """Samples of the given channels, see `Sampled`.
 
-        Blocks that cannot be decoded, have other channels or a sample that is not finite are left out, which is a gap.
+        Blocks that cannot be decoded, have other channels or contain a non-finite sample are left out and leave a gap.
         """
         names = [channel.name for channel in self.descriptor.channels]
         columns = [names.index(channel.name) for channel in channels]
@@ -229,7 +229,7 @@ class Recorded(Sampled):
             if pending and not continues:
                 yield self._stretch(start_ns, np.concatenate(pending))
                 pending, count = [], 0
-            # Anchored anew by every block, as the monitor does: the device's clock is the time.
+            # Every block's own start time sets the time base anew, as in the monitor: the device's clock decides.
             start_ns = block.start_ns - round(count * 1e9 / self.descriptor.rate_hz)
             pending.append(block.samples[:, used].astype(np.float64))
             count += pending[-1].shape[0]
@@ -272,7 +272,7 @@ class Recorded(Sampled):
 
 
 class Held(Sampled):
-    """The newest samples that a monitor holds, of one block or more, without a gap between them."""
+    """The newest samples that a monitor holds: one or more consecutive blocks without a gap."""
 
     def __init__(self, machine: MachineFile, blocks: Sequence[SampleBlock]) -> None:
         self._descriptor = machine.descriptor
@@ -295,7 +295,7 @@ class Held(Sampled):
     def stretches(
         self, channels: Sequence[Channel], longest_s: float | None = None, from_ns: int | None = None
     ) -> Iterator[Excerpt]:
-        """Samples of some channels after the last that has no number, cut after `longest_s`."""
+        """Samples of the given channels after their last non-finite sample, cut after `longest_s`."""
         names = [channel.name for channel in self._descriptor.channels]
         columns = [names.index(channel.name) for channel in channels]
         whole = replace(self._excerpt, samples=self._excerpt.samples[:, columns])

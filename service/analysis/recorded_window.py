@@ -1,4 +1,4 @@
-"""A window of recorded samples, as the monitor held it when they were live."""
+"""Rebuilds a window from recorded samples, as the monitor held it when they were live."""
 
 from collections import deque
 from dataclasses import replace
@@ -21,7 +21,7 @@ from service.analysis.snapshots.heading import LatestData
 from service.recordings.replay.source import RecordingSource
 
 _LEAD_S = 10.0
-"""How long before the window blocks are looked for: the first one that is needed may have begun before it."""
+"""Time before the window from which blocks are read: the first block needed may start before the window."""
 _NEWEST_SAMPLES = 20_000
 _NOT_EVALUATED = "no estimate: recorded samples are evaluated by an offline replay alone"
 
@@ -35,25 +35,25 @@ def recorded_window(
     *,
     lagged: bool,
 ) -> LatestData:
-    """The window of a recording that ends at a time.
+    """Rebuild the window of a recording that ends at a given time.
 
     Parameters
     ----------
     machine : MachineFile
-        What it is evaluated with.
+        Machine file with which the window is evaluated.
     recorded : str
-        ``SITE/MACHINE``, whose samples they are.
+        ``SITE/MACHINE`` under which the samples were recorded.
     until_ns : int or None
         End of the window; None is the end of the recording.
     report : Report or None
-        What was read of this window: then it has the same samples to the last one, and theory is that of its readings.
+        The report on this window: the window then has exactly its samples, and theory uses its readings.
     lagged : bool
-        Whether correlations are to be made of samples, or of spectra.
+        Whether correlation functions are computed from samples rather than from spectra.
 
     Raises
     ------
     RotorwatchError
-        If nothing was recorded before that time, or with other channels than the machine file has.
+        If nothing was recorded before that time, or the channels differ from those of the machine file.
     """
     keys = source.machine(recorded)
     plan = plan_for(machine, lagged=lagged)
@@ -87,8 +87,8 @@ def recorded_window(
 
 
 def _first_ns(plan: Plan, end_ns: int, report: Report | None) -> int:
-    """Time of the first sample that the window is made of."""
-    if report is not None and report.start_ns < report.end_ns:  # a window that is not full says no start
+    """Time of the first sample of the window."""
+    if report is not None and report.start_ns < report.end_ns:  # a window that is not full has no start
         return report.start_ns - round((plan.need - plan.fresh) * 1e9 / plan.rate_hz)
     return end_ns - round(((plan.hops - 1) * plan.stride + plan.need) * 1e9 / plan.rate_hz)
 

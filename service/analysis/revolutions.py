@@ -21,7 +21,7 @@ class Excerpt:
 
     @property
     def length_s(self) -> float:
-        """Length."""
+        """Duration."""
         return float(self.samples.shape[0] / self.rate_hz)
 
     @property
@@ -31,7 +31,7 @@ class Excerpt:
 
     @property
     def speed_rad_s(self) -> float:
-        """Mean speed, negative where the shaft turns from z to y; nan without a shaft angle."""
+        """Mean speed, negative if the shaft turns from z to y; NaN without a shaft angle."""
         if self.angle_rad is None or self.angle_rad.size < 2:
             return float("nan")
         whole = np.unwrap(self.angle_rad)
@@ -48,7 +48,7 @@ class Excerpt:
 
     @classmethod
     def of_blocks(cls, blocks: Sequence[SampleBlock], described: ChannelDescriptor) -> "Excerpt":
-        """All columns of blocks that follow each other, since the latest sample whose angle is not a number."""
+        """All columns of consecutive blocks, starting after the latest sample whose shaft angle is not finite."""
         samples, states = np.concatenate([block.samples for block in blocks]).astype(np.float64), described.states
         start_ns = blocks[-1].end_ns - round(samples.shape[0] / described.rate_hz * 1e9)
         angle_rad = samples[:, states.index("theta")] if "theta" in states else None
@@ -64,16 +64,16 @@ class Revolutions:
     """Samples of whole revolutions."""
 
     reason: str  # why there are none, or fewer than asked for
-    excerpt: Excerpt | None = None  # None where there is no whole revolution
+    excerpt: Excerpt | None = None  # None if there is no whole revolution
     count: int = 0
-    # (count + 1,), where the shaft angle is 0, in samples from the first one; empty where it is not measured.
+    # (count + 1,), positions of shaft angle 0, in samples from the first; empty if the angle is not measured.
     pulses: FloatArray = field(default_factory=lambda: np.empty(0))
 
 
 def pulses(angle_rad: npt.NDArray[np.floating] | None) -> tuple[int, FloatArray]:
-    """Direction of rotation, and where the shaft angle passes 0, in samples from the first one, interpolated.
+    """Direction of rotation (1 if the angle grows, -1 if it falls), and positions at which the shaft angle passes 0.
 
-    1 if the angle grows, -1 if it falls; and shape (n_pulses,), empty without an angle.
+    Positions are in samples from the first, interpolated, shape (n_pulses,); empty without an angle.
     """
     if angle_rad is None or angle_rad.size < 2:
         return 1, np.empty(0)
@@ -92,9 +92,9 @@ def newest_revolutions(
     Parameters
     ----------
     wanted : int
-        Fewer are taken where there are not so many, or too many samples in them.
+        Number of revolutions; fewer are returned if there are fewer, or if they have more than `most_samples`.
     speed_rad_s : float, optional
-        Mean speed: how long they are where there is no shaft angle.
+        Mean speed, from which the length of a revolution is computed if there is no shaft angle.
     """
     size, rate_hz = excerpt.samples.shape[0], excerpt.rate_hz
     reason = ""

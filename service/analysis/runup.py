@@ -1,4 +1,4 @@
-"""A run-up or coast-down: vectors at one order over the speed, and where the shaft is on average across its axis."""
+"""Run-ups and coast-downs: vectors of one order over speed, and the average shaft centreline."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,24 +19,24 @@ from service.analysis.vectors import estimated_vectors, read_vectors
 
 _MOST_POINTS = 400
 _LEAST_OF_ALL = 0.5
-"""Part of a stretch that a shorter one before a gap must have."""
+"""Least length of a stretch cut short by a gap, as a fraction of the full length."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunUp:
-    """Vectors of some channels, in order of time."""
+    """Vectors of one order of several channels, in order of time."""
 
     channels: tuple[Channel, ...]
     units: tuple[str, ...]
     order: int
-    revolutions: int | None  # that each vector is of; None where it is of a window of the monitor
+    revolutions: int | None  # per vector; None if each vector is from one window of the monitor
     time_ns: npt.NDArray[np.int64]  # (n,)
-    speed_rad_s: FloatArray  # (n,), negative where the shaft turns from z to y
-    # (n, n_channels), in `units`, and 0 to 360°.
+    speed_rad_s: FloatArray  # (n,), negative if the shaft turns from z to y
+    # (n, n_channels), amplitude in `units`, phase lag 0 to 360°.
     amplitude: FloatArray
     lag_deg: FloatArray
-    slow_roll_rpm: float | None  # the mean vector up to this speed was taken away
-    estimated: bool  # whether the speed was found in the vibration, so that there is no phase
+    slow_roll_rpm: float | None  # the mean vector up to this speed was subtracted
+    estimated: bool  # whether the speed was estimated from the vibration, so that there is no phase
 
     @property
     def direction(self) -> int:
@@ -45,7 +45,7 @@ class RunUp:
 
 
 def _past_run_up(data: Past, channels: tuple[Channel, ...], order: int) -> RunUp:
-    """Vectors of the windows of the history, as the monitor reported them."""
+    """Vectors that the monitor reported for the windows in the history."""
     measure = f"x{order}"
     found = []
     for report in data.reports:
@@ -83,26 +83,26 @@ def read_run_up(
     slow_roll_rpm: float | None = None,
     between_rpm: tuple[float, float] | None = None,
 ) -> RunUp:
-    """Vectors of everything that was recorded, or of the windows of the history, whatever their length.
+    """Vectors of all recorded samples, or of all windows in the history.
 
     Parameters
     ----------
     order : int
         Multiple of running speed: 1, 2 or 3.
     revolutions : int
-        How many each vector is taken of.
+        Number of revolutions per vector; the windows of a history are taken as they are.
     slow_roll_rpm : float, optional
-        The mean vector up to this speed is taken away: it is run-out, not vibration (API 670, slow-roll compensation).
+        The mean vector up to this speed is subtracted: it is run-out, not vibration (API 670, slow-roll compensation).
     between_rpm : (float, float), optional
-        Where the speed is looked for in the vibration, if there is no shaft angle.
+        Range in which the speed is estimated from the vibration, if there is no shaft angle.
 
     Raises
     ------
     MachineFileError
-        If the shaft angle is not measured, and no speeds are named; or it is, and they are; or a history has no samples
-        for what is asked.
+        If the shaft angle is not measured and `between_rpm` is missing, or is measured and `between_rpm` given; or if a
+        history is given with options that need samples or phases.
     RotorwatchError
-        If the shaft does not turn, or never as slowly as that.
+        If the shaft does not turn, or always turns faster than `slow_roll_rpm`.
     """
     if isinstance(data, Past):
         if slow_roll_rpm is not None or between_rpm is not None:
@@ -144,19 +144,19 @@ def read_run_up(
 
 @dataclass(frozen=True, slots=True)
 class Centreline:
-    """Mean positions at some places, in order of time (API 670: average shaft centreline)."""
+    """Mean shaft positions at some locations, in order of time (API 670: average shaft centreline)."""
 
     pairs: tuple[tuple[Channel, Channel], ...]
     each_s: float
-    time_ns: npt.NDArray[np.int64]  # (n,), middle of the samples of each
-    speed_rad_s: FloatArray  # (n,), nan without a shaft angle
+    time_ns: npt.NDArray[np.int64]  # (n,), middle of the samples averaged
+    speed_rad_s: FloatArray  # (n,), NaN without a shaft angle
     # (n, n_pairs).
     y_um: FloatArray
     z_um: FloatArray
 
 
 def _past_centreline(data: Past, pairs: Sequence[tuple[Channel, Channel]]) -> Centreline:
-    """Mean positions in the windows of the history, as the monitor reported them."""
+    """Mean positions that the monitor reported for the windows in the history."""
     told = {one.channel for report in data.reports for one in report.levels if one.mean is not None}
     pairs = [pair for pair in pairs if told.issuperset(one.name for one in pair)] or pairs
     channels = [channel for pair in pairs for channel in pair]
@@ -180,12 +180,12 @@ def _past_centreline(data: Past, pairs: Sequence[tuple[Channel, Channel]]) -> Ce
 
 
 def read_centreline(data: Sampled | Past, pairs: Sequence[tuple[Channel, Channel]], each_s: float) -> Centreline:
-    """Means over every so many seconds, in long recordings over longer ones; of a history those of its windows.
+    """Mean positions over stretches of `each_s` seconds, longer in long recordings; of a history, over its windows.
 
     Raises
     ------
     RotorwatchError
-        If there are not two such stretches.
+        If there are fewer than two stretches.
     """
     if isinstance(data, Past):
         return _past_centreline(data, pairs)
@@ -194,11 +194,11 @@ def read_centreline(data: Sampled | Past, pairs: Sequence[tuple[Channel, Channel
     for stretch in data.stretches([channel for pair in pairs for channel in pair], each_s):
         if stretch.length_s < _LEAST_OF_ALL * each_s:
             continue
-        # Of whole revolutions, where there are any, so that vibration at running speed has no part in the mean.
+        # Average over whole revolutions if there are any, so that 1x vibration does not contribute to the mean.
         whole = newest_revolutions(stretch, stretch.samples.shape[0]).excerpt or stretch
         middle_ns = (whole.start_ns + whole.end_ns) // 2
         while rows and begins_again(rows[-1][0], middle_ns):
-            rows.pop()  # of several runs at the same time the one that was recorded last is shown
+            rows.pop()  # if runs overlap in time, the one recorded last is shown
         rows.append((middle_ns, stretch.speed_rad_s, whole.samples.mean(axis=0)))
     if len(rows) < 2:
         raise RotorwatchError(

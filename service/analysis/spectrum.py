@@ -1,4 +1,4 @@
-"""Spectra of a recorded data: of its latest seconds, and over time or speed."""
+"""Spectra of samples: of the latest seconds, and over time or speed."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ _MOST_SPEEDS = 120
 _STEADY = 0.02
 _STANDS_HZ = 0.5
 _NYQUIST_OVER_SHOWN = 1.28
-"""Analysers show spectra up to the sampling rate over 2.56."""
+"""Analysers show spectra up to the sampling rate divided by 2.56."""
 
 Scaling = Literal["amplitude", "density"]
 
@@ -39,12 +39,12 @@ _ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
 
 
 def unit_shown(channel: Channel) -> tuple[str, float]:
-    """Unit in which values of a channel are shown, and the factor from its own."""
+    """Unit in which a channel's values are shown, and the factor to it from the channel's own unit."""
     return _SHOWN.get(channel.unit, (channel.unit, 1.0))
 
 
 def shown_as(channel: Channel, scaling: Scaling) -> tuple[str, float]:
-    """How values of a spectrum are stated, and the factor on a peak amplitude or a density in the channel's unit.
+    """Unit of a spectrum's values as shown, and the factor to it from a peak amplitude or a density in channel units.
 
     Amplitudes of displacement and tilt are peak to peak (ISO 20816-1: S_p-p), those of velocity, tilt rate and
     acceleration root mean square.
@@ -61,46 +61,46 @@ def shown_as(channel: Channel, scaling: Scaling) -> tuple[str, float]:
 class Spectrum:
     """Averaged spectra of some channels."""
 
-    # Oldest and newest data in it.
+    # Start of the oldest and end of the newest data.
     start_ns: int
     end_ns: int
     channels: tuple[Channel, ...]
     frequencies_hz: FloatArray  # (n_bins,)
-    values: FloatArray  # (n_channels, n_bins), as `shown_as` states them
+    values: FloatArray  # (n_channels, n_bins), in the units of `shown_as`
     scaling: Scaling  # ``amplitude`` or ``density``
-    resolution_hz: float  # distance of the lines
+    resolution_hz: float  # spacing of the lines
     averages: int  # segments, overlapping by half, whose power was averaged
-    speed_rad_s: float  # mean speed; nan without a shaft angle
+    speed_rad_s: float  # mean speed; NaN without a shaft angle
 
     @property
     def useful_hz(self) -> float:
-        """Up to which frequency there is something to be seen."""
+        """Upper end of the frequency range worth showing, see `_useful_hz`."""
         return max(_useful_hz(self.frequencies_hz, one, self.scaling, self.speed_rad_s) for one in self.values)
 
 
 @dataclass(frozen=True, slots=True)
 class FullSpectrum:
-    """Circles that add up to the motion of the shaft at some places.
+    """Full spectrum: diameters of the forward and reverse circles that add up to the shaft's motion at some locations.
 
-    y + jz is a sum of F e^{jωt}, which goes round from y to z, and R e^{-jωt}, which goes from z to y: the one with the
-    rotation is forward precession, the other reverse. Together they make an ellipse with the axes 2(|F| + |R|) and
-    2||F| - |R|| (D. E. Bently, C. T. Hatch, "Fundamentals of Rotating Machinery Diagnostics", full spectrum).
+    At each frequency y + jz is the sum of F e^{jωt}, which turns from y to z, and R e^{-jωt}, which turns from z to y.
+    The circle in the sense of rotation is forward precession, the other reverse. Their sum is an ellipse with the axes
+    2(|F| + |R|) and 2||F| - |R|| (D. E. Bently, C. T. Hatch, "Fundamentals of Rotating Machinery Diagnostics").
     """
 
     start_ns: int
     end_ns: int
     pairs: tuple[tuple[Channel, Channel], ...]
-    # (n_lines,), frequencies, Hz, or orders: positive ones are forward, or from y to z where the rotation is not known.
+    # (n_lines,), frequencies, Hz, or orders; positive is forward, or from y to z if the rotation is unknown.
     lines: FloatArray
-    values_um: FloatArray  # (n_pairs, n_lines), diameter of each circle: peak to peak
+    values_um: FloatArray  # (n_pairs, n_lines), diameter of each circle, i.e. peak to peak
     orders: bool
     resolution: float
     averages: int
-    speed_rad_s: float  # mean speed; nan without a shaft angle
+    speed_rad_s: float  # mean speed; NaN without a shaft angle
 
     @property
     def useful(self) -> float:
-        """Up to which line, on either side, there is something to be seen."""
+        """Upper end of the range of lines worth showing on either side, see `_useful_hz`."""
         ahead = self.lines[self.lines >= 0]
         both = [np.hypot(*(np.interp(one, self.lines, row) for one in (ahead, -ahead))) for row in self.values_um]
         speed_rad_s = 2 * np.pi if self.orders else self.speed_rad_s
@@ -113,22 +113,22 @@ class Waterfall:
 
     channel: Channel
     frequencies_hz: FloatArray  # (n_bins,)
-    # (n_spectra,), data in each.
+    # (n_spectra,), start and end of the data of each.
     start_ns: npt.NDArray[np.int64]
     end_ns: npt.NDArray[np.int64]
-    speed_rad_s: FloatArray  # (n_spectra,), mean speed; nan without a shaft angle
-    values: FloatArray  # (n_spectra, n_bins), as `shown_as` states them
+    speed_rad_s: FloatArray  # (n_spectra,), mean speed; NaN without a shaft angle
+    values: FloatArray  # (n_spectra, n_bins), in the units of `shown_as`
     scaling: Scaling  # ``amplitude`` or ``density``
     resolution_hz: float
 
     @property
     def useful_hz(self) -> float:
-        """Up to which frequency there is something to be seen."""
+        """Upper end of the frequency range worth showing, see `_useful_hz`."""
         fastest = float(np.max(np.abs(self.speed_rad_s)))
         return _useful_hz(self.frequencies_hz, self.values.max(axis=0), self.scaling, fastest)
 
     def over_speed(self) -> tuple[FloatArray, FloatArray]:
-        """Mean spectra over the speed: edges of the speeds, rad/s, shape (n + 1,), and spectra, shape (n, n_bins).
+        """Mean spectra in n classes of speed: class edges, rad/s, shape (n + 1,), and spectra, shape (n, n_bins).
 
         Raises
         ------
@@ -153,7 +153,7 @@ class Waterfall:
 
 
 def steady(speed_rad_s: FloatArray) -> str:
-    """What is said of speeds that are nearly the same; nothing if they are not."""
+    """Message that the speed stays nearly the same; empty if it does not."""
     slowest, fastest = (float(one(np.abs(speed_rad_s))) for one in (np.min, np.max))
     if fastest - slowest >= _STEADY * max(fastest, 1e-9):
         return ""
@@ -171,7 +171,7 @@ def read_spectrum(
     MachineFileError
         If the window is shorter than one segment, which is 1 / `resolution_hz` long.
     RotorwatchError
-        If there is no stretch so long without a gap.
+        If no stretch without a gap holds a segment.
     """
     segment = _segment(data, window_s, resolution_hz)
     used, speed_rad_s = _used(data, channels, window_s, segment)
@@ -191,7 +191,7 @@ def read_spectrum(
 
 
 def _used(data: Sampled, channels: Sequence[Channel], window_s: float, segment: int) -> tuple[list[Excerpt], float]:
-    """Stretches of the latest `window_s` that hold a segment, and their mean speed."""
+    """Stretches within the latest `window_s` that hold at least one segment, and their mean speed."""
     found = data.latest(channels, window_s)
     used = [stretch for stretch in found if stretch.samples.shape[0] >= segment]
     if not used:
@@ -214,15 +214,14 @@ def read_full_spectrum(
     Parameters
     ----------
     orders : bool
-        Over multiples of running speed: samples are taken anew at equal angles of the shaft, so that a speed that
-        changes does not smear the lines.
+        Order spectrum: samples are resampled at equal shaft angles, so that a changing speed does not smear the lines.
 
     Raises
     ------
     MachineFileError
         If the window is shorter than one segment, or `orders` are asked for without a shaft angle.
     RotorwatchError
-        If there is no stretch so long without a gap, or the shaft does not turn.
+        If no stretch without a gap holds a segment, or the shaft does not turn.
     """
     if orders and not data.has_angle:
         raise MachineFileError(f"{data.place}: --axis orders needs the shaft angle (keyphasor), which is not measured")
@@ -257,8 +256,8 @@ def read_full_spectrum(
 
 
 def _at_equal_angles(stretch: Excerpt, each: int) -> Excerpt:
-    """So many samples a revolution, as if they were per second."""
-    assert stretch.angle_rad is not None  # noqa: S101  # it was asked whether there is one
+    """Resample to `each` samples per revolution; the result's rate, in samples per revolution, is stated as Hz."""
+    assert stretch.angle_rad is not None  # noqa: S101  # the caller has checked that there is one
     turns = np.unwrap(stretch.angle_rad) / (2 * np.pi)
     turned = np.maximum.accumulate(turns if turns[-1] >= turns[0] else -turns)
     at = np.arange(np.ceil(turned[0] * each), np.floor(turned[-1] * each) + 1) / each
@@ -269,14 +268,14 @@ def _at_equal_angles(stretch: Excerpt, each: int) -> Excerpt:
 def read_waterfall(
     data: Sampled, channel: Channel, window_s: float, resolution_hz: float, scaling: Scaling
 ) -> Waterfall:
-    """Spectra of one channel over a recorded data, one per window; in long recordings over longer windows.
+    """Spectra of one channel, one per window of `window_s`; in long recordings windows are longer.
 
     Raises
     ------
     MachineFileError
         If the window is shorter than one segment, which is 1 / `resolution_hz` long.
     RotorwatchError
-        If there are not two stretches so long without a gap.
+        If fewer than two stretches without a gap hold a segment.
     """
     segment = _segment(data, window_s, resolution_hz)
     each_s = max(window_s, (data.to_ns - data.from_ns) / 1e9 / _MOST_SPECTRA)
@@ -285,7 +284,7 @@ def read_waterfall(
         if stretch.samples.shape[0] < segment:
             continue
         while rows and begins_again(rows[-1][1], stretch.start_ns):
-            rows.pop()  # of several runs at the same time the one that was recorded last is shown
+            rows.pop()  # if runs overlap in time, the one recorded last is shown
         (power,), _ = _mean_power([stretch.samples], stretch.rate_hz, segment, scaling)
         rows.append((stretch.start_ns, stretch.end_ns, stretch.speed_rad_s, _values(power, channel, scaling)))
     if len(rows) < 2:
@@ -310,10 +309,11 @@ def read_waterfall(
 def _mean_power(
     pieces: Iterable[npt.NDArray[np.inexact]], rate_hz: float, segment: int, scaling: Scaling
 ) -> tuple[FloatArray, int]:
-    """Mean power of Hann-windowed segments that overlap by half, each about its mean, and how many there are.
+    """Mean power of Hann-windowed, half-overlapping segments, each with its mean removed, and the number of segments.
 
-    Of a sine its squared amplitude, else a one-sided power spectral density; shape (n_channels, segment // 2 + 1). Of
-    complex samples (n_channels, segment), in the order of `numpy.fft.fft`. Every piece is one segment long at least.
+    With scaling ``amplitude``, a sine gives its squared amplitude, else the result is the one-sided power spectral
+    density, shape (n_channels, segment // 2 + 1). Complex samples give shape (n_channels, segment), in the order of
+    `numpy.fft.fft`. Every piece must hold at least one segment.
     """
     from scipy.signal import welch  # noqa: PLC0415  # slow to import; only for these spectra
 
@@ -329,19 +329,22 @@ def _mean_power(
             scaling="spectrum" if scaling == "amplitude" else "density",
             axis=0,
         )
-        # The one-sided spectrum is that of rms values; of complex samples it is two-sided, and that of circles.
+        # The one-sided spectrum gives squared rms values; the two-sided one of complex samples squared circle radii.
         factor = 2.0 if scaling == "amplitude" and not np.iscomplexobj(samples) else 1.0
         total, averages = total + mean.T * factor * count, averages + count
     return np.asarray(total / averages, dtype=np.float64), averages
 
 
 def lowest_hz(resolution_hz: float) -> float:
-    """From which frequency on a Hann window lets nothing of the mean through."""
+    """Lowest frequency that the mean does not reach through the main lobe of the Hann window."""
     return _CLEAR_OF_MEAN * resolution_hz
 
 
 def _useful_hz(frequencies_hz: FloatArray, values: FloatArray, scaling: Scaling, speed_rad_s: float) -> float:
-    """Up to four times the running speed, or as far as all but a thousandth of the power lies and half as far again."""
+    """Upper end of the range worth showing: 4x, or 1.5 times the frequency below which 99.9 % of the power lies.
+
+    The larger of both is rounded up to a round number.
+    """
     resolved = frequencies_hz >= lowest_hz(float(frequencies_hz[1]))
     power = np.cumsum((values if scaling == "density" else values**2) * resolved)
     reached_hz = float(frequencies_hz[np.searchsorted(power, _SHARE * power[-1])])
@@ -358,7 +361,7 @@ def _values(power: FloatArray, channel: Channel, scaling: Scaling) -> FloatArray
 
 
 def _segment(data: Sampled, window_s: float, resolution_hz: float) -> int:
-    """Samples of a segment, even."""
+    """Number of samples per segment, even."""
     rate_hz = data.descriptor.rate_hz
     segment = 2 * round(rate_hz / resolution_hz / 2)
     if segment < 8:

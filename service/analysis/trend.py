@@ -1,4 +1,4 @@
-"""Trends: what the monitor read of every parameter over time, and what it said."""
+"""Trends: readings of every parameter, or levels, and the states and alarms of the monitor over time."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -26,16 +26,16 @@ from service.recordings.replay.machine import choose_machine
 from service.recordings.replay.offline import OfflineReplay
 
 SHOWN = frozenset({EventKind.RAISED, EventKind.ESCALATED, EventKind.CLEARED})
-"""Events that say something of the machine; what operators did to alarms is left out of the picture."""
+"""Events shown in a trend: those caused by the machine, not by what operators did to alarms."""
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterTrend:
-    """Relative change of one parameter, window by window; nan where it was not read."""
+    """Relative change of one parameter, window by window; NaN where it was not read."""
 
     name: str
     text: str
-    # (n_reports,), change and the ends of its 95 % interval, plain ratios.
+    # (n_reports,), relative change and the ends of its 95 % interval, as ratios.
     change: FloatArray
     low: FloatArray
     high: FloatArray
@@ -43,10 +43,10 @@ class ParameterTrend:
 
 @dataclass(frozen=True, slots=True)
 class LevelTrend:
-    """One level of one channel, window by window; nan where there was none."""
+    """One level of one channel, window by window; NaN where there was none."""
 
-    title: str  # channel, what of it, and unit
-    # (n_reports,), in that unit; the limits that held, nan without.
+    title: str  # channel, measure and unit
+    # (n_reports,), level and the limits then in force, in that unit; NaN where there was no limit.
     level: FloatArray
     alert: FloatArray
     danger: FloatArray
@@ -59,17 +59,17 @@ class TrendSeries:
     name: str  # ``site/machine``
     end_ns: npt.NDArray[np.int64]  # (n_reports,), end of each window
     states: tuple[HealthState, ...]
-    # (n_reports,), measures of the windows by name, see `MEASURES`; nan where one is not known.
+    # (n_reports,), measures of the windows by name, see `MEASURES`; NaN where unknown.
     measures: Mapping[str, FloatArray]
     parameters: tuple[ParameterTrend, ...]
     levels: tuple[LevelTrend, ...]
     alarms: tuple[AlarmEventData, ...]
-    limits: AlarmSettings | None  # those in force, where the machine file is at hand
-    origin: str  # where the reports come from, in words
+    limits: AlarmSettings | None  # limits in force, if the machine file is available
+    origin: str  # origin of the reports, in words
 
 
 def past_trend(data: Past, *, levels: bool = False) -> TrendSeries:
-    """What the history holds of a machine.
+    """The trend of the reports in the history.
 
     Raises
     ------
@@ -81,19 +81,19 @@ def past_trend(data: Past, *, levels: bool = False) -> TrendSeries:
 
 
 def read_trend(data: Recorded, machine: str | None = None, *, levels: bool = False) -> TrendSeries:
-    """The recorded reports; or, without any or with another machine file, those of an offline replay.
+    """The trend of the recorded reports or, without any or with another machine file, of those of an offline replay.
 
     Parameters
     ----------
     machine : str, optional
-        ``FILE`` or ``FILE@BUNDLE``, to be evaluated anew with it.
+        ``FILE`` or ``FILE@BUNDLE`` with which the samples are evaluated again.
     levels : bool
-        Vibration levels, also where parameters were read.
+        Show vibration levels even if parameters were read.
 
     Raises
     ------
     RotorwatchError
-        If there are no reports and none can be computed, or nothing was read in any.
+        If there are no reports and none can be computed, or no report has a reading or level.
     """
     recorded = parsed_reports(message.payload for message in data.messages(data.keys.report))
     if machine is None and (reports := [_slim(one) for one in recorded]):
@@ -108,7 +108,7 @@ def read_trend(data: Recorded, machine: str | None = None, *, levels: bool = Fal
 
 
 def recorded_alarms(data: Recorded) -> tuple[AlarmEventData, ...]:
-    """Alarm events that were recorded, each once, by their time; unreadable ones are left out."""
+    """Recorded alarm events without repetitions, in order of time; unreadable ones are left out."""
     return _shown_alarms(message.payload for message in data.messages(data.keys.alarm_event))
 
 
@@ -145,7 +145,7 @@ def trend_of(
     ordered: list[Report] = []
     for report in {report.model_dump_json(): report for report in reports}.values():  # repetitions left out
         while ordered and ordered[-1].end_ns >= report.end_ns:
-            ordered.pop()  # of several runs at the same time the one that was recorded last is shown
+            ordered.pop()  # if runs overlap in time, the one recorded last is shown
         ordered.append(report)
     series = {name: np.full((3, len(ordered)), np.nan) for name in PARAMETER_TEXT}
     for number, report in enumerate(ordered):
@@ -177,7 +177,7 @@ def trend_of(
 
 
 def _level_trends(reports: Sequence[Report]) -> Iterator[LevelTrend]:
-    """Velocity of accelerometers where it has a limit, else the overall level; and what was ever beyond its limit."""
+    """For each channel, velocity if it has a limit, else the overall level; and every level ever beyond its limit."""
     by_report = [{one.channel: one for one in report.levels} for report in reports]
     for channel in dict.fromkeys(name for levels in by_report for name in levels):
         there = [levels.get(channel) for levels in by_report]
@@ -198,12 +198,12 @@ def _level_trends(reports: Sequence[Report]) -> Iterator[LevelTrend]:
 
 
 def _slim(report: Report) -> Report:
-    """What a trend shows of a report; a month of them must fit into memory."""
+    """The report without parts that a trend does not show: a month of reports must fit into memory."""
     return report.model_copy(update={"opinions": (), "equations": (), "detectable": ()})
 
 
 def _limits(keys: MachineKeys, report: Report) -> AlarmSettings | None:
-    """Limits of the shipped machine, if it was this one that reported."""
+    """Alarm limits of the shipped machine file, if the report was made with it."""
     try:
         machine = choose_machine(keys, None).machine
     except MachineFileError:
@@ -212,7 +212,7 @@ def _limits(keys: MachineKeys, report: Report) -> AlarmSettings | None:
 
 
 def _computed(data: Recorded, installed: Installed, levels: bool) -> TrendSeries:
-    """Reports of an offline replay, the same to the last bit as those of ``rotorwatch replay``."""
+    """The trend of an offline replay, whose reports are bit-identical to those of ``rotorwatch replay``."""
     machine = installed.machine
     reports: list[Report] = []
     alarms: list[AlarmEventData] = []

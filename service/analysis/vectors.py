@@ -1,4 +1,4 @@
-"""Vectors at orders of running speed, of whole revolutions one after the other."""
+"""Vectors at the orders of running speed, estimated from consecutive pieces of whole revolutions."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
@@ -20,24 +20,24 @@ from service.analysis.revolutions import Excerpt, pulses
 _LONGEST_S = 20.0
 _ESTIMATED_S = 2.0
 _STANDS_OUT = 15.0
-"""Times the surroundings: what noise has in 2 s is 3 to 8 times, see `models.diagnosis.window.rotation`."""
+"""Least strength of a line over its surroundings: noise reaches 3 to 8 in 2 s (`models.diagnosis.window.rotation`)."""
 _FOLLOWS, _FOLLOWS_S = 0.05, 2.5 * _ESTIMATED_S
-"""How far lines of one shaft may be apart, relative and in time."""
+"""Largest difference between consecutive lines of one shaft: relative speed, and time in s."""
 
 
 @dataclass(frozen=True, slots=True)
 class Vectors:
-    """Of some channels, piece by piece, SI units."""
+    """Vectors of several channels, piece by piece, SI units."""
 
-    time_ns: npt.NDArray[np.int64]  # (n_pieces,), middle of each
-    speed_rad_s: FloatArray  # (n_pieces,), mean speed; negative where the shaft turns from z to y
+    time_ns: npt.NDArray[np.int64]  # (n_pieces,), middle of each piece
+    speed_rad_s: FloatArray  # (n_pieces,), mean speed; negative if the shaft turns from z to y
     revolutions: npt.NDArray[np.int64]  # (n_pieces,)
     # (n_pieces, 4, n_channels), q of x = Re{q e^{jkθ}} at the orders k of `models.levels.measures.ORDERS`.
     orders: npt.NDArray[np.complex128]
 
 
 def vectors_of(excerpt: Excerpt, channels: Sequence[Channel], revolutions: int) -> Vectors:
-    """Vectors of every so many revolutions of channels with a shaft angle, as nearly as whole pieces allow."""
+    """Vectors of an excerpt with shaft angle, divided into equal pieces of about `revolutions` whole revolutions."""
     plan = level_plan(channels, excerpt.rate_hz, (0.0, excerpt.rate_hz))
     si = excerpt.samples * np.array([channel.to_si for channel in channels])
     direction, at = pulses(excerpt.angle_rad)
@@ -48,7 +48,7 @@ def vectors_of(excerpt: Excerpt, channels: Sequence[Channel], revolutions: int) 
         rows = slice(int(np.floor(at[first])), int(np.ceil(at[last])) + 1)
         assert excerpt.angle_rad is not None  # noqa: S101  # there are pulses
         x, angle = si[rows], excerpt.angle_rad[rows]
-        if last - first == 1:  # seen twice: in one revolution half an order cannot be told from the others
+        if last - first == 1:  # repeated: within one revolution, order 0.5 cannot be separated from the others
             x, angle = np.concatenate([x, x[1:]]), np.concatenate([angle, angle[1:]])
         found.append(hop_levels(plan, *waveform_of(x), angle).orders)
     begin, end = at[edges[:-1]], at[edges[1:]]
@@ -62,7 +62,7 @@ def vectors_of(excerpt: Excerpt, channels: Sequence[Channel], revolutions: int) 
 
 
 def read_vectors(data: Sampled, channels: Sequence[Channel], revolutions: int) -> Vectors:
-    """Vectors of everything that was recorded, each of so many revolutions.
+    """Vectors of all recorded samples, each of about `revolutions` revolutions.
 
     Raises
     ------
@@ -86,11 +86,10 @@ def read_vectors(data: Sampled, channels: Sequence[Channel], revolutions: int) -
 
 
 def estimated_vectors(data: Sampled, channels: Sequence[Channel], between_rad_s: tuple[float, float]) -> Vectors:
-    """Vectors against an angle that is found in the vibration itself: their phase means nothing.
+    """Vectors relative to an angle that is estimated from the vibration itself, so their phase is meaningless.
 
-    Only where the strongest line between two speeds stands out clearly, and follows from the one before or goes on in
-    the next, is it taken for the rotation: random vibration, at a resonance for instance, has no such line. It must be
-    that of 1×.
+    The strongest line between the two speeds, which must be that of 1×, is used if it stands out clearly and a line of
+    similar speed precedes or follows it: random vibration, at a resonance for instance, has no such line.
 
     Raises
     ------
@@ -135,7 +134,7 @@ def _one_after_the_other(pieces: Iterable[tuple[Excerpt, Vectors | None]]) -> Ve
     found: list[Vectors] = []
     for stretch, vectors in pieces:
         while found and begins_again(int(found[-1].time_ns[-1]), stretch.start_ns):
-            found.pop()  # of several runs at the same time the one that was recorded last is shown
+            found.pop()  # if runs overlap in time, the one recorded last is shown
         if vectors is not None and vectors.time_ns.size:
             found.append(vectors)
     if not found:

@@ -1,1 +1,1 @@
-"""Pictures of what `service.analysis` finds in recordings, by the kinds of ``rotorwatch plot``."""
+"""Pictures of the results of `service.analysis`, one module per kind of ``rotorwatch plot``."""

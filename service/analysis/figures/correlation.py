@@ -1,4 +1,4 @@
-"""Picture of the correlations: measured against the networks' prediction, the residual below."""
+"""Picture of correlation functions: measured and predicted by the networks, with the residual below."""
 
 from functools import partial
 
@@ -16,7 +16,7 @@ from service.recordings.replay.machine import choose_machine
 
 
 def correlation(data: Recorded, choice: str | None) -> Paint:
-    """Correlations of the latest window, with the shipped machine file or ``FILE[@BUNDLE]``."""
+    """Correlation functions of the latest window, with the shipped machine file or ``FILE[@BUNDLE]``."""
     installed = choose_machine(data.keys, choice)
     machine, bundle = installed.known, installed.bundle
     if machine is None or bundle is None:
@@ -29,7 +29,7 @@ def correlation(data: Recorded, choice: str | None) -> Paint:
 
 
 def _paint(window: WindowStatistics, panels: tuple[Panel, ...], name: str, networks: str, look: Look) -> Figure:
-    """Two panels for each equation."""
+    """Draw two panels for each equation."""
     figure = Figure(figsize=look.size_in or (11.0, 8.4))
     figure.set_layout_engine("constrained", h_pad=0.03, hspace=0.0)
     rows = (len(panels) + 1) // 2

@@ -1,4 +1,4 @@
-"""Picture of orbits: as measured and at running speed, with the keyphasor's dots."""
+"""Picture of orbits: unfiltered and at 1x, with keyphasor dots."""
 
 from functools import partial
 
@@ -12,7 +12,7 @@ from service.analysis.orbit import Orbit, Orbits, phase_lag_deg, read_orbits
 from service.analysis.recorded import Recorded
 
 _BLANK = 0.07
-"""Gap before the keyphasor's dot, of the ellipse's length."""
+"""Gap before the keyphasor dot, as a fraction of the ellipse's long axis."""
 
 
 def orbit(data: Recorded, revolutions: int) -> Paint:
@@ -21,7 +21,7 @@ def orbit(data: Recorded, revolutions: int) -> Paint:
 
 
 def _paint(found: Orbits, name: str, look: Look) -> Figure:
-    """A row for each place: raw, and 1×."""
+    """Draw a row for each location: unfiltered, and 1×."""
     rows = len(found.orbits)
     figure = Figure(figsize=look.size_in or (7.6, 1.0 + 4.2 * rows), layout="constrained")
     for row, orbit in zip(figure.subplots(rows, 2, squeeze=False), found.orbits, strict=True):
@@ -48,10 +48,10 @@ def _running_speed(axes: Axes, orbit: Orbit, found: Orbits) -> None:
     turn = np.exp(1j * found.direction * np.linspace(0, 2 * np.pi, 720, endpoint=False))
     y, z = np.real(ellipse.y * turn), np.real(ellipse.z * turn)
     far = np.hypot(y - y[0], z - z[0]) > _BLANK * 2 * ellipse.semi_major
-    last = int(np.flatnonzero(far)[-1]) + 1 if far.any() else y.size  # the way to the dot is left blank
+    last = int(np.flatnonzero(far)[-1]) + 1 if far.any() else y.size  # the curve just before the dot is left blank
     axes.plot(y[:last], z[:last], color=COLOURS[0], linewidth=1.8)
     axes.plot(y[:1], z[:1], "o", color=COLOURS[1], markersize=7, markeredgecolor="white", markeredgewidth=0.6)
-    for part in (0.3, 0.8):  # which way it goes
+    for part in (0.3, 0.8):  # arrowheads that show the sense
         index = int(part * 720)
         axes.annotate(
             "",
@@ -69,7 +69,7 @@ def _running_speed(axes: Axes, orbit: Orbit, found: Orbits) -> None:
 
 
 def _frame(axes: Axes, orbit: Orbit, path: tuple[np.ndarray, np.ndarray], lines: list[str]) -> None:
-    """Both axes as far as the path, and room above for the text."""
+    """Set both axes to the extent of the path, with room above for the text."""
     frame_plane(axes, orbit.names, "µm")
     axes.text(
         0.02, 0.985, "\n".join(lines), transform=axes.transAxes, ha="left", va="top", fontsize=8, color=INK, zorder=5

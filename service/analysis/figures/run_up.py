@@ -1,8 +1,7 @@
-"""Pictures of a run-up or coast-down: vectors over the speed (Bode), in their plane (polar), the shaft's centreline.
+"""Pictures of a run-up or coast-down: Bode plot, polar plot and average shaft centreline.
 
-As ISO 13373-2 and API 670 have them: phase is the lag from the keyphasor's pulse to the positive peak. In a polar plot
-0° is where the sensor is, and the lag is counted against the rotation, so that an angle on the plot is one on the
-machine.
+They follow ISO 13373-2 and API 670: phase is the lag from the keyphasor pulse to the positive peak. In a polar plot 0°
+is at the sensor, and the lag is counted against the rotation, so that angles on the plot are angles on the machine.
 """
 
 from collections.abc import Sequence
@@ -42,10 +41,10 @@ from service.analysis.runup import Centreline, RunUp, read_centreline, read_run_
 from service.analysis.spectrum import steady
 
 _APART = 0.16
-"""Distance of marks, of the longest vector."""
+"""Least distance between marks, as a fraction of the longest vector."""
 
 
-def bode(  # what may be asked for
+def bode(
     data: Recorded | Past,
     channels: Sequence[str],
     order: int,
@@ -53,7 +52,7 @@ def bode(  # what may be asked for
     slow_roll_rpm: float | None,
     between_rpm: tuple[float, float] | None = None,
 ) -> Paint:
-    """Amplitude and phase lag at an order over the speed."""
+    """Amplitude and phase lag of one order over speed."""
     found = read_run_up(data, data.chosen(channels), order, revolutions, slow_roll_rpm, between_rpm)
     if text := steady(found.speed_rad_s):
         raise RotorwatchError(f"a Bode plot needs a run-up or coast-down: {text}")
@@ -63,13 +62,13 @@ def bode(  # what may be asked for
 def polar(
     data: Recorded | Past, channels: Sequence[str], order: int, revolutions: int, slow_roll_rpm: float | None
 ) -> Paint:
-    """The same as vectors in their plane, with speeds or times written at points."""
+    """Vectors of one order in the polar plane, with points labelled by speed or time."""
     found = read_run_up(data, data.chosen(channels), order, revolutions, slow_roll_rpm)
     return partial(_paint_polar, found, data.name)
 
 
 def _paint_bode(found: RunUp, name: str, look: Look) -> Figure:
-    """For each channel phase above, where there is one, and amplitude below."""
+    """Draw for each channel the phase lag above, if there is one, and the amplitude below."""
     columns = min(2, len(found.channels))
     rows = -(-len(found.channels) // columns)
     figure = Figure(figsize=look.size_in or (5.6 * columns if columns > 1 else 8.0, 0.8 + 4.4 * rows))
@@ -104,7 +103,7 @@ def _paint_bode(found: RunUp, name: str, look: Look) -> Figure:
 
 
 def _lag(axes: Axes, speed: FloatArray, lag_deg: FloatArray, amplitude: FloatArray) -> None:
-    """Phase lag, downwards; cut where the fewest strong vectors are, so that the curve stays in one piece."""
+    """Draw the phase lag, growing downwards, wrapped at an angle with few strong vectors to avoid jumps."""
     cut = _cut_deg(lag_deg, amplitude)
     shown = (lag_deg - cut) % 360 + cut
     jumps = np.abs(np.diff(shown, append=shown[-1])) > 180
@@ -145,7 +144,7 @@ def _paint_polar(found: RunUp, name: str, look: Look) -> Figure:
 
 
 def _trace(axes: PolarAxes, found: RunUp, number: int) -> None:
-    """The vectors' ends in order of time, with speeds along the way."""
+    """Draw the tips of the vectors in order of time, labelled with speeds or times."""
     lag_deg, amplitude = found.lag_deg[:, number], found.amplitude[:, number]
     lag = np.radians(lag_deg)
     axes.plot(lag, amplitude, ".-", color=COLOURS[0], markersize=3, linewidth=0.7)
@@ -174,7 +173,7 @@ def _heading(figure: Figure, look: Look, found: RunUp, title: str) -> None:
 
 
 def centreline(data: Recorded | Past, place: str | None, each_s: float, clearance_um: float | None) -> Paint:
-    """Mean positions of pairs of probes, from the first one on."""
+    """Mean positions of the shaft at pairs of probes, relative to the first one."""
     pairs = recorded_pairs(data, place)
     return partial(_paint_centreline, read_centreline(data, pairs, each_s), data.name, clearance_um)
 
@@ -212,7 +211,7 @@ def _paint_centreline(found: Centreline, name: str, clearance_um: float | None, 
 def _frame(
     axes: Axes, found: Centreline, number: int, y: np.ndarray, z: np.ndarray, clearance_um: float | None
 ) -> None:
-    """The same length on both axes."""
+    """Set limits with equal scales on both axes, and state the start position."""
     names = planes_of(found.pairs[number]).names
     frame_plane(axes, names, "µm from the start")
     start = f"start: {names[0]} {found.y_um[0, number]:.4g} µm, {names[1]} {found.z_um[0, number]:.4g} µm"

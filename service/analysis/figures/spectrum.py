@@ -1,4 +1,4 @@
-"""Pictures of spectra: of a moment, one after the other, and full ones: forward precession to the right of reverse."""
+"""Pictures of spectra: single spectra, waterfalls, and full spectra with forward precession right of reverse."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,18 +46,18 @@ _DECADES = 4
 _MOST_TRACES = 60
 _ORDERS = (1, 2)
 _CLOSE = 0.035
-"""Distance of orders, of the axis, up to which their names would cover each other."""
+"""Distance between orders, as a fraction of the axis, below which their names would overlap."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """How spectra are taken and shown."""
+    """Settings with which spectra are computed and shown."""
 
     window_s: float
     resolution_hz: float
     scaling: Scaling  # ``amplitude`` or ``density``
     log: bool  # whether amplitudes are on a logarithmic scale
-    to_hz: float | None = None  # highest frequency shown; None is as far as there is something to be seen
+    to_hz: float | None = None  # highest frequency shown; None stands for the range worth showing
 
     def __post_init__(self) -> None:
         if self.to_hz is not None and self.to_hz < 4 * self.resolution_hz:
@@ -67,13 +67,13 @@ class Lines:
 
 
 def spectrum(data: Recorded, channels: Sequence[str], lines: Lines) -> Paint:
-    """Spectra of the latest seconds; of the first quantity measured if no channel is named."""
+    """Spectra of the latest seconds; without names, of all channels of the first quantity measured."""
     found = read_spectrum(data, data.chosen(channels), lines.window_s, lines.resolution_hz, lines.scaling)
     return lambda look: paint_spectrum(found, data.name, look, lines)
 
 
 def waterfall(data: Recorded, channels: Sequence[str], lines: Lines, *, over_speed: bool, cascade: bool) -> Paint:
-    """Spectra of one channel, the first displacement if none is named, over time or speed, as colours or as lines."""
+    """Spectra of one channel (without a name, the first displacement) over time or speed, as colours or lines."""
     if len(channels) > 1:
         raise MachineFileError(f"--channel: a waterfall is of one channel, found {', '.join(channels)}")
     found = read_waterfall(data, data.chosen(channels)[0], lines.window_s, lines.resolution_hz, lines.scaling)
@@ -82,7 +82,7 @@ def waterfall(data: Recorded, channels: Sequence[str], lines: Lines, *, over_spe
 
 
 def paint_spectrum(found: Spectrum, name: str, look: Look, lines: Lines) -> Figure:
-    """A panel for each channel."""
+    """Draw a panel for each channel."""
     count = len(found.channels)
     figure = Figure(figsize=look.size_in or (9.5, 1.2 + 1.75 * count), layout="constrained")
     panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
@@ -112,7 +112,7 @@ def paint_waterfall(
     over_speed: bool,
     cascade: bool,
 ) -> Figure:
-    """Spectra as rows of colour, or as lines one behind the other."""
+    """Draw spectra as a colour map, or as a cascade of lines."""
     figure = Figure(figsize=look.size_in or (9.5, 7.0 if cascade else 6.0), dpi=look.dpi, layout="constrained")
     axes = figure.subplots()
     limits_hz, shown = _shown(found, lines.to_hz)
@@ -142,8 +142,8 @@ def _map(axes: Axes, found: Waterfall, shown: npt.NDArray[np.bool_], *, over_spe
         values = values[:, shown]
     else:
         rows, values = _rows_in_time(found, found.values[:, shown])
-    # Columns narrower than a pixel are not all drawn, and a steady line could be missing from the picture. So lines are
-    # put together, as high as the highest of them, until a column has two pixels.
+    # Columns narrower than a pixel are not all drawn, so a steady line could be missing. Therefore adjacent lines are
+    # merged, keeping the highest, until a column has two pixels.
     group = -(-frequency.size // max(1, int(axes.bbox.width / 2)))
     first = np.arange(0, frequency.size, group)
     columns, values = np.append(columns[first], columns[-1]), np.fmax.reduceat(values, first, axis=1)
@@ -197,7 +197,7 @@ def _cascade(axes: Axes, found: Waterfall, shown: npt.NDArray[np.bool_], *, over
 
 
 def _rows_in_time(found: Waterfall, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges of the rows as dates, and rows with an empty one in each gap."""
+    """Edges of the rows as dates, and the rows with a row of NaN inserted at each gap."""
     edges, rows = [found.start_ns[0]], []
     for start_ns, end_ns, row in zip(found.start_ns, found.end_ns, values, strict=True):
         if start_ns > edges[-1] + 10**6:
@@ -209,7 +209,7 @@ def _rows_in_time(found: Waterfall, values: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _orders(axes: Axes, found: Spectrum, values: np.ndarray, frequency: np.ndarray, channel: Channel) -> None:
-    """Marks at running speed and twice that, with the height of the line there."""
+    """Mark 1x and 2x, with the height of the line there."""
     if not np.isfinite(found.speed_rad_s) or abs(found.speed_rad_s) < 1e-6:
         return
     texts = []
@@ -227,9 +227,9 @@ def _orders(axes: Axes, found: Spectrum, values: np.ndarray, frequency: np.ndarr
 
 
 def _name_order(axes: Axes, text: str, at: float, order: int, *, of_axis: float) -> None:
-    """Name an order beside its line: lower than the one before where orders are too close to stand side by side."""
+    """Label an order beside its line; if orders are close, each label is placed below that of the order before."""
     close = of_axis < _CLOSE
-    away = close and at < 0  # from the names on the other side
+    away = close and at < 0  # keeps clear of the labels on the positive side
     axes.annotate(
         text, (at, 1.0), xycoords=("data", "axes fraction"), xytext=(-3 if away else 3, -2 - 11 * close * (order - 1)),
         textcoords="offset points", ha="right" if away else "left", va="top", fontsize=8, color=COLOURS[1],
@@ -256,7 +256,7 @@ def _order_lines(axes: Axes, found: Waterfall, rows: np.ndarray, *, over_speed: 
 
 
 def _shown(found: Spectrum | Waterfall, to_hz: float | None) -> tuple[tuple[float, float], npt.NDArray[np.bool_]]:
-    """Ends of the frequency axis, and the lines between them."""
+    """Limits of the frequency axis, Hz, and a mask of the lines between them."""
     low, high = lowest_hz(found.resolution_hz), found.useful_hz if to_hz is None else to_hz
     high = min(high, float(found.frequencies_hz[-1]))
     slack = 1e-6 * found.resolution_hz
@@ -264,13 +264,13 @@ def _shown(found: Spectrum | Waterfall, to_hz: float | None) -> tuple[tuple[floa
 
 
 def _depth(found: Spectrum | Waterfall | FullSpectrum) -> float:
-    """Smallest height that is shown on a logarithmic scale, over the greatest: 80 dB below."""
+    """Ratio of the smallest to the greatest height shown on a logarithmic scale: 80 dB."""
     density = not isinstance(found, FullSpectrum) and found.scaling == "density"
     return float(10.0 ** (-2 * _DECADES if density else -_DECADES))
 
 
 def _heights(axes: Axes, values: np.ndarray, depth: float | None, room: float) -> None:
-    """Ends of the axis of heights: of a logarithmic one from `depth` on, otherwise with `room` above for names."""
+    """Set the vertical axis: logarithmic down to `depth` times the top, or linear up to `room` times the top."""
     top = float(values.max()) or 1.0
     if depth is None:
         axes.set_ylim(0, room * top)
@@ -280,7 +280,7 @@ def _heights(axes: Axes, values: np.ndarray, depth: float | None, room: float) -
 
 
 def full_spectrum(data: Recorded, place: str | None, lines: Lines, *, orders: bool) -> Paint:
-    """Forward and reverse components of pairs of probes in the latest seconds."""
+    """Full spectra of pairs of probes in the latest seconds."""
     pairs = recorded_pairs(data, place)
     found = read_full_spectrum(data, pairs, lines.window_s, lines.resolution_hz, orders=orders)
     return partial(_paint_full, found, data.name, lines)
@@ -312,7 +312,7 @@ def _paint_full(found: FullSpectrum, name: str, lines: Lines, look: Look) -> Fig
 
 
 def _sides(axes: Axes, *, known: bool) -> None:
-    """Without the shaft angle nobody knows which way it turns, and so not what is forward."""
+    """Label both sides; without the shaft angle, the sense of rotation and thus forward precession are unknown."""
     for at, side, text in (
         (0.01, "left", "reverse" if known else "z to y"),
         (0.99, "right", "forward" if known else "y to z"),
@@ -321,7 +321,7 @@ def _sides(axes: Axes, *, known: bool) -> None:
 
 
 def _marks(axes: Axes, found: FullSpectrum, values: np.ndarray, shown: npt.NDArray[np.bool_]) -> None:
-    """Lines at running speed and twice that on either side, with the height there."""
+    """Mark 1x and 2x on either side, with the height there."""
     turns = 1.0 if found.orders else abs(found.speed_rad_s) / (2 * np.pi)
     if not np.isfinite(turns) or turns < 1e-6:
         return

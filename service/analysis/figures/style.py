@@ -1,4 +1,4 @@
-"""How the pictures look, and how they are written: the same data make the same bytes."""
+"""Style and output of the pictures; the same data give the same bytes."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from service.analysis.spectrum import steady
 from service.recordings.replay.source import clock
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""After Okabe and Ito: told apart with any colour vision."""
+"""Okabe and Ito's palette, distinguishable with any colour vision."""
 INK, GREY = "#222222", "#777777"
 STATE_COLOURS = {
     "healthy": "#009E73",
@@ -39,7 +39,7 @@ STATE_COLOURS = {
 }
 SEVERITY_COLOURS = {"alert": "#E69F00", "danger": "#D55E00"}
 PLATE = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-"""Behind a text that stands on lines or colours."""
+"""Background of text that is drawn over lines or colours."""
 
 _ROUND = tuple(step * 10.0**power for power in range(-3, 9) for step in (1, 2, 5))
 _MOST_MARKS = 30
@@ -59,29 +59,29 @@ _STYLE = {
     "grid.linewidth": 0.6,
     "legend.frameon": False,
     "lines.linewidth": 1.2,
-    "text.hinting": "none",  # letters keep their distances in small pictures
+    "text.hinting": "none",  # keeps letter spacing in small pictures
     "svg.hashsalt": "rotorwatch",
-    "svg.fonttype": "path",  # no font is needed to look at it
+    "svg.fonttype": "path",  # viewing needs no font
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What the command line says of the picture itself."""
+    """Options of the command line that concern the picture itself."""
 
-    title: str | None = None  # instead of the picture's own
-    size_in: tuple[float, float] | None = None  # width and height, inches; the kind's own if left out
+    title: str | None = None  # replaces the default title
+    size_in: tuple[float, float] | None = None  # width and height, inches; None is the default of the kind of picture
     dpi: float = 120.0  # pixels per inch of a PNG
 
 
 Paint = Callable[[Look], Figure]
-"""Draws what was read; what returns one raises `RotorwatchError` if there is nothing to be seen."""
+"""Draws data already read; functions that return a `Paint` raise `RotorwatchError` if there is nothing to draw."""
 
 
 def draw(path: Path, look: Look, paint: Paint) -> None:
-    """Draw in the house style, whatever the settings of the person who draws, and write it as PNG or SVG by its suffix.
+    """Draw in the house style, independent of the user's matplotlib settings, and write as PNG or SVG by suffix.
 
-    Time and program are not in it.
+    The file contains neither the time nor the program that made it.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def _write(figure: Figure, path: Path, dpi: float) -> None:
 
 
 def heading(figure: Figure, look: Look, title: str, span_ns: tuple[int, int], *details: str) -> None:
-    """Title, and a line on what is shown: from when to when, UTC, the date once if it is the same, and `details`."""
+    """Write the title and a line with the time span, UTC (the date once if it is the same), and `details`."""
     first, last = (clock(time_ns) for time_ns in span_ns)
     when = f"{first} to {last[11:] if last[:10] == first[:10] else last} UTC"
     figure.suptitle(look.title or title, x=0.012, y=0.995, ha="left", va="top", fontsize=11.5, fontweight="bold")
@@ -127,12 +127,12 @@ def heading(figure: Figure, look: Look, title: str, span_ns: tuple[int, int], *d
 
 
 def place_text(channel: Channel) -> str:
-    """What a channel measures, and where."""
+    """Quantity, location and direction of a channel, in words."""
     return f"{channel.quantity.replace('_', ' ')}, {channel.location}, {channel.way}"
 
 
 def frame_plane(axes: Axes, names: tuple[str, str], unit: str) -> None:
-    """Axes y and z to one scale, named after the sensors in them, or what two others are turned to."""
+    """Give the axes y and z one scale, and label them with the names of the sensors or of `planes_of`."""
     for axis, way, name in zip((axes.xaxis, axes.yaxis), "yz", names, strict=True):
         axis.set_label_text(f"{name if ' of ' in name else f'{way}: {name}'}, {unit}")
     axes.axhline(0, color=GREY, linewidth=0.6)
@@ -141,25 +141,25 @@ def frame_plane(axes: Axes, names: tuple[str, str], unit: str) -> None:
 
 
 def rotation_text(direction: int) -> str:
-    """Which way the shaft turns, with y to the right and z up."""
+    """Sense of rotation in words, as seen with y to the right and z up."""
     return "rotation " + ("y to z, counter-clockwise here ↺" if direction > 0 else "z to y, clockwise here ↻")
 
 
 def rpm(speed_rad_s: float) -> str:
-    """Speed in words; nothing if it is not known."""
+    """Speed in words."""
     if not np.isfinite(speed_rad_s):
         return "speed not measured"
     return f"{abs(speed_rad_s) * 30 / np.pi:.0f} rpm"
 
 
 def speeds_text(speed_rad_s: FloatArray) -> str:
-    """From which speed to which."""
+    """Range of speeds in words."""
     low, high = float(np.min(np.abs(speed_rad_s))), float(np.max(np.abs(speed_rad_s)))
     return rpm(low) if not np.isfinite(low) or high - low < 0.005 * high else f"{rpm(low)} to {rpm(high)}"
 
 
 def along_path(speed_rad_s: FloatArray, time_ns: npt.NDArray[np.int64]) -> tuple[FloatArray, str]:
-    """Numbers to be written along a path, and what they are: speeds if they change, times after the start if not."""
+    """Labels of the points of a path and their unit: speeds if the speed changes, else times after the start."""
     if np.isfinite(speed_rad_s).all() and not steady(speed_rad_s):
         return np.abs(speed_rad_s) * 30 / np.pi, "speed, rpm"
     seconds = (time_ns - time_ns[0]) / 1e9
@@ -168,12 +168,12 @@ def along_path(speed_rad_s: FloatArray, time_ns: npt.NDArray[np.int64]) -> tuple
 
 
 def mark_text(value: float, unit: str) -> str:
-    """One of those numbers."""
+    """Format one label of `along_path`."""
     return f"{value:.0f}" if unit.endswith("rpm") else f"{value:.3g}"
 
 
 def spread_marks(along: FloatArray, places: npt.NDArray[Any], apart: float) -> list[int]:
-    """Points of a path to be labelled: its ends, and others near round numbers `along` it that are so far `apart`."""
+    """Indices of points to be labelled: the ends, and points nearest to round values of `along`, at least `apart`."""
     step = next(one for one in _ROUND if np.ptp(along) / one <= _MOST_MARKS)
     off = np.abs(along - step * np.round(along / step))
     passed = [int(at) for at in np.flatnonzero(np.diff(np.floor(along / step)))]
@@ -185,18 +185,18 @@ def spread_marks(along: FloatArray, places: npt.NDArray[Any], apart: float) -> l
 
 
 def as_dates(time_ns: npt.NDArray[np.int64]) -> FloatArray:
-    """Nanoseconds since 1970 as matplotlib counts time."""
+    """Nanoseconds since 1970 as matplotlib dates."""
     counted = date2num(time_ns.astype("datetime64[ns]"))  # type: ignore[no-untyped-call]  # stub without types
     return np.asarray(counted, dtype=np.float64)
 
 
 def as_date(time_ns: int) -> float:
-    """One time as matplotlib counts it."""
+    """Nanoseconds since 1970 as a matplotlib date."""
     return float(as_dates(np.array([time_ns], dtype=np.int64))[0])
 
 
 def time_axis(axes: Axes, *, vertical: bool = False) -> None:
-    """UTC clock times along an axis."""
+    """Label an axis with UTC clock times."""
     axis = axes.yaxis if vertical else axes.xaxis
     locator = AutoDateLocator(tz="UTC", minticks=4, maxticks=9)  # type: ignore[no-untyped-call]  # stub without types
     axis.set_major_locator(locator)
@@ -211,8 +211,8 @@ def alarm_text(alarm: AlarmEventData) -> str:
 
 
 def alarm_lines(axes: Axes, alarms: Iterable[AlarmEventData], *, vertical: bool = False) -> None:
-    """A line at each alarm event: full where raised or escalated, dashed where cleared."""
-    for alarm in sorted(alarms, key=lambda event: event.severity):  # danger over alert
+    """Draw a line at each alarm event: solid if raised or escalated, dashed if cleared."""
+    for alarm in sorted(alarms, key=lambda event: event.severity):  # danger is drawn over alert
         at = as_date(alarm.time_ns)
         colour = SEVERITY_COLOURS.get(alarm.severity, INK)
         dashes = "--" if alarm.kind == "cleared" else "-"

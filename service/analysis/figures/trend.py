@@ -1,4 +1,4 @@
-"""Picture of a trend: a panel for every parameter, over them the machine's state."""
+"""Picture of a trend: a strip with the machine's state, and below it a panel for every parameter, level and measure."""
 
 from functools import partial
 
@@ -38,7 +38,7 @@ _GAP = 2.5
 _DASHES = (0, (4, 3))
 _LEAST_PERCENT = 5.0
 _LETTER_IN, _ROW_PT = 0.065, 11.0
-"""Width of a letter in the small print, and how far its lines are apart."""
+"""Width of a letter in small print, in inches, and its line spacing, in points."""
 
 
 def trend(data: Recorded | Past, machine: str | None, *, levels: bool) -> Paint:
@@ -51,7 +51,7 @@ def trend(data: Recorded | Past, machine: str | None, *, levels: bool) -> Paint:
 
 
 def paint_trend(trend: TrendSeries, look: Look) -> Figure:
-    """Small multiples over one time axis."""
+    """Draw all panels over one time axis."""
     count = len(trend.parameters)
     measures = [name for name in MEASURES if trend.parameters or np.isfinite(trend.measures[name]).any()]
     small = len(trend.levels) + len(measures)
@@ -76,7 +76,7 @@ def paint_trend(trend: TrendSeries, look: Look) -> Figure:
         alarm_lines(axes, trend.alarms)
     rows = {}
     for name, axes in zip((MODEL, *(one.name for one in trend.parameters)), panels, strict=False):
-        # A parameter's alarm belongs to its panel, any other to the one of the states.
+        # A parameter's alarms are named in its panel, all others over the strip of states.
         own = [one for one in trend.alarms if (one.name if one.name in PARAMETER_TEXT else MODEL) == name]
         rows[name] = _name_alarms(axes, own)
     _states(panels[0], trend, step_ns, rows[MODEL])
@@ -111,7 +111,7 @@ def _legend(trend: TrendSeries) -> list[Patch | Line2D]:
 
 
 def _states(axes: Axes, trend: TrendSeries, step_ns: int, rows: int) -> None:
-    """A strip: what the monitor said of the machine, from each report on to the next; over it, rows of alarms."""
+    """Draw a strip of the machine's states, each from its report to the next; its legend clears `rows` of alarms."""
     after = np.minimum(np.diff(trend.end_ns, append=trend.end_ns[-1] + step_ns), round(_GAP * step_ns))
     for begin, end, state in zip(as_dates(trend.end_ns), as_dates(trend.end_ns + after), trend.states, strict=True):
         axes.axvspan(float(begin), float(end), color=STATE_COLOURS[state], linewidth=0)
@@ -133,13 +133,13 @@ def _states(axes: Axes, trend: TrendSeries, step_ns: int, rows: int) -> None:
 
 
 def _name_alarms(axes: Axes, alarms: list[AlarmEventData]) -> int:
-    """Events of a parameter in the line of its title, those of the model over the states; returns in how many rows.
+    """Write the names of alarm events above a panel, and return the number of rows used.
 
-    Side by side, texts of events that are close to each other could not be read.
+    Events close to each other are put in different rows, because their texts would overlap.
     """
     letter = _LETTER_IN * axes.figure.dpi / axes.bbox.width
     first, last = axes.get_xlim()
-    taken = [letter * len(axes.get_title(loc="left")) or -1.0]  # up to where each row is full, as a share of the axis
+    taken = [letter * len(axes.get_title(loc="left")) or -1.0]  # end of the text in each row, as a fraction of the axis
     for alarm in sorted(alarms[:8], key=lambda event: event.time_ns):
         text, at = alarm_text(alarm), as_date(alarm.time_ns)
         half, middle = letter * len(text) / 2, (at - first) / (last - first)
@@ -165,7 +165,7 @@ def _parameter(axes: Axes, parameter: ParameterTrend, trend: TrendSeries, step_n
     wide = float(np.nanmedian(np.maximum(np.abs(low - change), np.abs(high - change))))
     limit = _limits(axes, parameter, trend.limits)
     ends = float(np.nanmax(np.abs(np.append(low, high))))
-    # One window with an endless interval must not hide the others.
+    # One window with a very wide interval must not compress all others.
     top = max(_LEAST_PERCENT, 1.15 * limit, min(1.15 * ends, 2.5 * max(far + wide, limit)))
     axes.set_ylim(-top, top)
 
@@ -175,7 +175,7 @@ def _danger_near(parameter: ParameterTrend, alarms: AlarmSettings) -> bool:
 
 
 def _limits(axes: Axes, parameter: ParameterTrend, alarms: AlarmSettings | None) -> float:
-    """Lines at the alarm limits, either sign; danger only where it is near. The largest one drawn, in percent."""
+    """Draw the alarm limits of both signs, danger only if it is near; return the largest one drawn, in percent."""
     if alarms is None:
         return 0.0
     limits = alarms.for_parameter(parameter.name)
@@ -189,7 +189,7 @@ def _limits(axes: Axes, parameter: ParameterTrend, alarms: AlarmSettings | None)
 
 
 def _level(axes: Axes, level: LevelTrend, trend: TrendSeries, step_ns: int) -> None:
-    """A level and the limits that held, those far above it left out of the picture."""
+    """Draw a level and the limits then in force; limits far above the level lie outside the axis."""
     time, values, alert, danger = _with_gaps(trend.end_ns, step_ns, level.level, level.alert, level.danger)
     axes.plot(time, values, color=COLOURS[0], linewidth=1.2)
     for limit, severity in ((alert, "alert"), (danger, "danger")):
@@ -220,7 +220,7 @@ def _measure(axes: Axes, name: str, trend: TrendSeries, step_ns: int) -> None:
 def _with_gaps(
     end_ns: npt.NDArray[np.int64], step_ns: int, *series: npt.NDArray[np.float64]
 ) -> tuple[npt.NDArray[np.float64], ...]:
-    """Times for matplotlib, and series with a nan where reports are missing: no line is drawn across."""
+    """Times for matplotlib, and series with NaN inserted where reports are missing, so that no line crosses the gap."""
     after = np.flatnonzero(np.diff(end_ns) > _GAP * step_ns) + 1
     time = as_dates(np.insert(end_ns, after, end_ns[after - 1] + 1))
     return (time, *(np.insert(values, after, np.nan) for values in series))

@@ -1,4 +1,4 @@
-"""Picture of waveforms: samples over time, the keyphasor's pulses on them."""
+"""Picture of waveforms: samples over time, with keyphasor pulses marked."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -20,7 +20,7 @@ _SOON_S = 10.0
 
 
 def waveform(data: Recorded, channels: Sequence[str], window_s: float | None) -> Paint:
-    """The latest samples of channels; of as long as 8 revolutions, if no length is named."""
+    """The latest samples of channels; without `window_s`, over 8 revolutions."""
     chosen = data.chosen(channels)
     length_s = window_s or _usual_s(data, chosen)
     found = data.latest(chosen, length_s + _SOON_S)
@@ -36,7 +36,7 @@ def waveform(data: Recorded, channels: Sequence[str], window_s: float | None) ->
 
 
 def _usual_s(data: Recorded, chosen: Sequence[Channel]) -> float:
-    """As long as some revolutions, or half a second where the shaft is not seen to turn."""
+    """Duration of 8 revolutions, or 0.5 s if fewer than two keyphasor pulses are found."""
     marked = [pulses(stretch.angle_rad)[1] / stretch.rate_hz for stretch in data.latest(chosen[:1], _SOON_S)[-1:]]
     if not marked or marked[0].size < 2:
         return _USUAL_S
@@ -44,7 +44,7 @@ def _usual_s(data: Recorded, chosen: Sequence[Channel]) -> float:
 
 
 def _paint(found: Sequence[Excerpt], channels: Sequence[Channel], name: str, look: Look) -> Figure:
-    """A panel for each channel, its mean in the title: what is left is vibration."""
+    """Draw a panel for each channel, with the mean subtracted and stated in the title."""
     figure = Figure(figsize=look.size_in or (9.5, 1.3 + 1.6 * len(channels)), layout="constrained")
     panels = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
     start_ns = found[0].start_ns

@@ -1,1 +1,1 @@
-"""Snapshots of a live machine: correlations and spectra beside what theory predicts, and orbits, as JSON."""
+"""Snapshots of a live machine as JSON: correlation functions and spectra with theory, orbits, and values of plots."""

@@ -1,4 +1,4 @@
-"""Which channels a snapshot is of: those asked for by name, or a sensible few."""
+"""Selection of a snapshot's channels: those requested by name, or a default choice; units and rounding of values."""
 
 from collections.abc import Sequence
 
@@ -12,22 +12,22 @@ from models.signals.channels import Channel, Quantity, parts_seen, state_name
 from rotorwatch.records.snapshots import Units
 
 MOST_PAIRS = 8
-"""Pairs in a snapshot that no pair was asked for."""
+"""Most pairs in a snapshot if none is requested."""
 _MOST_CHANNELS = 64
 _DIGITS = 6
 
 
 class SnapshotError(RotorwatchError):
-    """A snapshot was asked for that this machine's channels do not allow; the message lists what is there."""
+    """The machine's channels do not allow the requested snapshot; the message lists what is available."""
 
 
 def chosen_channels(machine: MachineFile, names: Sequence[str], field: str = "channel") -> tuple[Channel, ...]:
-    """Channels by name; without names all of the first quantity measured, displacements before velocities.
+    """Channels by name; without names, all of the first quantity measured (displacements before velocities).
 
     Raises
     ------
     SnapshotError
-        If there is no such channel, or it is the shaft angle, or there are too many names.
+        If a channel does not exist or is the shaft angle, or there are too many names.
     """
     there = {channel.name: channel for channel in machine.sensors if state_name(channel) != "theta"}
     if len(names) > _MOST_CHANNELS:
@@ -48,14 +48,15 @@ def chosen_channels(machine: MachineFile, names: Sequence[str], field: str = "ch
 def chosen_pairs(
     machine: MachineFile, first: Sequence[str] = (), second: Sequence[str] = ()
 ) -> tuple[tuple[Channel, Channel], ...]:
-    """Pairs of channels by name, each channel with itself where there is no `second`; a few without names.
+    """Pairs of channels by name; without `second`, each channel with itself; without names, a default choice.
 
-    The few are every displacement with itself, then those of one plane, then those of one place with each other.
+    By default, each channel of the first quantity measured (usually displacement) is paired with itself, then with
+    those in the same direction, then with those at the same location, up to `MOST_PAIRS`.
 
     Raises
     ------
     SnapshotError
-        If there is no such channel, or `first` and `second` are not equally many.
+        If there is no such channel, or `first` and `second` differ in number.
     """
     if first or second:
         if second and len(second) != len(first):
@@ -79,12 +80,12 @@ def chosen_pairs(
 
 
 def check_held(machine: MachineFile, channels: Sequence[Channel], states: Sequence[str]) -> None:
-    """Refuse channels that are not among the states of a window: at their places only levels are watched.
+    """Refuse channels that are not among the states of a window: at their locations only levels are watched.
 
     Raises
     ------
     SnapshotError
-        If the window holds none of a channel.
+        If a channel is not among the window's states.
     """
     without = [channel.name for channel in channels if state_name(channel) not in states]
     if without:
@@ -94,9 +95,9 @@ def check_held(machine: MachineFile, channels: Sequence[Channel], states: Sequen
 
 
 def seen_by(channels: Sequence[Channel]) -> tuple[tuple[str, ...], FloatArray | None]:
-    """States of the model that channels see, and the parts of them that each sees, shape (n_channels, n_states).
+    """States that channels measure, and each channel's coefficients of these states, shape (n_channels, n_states).
 
-    Without parts each channel sees one state alone, in their order.
+    The coefficients are None if each channel measures a single state; states are then in the order of channels.
     """
     parts = [parts_seen(channel) for channel in channels]
     states = tuple(dict.fromkeys(state for each in parts for state in each))
@@ -122,7 +123,7 @@ def product_unit(first: Channel, second: Channel, units: Units) -> tuple[str, fl
 
 
 def figures(values: npt.ArrayLike) -> tuple[float | None, ...]:
-    """Numbers for JSON: six significant digits; None for what is not finite.
+    """Numbers for JSON, rounded to six significant digits; None if not finite.
 
     Examples
     --------
@@ -132,7 +133,7 @@ def figures(values: npt.ArrayLike) -> tuple[float | None, ...]:
     array = np.asarray(values, dtype=np.float64)
     finite = np.isfinite(array)
     solid = np.where(finite & (array != 0), array, 1.0)
-    # A power of ten within what a number holds exactly: the quotient is then the shortest decimal.
+    # Powers of ten up to 22 are exact in double precision: the quotient is then the shortest decimal.
     power = np.clip(_DIGITS - 1 - np.floor(np.log10(np.abs(solid))), -22, 22)
     up, down = 10.0 ** np.maximum(power, 0), 10.0 ** np.maximum(-power, 0)
     rounded = np.where(array == 0, 0.0, np.round(solid * up / down) * down / up)
@@ -142,5 +143,5 @@ def figures(values: npt.ArrayLike) -> tuple[float | None, ...]:
 
 
 def known_figures(values: npt.ArrayLike) -> tuple[float, ...]:
-    """The same, without what is not finite."""
+    """As `figures`, leaving out values that are not finite."""
     return tuple(one for one in figures(values) if one is not None)

@@ -1,4 +1,4 @@
-"""Correlation functions of the latest window beside what theory predicts."""
+"""Correlation functions of the latest window, with theory."""
 
 from collections.abc import Sequence
 
@@ -26,8 +26,8 @@ def correlation_snapshot(
     Parameters
     ----------
     first, second : sequence of str
-        Channels by name: the references, and as many responses; without `second` every channel with itself, without
-        both a few pairs (`service.analysis.snapshots.channels.chosen_pairs`).
+        Names of the references, and of as many responses; for defaults see
+        `service.analysis.snapshots.channels.chosen_pairs`.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def correlation_snapshot(
 def _predicted(
     prediction: Prediction, channels: Sequence[Channel], places: list[tuple[int, int]], measured: MeasuredCorrelations
 ) -> tuple[FloatArray | None, FloatArray | None]:
-    """Theory for pairs of channels; those at an angle are sums over the states that they see."""
+    """Theory for pairs of channels, nominal and estimated; inclined sensors are sums over the states they measure."""
     states, parts = seen_by(channels)
     if parts is None:
         return prediction.correlations(states, places, measured.lags_s, measured.band_hz)

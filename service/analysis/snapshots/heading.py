@@ -1,4 +1,4 @@
-"""Parts that all snapshots have in common: whose they are, of which window, and what the predictions are of."""
+"""Common parts of all snapshots: machine, window, and the parameter changes that theory assumes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,29 +29,29 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class LatestData:
-    """What a monitor holds at one moment; nothing in it is changed afterwards."""
+    """Immutable copy of a monitor's latest data."""
 
     window: WindowStatistics | None = None  # the latest full window
     filled: float = 0.0  # fraction of a full window that is filled now
     # Readings of that window by the diagnostician that decides; empty if it was not evaluated.
     parameters: tuple[Parameter, ...] = ()
-    why_not: str = ""  # why it was not evaluated
+    why_not: str = ""  # why the window was not evaluated
     blocks: tuple[SampleBlock, ...] = ()  # the newest blocks, without a gap
-    lacking: str = ""  # why there is no window, where it is not that one is still filling
-    sensors: tuple[SensorFault, ...] = ()  # found in the window
+    lacking: str = ""  # why there is no window, unless it is still filling
+    sensors: tuple[SensorFault, ...] = ()  # sensor faults in the window
 
     @property
     def missing(self) -> frozenset[str]:
-        """States that lacked numbers in the window: what stands in for them is not to be shown."""
+        """States without numbers in the window, whose substitute values must not be shown."""
         return frozenset(implicated(one for one in self.sensors if one.kind is FaultKind.MISSING))
 
     def mark(self) -> tuple[object, ...]:
-        """What an answer about the window depends on; short, so that it may be kept."""
+        """Key of everything on which an answer about the window depends; small, so that it can be cached."""
         return None if self.window is None else self.window.end_ns, self.parameters, self.filled, self.why_not
 
 
 def heading(subject: Subject, data: LatestData) -> dict[str, Any]:
-    """Whose snapshot this is, and of which window: first fields of every snapshot."""
+    """First fields of every snapshot: the machine, its window and speed."""
     window = data.window
     speed = np.nan if window is None or "theta" in data.missing else window.speed_rad_s
     return {
@@ -64,12 +64,12 @@ def heading(subject: Subject, data: LatestData) -> dict[str, Any]:
 
 
 def unsent(machine: MachineFile, data: LatestData) -> str:
-    """What is said of channels that lacked numbers in the window; empty if all had them."""
+    """Message on channels without numbers in the window; empty if all had numbers."""
     return no_data([one.name for one in machine.sensors if state_name(one) in data.missing])
 
 
 def no_window(machine: MachineFile, data: LatestData) -> str:
-    """Why nothing can be shown: before the first window is full, or where only levels are watched."""
+    """Reason for showing nothing: the first window is not full yet, or only levels are watched."""
     if data.lacking:
         return data.lacking
     if data.window is not None:
@@ -78,7 +78,7 @@ def no_window(machine: MachineFile, data: LatestData) -> str:
 
 
 def theory(changes: Mapping[str, float], nominal_reason: str, estimated_reason: str) -> Theory:
-    """What the predictions are of."""
+    """Parameter changes that the predictions assume, and reasons for missing predictions."""
     shown = {} if estimated_reason else changes
     return Theory(
         changes=tuple(

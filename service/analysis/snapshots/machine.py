@@ -1,6 +1,6 @@
-"""Where a machine's snapshots are asked for: what is known of it, and the theory of its latest window.
+"""Makes the snapshots of one machine, and caches the theory of its latest window.
 
-What makes them is imported when somebody asks: a process that only evaluates machines does without.
+The modules that compute snapshots are imported at the first request, so a process that only evaluates does without.
 """
 
 import threading
@@ -21,9 +21,9 @@ _NO_WINDOW = "there is no window yet"
 
 
 class MachineSnapshots:
-    """Makes snapshots of one machine; any thread may ask.
+    """Makes snapshots of one machine; thread-safe.
 
-    The theory of a window takes longer than all the rest, and is kept as long as somebody keeps the window.
+    The theory of a window takes longest to compute, so it is cached for as long as the window exists.
     """
 
     def __init__(self, installed: Installed, identity: Identity) -> None:

@@ -1,4 +1,4 @@
-"""Orbits of the latest window at running speed, and the newest revolutions as measured."""
+"""1x orbits of the latest window, and unfiltered orbits of the newest revolutions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,17 +27,17 @@ _NO_SPEED = "the speed of rotation is not known"
 
 @dataclass(frozen=True, slots=True)
 class _Vectors:
-    """Vectors q of x = Re{q e^{jθ}} in the window, SI, of all its states."""
+    """1x vectors q of x = Re{q e^{jθ}} of all states in the window, SI."""
 
     mean: ComplexArray  # (n,)
-    hops: ComplexArray  # (n_hops, n), the same of every hop; their scatter gives standard errors
+    hops: ComplexArray  # (n_hops, n), vectors of every hop; their scatter gives standard errors
     direction: int  # 1 if θ grows, -1 if it falls
-    # Whether θ is the shaft's own angle; else it begins anywhere, and which way the shaft turns is not known.
+    # Whether θ is the measured shaft angle; else its origin is arbitrary, and the sense of rotation unknown.
     absolute: bool
 
 
 def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, units: Units = "channel") -> OrbitSnapshot:
-    """Orbits at every place with displacements in both directions, and so many whole revolutions as measured.
+    """Orbits at every location with displacements in both directions; paths over `revolutions` whole revolutions.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
     elif pairs != there or "theta" in data.missing:
         reason = unsent(machine, data)
     elif not places:
-        reason = ""  # the window holds none of these places; `path_reason` says what there is of them
+        reason = ""  # the window does not hold these locations; `path_reason` covers them
     elif window is None:
         reason = no_window(machine, data)
     else:
@@ -123,7 +123,7 @@ def _place(
 
 
 def _elsewhere(pair: tuple[Channel, Channel], excerpt: Excerpt | None, path: PathSamples, units: Units) -> PlaceOrbit:
-    """Orbit at a place that the model does not have, and the window neither: of the newest revolutions."""
+    """Orbit of the newest revolutions at a location that neither the model nor the window has."""
     ellipse = None
     if excerpt is not None and excerpt.angle_rad is not None:
         motion = np.array([path.y, path.z], dtype=np.float64)
@@ -154,7 +154,7 @@ def _vector(name: str, column: int, vectors: _Vectors, factor: float) -> Running
 
 
 def _predicted(known: Machine, rotor: RotorParameters, window: WindowStatistics) -> ComplexArray:
-    """Vectors that the unbalance makes at the window's speed, of all states."""
+    """1x vectors of all states due to the unbalance, at the window's speed."""
     q1, q2 = synchronous_response(rotor, window.speed_rad_s)
     return np.asarray((q1 - 1j * q2) * np.exp(1j * known.operation.unbalance_phase_rad), dtype=np.complex128)
 

@@ -42,7 +42,7 @@ _CENTRELINE_S = 1.0
 def waveform_snapshot(
     data: Sampled, channels: tuple[Channel, ...], revolutions: int, speed_rad_s: float | None
 ) -> WaveformSnapshot:
-    """The newest whole revolutions of some channels, and pulses of the phase reference; without it, of a mean speed."""
+    """The newest whole revolutions of the channels, from the phase reference's pulses or, without, the mean speed."""
     sent = data.sent(channels)
     if not sent:
         raise RotorwatchError(data.lacking)
@@ -72,12 +72,12 @@ def waveform_snapshot(
 
 
 def full_spectrum_snapshot(data: Sampled) -> FullSpectrumSnapshot:
-    """Full spectra of the newest seconds at every place where displacements are measured in both directions.
+    """Full spectra of the newest seconds at every location with displacements in both directions.
 
     Raises
     ------
     RotorwatchError
-        If there is no such place, or too few samples.
+        If there is no such location, or too few samples.
     """
     resolution_hz = min(_FULL_HZ, data.descriptor.rate_hz / 16)
     found = read_full_spectrum(data, recorded_pairs(data), _FULL_S, resolution_hz, orders=False)
@@ -107,12 +107,12 @@ def full_spectrum_snapshot(data: Sampled) -> FullSpectrumSnapshot:
 
 
 def waterfall_snapshot(data: Sampled, channel: Channel, over: Literal["time", "speed"]) -> WaterfallSnapshot:
-    """Amplitude spectra of one channel, one after the other; where there are many lines the largest of neighbours.
+    """Amplitude spectra of one channel over time or speed; groups of adjacent lines are reduced to their maximum.
 
     Raises
     ------
     RotorwatchError
-        If there are too few samples, or over speed if that is not known or does not change.
+        If there are too few samples or, over speed, if the speed is unknown or does not change.
     """
     rate_hz = data.descriptor.rate_hz
     if over == "speed" and not data.has_angle:
@@ -157,12 +157,12 @@ def waterfall_snapshot(data: Sampled, channel: Channel, over: Literal["time", "s
 def vector_series(
     data: Sampled | Past, channels: tuple[Channel, ...], order: int, revolutions: int, slow_roll_rpm: float | None
 ) -> VectorSeries:
-    """Vectors of some channels: of the windows of the history, or of every so many revolutions of samples.
+    """Vectors of channels: of every window of a history, or of every `revolutions` revolutions of samples.
 
     Raises
     ------
     RotorwatchError
-        If there are none: without a shaft angle, or if the shaft does not turn.
+        If there are none: there is no shaft angle, or the shaft does not turn.
     """
     found = read_run_up(data, channels, order, revolutions, slow_roll_rpm)
     every = -(-found.time_ns.size // _MOST_VECTORS)
@@ -187,12 +187,12 @@ def vector_series(
 
 
 def centreline_series(data: Sampled | Past) -> CentrelineSeries:
-    """Mean positions wherever displacements are measured in both directions.
+    """Mean shaft positions at all locations with displacements in both directions.
 
     Raises
     ------
     RotorwatchError
-        If there is no such place, or there are not two positions.
+        If there is no such location, or fewer than two positions.
     """
     pairs = recorded_pairs(data)
     found = read_centreline(data, pairs, _CENTRELINE_S)
@@ -210,7 +210,7 @@ def centreline_series(data: Sampled | Past) -> CentrelineSeries:
 
 
 def _whose(data: Sampled | Past) -> dict[str, Any]:
-    """Whose values they are, and what they come from: first fields of the values of a plot."""
+    """First fields of every plot's values: the machine, and the source of the data."""
     site, machine = data.name.split("/")
     samples = "recordings" if isinstance(data, Recorded) else "newest samples"
     return {"site": site, "machine": machine, "source": "history" if isinstance(data, Past) else samples}
@@ -222,7 +222,7 @@ def _newest(excerpt: Excerpt) -> Excerpt:
 
 
 def _grouped(values: FloatArray, group: int) -> FloatArray:
-    """Groups of neighbours, shape (n_groups, group); what is left at the end makes none."""
+    """Groups of adjacent values, shape (n_groups, group); an incomplete last group is dropped."""
     return values[: values.size // group * group].reshape(-1, group)
 
 

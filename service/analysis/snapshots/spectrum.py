@@ -1,4 +1,4 @@
-"""Power spectral densities of the latest window beside what theory predicts, and coherence of pairs."""
+"""Power spectral densities of the latest window, with theory, and coherence of pairs of channels."""
 
 from collections.abc import Sequence
 from typing import TypeVar
@@ -26,16 +26,16 @@ from service.analysis.snapshots.channels import (
 from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory, unsent
 
 MOST_LINES = 1000
-"""Lines in a snapshot; where the band has more, neighbours are averaged."""
+"""Most lines in a snapshot; if the band has more, adjacent lines are averaged."""
 _SHARED = (1 + 2 / 36, 4 / 9 + 2 * 0.0200, 1 / 36 + 2 * 0.0069)
-"""Squared correlations of half-overlapping Hann segments' power in one line, and in lines one and two apart."""
+"""Sums of squared correlations of half-overlapping Hann segments' power: in one line, and in lines 1 and 2 apart."""
 _OUTER = (0.025, 0.975)
 _Array = TypeVar("_Array", FloatArray, ComplexArray)
 _Spectra = tuple[ComplexArray, ComplexArray | None, ComplexArray | None]
-"""Two-sided cross-spectra, SI²/Hz: measured, nominal, estimated; shape (n_lines, n, n), states in one order."""
+"""Two-sided cross-spectra, SI²/Hz: measured, nominal, estimated; shape (n_lines, n, n), in the same order of states."""
 
 
-def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
+def spectrum_snapshot(  # noqa: PLR0913  # options of the request
     subject: Subject,
     data: LatestData,
     prediction: Prediction,
@@ -50,16 +50,16 @@ def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
     Parameters
     ----------
     channels : sequence of str
-        By name; without names all displacements, or all of the first quantity that is measured.
+        Names; without names, all channels of the first quantity measured (displacements first).
     first, second : sequence of str
-        Pairs to be given with cross-spectrum and coherence; none without names.
+        Names of the pairs whose cross-spectrum and coherence are given; none by default.
     band_hz : tuple of float, optional
-        Lines from and to, within those of the machine file's band.
+        Lowest and highest frequency, limited to the machine file's band.
 
     Raises
     ------
     SnapshotError
-        If there is no such channel, or the band holds no line.
+        If there is no such channel, or the band holds too few lines.
     """
     machine, window = subject.machine, None if data.window is None else data.window.as_mounted
     chosen = chosen_channels(machine, channels)
@@ -132,7 +132,7 @@ def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
 
 
 def _checked(machine: MachineFile, band_hz: tuple[float, float] | None) -> tuple[float, float]:
-    """Lines from and to; two at least, so that they have a distance."""
+    """Limits of the band, checked to hold at least two lines, so that a line spacing is defined."""
     there = machine.window.band_hz
     if band_hz is None:
         return there
@@ -146,7 +146,7 @@ def _checked(machine: MachineFile, band_hz: tuple[float, float] | None) -> tuple
 
 
 def _grouped(values: _Array, group: int) -> _Array:
-    """Means of `group` neighbours along the first axis; what is left at the end makes no group."""
+    """Means of `group` adjacent values along the first axis; an incomplete last group is dropped."""
     if group == 1:
         return values
     whole = values[: values.shape[0] // group * group]
@@ -154,7 +154,7 @@ def _grouped(values: _Array, group: int) -> _Array:
 
 
 def _averages(n_segments: int, group: int) -> float:
-    """Independent averages in one line."""
+    """Effective number of independent averages in one line, or in `group` averaged lines."""
     near = sum(2 * (1 - apart / group) * _SHARED[apart] for apart in (1, 2) if apart < group)
     return n_segments * group / (_SHARED[0] + near)
 
@@ -197,6 +197,6 @@ def _cross(pair: tuple[Channel, Channel], i: int, j: int, spectra: _Spectra, uni
 
 def _coherence(spectra: ComplexArray, i: int, j: int) -> FloatArray:
     power = spectra[:, i, i].real * spectra[:, j, j].real
-    with np.errstate(invalid="ignore", divide="ignore"):  # nothing is coherent with a channel that does not move
+    with np.errstate(invalid="ignore", divide="ignore"):  # coherence is NaN if a channel has no motion
         share = np.abs(spectra[:, i, j]) ** 2 / power
     return np.asarray(np.where(power > 0, np.minimum(share, 1.0), np.nan), dtype=np.float64)
