@@ -1,7 +1,7 @@
-"""Sources of measuring systems, each read by a library of its own.
+"""Sources for files of measuring systems, each read with its own library.
 
-TDMS files of LabVIEW and DIAdem; ASAM MDF version 4 (MF4), the format of vehicle and test bench recorders; and of the
-Universal File Format data set 58 (functions at nodal degrees of freedom), time responses.
+TDMS files of LabVIEW and DIAdem; ASAM MDF version 4 (MF4), the format of vehicle and test bench recorders; and time
+responses in data set 58 (functions at nodal degrees of freedom) of the Universal File Format.
 """
 
 import logging
@@ -30,7 +30,7 @@ class TdmsSource(Source):
         with readable(path, self.kind, self.package):
             from nptdms import TdmsFile  # noqa: PLC0415  # an extra
 
-            self._file = path.open("rb")  # ours, because the library leaves a file open that it cannot read
+            self._file = path.open("rb")  # opened here, because the library does not close a file that it cannot read
             try:
                 self._tdms = TdmsFile.open(self._file)
                 channels = [channel for group in self._tdms.groups() for channel in group.channels()]
@@ -56,7 +56,7 @@ class TdmsSource(Source):
         return found or Timing()
 
     def unit(self, column: Reference) -> str:
-        """Property ``unit_string``, or what NI-DAQ calls it."""
+        """Property ``unit_string``, or ``NI_UnitDescription`` as written by NI-DAQ."""
         properties = self._column(column).properties
         return str(properties.get("unit_string") or properties.get("NI_UnitDescription") or "")
 
@@ -76,7 +76,7 @@ def _told(timing: Timing) -> str:
 
 
 def _waveform(properties: Any) -> Timing:
-    """Rate and start of a waveform; a text that is no number or ISO 8601 time says nothing, and the mapping has to."""
+    """Rate and start of a waveform; unreadable values count as missing, and the mapping must then state them."""
     rate_hz = start_ns = None
     with suppress(TypeError, ValueError):
         increment_s = float(properties.get("wf_increment") or 0.0)
@@ -91,8 +91,8 @@ def _waveform(properties: Any) -> Timing:
 class MdfSource(Source):
     """An MF4 file, read piece by piece.
 
-    A channel is named by its own name where that is unique, and always ``number of its group/name``. ``time`` is the
-    time column of the first channel that is asked for together with it.
+    A channel is named ``number of its group/name``, and also by its own name if that is unique. ``time`` is the time
+    column of the first channel that is requested together with it.
     """
 
     kind, package, entry = "MF4", "asammdf", "channel"
@@ -103,9 +103,9 @@ class MdfSource(Source):
             from asammdf import MDF  # noqa: PLC0415  # an extra
             from asammdf.blocks.mdf_v4 import MDF4  # noqa: PLC0415
 
-            # What it has half read of a damaged file it cannot close, and says so with a traceback beside ours.
+            # The library fails to close a half-read damaged file, and would print a second traceback from __del__.
             MDF4.__del__ = lambda _: None  # type: ignore[method-assign]
-            logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # its errors come as exceptions as well
+            logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # its errors are raised as exceptions as well
             self._file: Any = MDF(path)
             for name, found in self._file.channels_db.items():
                 for group, index in found:
@@ -165,7 +165,7 @@ class MdfSource(Source):
 
 
 class UniversalSource(Source):
-    """A UFF file, read whole. A data set is named by its first line where that is unique, and by number: ``set 1``."""
+    """A UFF file, read whole. A data set is named by number, ``set 1``, and by its first line if that is unique."""
 
     kind, package, entry = "UFF", "pyuff", "data set"
 
@@ -176,7 +176,7 @@ class UniversalSource(Source):
             file = pyuff.UFF(str(path))
             numbers = [number for number, kind in enumerate(file.get_set_types()) if kind == 58]
             read = file.read_sets(numbers) if numbers else []
-            # Each data set stands between two such lines.
+            # Each data set is enclosed by two such lines, so an odd number means that the file is truncated.
             whole = len(re.findall(rb"(?m)^    -1 *\r?$", path.read_bytes())) % 2 == 0
             self._cut = "" if whole else "; the file is truncated, it ends within another one"
         sets: list[dict[str, Any]] = [read] if isinstance(read, dict) else list(read)
@@ -213,14 +213,14 @@ class UniversalSource(Source):
         return "" if label == "NONE" else label
 
     def named(self, column: str) -> str:
-        """Return the name of a data set that there is; of a file that is cut, say so where it is not."""
+        """Check that a data set exists, and return its name; the error says if the file is truncated."""
         try:
             return super().named(column)
         except SourceError as error:
             raise SourceError(f"{error}{self._cut}") from error
 
     def _rate_hz(self, reference: Reference) -> float:
-        self._column(reference)  # refuses what is not there
+        self._column(reference)  # raises if there is no such data set
         found = self._sets[reference.column]
         step_s = float(found["abscissa_inc"])
         if found["abscissa_spacing"] == 1 and step_s > 0:

@@ -19,7 +19,7 @@ _TURN = 2 * np.pi
 
 
 def pulse_times(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: Mapping) -> FloatArray:
-    """Read when the pulses of a file came; a sampled signal is gone through for that alone.
+    """Read the times of a file's keyphasor pulses; a sampled signal is read through once for this purpose.
 
     Returns
     -------
@@ -29,7 +29,7 @@ def pulse_times(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: Map
     Raises
     ------
     SourceError
-        If what should be times is none.
+        If the array does not hold times.
     """
     if keyphasor.pulse_times is not None:
         what = keyphasor.pulse_times
@@ -48,7 +48,7 @@ def pulse_times(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: Map
 
 
 def read_pulses(path: Path, runs: Sequence[FloatArray], keyphasor: Keyphasor) -> PulseTrain:
-    """Judge the pulses of a file, or of the files of a folder, each by those of its own run, which has no gaps.
+    """Build the pulse train of a file or folder from `runs`, pulse times without gaps; each run is checked on its own.
 
     Raises
     ------
@@ -65,27 +65,27 @@ def read_pulses(path: Path, runs: Sequence[FloatArray], keyphasor: Keyphasor) ->
 
 @dataclass(slots=True)
 class AngleColumn:
-    """Puts the shaft angle where the machine file has it, and brings angles into [0, 2π).
+    """Inserts the shaft angle at its column in the machine file, and wraps angles to [0, 2π).
 
-    Rows whose angle is not known are left out, and make a gap; where channels may be missing, they only lack it.
+    Rows with unknown angle are left out and leave a gap; if channels may be missing, the angle is NaN there instead.
     """
 
     machine: MachineFile
     pulses: PulseTrain | None
     reverse: bool  # whether the shaft turns from z to y
     partial: bool = False  # whether channels may be missing
-    unknown: int = 0  # rows
-    # How far a column of angles turned, rad, and in which time, ns.
+    unknown: int = 0  # rows with unknown angle
+    # Total rotation in a column of angles, rad, and its duration, ns.
     turned: float = 0.0
     passed_ns: float = 0.0
 
     @property
     def speed_rpm(self) -> float | None:
-        """Mean speed of a column of angles, negative from z to y; None without one."""
+        """Mean speed from a column of angles, negative from z to y; None without such a column."""
         return 60e9 * self.turned / (_TURN * self.passed_ns) if self.passed_ns else None
 
     def feed(self, parts: Iterator[Piece]) -> Iterator[Piece]:
-        """Complete a file's pieces."""
+        """Add the shaft angle to a file's pieces."""
         column = next((n for n, c in enumerate(self.machine.sensors) if c.quantity is Quantity.SHAFT_ANGLE), None)
         pending = False
         for piece in parts:

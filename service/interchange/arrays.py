@@ -1,7 +1,7 @@
 """Sources that hold named arrays: NumPy .npz, MATLAB .mat, WAV.
 
-What the three have in common: an array is a set of columns, samples run along its longer side, and rows are cut from
-memory (or from the file, where it is mapped).
+In all three an array is a set of columns, samples run along its longer side, and rows are sliced from memory (or from
+the file, if it is memory-mapped).
 """
 
 import os
@@ -19,7 +19,7 @@ from service.interchange.source import Array, Reference, Source, SourceError, Ti
 
 
 class _Arrays(Source):
-    """Columns of named arrays, each still in the file if its array is."""
+    """Columns of named arrays, sliced when their rows are read."""
 
     def _rows(self, reference: Reference) -> tuple[int, Callable[[slice], Any]]:
         array = self._column(Reference(reference.column))  # an ndarray, or a data set that slices like one
@@ -57,15 +57,15 @@ class NumpySource(_Arrays):
                     except ValueError as error:
                         if "allow_pickle" not in str(error):
                             raise
-                        # Objects are nobody's samples; without them the rest may be used.
+                        # Object arrays hold no samples; the other arrays can still be used.
             super().__init__(path, arrays)
 
 
 class MatlabSource(_Arrays):
     """A MATLAB .mat file: version 4 to 7 read whole, version 7.3 (HDF5) column by column.
 
-    Fields of structs are named ``struct.field``, those of the third of several ``struct(3).field``, and what is in the
-    third cell ``cell{3}``.
+    Fields are named ``struct.field``, in the third element of a struct array ``struct(3).field``; the contents of the
+    third cell of a cell array ``cell{3}``.
     """
 
     kind, package = "MATLAB", "h5py"
@@ -102,13 +102,13 @@ class MatlabSource(_Arrays):
             self._file.close()
 
 
-_UNKNOWN_SIZE = 0xFFFFFFFF  # of samples that a program wrote without knowing how many there would be
+_UNKNOWN_SIZE = 0xFFFFFFFF  # size field of a data chunk whose length was not known when it was written
 
 
 class WavSource(_Arrays):
-    """A WAV file; its channels are named ``1``, ``2`` and so on. Mapped, not read, where its number format allows.
+    """A WAV file; its channels are named ``1``, ``2`` and so on. It is memory-mapped if its number format allows.
 
-    Whole numbers come as fractions of full scale, so that `scale` in the mapping is the unit's value at full scale.
+    Integers are converted to fractions of full scale, so `scale` in the mapping is the value at full scale.
     """
 
     kind = "WAV"
@@ -118,17 +118,17 @@ class WavSource(_Arrays):
 
         self._check_whole(path)
         with readable(path, self.kind), warnings.catch_warnings():
-            warnings.simplefilter("ignore", wavfile.WavFileWarning)  # chunks of other programs that it skips
+            warnings.simplefilter("ignore", wavfile.WavFileWarning)  # other programs' chunks, which the library skips
             try:
                 rate, samples = wavfile.read(path, mmap=True)
             except ValueError:  # 24 bits cannot be mapped
                 rate, samples = wavfile.read(path)
         table = samples[:, None] if samples.ndim == 1 else samples
-        self._rate_hz = float(rate) or None  # 0 says nothing
+        self._rate_hz = float(rate) or None  # 0 means unknown
         super().__init__(path, {str(number + 1): table[:, number] for number in range(table.shape[1])})
 
     def _check_whole(self, path: Path) -> None:
-        """Refuse a file that ends before its samples do: what is not there would be missed by nobody."""
+        """Refuse a truncated file, which would otherwise be read without any error."""
         with readable(path, self.kind), path.open("rb") as file:
             order, frame, long_size = (">" if file.read(12)[:4] == b"RIFX" else "<"), 1, 0
             while len(head := file.read(8)) == 8:
@@ -149,15 +149,15 @@ class WavSource(_Arrays):
                 file.seek(size + size % 2 - len(content), os.SEEK_CUR)
 
     def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002
-        """Return the rate in the header; WAV knows no start time."""
+        """Rate from the header; WAV has no start time."""
         return Timing(rate_hz=self._rate_hz)
 
     def unit(self, column: Reference) -> str:
-        """Say that whole numbers have none, so that nobody takes them for the unit's without a word."""
+        """``of full scale`` for integers, so that they are not silently taken for values in the channel's unit."""
         return "of full scale" if self._columns[column.column].dtype.kind in "iu" else ""
 
     def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
-        """Rows, `CHUNK_ROWS` at a time, whole numbers over full scale."""
+        """Rows, `CHUNK_ROWS` at a time, integers as fractions of full scale."""
         for chunk in super().chunks(columns):
             yield tuple(_over_full_scale(column) for column in chunk)
 
@@ -171,14 +171,14 @@ def _over_full_scale(column: Array) -> Array:
 
 
 def _arrays_in(name: str, value: Any) -> Iterator[tuple[str, Array]]:
-    """Numeric arrays of a variable, also those in structs and cells, by the names that MATLAB has for them."""
+    """Numeric arrays of a variable, including those in structs and cells, by their MATLAB names."""
     array = np.asarray(value)
     if array.dtype.names is not None:  # structs
         for number, struct in enumerate(array.ravel(order="F")):
             place = name if array.size == 1 else f"{name}({number + 1})"
             for field in array.dtype.names:
                 yield from _arrays_in(f"{place}.{field}", struct[field])
-    elif array.dtype == object and isinstance(value, np.ndarray):  # a sparse matrix is none
+    elif array.dtype == object and isinstance(value, np.ndarray):  # excludes sparse matrices
         for number, inner in enumerate(array.ravel(order="F")):
             yield from _arrays_in(f"{name}{{{number + 1}}}", inner)
     elif array.dtype.kind in "fiub":
@@ -186,9 +186,9 @@ def _arrays_in(name: str, value: Any) -> Iterator[tuple[str, Array]]:
 
 
 def _collect_hdf5(found: dict[str, Any], name: str, item: Any, within: tuple[str, ...] = (), place: str = "") -> None:
-    """Take numeric data sets; MATLAB's table (n, m) is stored as (m, n), which the longer side settles.
+    """Collect numeric data sets in `found`. MATLAB stores (n, m) tables as (m, n); samples run along the longer side.
 
-    Cells, and fields of several structs, are references to what is stored elsewhere in the file.
+    Cells, and fields of struct arrays, are references to objects elsewhere in the file, which are followed.
     """
     name = place + name
     if name.startswith("#") or not hasattr(item, "shape"):
@@ -198,7 +198,7 @@ def _collect_hdf5(found: dict[str, Any], name: str, item: Any, within: tuple[str
         is_cell = not parent or item.attrs.get("MATLAB_class", b"") == b"cell"
         for number, reference in enumerate(np.ravel(item[()])):
             place = f"{name}{{{number + 1}}}" if is_cell else f"{parent}({number + 1})/{field}"
-            if not reference or (inner := item.file[reference]).name in within:  # to nothing, or in a circle
+            if not reference or (inner := item.file[reference]).name in within:  # null reference, or a cycle
                 continue
             inside = (*within, inner.name)
             _collect_hdf5(found, place, inner, inside)

@@ -1,4 +1,4 @@
-"""Pieces of samples to the messages of a recording."""
+"""Converts pieces of samples to the messages of a recording."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,20 +15,20 @@ from service.interchange.samples import Piece
 
 _BLOCK_S = 0.1
 _TURN = 2 * np.pi
-_SAME_NS = 1_000_000  # between blocks that follow each other, whose times are means
+_SAME_NS = 1_000_000  # largest time between consecutive blocks, whose times are means
 
 
 @dataclass(slots=True)
 class Written:
-    """What went into the recording."""
+    """Summary of what was written to the recording."""
 
     blocks: int = 0
     samples: int = 0
     lengths: list[int] = field(default_factory=list)  # samples of each contiguous stretch
     too_short: int = 0  # samples in stretches too short for a block, left out
-    missing: dict[str, list[tuple[int, int]]] = field(default_factory=dict)  # of each channel, from when to when, ns
-    none_whole: int = 0  # samples in blocks in which every channel misses some, left out
-    # Time of the first sample, and of the one after the last.
+    missing: dict[str, list[tuple[int, int]]] = field(default_factory=dict)  # by channel, start and end times, ns
+    none_whole: int = 0  # samples left out in blocks in which every channel lacks some
+    # Time of the first sample, and of the sample after the last.
     start_ns: int = 0
     end_ns: int = 0
 
@@ -36,9 +36,9 @@ class Written:
 class BlockMaker:
     """Cuts pieces into blocks of 0.1 s, as a publisher would have sent them.
 
-    A block's time is the mean of its rows' times, each less its place in the block: jitter of single rows averages out
-    and a clock that runs a little fast or slow is followed. The first row of the file is at `origin_ns`. A channel that
-    misses numbers in a block is missing in all of it, as a monitor takes no others.
+    A block's start time is the mean over its rows of the row's time minus its nominal offset in the block: jitter of
+    single rows averages out, and a slightly fast or slow clock is followed. The first row of the file is at
+    `origin_ns`. A channel that lacks some numbers in a block is missing in all of it, as a monitor requires.
     """
 
     def __init__(self, machine: MachineFile, origin_ns: int) -> None:
@@ -55,7 +55,7 @@ class BlockMaker:
         self.written = Written()
 
     def feed(self, pieces: Iterator[Piece]) -> Iterator[RecordedMessage]:
-        """Descriptor and blocks of a file's pieces, to the end."""
+        """Convert all pieces of a file to a descriptor and blocks."""
         time_ns, samples = np.empty(0), np.empty((0, len(self._machine.sensors)))
         for piece in pieces:
             if piece.begins:
@@ -64,7 +64,7 @@ class BlockMaker:
             else:
                 time_ns = np.concatenate([time_ns, piece.time_ns])
                 samples = np.concatenate([samples, piece.samples])
-            # What remains is always long enough for a block of its own.
+            # The remainder is always long enough for a block of its own.
             whole = max(0, (time_ns.size - self._least) // self._length)
             for first in range(0, whole * self._length, self._length):
                 rows = slice(first, first + self._length)
@@ -73,7 +73,7 @@ class BlockMaker:
         yield from self._rest(time_ns, samples)
 
     def _rest(self, time_ns: FloatArray, samples: FloatArray) -> Iterator[RecordedMessage]:
-        """End of a stretch: one block, or two if that would be too long."""
+        """Convert the end of a stretch to one block, or two if one would be too long."""
         if time_ns.size < self._least:
             self.written.too_short += time_ns.size
             return
@@ -82,7 +82,7 @@ class BlockMaker:
             yield from self._block(time_ns[rows], samples[rows])
 
     def _missing(self, silence_s: float) -> int:
-        """Blocks that would have filled a gap: they are missing in the count, too. Between snapshots there are none."""
+        """Number of blocks that would have filled a gap, by which the sequence advances; 0 between snapshots."""
         schedule = self._machine.schedule
         if schedule is not None:
             if schedule.is_silence(silence_s):
@@ -123,7 +123,7 @@ class BlockMaker:
         self.written.end_ns = block.end_ns
 
     def _note(self, lost: npt.NDArray[np.bool_], block: SampleBlock) -> None:
-        """Take note of the channels that a block lacks, stretch by stretch."""
+        """Record the channels that a block lacks, merging consecutive blocks into stretches."""
         for number in np.flatnonzero(lost):
             times = self.written.missing.setdefault(self._machine.sensors[number].name, [])
             continues = bool(times) and block.start_ns - times[-1][1] < _SAME_NS

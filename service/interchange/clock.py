@@ -1,4 +1,4 @@
-"""Time of each row: from a column, or from a rate. Rates, order and gaps are judged here, for all formats."""
+"""Time of each row, from a column or a rate; checks rates and order of times for all formats."""
 
 import math
 from collections.abc import Iterator
@@ -19,16 +19,16 @@ from service.interchange.source import Array, Reference, Source, SourceError, Ti
 _MOST_RATIO = 2000
 _LATEST_NS = 9_214_646_400 * 10**9  # 2262: nanoseconds since 1970 fill 64 bits soon after
 _ROUNDED = 1e-4
-"""How far the mapping's rate may be from the file's: WAV rounds it to whole Hz, UFF the step to six digits."""
+"""Largest relative difference of the mapping's and the file's rate: WAV rounds to whole Hz, UFF steps to six digits."""
 _YEAR_NS = 31_556_952e9
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """How times are read, and how fast the rows come."""
+    """Time base of a file: conversion of its times, and its rate."""
 
     path: Path  # the file, for messages
-    column: Reference | None  # column with the times; without one, rows are equally spaced
+    column: Reference | None  # column with the times; None if rows are equally spaced
     unit_ns: float  # nanoseconds per unit of that column
     origin_ns: int  # time of the first row, nanoseconds since 1970-01-01 UTC
     first: Array  # the first row's entry in the column, shape (1,); times are counted from it
@@ -36,7 +36,7 @@ class Clock:
     ratio: Fraction  # the machine's rate over `rate_hz`; other than 1 if the file is to be resampled
 
     def times(self, entries: Array | None, first_row: int, count: int) -> FloatArray:
-        """Times of `count` rows, nanoseconds since the first row of the file; nan where there is none.
+        """Times of `count` rows, nanoseconds since the first row of the file; NaN where there is none.
 
         `entries` is the time column of these rows, if there is one.
         """
@@ -45,9 +45,10 @@ class Clock:
         return _since(entries, self.first, self.unit_ns)
 
     def after(self, first: "Clock") -> "Clock":
-        """Return the clock of a later file of a folder: what a time column has that runs on counts once.
+        """Return the clock of a later file of a folder, without counting the offset between files twice.
 
-        It has already passed what the files' names, or their places in a schedule, say has passed.
+        If a time column continues from file to file, it already contains the offset that the files' names, or their
+        places in a schedule, state; then the column alone decides.
         """
         if self.column is None or first.first.dtype.kind == "M":
             return self
@@ -56,7 +57,7 @@ class Clock:
         return replace(self, origin_ns=first.origin_ns + ran_ns) if 2 * ran_ns > told_ns > 0 else self
 
     def pulse_times(self, entries: Array, unit_ns: float) -> FloatArray:
-        """Times of pulses, which are counted from the same zero as the rows."""
+        """Times of pulses, nanoseconds since the first row; `entries` are counted from the same zero as the rows."""
         zero = self.first.astype(np.float64)[0] * self.unit_ns if self.column is not None else 0.0
         return np.asarray(entries.astype(np.float64) * unit_ns - zero)
 
@@ -64,12 +65,12 @@ class Clock:
 def clock_for(
     source: Source, columns: list[Reference], base: TimeBase, machine: MachineFile, start_ns: int | None = None
 ) -> Clock:
-    """Find out how fast the rows come, and check it against the machine; `start_ns` is the start of the rows, if known.
+    """Determine the rate and start of the rows, and check the rate against the machine; `start_ns` is used if known.
 
     Raises
     ------
     SourceError
-        If the file and the mapping do not tell, contradict each other, or the rate is not the machine's.
+        If file and mapping lack the rate or start or contradict each other, or the rate is not the machine's.
     """
     path, timing = source.path, source.timing(columns)
     column, unit_ns = timing.time, 1e9
@@ -112,9 +113,9 @@ def clock_for(
 
 
 def _check_unit(source: Source, column: Reference, base: TimeBase) -> None:
-    """Refuse a unit of time other than the file's: where it resamples, another rate would go unnoticed."""
+    """Refuse a unit of time other than the file's: with resampling, the wrong rate would go unnoticed."""
     stated = source.unit(column) if column.column in source.names() else ""
-    with suppress(ValueError):  # what is not understood contradicts nothing
+    with suppress(ValueError):  # an unknown unit is no contradiction
         if not base.is_datetime and time_unit_ns(stated) != time_unit_ns(base.unit):
             raise SourceError(
                 f"{source.path}: column {column} is in {stated!r} according to the file, but time.unit in the mapping "
@@ -123,7 +124,7 @@ def _check_unit(source: Source, column: Reference, base: TimeBase) -> None:
 
 
 def _declared_rate(source: Source, base: TimeBase, timing: Timing) -> float | None:
-    """Rate that the mapping or the file states; both together must agree."""
+    """Rate that the mapping or the file states; if both do, they must agree."""
     told = base.rate_hz
     if base.rate_from is not None:
         found = np.ravel(source.values(base.rate_from)).astype(np.float64)
@@ -166,7 +167,7 @@ def _first_times(source: Source, column: Reference, columns: list[Reference]) ->
 
 
 def _measured_rate(path: Path, column: Reference, times: FloatArray) -> tuple[float, float]:
-    """Rate of a time column, gaps left out, to the first uncertain digit; and how uncertain the jitter makes it."""
+    """Rate of a time column without gaps, rounded to its first uncertain digit; and its relative error from jitter."""
     steps = np.diff(times)
     check_order(path, column, times, 0)
     usual = float(np.median(steps))
@@ -211,13 +212,13 @@ def _ratio(path: Path, rate_hz: float, tolerance: float, base: TimeBase, machine
 
 
 def _since(entries: Array, first: Array, unit_ns: float) -> FloatArray:
-    """Nanoseconds from the first entry; differences of whole numbers are taken before they are rounded to floats."""
+    """Nanoseconds since the first entry; integers are subtracted before conversion to float, which would round them."""
     if entries.dtype.kind == "M":
         since = (entries.astype("datetime64[ns]") - first.astype("datetime64[ns]")).astype(np.int64)
         return np.where(np.isnat(entries), np.nan, since.astype(np.float64))
     if entries.dtype.kind in "iu":
         return np.asarray((entries.astype(np.int64) - first.astype(np.int64)) * unit_ns, dtype=np.float64)
-    numbers = np.where(np.abs(entries) < _LATEST_NS, entries, np.nan)  # others are no times, whatever the unit
+    numbers = np.where(np.abs(entries) < _LATEST_NS, entries, np.nan)  # larger numbers are no valid times in any unit
     return np.asarray((numbers.astype(np.float64) - first.astype(np.float64)) * unit_ns)
 
 

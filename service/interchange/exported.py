@@ -1,4 +1,4 @@
-"""What can be taken out of recordings as a table: the stream, the reports, the alarms.
+"""Tables from recordings: the stream, the reports, the alarms.
 
 A table is a schema, whose fields carry ``unit`` and ``description`` in their metadata, and batches of rows.
 """
@@ -33,35 +33,35 @@ _Row = dict[str, object]
 
 
 class _Levels(BaseModel):
-    """What is read of a report to know its columns."""
+    """The part of a report that determines its columns."""
 
     levels: tuple[ChannelLevels, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What to take of which recordings."""
+    """Data to be exported from recordings."""
 
-    recordings: tuple[Path, ...]  # in any order; they are read in the order of their beginnings
-    machine: str | None = None  # ``site/machine``; may be left out where the recordings hold only one
-    # Data time, from the first to without the last.
+    recordings: tuple[Path, ...]  # in any order; they are read in order of their starts
+    machine: str | None = None  # ``site/machine``; optional if the recordings hold only one
+    # Data time, start included, end excluded.
     from_ns: int | None = None
     to_ns: int | None = None
     si: bool = False  # whether samples are converted to SI units
 
     def ordered(self) -> list[Path]:
-        """Recordings by the time they begin."""
+        """Recordings in order of their starts."""
         return sorted(self.recordings, key=lambda path: (summarize_recording(path).start_ns, path))
 
     def root(self) -> str:
-        """What the machine's keys start with.
+        """Prefix of the machine's keys.
 
         Raises
         ------
         MachineFileError
-            If the recordings hold several machines and none is chosen, or not the chosen one.
+            If the recordings hold several machines and none is chosen, or the chosen one is missing.
         RecordingError
-            If they hold none, or cannot be read.
+            If the recordings hold no machine or cannot be read.
         """
         keys = {key for path in self.recordings for key in summarize_recording(path).messages}
         parts = {tuple(key.split("/")[:3]) for key in keys if key.startswith(f"{PREFIX}/") and key.count("/") >= 3}
@@ -88,7 +88,7 @@ class Table:
 
     schema: pa.Schema
     batches: Iterator[pa.RecordBatch]
-    rows: int = 0  # rows that were taken so far
+    rows: int = 0  # rows read so far
     skipped: list[str] = field(default_factory=list)  # messages that could not be used, and why
 
 
@@ -98,7 +98,7 @@ def stream_table(selection: Selection) -> Table:
     Raises
     ------
     RecordingError
-        If there is no stream or no descriptor, or the channels change on the way.
+        If there is no stream or no descriptor, or the channels change within the recordings.
     """
     root = selection.root()
     descriptor = _descriptor(selection, f"{root}/descriptor")
@@ -150,10 +150,10 @@ def report_table(selection: Selection) -> Table:
 
 
 def _level_fields(selection: Selection) -> list[pa.Field]:
-    """A column for each level of each channel that is in any of the reports."""
+    """A column for each level of each channel that occurs in any report."""
     found: dict[str, pa.Field] = {}
     for _, message in _messages(selection, f"{selection.root()}/report"):
-        with suppress(ValidationError):  # told when its row is read
+        with suppress(ValidationError):  # reported when its row is read
             for levels in _Levels.model_validate_json(message.payload).levels:
                 pp = levels.detection == "peak to peak"
                 for measure in _level_values(levels):
@@ -165,7 +165,7 @@ def _level_fields(selection: Selection) -> list[pa.Field]:
 
 
 def _level_values(levels: ChannelLevels) -> dict[str, float]:
-    """Its levels and their phases, as far as there are any."""
+    """A channel's levels and phases that have values, by name."""
     return {name: value for name, value in vars(levels).items() if isinstance(value, float)}
 
 
@@ -222,7 +222,7 @@ def _descriptor(selection: Selection, key: str) -> ChannelDescriptor:
 def _stream_batches(
     selection: Selection, key: str, descriptor: ChannelDescriptor, factors: Sequence[float], table: Table
 ) -> Iterator[pa.RecordBatch]:
-    """Collect blocks to batches; what overlaps or cannot be decoded is left out and said."""
+    """Collect blocks in batches; blocks that overlap or cannot be used are left out and listed in `skipped`."""
     pending: list[tuple[npt.NDArray[np.int64], SampleBlock, slice]] = []
     count, last_ns = 0, -(2**63)
     tolerance_ns = round(5e8 / descriptor.rate_hz)
@@ -270,7 +270,7 @@ def _batch(
 def _message_table(
     selection: Selection, topic: str, fields: list[pa.Field], row: Callable[[bytes], _Row], time: str
 ) -> Table:
-    """Rows from JSON messages; a message that does not follow its schema is left out and said."""
+    """Rows from JSON messages; messages that violate their schema are left out and listed in `skipped`."""
     key = f"{selection.root()}/{topic}"
     table = Table(pa.schema(fields, metadata={"key": key}), iter(()))
 

@@ -1,4 +1,4 @@
-"""Export: a table from recordings into a file of another program, with units."""
+"""Export of a table from recordings to a file for other programs, with units."""
 
 import re
 from collections.abc import Iterator
@@ -26,18 +26,18 @@ _TABLES = {"stream": stream_table, "reports": report_table, "alarms": alarm_tabl
 def export(
     selection: Selection, what: ExportSubject, kind: ExportFormat, out: Path, *, overwrite: bool = False
 ) -> Table:
-    """Write a table, and return it: it says how many rows there were and what was left out.
+    """Write a table and return it, with its number of rows and the messages that were skipped.
 
     Parquet has ``unit`` and ``description`` in the metadata of its fields; CSV has ``name [unit]`` in its header; .mat
-    has a struct per column with its samples, unit and description. Parquet and CSV are written as the recordings are
-    read; a .mat file is put together in memory. Nothing is left of a file that cannot be completed.
+    has a struct per column with its samples, unit and description. Parquet and CSV are written while the recordings are
+    read; a .mat file is assembled in memory. An incomplete file is removed.
 
     Raises
     ------
     MachineFileError
-        If there is such a file already.
+        If the file already exists.
     RecordingError
-        If the recordings cannot be read, have nothing of what is wanted, or the file cannot be written.
+        If the recordings cannot be read or hold none of the requested data, or the file cannot be written.
     """
     if out.exists() and not overwrite:
         raise MachineFileError(f"{out}: already exists; --overwrite replaces it")
@@ -63,14 +63,14 @@ def export(
 
 @contextmanager
 def _completed(out: Path) -> Iterator[Path]:
-    """Give a file its name when it is complete."""
+    """Write to a temporary name, and rename the file when it is complete."""
     if out.is_dir():
         raise RecordingError(f"{out}: is a folder, expected the name of a file")
     if out.exists() and not out.is_file():
         raise RecordingError(f"{out}: is a device or pipe, expected the name of a file")
     part = out.with_name(out.name + ".part")
     try:
-        part.touch()  # what a library says of a folder that is not there is not for users
+        part.touch()  # fails early with a clear error, unlike the libraries, if the folder does not exist
         yield part
         part.replace(out)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""A folder of files, each a snapshot or a stretch of one: in the order of their times, as if they were one file."""
+"""Import of a folder of files, snapshots or parts of a longer stretch, in order of time, as if they were one file."""
 
 import re
 from collections import deque
@@ -34,16 +34,16 @@ class SnapshotFile:
     """A file of a folder."""
 
     path: Path
-    # Time of its first row, nanoseconds since 1970-01-01 UTC, where its name or its place among the others tells; None
-    # where the file itself does.
+    # Time of its first row, nanoseconds since 1970-01-01 UTC, from its name or its place among the others; None if the
+    # file itself states it.
     start_ns: int | None
 
 
 def time_in_name(name: str, zone: tzinfo = UTC, shared: Container[str] = ()) -> int | None:
-    """Time that the name of a file holds: a date with a time of day, or seconds and so on since 1970.
+    """Time in a file name, ns since 1970: a date with time of day, or a count of s, ms, µs or ns since 1970.
 
-    Of an hour that occurs twice, the first is taken. Numbers that all files of a folder have in their names, such as
-    that of a device, are no seconds since 1970: those `shared`.
+    For an hour that occurs twice (end of daylight saving time), the first is taken. Numbers that all file names of a
+    folder share (`shared`), such as a device number, are not taken for times.
 
     Examples
     --------
@@ -59,7 +59,7 @@ def time_in_name(name: str, zone: tzinfo = UTC, shared: Container[str] = ()) -> 
         fields = [int(part) for part in found.groups("0")[:6]]
         try:
             seconds = int(datetime(*fields, tzinfo=zone).timestamp())  # type: ignore[arg-type, misc]  # six of them
-        except ValueError:  # digits that are no date
+        except ValueError:  # digits that form no date
             return None
         return seconds * 10**9 + int((found.group(7) or "0").ljust(9, "0"))
     since = next((found for found in _UNIX.finditer(name) if found.group() not in shared), None)
@@ -69,22 +69,22 @@ def time_in_name(name: str, zone: tzinfo = UTC, shared: Container[str] = ()) -> 
 
 
 def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tuple[SnapshotFile, ...]:
-    """Files of a folder in the order of their times, or of the numbers in their names.
+    """Files of a folder in order of their times, or of the numbers in their names.
 
-    Their times are in the files, or are counted from ``time.start`` of the mapping by the machine's schedule, or are in
-    their names. Files of formats that are not known are left out, unless the mapping says the format.
+    Times are those in the files, or are counted from the mapping's ``time.start`` by the machine's schedule, or are
+    those in the names. Files of unknown formats are left out, unless the mapping states the format.
 
     Raises
     ------
     SourceError
-        If there is none, or a start is given and no schedule.
+        If there is no usable file, or the mapping gives a start but the machine has no schedule.
     """
     paths = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     paths = sorted((path for path in paths if mapping.format_of(path) is not None), key=_natural)
     if not paths:
         raise SourceError(f"{folder}: no file of a known format in it; say format = ... in the mapping")
     base, schedule = mapping.time, machine.schedule
-    # The files' column may run on from one to the next.
+    # The time column may continue from one file to the next.
     runs_on = base.start is not None and base.column is not None and schedule is None
     dated = base.start is None and any(kind.dated for kind in map(mapping.format_of, paths) if kind)
     if base.is_absolute or runs_on or dated:
@@ -105,7 +105,7 @@ def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tupl
 
 
 def _or_named(paths: Sequence[Path], mapping: Mapping) -> str:
-    """What else to do where a start is given and names have times."""
+    """Advice for the error message if a start is given although all names have times."""
     named = isinstance(mapping.time.start, datetime) and None not in _named(paths, mapping)
     return "; or leave out time.start, and the times in their names count" if named else ""
 
@@ -118,9 +118,9 @@ def _named(paths: Sequence[Path], mapping: Mapping) -> list[int | None]:
 
 
 def _by_their_own_times(paths: Sequence[Path], mapping: Mapping, machine: MachineFile) -> tuple[SnapshotFile, ...]:
-    """Files that say themselves when they begin, in that order; of one that does not, its name counts.
+    """Files ordered by the start times that they state themselves, or else by those in their names.
 
-    One that cannot be read comes first: whoever reads them says what is wrong with it.
+    Unreadable files come first, so that their error is raised when the files are read.
     """
     begun, base = [], mapping.time
     for path, told_ns in zip(paths, _named(paths, mapping), strict=True):
@@ -135,9 +135,9 @@ def _by_their_own_times(paths: Sequence[Path], mapping: Mapping, machine: Machin
 
 
 def _places(paths: Sequence[Path]) -> list[int]:
-    """Places of files in a schedule, from 0: a number that is missing among those in their names leaves one empty.
+    """Places of files in a schedule, from 0: a number missing from the sequence in their names leaves a place empty.
 
-    If they do not differ in one number that counts in equal steps, they follow each other.
+    If the names do not differ in exactly one number that counts in equal steps, the files have consecutive places.
     """
     parts = [re.split(r"(\d+)", path.name) for path in paths]
     columns = list(zip(*parts, strict=False))
@@ -150,7 +150,7 @@ def _places(paths: Sequence[Path]) -> list[int]:
 
 
 def _readings(texts: Sequence[str]) -> Iterator[list[int]]:
-    """Numbers in names: as they are, and as times of day or dates, in seconds."""
+    """Interpretations of the numbers in names: plain numbers, and times of day or dates in seconds."""
     yield [int(text) for text in texts]
     for form, length in (("%H%M", 4), ("%H%M%S", 6), ("%Y%m%d", 8)):
         with suppress(ValueError):
@@ -160,7 +160,7 @@ def _readings(texts: Sequence[str]) -> Iterator[list[int]]:
 
 
 def _steps(numbers: Sequence[int]) -> list[int] | None:
-    """Places of numbers that count in equal steps, but for what is missing; None if they do not."""
+    """Places of numbers that count in equal steps, some possibly missing; None if they do not."""
     steps = [after - before for before, after in pairwise(numbers)]
     step = gcd(*steps)
     return [(number - numbers[0]) // step for number in numbers] if step and median(steps) == step else None
@@ -172,13 +172,13 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 
 def unusable(files: Sequence[SnapshotFile], mapping: Mapping, machine: MachineFile) -> dict[Path, SourceError]:
-    """Files that cannot be read to their end, each by itself, and what is wrong with them.
+    """Files that cannot be read to their end when opened individually, and the error of each.
 
     Raises
     ------
     SourceError
-        If the times of the others depend on one of them: their places in a schedule are counted, and its name does not
-        say whether it has such a place.
+        If the others' times depend on such a file: places in a schedule are counted, and its name does not show whether
+        it occupies one.
     """
     faults: dict[Path, SourceError] = {}
     for file in files:
@@ -211,7 +211,7 @@ def runs_of_pulses(
     machine: MachineFile,
     keyphasor: Keyphasor,
 ) -> list[FloatArray]:
-    """Times of the pulses of a first file and of others, on its clock; those of files without a break in one run.
+    """Pulse times of the first file (`begun`) and the others, on the first file's clock; contiguous files share a run.
 
     Raises
     ------
@@ -248,7 +248,7 @@ def joined(
     machine: MachineFile,
     read: Read,
 ) -> Iterator[Piece]:
-    """Pieces of a first file, and then those of others, on its clock; `read` is kept up to date for all together.
+    """Pieces of the first file (`begun`) and of the others, on the first file's clock; `read` sums up all files.
 
     Raises
     ------

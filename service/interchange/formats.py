@@ -9,12 +9,12 @@ from typing import Any, Self
 class Format(StrEnum):
     """Format of a file."""
 
-    source: str  # class in this package, imported when it is needed with the library that only it needs
-    suffixes: tuple[str, ...]  # how files of it are named
-    dated: bool  # whether they say when they were recorded
+    source: str  # class in this package, imported together with its library when needed
+    suffixes: tuple[str, ...]  # endings of file names
+    dated: bool  # whether files state when they were recorded
 
     def __new__(cls, name: str, source: str, suffixes: tuple[str, ...], dated: bool = False) -> Self:
-        """A row: name in a mapping, class, suffixes, whether files have dates."""
+        """Create a member from its name in a mapping, class, suffixes, and whether files are dated."""
         kind = str.__new__(cls, name)
         kind._value_, kind.source, kind.suffixes, kind.dated = name, source, suffixes, dated
         return kind
@@ -30,11 +30,11 @@ class Format(StrEnum):
 
     @classmethod
     def of(cls, path: Path) -> Self | None:
-        """What the end of a file's name says; None if it says nothing."""
+        """Format by the ending of a file's name; None if unknown."""
         return next((kind for kind in cls if path.name.lower().endswith(kind.suffixes)), None)
 
     @property
     def reader(self) -> Any:
-        """The class that reads it, a `Source`."""
+        """The `Source` class that reads this format."""
         module, _, name = self.source.partition(".")
         return getattr(import_module(f"service.interchange.{module}"), name)

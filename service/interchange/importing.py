@@ -1,4 +1,4 @@
-"""Import: a file from another program becomes a recording, and what was done to it is said in sentences.
+"""Import of a file from another program into a recording, with a summary in sentences.
 
 ::
 
@@ -30,44 +30,44 @@ from service.interchange.samples import Piece, Read, pieces, signals_of
 from service.interchange.source import Reference, SourceError
 from service.monitor.alarm_conversion import rfc3339
 
-_NOTED = 0.01  # part of the rows whose loss is pointed out
-_MOST_ALONE = 0.1  # part of the rows that may have a gap on either side
+_NOTED = 0.01  # fraction of rows lost from which a note is given
+_MOST_ALONE = 0.1  # largest fraction of isolated rows, i.e. with a gap on either side
 _LISTED = 10
 _NAMED = 5
-_VARIED = 1.1  # ratio of speeds in a file from which on both are told
-_FEW_SAMPLES = 4.0  # samples for each pulse of the keyphasor below which it may be one that comes faster
+_VARIED = 1.1  # ratio of highest to lowest speed from which both are stated
+_FEW_SAMPLES = 4.0  # samples per keyphasor pulse below which the true pulse rate may be higher (aliasing)
 
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """What an import did."""
+    """Result of an import."""
 
     source: Path
     recording: Path
     machine: MachineFile
     mapping: Mapping
     clock: Clock
-    read: Read  # what was met in the file
-    written: Written  # what went into the recording
+    read: Read  # summary of what was read
+    written: Written  # summary of what was written
     angle: AngleColumn
     cut_rows: int  # rows at the ends of stretches where filters are not settled
-    left_out: list[str]  # names in a folder that were not read: other formats, folders, links to nothing
-    unusable: list[SourceError]  # what is wrong with files of a folder that were left out for it
-    by_name: bool  # whether the times are those in the names of the files
-    doubts: list[str]  # units in the file that are not understood
+    left_out: list[str]  # names in a folder that were not read: other formats, folders, broken links
+    unusable: list[SourceError]  # errors of the folder's files that were left out as unreadable
+    by_name: bool  # whether times were taken from file names
+    doubts: list[str]  # notes on units in the file that are not understood
 
 
 def import_file(
     path: Path, mapping: Mapping, machine: MachineFile, recording: Path, *, overwrite: bool = False
 ) -> Imported:
-    """Import a file, or a folder of files that follow each other: without those of them that cannot be read.
+    """Import a file, or a folder of consecutive files without those that cannot be read.
 
-    Nothing is left of the recording if the import fails.
+    If the import fails, the incomplete recording is removed.
 
     Raises
     ------
     SourceError
-        If the file cannot be used, or no file of the folder, naming row and column where it is about one.
+        If the file, or every file of the folder, cannot be used; names row and column where applicable.
     RecordingError
         If the recording cannot be written.
     """
@@ -77,7 +77,7 @@ def import_file(
     try:
         return _imported(path, files, mapping, machine, recording, overwrite=overwrite)
     except SourceError:
-        # Only now is every file read by itself: that takes as long as the import.
+        # Reading every file individually takes as long as the import, so it is only done after a failure.
         faults = unusable(files, mapping, machine)
         if not faults or len(faults) == len(files):
             raise
@@ -171,7 +171,7 @@ def _nothing(path: Path, machine: MachineFile, read: Read, written: Written, cut
 
 
 def summary_lines(done: Imported) -> list[str]:
-    """Describe an import; every gap, filled row, cut end and limit of validity is stated."""
+    """Describe an import in sentences, with every gap, filled row, cut end and limit of validity."""
     machine, read, written = done.machine, done.read, done.written
     several = f"{read.files} files, " if read.files > 1 else ""
     if read.shortest < read.longest:
@@ -248,7 +248,7 @@ def _gap_lines(done: Imported) -> list[str]:
 
 
 def _snapshot_lines(machine: MachineFile, written: Written) -> list[str]:
-    """Snapshots that the monitor will leave out, because what the file or the filters left of them is too short."""
+    """Note on snapshots that are too short for the monitor, in the file or after the filters."""
     if machine.schedule is None:
         return []
     least = floor(machine.hop_data_s * machine.rate_hz + 1e-6)
@@ -312,8 +312,8 @@ def _pulse_lines(done: Imported, train: PulseTrain) -> tuple[list[str], float]:
     turned = np.diff(train.counts)[train.known] / train.pulses_per_turn
     passed_ns, turns = float(took_ns.sum()), float(turned.sum())
     speed_rpm = turns / passed_ns * 60e9 if turns else float("nan")
-    # Of several files or a run-up, the mean alone would be a speed at which the machine never ran.
-    # Taken turn by turn, because between two marks of many a sample more or less is much.
+    # For several files or a run-up, the mean alone may be a speed at which the machine never ran. Speeds are computed
+    # per revolution, because with many pulses per revolution a single interval is only a few samples long.
     marks = np.arange(0, took_ns.size - train.pulses_per_turn + 1, train.pulses_per_turn)
     each_rpm = (
         np.add.reduceat(turned, marks) / np.add.reduceat(took_ns, marks) * 60e9 if marks.size else np.full(1, speed_rpm)

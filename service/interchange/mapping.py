@@ -1,4 +1,4 @@
-"""The mapping: which column of a foreign file is which channel of the machine, in which unit, at which time.
+"""The mapping from the columns of a foreign file to the machine's channels, with units and time base.
 
 One TOML file; ``docs/interchange.md`` explains each field.
 """
@@ -21,7 +21,7 @@ from service.interchange.source import Source, SourceError
 
 _DATETIME = "datetime"
 _ZEROS_NS = {"unix": 0, "datenum": -719_529 * 86_400 * 10**9}
-"""Where counts of time begin, nanoseconds since 1970; MATLAB counts days from a year 0."""
+"""Zero points of time counts, nanoseconds since 1970; MATLAB counts days from a year 0."""
 
 
 def _text(value: object) -> object:
@@ -33,7 +33,7 @@ _Name = Annotated[str, BeforeValidator(_text), Field(min_length=1)]
 
 
 class CsvFormat(BaseModel, extra="forbid", frozen=True):
-    """How a text table is written."""
+    """Layout of a text table."""
 
     delimiter: str = Field(default=",", min_length=1, max_length=1, description="between cells")
     decimal: Literal[".", ","] = Field(default=".", description="decimal sign")
@@ -75,8 +75,8 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
     fill_gaps_up_to_s: float = Field(
         default=0.0, ge=0, le=1, description="gaps up to this length are filled with straight lines"
     )
-    # Refused unless asked for: in a file, empty cells are more often those of columns of several rates, or of a wrong
-    # mapping, than a dead probe's, and here, other than live, that can still be put right.
+    # Refused by default: empty cells in a file are more often due to columns with different rates or a wrong mapping
+    # than to a dead probe, and unlike in a live stream, this can still be corrected.
     not_finite: Literal["refuse", "gap", "missing"] = Field(
         default="refuse",
         description="what to make of empty cells, NaN and infinities: missing keeps the other channels of such rows",
@@ -114,7 +114,7 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
 
     @property
     def is_absolute(self) -> bool:
-        """Whether the time column says by itself when its rows were, as dates or as a count from a known zero."""
+        """Whether the time column is absolute by itself: dates, or a count from a known zero."""
         return self.is_datetime or isinstance(self.start, str)
 
     @property
@@ -128,7 +128,7 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
 
 
 class Column(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
-    """Where a channel's samples are: sample = sign · (number · scale + offset) in `unit`."""
+    """Column with a channel's samples: sample = sign · (number · scale + offset) in `unit`."""
 
     column: _Name = Field(description="column, array, channel or data set")
     index: int | None = Field(default=None, ge=0, description="column of a table within an array file, from 0")
@@ -176,7 +176,7 @@ class Keyphasor(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
 
 
 class Mapping(BaseModel, extra="forbid", frozen=True):
-    """All of it."""
+    """A complete mapping."""
 
     format: Format | None = Field(default=None, description="format of the file where its name does not say")
     csv: CsvFormat = CsvFormat()
@@ -191,7 +191,7 @@ class Mapping(BaseModel, extra="forbid", frozen=True):
         return {} if self.acceleration is None else self.acceleration.channels
 
     def format_of(self, path: Path) -> Format | None:
-        """Format that is said here, or by the end of a file's name; None if neither says one."""
+        """Format stated in the mapping, or else by the file name; None if unknown."""
         return self.format or Format.of(path)
 
     def open(self, path: Path) -> Source:
@@ -221,7 +221,7 @@ class Mapping(BaseModel, extra="forbid", frozen=True):
         return cast(Source, found)
 
     def check_against(self, machine: MachineFile) -> None:
-        """Check that every channel of the machine is mapped, once, and in a unit of its quantity.
+        """Check that every channel of the machine is mapped exactly once, in a unit of its quantity.
 
         Raises
         ------
@@ -245,7 +245,7 @@ class Mapping(BaseModel, extra="forbid", frozen=True):
             raise ValueError("keyphasor: the machine has no shaft_angle channel for it")
 
     def _check_double(self, table: str, columns: dict[str, Column], known: dict[str, Sensor]) -> None:
-        """Refuse one column for two sensors: only an accelerometer may be two, once a velocity, once a displacement."""
+        """Refuse one column for two channels, except an accelerometer for one velocity and one displacement."""
         taken: dict[tuple[str, int | None, Quantity | None], str] = {}
         for name, one in columns.items():
             key = (one.column, one.index, known[name].quantity if columns is self.accelerations else None)

@@ -1,13 +1,13 @@
-"""Filters over pieces of any length: a stretch is cut into overlapping windows, so that memory stays flat.
+"""Filtering of stretches of any length in overlapping windows, so that memory use is constant.
 
-Each window has context before and after the rows whose result is kept. The beginning and the end of a stretch have
-none; there the result is not valid and is left out.
+Each window has context before and after the rows whose result is kept. The first and last rows of a stretch lack
+context; the result there is invalid and left out.
 
-A filter says at multiples of how many rows of a stretch windows begin (`multiple`), how many rows of context there are
-before and after (`context`), and which columns it changes (`columns`). It takes times and samples of a window with its
-contexts, and the first row of the stretch, and returns times and samples of the rows between the contexts.
+A filter states the rows of which windows start at multiples (`multiple`), the rows of context before and after
+(`context`), and the columns that it changes (`columns`). It is called with times and samples of a window including
+context, and with the first row of the stretch, and returns times and samples of the rows between the contexts.
 
-Where a channel is missing, a filter is given straight lines, and what they reach of its result is missing too.
+Where a channel is missing, the filter input is interpolated linearly, and all output within reach is missing too.
 """
 
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ _CORE_ROWS = 65536
 
 
 class Overlap:
-    """Runs a filter over pieces; remembers what the next window needs."""
+    """Runs a filter over pieces, and keeps the rows that the next window needs."""
 
     def __init__(self, window_filter: "Integration | Resampling") -> None:
         self._filter = window_filter
@@ -38,7 +38,7 @@ class Overlap:
         self.cut_rows = 0
 
     def feed(self, pieces: Iterator[Piece]) -> Iterator[Piece]:
-        """Filter a file's pieces, to the end."""
+        """Filter all pieces of a file."""
         for piece in pieces:
             if piece.begins:
                 yield from self._finish()
@@ -51,7 +51,7 @@ class Overlap:
         yield from self._finish()
 
     def _finish(self) -> Iterator[Piece]:
-        """End of a stretch."""
+        """Filter the rest of a stretch at its end."""
         if self._rows > 2 * self._context:
             yield from self._window(self._rows, self._rows)
             self.cut_rows += 2 * self._context
@@ -79,14 +79,14 @@ class Overlap:
         new_ns, result = self._filter(time_ns, bridged, self._level)
         reached, columns = lost.copy(), self._filter.columns
         reached[:, columns] = maximum_filter1d(lost[:, columns], 2 * self._context + 1, axis=0)
-        # The rate may be another one now.
+        # The filter may have changed the rate.
         at = self._context + np.arange(new_ns.size) * (time_ns.size - 2 * self._context) // max(1, new_ns.size)
         result[reached[at]] = np.nan
         return new_ns, result
 
 
 class Integration:
-    """Integrates the accelerometers among the columns; the others pass."""
+    """Integrates the accelerometers among the columns; other columns pass unchanged."""
 
     multiple = 1
 
@@ -107,9 +107,9 @@ class Integration:
 
 
 class Resampling:
-    """Changes the rate by a ratio, new over old (`scipy.signal.resample_poly`, its Kaiser window 5.0).
+    """Changes the rate by a ratio, new over old (`scipy.signal.resample_poly`, Kaiser window with β = 5.0).
 
-    Columns with angles go as cosine and sine.
+    Columns with angles are resampled as cosine and sine.
     """
 
     def __init__(self, ratio: Fraction, angles: list[int]) -> None:
@@ -117,7 +117,7 @@ class Resampling:
         self.columns: slice | list[int] = slice(None)
         self.multiple = self._down
         widest = max(self._up, self._down)
-        # resample_poly's filter reaches ten samples of the lower rate to either side.
+        # The filter of resample_poly extends over ten samples at the lower rate on either side.
         reach = -(-10 * widest // self._up) + 1
         self.context = -(-reach // self._down) * self._down
 

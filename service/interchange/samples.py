@@ -1,4 +1,4 @@
-"""Rows of a file as samples of the machine's channels, in pieces without a gap."""
+"""Converts the rows of a file to samples of the machine's channels, in pieces without a gap."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,58 +16,58 @@ from service.interchange.source import Array, Reference, Source, SourceError, as
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """How a column becomes a channel: sample = number · factor + offset, in the channel's unit."""
+    """Conversion of a column to a channel: sample = number · factor + offset, in the channel's unit."""
 
-    reference: Reference  # where its numbers are
+    reference: Reference  # column with the numbers
     factor: float
     offset: float
     integrations: int  # how often it is integrated: 0, or 1 or 2 for an accelerometer
-    is_angle: bool  # whether it runs in circles
-    largest: float = float(np.finfo(np.float64).max)  # what the samples of the machine can hold
-    doubt: str = ""  # that the unit in the file is not understood, and what its numbers are taken for
+    is_angle: bool  # whether it is an angle, which wraps at 2π
+    largest: float = float(np.finfo(np.float64).max)  # largest value of the machine's dtype
+    doubt: str = ""  # note that the unit in the file is not understood, and which unit is assumed
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
     """Rows without a gap."""
 
-    begins: bool  # whether there is a gap before it, or nothing; otherwise it continues the last piece
+    begins: bool  # whether it starts a stretch (first piece, or after a gap); otherwise it continues the last piece
     time_ns: FloatArray  # (n,), nanoseconds since the first row of the file
     samples: FloatArray  # (n, n_channels), in the units of the channels; NaN where a channel is missing
 
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Time without rows, nanoseconds since the first row: from where the next row should have come to where it came."""
+    """Time without rows: expected and actual time of the next row, nanoseconds since the first row."""
 
     from_ns: float
     to_ns: float
-    row: int  # of the file
+    row: int  # row of the file after the gap
     file: str
 
 
 @dataclass(slots=True)
 class Read:
-    """What was met on the way."""
+    """Summary of what was read, updated during reading."""
 
     files: int = 1
-    rows: int = 0  # of all files together
-    # Rows of the shortest and longest of several files; 0 of one.
+    rows: int = 0  # total of all files
+    # Rows of the shortest and longest of several files; 0 for a single file.
     shortest: int = 0
     longest: int = 0
     gaps: list[Gap] = field(default_factory=list)
-    filled: int = 0  # rows that were put into short gaps
-    # Rows left out for an empty cell, NaN, infinity or a number beyond the dtype; of every channel, if those may miss.
+    filled: int = 0  # rows inserted into short gaps
+    # Rows left out because a cell (every cell, if channels may be missing) is empty, NaN, infinite or beyond the dtype.
     left_out: int = 0
 
 
 def signals_of(source: Source, mapping: Mapping, machine: MachineFile) -> list[Signal]:
-    """Columns of the machine's channels, in the order of the machine file; the keyphasor's channel is not among them.
+    """Conversions for the machine's channels, in the order of the machine file, without that of the keyphasor.
 
     Raises
     ------
     SourceError
-        If a column is missing, or its unit is missing, wrong or contradicts what the file says.
+        If a column is missing, or its unit is missing, wrong, or contradicts that in the file.
     """
     found = []
     for channel in machine.sensors:
@@ -93,12 +93,12 @@ def signals_of(source: Source, mapping: Mapping, machine: MachineFile) -> list[S
 
 
 def pieces(source: Source, signals: Sequence[Signal], clock: Clock, mapping: Mapping, read: Read) -> Iterator[Piece]:
-    """Read the file once, cut at its gaps; `read` is kept up to date.
+    """Read the file once, in pieces cut at gaps, and update `read`.
 
     Raises
     ------
     SourceError
-        For times that do not ascend and cells that are no numbers, naming row and column.
+        If times do not ascend or a cell is no number, naming row and column.
     """
     splitter = _Splitter(clock, mapping, signals, read)
     columns = [signal.reference for signal in signals]
@@ -113,7 +113,7 @@ def pieces(source: Source, signals: Sequence[Signal], clock: Clock, mapping: Map
 
 
 class _Splitter:
-    """Cuts rows at gaps; remembers the last row."""
+    """Cuts rows at gaps, also between consecutive chunks."""
 
     def __init__(self, clock: Clock, mapping: Mapping, signals: Sequence[Signal], read: Read) -> None:
         self._clock, self._base, self._signals, self._read = clock, mapping.time, signals, read
@@ -169,7 +169,7 @@ class _Splitter:
         )
 
     def _steps(self, time_ns: FloatArray, rows: npt.NDArray[np.intp]) -> npt.NDArray[np.int64]:
-        """Sampling steps from the row before to each row: 1 where they are contiguous; 2 and more after a gap."""
+        """Sampling steps from the previous row to each row: 1 if contiguous, 2 or more after a gap."""
         before = self._last.time_ns[-1] if self._last is not None else time_ns[0] - self._step_ns
         passed = np.diff(time_ns, prepend=before) / self._step_ns
         steps = np.rint(passed).astype(np.int64)
@@ -182,7 +182,7 @@ class _Splitter:
         return steps
 
     def _joined(self, piece: Piece, steps: int, row: int) -> Iterator[Piece]:
-        """Put a piece behind the last one; short gaps are filled."""
+        """Append a piece to the last one; short gaps are filled."""
         last, self._last = self._last, piece
         if last is None:
             yield replace(piece, begins=True)
@@ -197,7 +197,7 @@ class _Splitter:
             yield replace(piece, begins=True)
 
     def _bridge(self, last: Piece, piece: Piece, steps: int) -> Piece:
-        """Straight lines across a gap; angles turn on at the speed they had."""
+        """Interpolate linearly across a gap; angles continue at their previous speed."""
         part = np.arange(1, steps)[:, None] / steps
         change = piece.samples[0] - last.samples[-1]
         for number in self._angles:
@@ -211,10 +211,10 @@ class _Splitter:
 
 
 def _unit(source: Source, column: Column, name: str, quantity: str) -> tuple[str, str]:
-    """Unit of a column, and a doubt about it, or an empty string.
+    """Unit of a column, and a note of doubt about it, or an empty string.
 
-    What the mapping says must not contradict what the file says. A unit in the file, such as volts, that is not one of
-    the quantity is pointed out where nothing converts it.
+    The mapping must not contradict the file. If the file states a unit that is not one of the quantity, such as volts,
+    and the mapping does not scale it, the note says so.
     """
     reference = Reference(column.column, column.index)
     stated = source.unit(reference) if reference.column in source.names() else ""
@@ -247,7 +247,7 @@ def _unit(source: Source, column: Column, name: str, quantity: str) -> tuple[str
 
 
 def _scale(source: Source, column: Column) -> float:
-    """Scale of a column; an array of scales is entered at the column's index."""
+    """Scale of a column; from an array of several scales, that at the column's index is taken."""
     if column.scale_from is None:
         return column.scale
     scales = np.ravel(source.values(column.scale_from)).astype(np.float64)

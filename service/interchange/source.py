@@ -1,7 +1,7 @@
-"""What an importer asks of a file. A new format is one class, and a row of `service.interchange.formats`.
+"""Interface of file formats to the importer. A new format is one class, and a row of `service.interchange.formats`.
 
-A source hands out columns as the file has them, in pieces, and what the file itself says of time and units. It checks
-nothing: units, times and numbers are judged in one place for all formats.
+A source yields columns as they are in the file, in pieces, and the time and units that the file states. It does not
+check them: units, times and numbers are checked in one place for all formats.
 """
 
 import re
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from models.errors import MachineFileError
 from models.mistakes import did_you_mean
 
-CHUNK_ROWS = 65536  # rows that are read at a time
+CHUNK_ROWS = 65536  # rows read at a time
 
 Array = npt.NDArray[Any]
 
@@ -40,66 +40,66 @@ class Reference:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """What a file says about the time of its rows."""
+    """Time base that a file states for its rows."""
 
     rate_hz: float | None = None  # samples per second
     start_ns: int | None = None  # time of the first row (or of time 0 in `time`), nanoseconds since 1970-01-01 UTC
-    # The column with the time of each row, in seconds from `start_ns`, where the format has one by itself.
+    # Column with the time of each row, in seconds since `start_ns`, if the format defines one.
     time: Reference | None = None
 
 
 class Source:
     """An open file of named columns; a context manager.
 
-    A format says how its columns are found, and of these methods what is otherwise than here: columns that have a
-    length and can be sliced, in a file that knows neither time nor units. `columns` are what the format's library has
-    for each, by name. Opening a file that is not of the format raises `SourceError`.
+    A subclass finds the columns of its format and passes them as `columns`, objects of the format's library by name.
+    The methods here serve columns that have a length and can be sliced, in a file without time and units; a subclass
+    overrides those that differ. Opening a file that is not of the format raises `SourceError`.
     """
 
-    kind: ClassVar[str]  # what the format is called
+    kind: ClassVar[str]  # name of the format
     package: ClassVar[str] = ""  # package of the extra ``io`` that reads it
-    entry: ClassVar[str] = "column"  # what the format calls a column
+    entry: ClassVar[str] = "column"  # the format's word for a column
 
     def __init__(self, path: Path, columns: Mapping[str, Any]) -> None:
         self.path = path
         self._columns = columns
 
     def names(self) -> tuple[str, ...]:
-        """Columns that there are."""
+        """Names of all columns."""
         return tuple(self._columns)
 
     def named(self, column: str) -> str:
-        """Return the name of a column that there is.
+        """Check that a column exists, and return its name.
 
         Raises
         ------
         SourceError
-            For another one, naming those that there are.
+            If it does not exist; the message lists the columns.
         """
         names = self.names()
         if column not in names:
             there = ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "")
-            # What is left out most often is a unit behind the name.
+            # The most common mistake is to leave out the unit that follows the name.
             near = [name for name in names if _bare(name) == _bare(column)]
             meant = f"; did you mean {near[0]!r}?" if len(near) == 1 else did_you_mean(column, names)
             raise SourceError(f"{self.path}: no {self.entry} {column!r}; there are {there or 'none'}{meant}")
         return column
 
-    def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002  # others need them
-        """What the file says of the time of these columns; raises `SourceError` if they contradict each other."""
+    def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002  # for subclasses
+        """Time base that the file states for these columns; raises `SourceError` if they contradict each other."""
         return Timing()
 
-    def unit(self, column: Reference) -> str:  # noqa: ARG002  # others need it
+    def unit(self, column: Reference) -> str:  # noqa: ARG002  # for subclasses
         """Unit that the file states for a column, or an empty string."""
         return ""
 
     def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
-        """Go through the rows from the first one on, `CHUNK_ROWS` at a time; may be asked again.
+        """Iterate over all rows, `CHUNK_ROWS` at a time; may be called repeatedly.
 
         Yields
         ------
         tuple of ndarray, shape (n_rows,)
-            One per column and of the same length, numbers or datetime64 as the file has them.
+            One array per column, all of the same length, numbers or datetime64 as in the file.
         """
         lengths, reads = zip(*(self._rows(reference) for reference in columns), strict=True) if columns else ((), ())
         count = equally_long(self.path, columns, lengths)
@@ -109,7 +109,7 @@ class Source:
                 yield tuple(np.asarray(read(rows)) for read in reads)
 
     def values(self, column: str) -> Array:
-        """Read an array that is no column of samples, such as scales or times of pulses, as the file has it."""
+        """Read an array that is not a column of samples, such as scales or pulse times, as it is in the file."""
         with readable(self.path, self.kind, self.package):
             return np.ravel(np.asarray(self._column(Reference(column))[...]))
 
@@ -123,30 +123,30 @@ class Source:
         self.close()
 
     def _column(self, reference: Reference) -> Any:
-        """What the library has for a column that has no index."""
+        """The library's object for a column without index."""
         found = self._columns[self.named(reference.column)]
         if reference.index is not None:
             raise SourceError(f"{self.path}: {self.entry} {reference}: index is for tables within .npz and .mat files")
         return found
 
     def _rows(self, reference: Reference) -> tuple[int, Callable[[slice], Any]]:
-        """Length of a column, and what reads some of its rows."""
+        """Length of a column, and a function that reads a slice of its rows."""
         column = self._column(reference)
         return len(column), column.__getitem__
 
 
 def _bare(name: str) -> str:
-    """Name of a column without unit, blanks, and differences between capital and small letters."""
+    """Name of a column without unit and blanks, case-folded, for comparison."""
     return re.sub(r"\s+|[\[(].*", "", name).casefold()
 
 
 def equally_long(path: Path, columns: Sequence[Reference], lengths: Sequence[int]) -> int:
-    """Length of columns that belong together.
+    """Common length of columns.
 
     Raises
     ------
     SourceError
-        Naming two whose lengths differ.
+        If lengths differ, naming two columns.
     """
     for reference, length in zip(columns, lengths, strict=True):
         if length != lengths[0]:
@@ -158,12 +158,12 @@ def equally_long(path: Path, columns: Sequence[Reference], lengths: Sequence[int
 
 @contextmanager
 def readable(path: Path, kind: str, package: str = "") -> Iterator[None]:
-    """Say clearly that a file is damaged or not of this kind, or which package reads it.
+    """Convert errors in reading to clear ones: damaged file, not of this kind, or the package that is missing.
 
     Raises
     ------
     SourceError
-        For whatever a format's library raises on a bad file: most of them know no errors of their own.
+        For any exception of a format's library: most libraries have no error class for bad files.
     """
     try:
         yield

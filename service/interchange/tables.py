@@ -21,14 +21,14 @@ _ZONED = r"(Z|[T ].*[+-]\d\d(:?\d\d)?)$"
 
 
 class _Table(Source):
-    """What the two tables have in common; a table's time is a column that the mapping names."""
+    """Base class of both tables; the time column is named in the mapping."""
 
     def __init__(self, path: Path, names: Sequence[str]) -> None:
         super().__init__(path, dict.fromkeys(names))
         self._twice = {name for name in names if names.count(name) > 1}
 
     def values(self, column: str) -> Array:
-        """Read a column that may be shorter than the others; empty cells are left out."""
+        """Read a column that may be shorter than others; empty cells are left out."""
         pieces = [piece for (piece,) in self.chunks([Reference(column)])]
         joined = np.concatenate(pieces) if pieces else np.empty(0)
         return np.asarray(joined[~np.isnan(joined)])
@@ -44,8 +44,8 @@ class _Table(Source):
 class CsvSource(_Table):
     """A text table. Columns without a header are named ``1``, ``2`` and so on.
 
-    The time column has ISO 8601 times if these are `datetimes`, in `zone` where they name none. Where its first cells
-    are whole numbers it is read as such, because nanoseconds since 1970 have more digits than a float.
+    With `datetimes`, the time column has ISO 8601 times, in `zone` unless they state one. If its first cells are
+    integers it is read as such, because nanoseconds since 1970 have more digits than a float.
     """
 
     kind = "CSV"
@@ -70,7 +70,7 @@ class CsvSource(_Table):
         names = [label.strip() if form.header else str(number + 1) for number, label in enumerate(labels)]
         if not datetimes and time_column in names and schema.field(names.index(time_column)).type == pa.int64():
             self._time_type = pa.int64()
-        # Arrow's own names: with the blanks around them, or numbers if there is no header.
+        # Arrow's own names: with surrounding blanks, or generated if there is no header.
         self._labels: dict[str, str] = dict(zip(names, labels, strict=True))
         super().__init__(path, names)
 
@@ -83,7 +83,7 @@ class CsvSource(_Table):
         return ""
 
     def named(self, column: str) -> str:
-        """Return the name of a column that there is; where numbers stand in its place, say so."""
+        """Check that a column exists, and return its name; the error says if the header consists of numbers."""
         try:
             return super().named(column)
         except SourceError as error:
@@ -139,12 +139,12 @@ class CsvSource(_Table):
         return _array(_utc(column, self._zone) if self._is_datetime(name) else column)
 
     def _told(self, error: Exception) -> str:
-        """What Arrow says, with rows counted from 1, without header lines."""
+        """Arrow's message, with rows counted from 1 without header lines."""
         before = self._form.skip_lines + self._form.header + self._form.skip_lines_after_header
         return re.sub(r"Row #(\d+)", lambda found: f"row {int(found[1]) - before}", str(error))
 
     def _fault(self, wanted: list[str]) -> str:
-        """Find the cell that is no number."""
+        """Message on the first cell that is not a number or time; empty if none is found."""
         row = 0
         with self._reader(self.path, wanted, as_text=True) as reader:
             try:
@@ -187,14 +187,14 @@ class CsvSource(_Table):
                 _utc(pa.array([cell]), self._zone)
             else:
                 whole, *parts = cell.strip().split(self._form.decimal)
-                float(".".join([whole.replace(".", "x"), *parts]))  # a point in another place makes it no number
+                float(".".join([whole.replace(".", "x"), *parts]))  # a point in another place is no decimal sign
         except (ValueError, pa.ArrowInvalid):
             return False
         return True
 
 
 class ParquetSource(_Table):
-    """A Parquet file, read row group by row group; timestamps that name no time zone are of `zone`."""
+    """A Parquet file, read row group by row group; timestamps without a time zone are in `zone`."""
 
     kind = "Parquet"
 
@@ -217,14 +217,14 @@ class ParquetSource(_Table):
             numbers = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_null(kind)
             if not (numbers or pa.types.is_timestamp(kind)):
                 raise SourceError(f"{self.path}: column {name!r} holds {kind}, expected numbers")
-        # With pre_buffer Arrow would keep all that it has read of the file.
+        # With pre_buffer, Arrow would keep everything that it has read in memory.
         with readable(self.path, self.kind), pa.parquet.ParquetFile(self.path, pre_buffer=False) as file:
             for batch in file.iter_batches(batch_size=CHUNK_ROWS, columns=wanted, use_threads=False):
                 yield tuple(_array(_of_zone(batch.column(name), self._zone)) for name in wanted)
 
 
 def _utc(cells: Any, zone: str) -> Any:
-    """ISO 8601 times as Arrow's."""
+    """Convert ISO 8601 texts to Arrow timestamps in UTC; those without a zone are in `zone`."""
     zoned = pa.compute.match_substring_regex(cells, _ZONED)
     in_utc = pa.compute.binary_join_element_wise(cells, "Z", "")
     times = pa.compute.if_else(zoned, cells, in_utc).cast(pa.timestamp("ns", tz="UTC"))
@@ -232,7 +232,7 @@ def _utc(cells: Any, zone: str) -> Any:
 
 
 def _of_zone(times: Any, zone: str) -> Any:
-    """Timestamps without a time zone as those of one; of an hour that occurs twice, the first."""
+    """Convert timestamps without a time zone from `zone` to UTC; for an hour that occurs twice, the first is taken."""
     if zone == "UTC" or not pa.types.is_timestamp(times.type) or times.type.tz is not None:
         return times
     since = pa.compute.assume_timezone(times, zone, ambiguous="earliest", nonexistent="latest")
@@ -240,8 +240,8 @@ def _of_zone(times: Any, zone: str) -> Any:
 
 
 def _array(column: Any) -> Array:
-    """An Arrow column as numpy's: nan where a number is missing, NaT where a time is."""
+    """Convert an Arrow column to NumPy, with NaN for missing numbers and NaT for missing times."""
     if pa.types.is_timestamp(column.type):
         return np.asarray(column.cast(pa.timestamp("ns")).to_numpy(zero_copy_only=False))
-    numbers = column.cast(pa.float64()) if pa.types.is_null(column.type) else column  # of a column without any
+    numbers = column.cast(pa.float64()) if pa.types.is_null(column.type) else column  # a column without any numbers
     return np.asarray(numbers.to_numpy(zero_copy_only=False))
