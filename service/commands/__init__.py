@@ -1,1 +1,1 @@
-"""The commands of ``rotorwatch`` by subject; each module has them in ``commands``."""
+"""The commands of ``rotorwatch`` by subject; each module defines its commands in ``commands``."""

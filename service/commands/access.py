@@ -19,7 +19,7 @@ import typer
 from models.errors import MachineFileError
 from service.commands.running import HistoryOption
 
-if TYPE_CHECKING:  # these import sqlalchemy, which --help must not wait for
+if TYPE_CHECKING:  # these import sqlalchemy, which would delay --help
     from rotorwatch.records.history import AuditRecord
     from service.history.store import Store
     from service.settings.service import HistorySettings
@@ -70,7 +70,7 @@ def create(
 
 
 def creation_hint(config: Path | None, history: "HistorySettings") -> str:
-    """Say how a first token is created for a monitor, from any folder and without its environment."""
+    """Instruction for creating a monitor's first token, valid in any folder and without the monitor's environment."""
     if history.in_memory:
         return (
             "no tokens can exist for it: the history is in memory, where other programs cannot create them; started "
@@ -176,7 +176,7 @@ def audit(
 
 
 def _with_outcomes(store: "Store", machine: str | None, actor: str | None) -> "Iterator[AuditRecord]":
-    """Entries, newest first, without the beginnings whose outcome is there too."""
+    """Audit entries, newest first, without `STARTED` entries whose outcome has an entry too."""
     from service.access.audit import STARTED  # noqa: PLC0415  # keeps --help quick
 
     outcomes: set[tuple[int, str, str]] = set()
@@ -191,12 +191,12 @@ def _with_outcomes(store: "Store", machine: str | None, actor: str | None) -> "I
 
 
 def _audit_line(entry: "AuditRecord", who: int, origin: int) -> str:
-    """One entry in a line, which nothing is cut off from; `who` and `origin` are widths of columns."""
+    """Format an entry as a line of any length; `who` and `origin` are column widths."""
     from service.access.audit import STARTED  # noqa: PLC0415  # keeps --help quick
 
     status = str(entry.status) if entry.status else "not known"
     done = " ".join(part for part in (entry.action, entry.machine, entry.alarm) if part and part != STARTED)
-    what = done or f"{entry.method} {entry.path}"  # an action says all that the path of its request does
+    what = done or f"{entry.method} {entry.path}"  # the action tells as much as the path of the request
     why = f": {entry.reason}" if entry.reason else ""
     columns = (_utc(entry.at_ns), f"{status:<9}", f"{entry.actor or '-':<{who}}", f"{entry.address or '-':<{origin}}")
     return "  ".join((*columns, f"{what}{why}"))
@@ -222,7 +222,7 @@ def _opened(config: Path | None) -> "Iterator[Store]":
 
 
 def _write(store: "Store", action: str, reason: str) -> None:
-    """Into the audit log, before it is done."""
+    """Write an action to the audit log, before it is executed."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a container whose user has no name

@@ -1,13 +1,13 @@
-"""The demo: a simulated machine breaks, the monitor says what broke; the machine is repaired, and breaks again.
+"""The demo: a simulated machine breaks, the monitor names the fault; the machine is repaired, and breaks again.
 
-Simulator and monitor run as separate programs on loopback with nothing else running; this program only starts them,
-listens to the topics like any other client, asks the HTTP API, and stops them again::
+Simulator and monitor run as separate programs on loopback; this program only starts them, subscribes to the topics and
+queries the HTTP API like any other client, and stops them again::
 
     rotorsim publish ──stream──> rotorwatch run ──report, alarm/event──> this program
            └────────────truth──────────────────────────────────────────────┘
 
-One stream holds all of it, so that for the monitor the machine never stops; what is injected when is told to the
-simulator beforehand::
+It is all one stream, so that for the monitor the machine never stops; the simulator gets the schedule of all faults at
+its start::
 
     0 s        140 s          300 s          500 s          660 s
     healthy    first fault    repaired       next fault     repaired    ...
@@ -46,7 +46,7 @@ from service.stream.transport import TopicMessage, follow
 from service.terminal.lines import alarm_event_line, report_heading, report_row, with_minus_signs
 
 FAULTS = {"k_by": -0.25, "c_by": -0.30, "k_bz": -0.25, "c_bz": -0.30, "e": 0.30}
-"""What can break, and the relative change; the simulator's scenarios of these names do the same."""
+"""Faults as relative changes of parameters; the simulator's scenarios of these names apply the same changes."""
 
 _HEALTHY_S = 140.0
 _BROKEN_S = 160.0
@@ -59,19 +59,19 @@ _OF_A_BUSY_COMPUTER = (GAP, CLOCK, OVERLOADED, STREAM_LOST)
 _PORTS = (7447, 8080)
 _ENVIRONMENT = {
     "PYTHONUNBUFFERED": "1",
-    # A demo leaves nothing behind, and who runs it is the only one to look at it.
+    # The demo must leave no files, and only the local user has access.
     "ROTORWATCH_HISTORY__URL": "sqlite:///:memory:",
     "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true",
 }
 _RECORDING = {
-    "rotate_s": 10.0,  # so that what is replayed need not be waited for
+    "rotate_s": 10.0,  # short, so that recordings are soon available for replay
     "rotate_mb": 50.0,
     "keep_gb": 0.15,
     "alarm_keep_gb": 0.15,
     "alarm_before_s": 60.0,
     "alarm_after_s": 60.0,
 }
-# A program that ends when the other end of its standard input is gone: however the demo ends, killed or not.
+# Wrapper that ends a program when its standard input is closed, so that it ends even if the demo is killed.
 _TIED = """
 import atexit, os, runpy, shutil, signal, sys, threading, time
 def tied():
@@ -89,7 +89,7 @@ runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 
 
 class Truth(BaseModel, extra="ignore", frozen=True):
-    """The part of the simulator's truth record that the demo looks at."""
+    """The part of the simulator's truth record that the demo uses."""
 
     time_ns: int
     data_s: float
@@ -98,19 +98,19 @@ class Truth(BaseModel, extra="ignore", frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class DemoOptions:
-    """What to show."""
+    """Options of the demo."""
 
-    fault: str  # what breaks first, one of `FAULTS`, or "none"
-    seed: int  # of the simulation; training used none of the small numbers
+    fault: str  # first fault, one of `FAULTS`, or "none"
+    seed: int  # of the simulation; training used no small seeds
     pace: float  # data seconds per second
-    once: bool  # end after the first fault, or after as long without one
-    # 0 takes free ones, for Zenoh as well; if left out, the usual ones are taken where they are free.
+    once: bool  # end after the first fault, or after the same time without a fault
+    # 0 takes free ports, for Zenoh too; None takes the usual ports if they are free.
     http_port: int | None = None
 
 
 @dataclass(slots=True)
 class Outcome:
-    """What was injected and what was said about it."""
+    """Faults injected in one round, and alarms raised."""
 
     injected: dict[str, float] = field(default_factory=dict)  # true relative changes, from the truth topic
     # Relative changes of the raised alarms, from the alarm topic.
@@ -118,11 +118,11 @@ class Outcome:
     over_http: set[str] = field(default_factory=set)  # parameters whose alarm the HTTP API showed too
     windows: int = 0  # reports on evaluated windows
     others: set[str] = field(default_factory=set)  # other raised alarms
-    # Raised alarms on the stream, as a busy computer brings them about.
+    # Raised alarms about the stream, which a busy computer can cause.
     of_the_data: set[str] = field(default_factory=set)
 
     def verdict(self) -> str:
-        """Why the demo failed; empty if exactly what was injected was raised, on the topic and over HTTP."""
+        """Why the demo failed; empty if exactly the injected faults were raised, on the topic and over HTTP."""
         if not self.windows:
             return "no window was evaluated"
         wrong = sorted(set(self.raised) - set(self.injected))
@@ -140,7 +140,7 @@ class Outcome:
         return f"the HTTP API did not show the alarm on {', '.join(unseen)}" if unseen else ""
 
     def line(self) -> str:
-        """What was named against what was injected."""
+        """Summary of injected and named changes."""
         sides = (
             ", ".join(f"{name} {change:+.1%}" for name, change in changes.items()) or "nothing"
             for changes in (self.injected, self.raised)
@@ -151,9 +151,9 @@ class Outcome:
 
 
 def run_demo(options: DemoOptions) -> int:
-    """Run the demo until it was seen what is named (`once`) or until interrupted.
+    """Run the demo for one fault (`once`) or until interrupted.
 
-    The exit code is 0 if exactly the injected parameter was named, 1 otherwise; interrupted, 130.
+    The exit code is 0 if exactly the injected parameter was named, 1 if not, and 130 if interrupted.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def run_demo(options: DemoOptions) -> int:
 
 
 class _Show:
-    """What is told of the two programs' messages."""
+    """Runs the two programs, and prints their messages."""
 
     def __init__(self, options: DemoOptions, console: Console) -> None:
         self._options, self._console = options, console
@@ -197,7 +197,7 @@ class _Show:
         self._outcome = Outcome()
 
     def run(self, stack: ExitStack) -> bool:
-        """Start both programs and show what comes, to the end; whether exactly what was injected was named."""
+        """Start both programs and show their messages to the end; return whether exactly the injected was named."""
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="rotorwatch-demo-", ignore_cleanup_errors=True))
         monitor = stack.enter_context(
             _program("monitor", "service", "run", "--listen", self._endpoint,
@@ -225,7 +225,7 @@ class _Show:
                 continue
             try:
                 ended = self._tell(message)
-            except httpx.TransportError as error:  # it may have died since it sent this
+            except httpx.TransportError as error:  # the monitor may have died after sending this message
                 with suppress(subprocess.TimeoutExpired):
                     monitor.process.wait(_STOP_S)
                 monitor.must_run()
@@ -269,7 +269,7 @@ class _Show:
         )
 
     def _tell(self, message: TopicMessage) -> bool:
-        """Show a message; whether the damage has been there for long enough."""
+        """Show a message; return whether the fault has been present for `_BROKEN_S`, i.e. the round is over."""
         topic, console, outcome = message.key.rsplit("/", 1)[-1], self._console, self._outcome
         if topic == "report":
             report = Report.model_validate_json(message.text)
@@ -301,7 +301,7 @@ class _Show:
         return False
 
     def _tell_truth(self, truth: Truth) -> None:
-        """Say what was injected, once the windows that hold it are shown."""
+        """Print the injected change, before the first window that contains it."""
         changes = {name: value for name, value in truth.relative_changes.items() if value}
         self._outcome.injected |= changes
         if changes:
@@ -309,7 +309,7 @@ class _Show:
             self._console.print(f"          [bold]the simulator has just changed {text}[/] (the monitor does not know)")
 
     def _end_of_round(self) -> str | None:
-        """Say what was named against what was injected; after the only round, what was wrong, empty if nothing."""
+        """Print the result of a round; with `once`, return why it failed (empty if passed), else None."""
         reason = self._outcome.verdict()
         if reason:
             self._console.print(f"[bold red]demo failed:[/] {with_minus_signs(reason)}")
@@ -328,7 +328,7 @@ class _Show:
 
 @dataclass(slots=True)
 class _Program:
-    """One started program and where its output goes."""
+    """A started program and the file with its output."""
 
     name: str
     process: subprocess.Popen[bytes]
@@ -344,9 +344,9 @@ class _Program:
 
 @contextmanager
 def _program(name: str, module: str, *arguments: str, recordings: str = "") -> Iterator[_Program]:
-    """Run a program beside this one; it is gone when the block is left, however it is left, and so is its folder."""
+    """Run a program in the background; it is stopped, and `recordings` removed, however the block is left."""
     recording = {"ROTORWATCH_RECORDING": json.dumps({**_RECORDING, "directory": recordings})} if recordings else {}
-    with tempfile.TemporaryFile() as output:  # has no name, so that it cannot be left behind
+    with tempfile.TemporaryFile() as output:  # nameless, so that it cannot be left behind
         process = subprocess.Popen(  # noqa: S603  # our own modules, no shell
             [sys.executable, "-c", _TIED, recordings, module, *arguments],
             stdout=output,
@@ -371,7 +371,7 @@ def _program(name: str, module: str, *arguments: str, recordings: str = "") -> I
 
 def _wait_until_ready(url: str, monitor: _Program) -> None:
     deadline = time.monotonic() + _START_S
-    with httpx.Client(timeout=1.0) as client:  # one, since every client reads all certificates first
+    with httpx.Client(timeout=1.0) as client:  # created once, because every client loads all certificates
         while time.monotonic() < deadline:
             monitor.must_run()
             try:
@@ -400,7 +400,7 @@ def _interruptible() -> Iterator[None]:
 
 
 def _command() -> str:
-    """How this program is called from where the demo was started."""
+    """Command with which this program can be called from the current folder."""
     if shutil.which("rotorwatch"):
         return "rotorwatch"
     script = Path(sys.executable).parent / "rotorwatch"
@@ -413,7 +413,7 @@ def _port(usual: int | None) -> int:
     while True:
         if port is not None:
             with socket.socket() as probe:
-                # As servers do; else a port of which a connection has just been closed would look taken.
+                # As servers do; otherwise a port with a recently closed connection would look taken.
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 try:
                     probe.bind(("127.0.0.1", port))

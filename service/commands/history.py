@@ -8,7 +8,7 @@ import typer
 from models.errors import MachineFileError
 from service.commands.running import HistoryOption
 
-if TYPE_CHECKING:  # imports sqlalchemy, which --help must not wait for
+if TYPE_CHECKING:  # imports sqlalchemy, which would delay --help
     from service.history.file import HistoryFile
 
 commands = typer.Typer(

@@ -1,4 +1,4 @@
-"""``rotorwatch init`` and ``rotorwatch doctor``: begin with a machine, and see what arrives of it."""
+"""``rotorwatch init`` and ``rotorwatch doctor``: set up a machine, and check what arrives from it."""
 
 import json
 import sys
@@ -13,7 +13,7 @@ from models.errors import MachineFileError
 from service.commands.replay import link_of
 from service.commands.running import ENDPOINT, ConnectOption, LinkOption, ListenOption, finite, prepare_numerics
 
-if TYPE_CHECKING:  # these import numpy, which --help must not wait for
+if TYPE_CHECKING:  # these import numpy, which would delay --help
     from models.machine import MachineFile
 
 commands = typer.Typer()
@@ -117,7 +117,7 @@ def _asked(option: str, text: str, kind: type[str] | type[float] = str, *, empty
 
 
 def _asked_sensors() -> list[str]:
-    """Channels, one a line, until an empty one; one that cannot be used is asked for again."""
+    """Ask for channels, one per line, until an empty line; after an error, ask again."""
     from models.mistakes import checked  # noqa: PLC0415  # keeps --help quick
     from models.signals.channels import Channel  # noqa: PLC0415
 
@@ -153,7 +153,7 @@ def _schedule(given: str) -> dict[str, str]:
 
 
 def _machine_text(machine: "MachineFile", speed_rpm: float | None) -> str:
-    """A machine file of what is known, and hints at the rest."""
+    """Text of a machine file with the known fields."""
     lines = [f"{key} = {json.dumps(value)}" for key, value in (("site", machine.site), ("name", machine.name))]
     lines += [f"rate_hz = {machine.rate_hz}", f'dtype = "{machine.dtype}"']
     if speed_rpm is not None:

@@ -1,4 +1,4 @@
-"""Commands for recordings from and to the files of other programs: ``import`` and ``export``."""
+"""``rotorwatch import`` and ``rotorwatch export``: recordings from and to files of other programs."""
 
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -108,7 +108,7 @@ def export(
 
 
 def _nanoseconds(option: str, text: str | None) -> int | None:
-    """A time without a zone is UTC."""
+    """Parse an ISO 8601 time to nanoseconds since 1970; a time without a zone is UTC."""
     if text is None:
         return None
     try:

@@ -78,7 +78,7 @@ def _describe() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Picture:
-    """What every picture asks for."""
+    """Options that all pictures have in common."""
 
     files: Annotated[
         list[Path] | None,
@@ -109,7 +109,7 @@ class _Picture:
     )
 
     def check(self) -> None:
-        """Refuse what cannot be written, before anything is computed."""
+        """Refuse an output that cannot be written, before anything is computed."""
         if self.out.suffix.lower() not in (".png", ".svg"):
             raise MachineFileError(f"--out is {self.out}, expected a name that ends in .png or .svg")
         if self.out.exists() and not self.overwrite:
@@ -122,7 +122,7 @@ class _Picture:
             ) from error
 
     def recorded(self, at: str | None = None, *, reports: bool = False) -> "Recorded":
-        """The data it is of."""
+        """The recorded data to be drawn."""
         from service.analysis.recorded import Recorded  # noqa: PLC0415  # keeps --help quick
 
         if self.history is not None:
@@ -135,7 +135,7 @@ class _Picture:
         return found
 
     def known(self, *, reports: bool = False) -> "Recorded | Past":
-        """The recorded data it is of, or what the history has."""
+        """The recorded data to be drawn, or those of the history."""
         if self.history is None or self.files:
             if self.history is not None:
                 raise MachineFileError("both recordings and --history are given, expected one of them")
@@ -161,7 +161,7 @@ class _Picture:
 
 
 def _kind(paint: Callable[..., "Paint"]) -> None:
-    """Add a command: with the options of every picture, which it gets as one object, and with its own."""
+    """Add a command for a kind of picture: the common options, passed as one `_Picture`, and its own."""
     shared = signature(_Picture).parameters
 
     def command(**given: Any) -> None:

@@ -1,4 +1,4 @@
-"""``rotorwatch record`` and ``rotorwatch recover``: messages into files, and what a crash left of them."""
+"""``rotorwatch record`` and ``rotorwatch recover``: write messages to files, and recover files after a crash."""
 
 import json
 import sys
@@ -15,7 +15,7 @@ from models.errors import MachineFileError, RecordingError
 from service.commands.replay import link_of
 from service.commands.running import ConnectOption, LinkOption, ListenOption, exit_code, prepare_numerics
 
-if TYPE_CHECKING:  # these import numpy, which --help must not wait for
+if TYPE_CHECKING:  # these import numpy, which would delay --help
     from models.machine import MachineFile
     from models.signals.salvage import Salvage
     from service.recordings.recorder import MachineRecorder
@@ -89,7 +89,7 @@ def record(
             for one in machines
         ]
         for recorder in recorders:
-            recorder.prepare()  # a folder that cannot be written is a mistake to be told at once
+            recorder.prepare()  # raises at once if the folder cannot be written
         stop = undo.enter_context(stop_request())
         session = Link(link_of(connect, listen, link))
         undo.callback(session.close)
@@ -148,7 +148,7 @@ def recover(
 
 
 def _tell_changes(recorders: "list[MachineRecorder]", told: dict[Path, str]) -> None:
-    """Write a JSON line for every recorder whose status is another than was told."""
+    """Write a JSON line for every recorder whose status has changed since its last line."""
     for recorder in recorders:
         line = json.dumps(asdict(recorder.status()))
         if told.get(recorder.folder) != line:
@@ -160,7 +160,7 @@ def _tell_changes(recorders: "list[MachineRecorder]", told: dict[Path, str]) -> 
 def _settings(
     config: Path | None, machines: list[str] | None, out: Path | None, changes: dict[str, float]
 ) -> "tuple[list[MachineFile], RecordingSettings, HistorySettings]":
-    """Machines, what is kept, and the history of the monitor: the command line over the settings file."""
+    """Machines, recording and history settings; the command line overrides the settings file."""
     from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
     from models.mistakes import checked  # noqa: PLC0415
     from service.settings.service import RecordingSettings, load_settings  # noqa: PLC0415
@@ -184,7 +184,7 @@ def _settings(
 
 
 def _summed_up(recorders: "list[MachineRecorder]") -> bool:
-    """Say what was recorded; whether it was everything."""
+    """Print what was recorded; return whether nothing was lost."""
     whole = True
     for recorder in recorders:
         status = recorder.status()

@@ -1,4 +1,4 @@
-"""``rotorwatch replay``: recordings through the monitor offline, or onto the network as they were."""
+"""``rotorwatch replay``: evaluates recordings offline, or publishes them on the network unchanged."""
 
 import os
 import re
@@ -15,7 +15,7 @@ import typer
 from models.errors import MachineFileError, RecordingError, RotorwatchError
 from service.commands.running import ENDPOINT, FromOption, ToOption, finite, prepare_numerics
 
-if TYPE_CHECKING:  # these import pydantic, numpy and pyarrow, which --help must not wait for
+if TYPE_CHECKING:  # these import pydantic, numpy and pyarrow, which would delay --help
     from models.signals.keys import MachineKeys
     from models.signals.link import LinkSettings
     from rotorwatch.records.replays import OfflineSummary
@@ -40,7 +40,7 @@ def in_namespace(link: "LinkSettings", namespace: str | None) -> "LinkSettings":
     Raises
     ------
     MachineFileError
-        If it cannot be the beginning of a key.
+        If the namespace is not a valid prefix of a key.
     """
     if namespace is None:
         return link
@@ -236,7 +236,7 @@ def _evaluate(
         run = OfflineReplay(source, keys, installed, write, from_ns=task.from_ns, to_ns=task.to_ns)
         for text in run.descriptor_differences:
             typer.echo(f"the recorded channel descriptor differs from the machine file: {text}", err=True)
-        # Lines and a bar in one terminal would spoil each other.
+        # No progress bar if the lines go to the same terminal.
         quiet = out is None and sys.stdout.isatty() and not as_json
         with show("none" if quiet else progress) as bar:
             summary = run.run(control, bar)
@@ -256,7 +256,7 @@ def _evaluate(
 def _evaluate_all(
     source: "RecordingSource", tasks: "Sequence[MachineTask]", folder: Path | None, overwrite: bool, ray: str
 ) -> None:
-    """Evaluate every machine on a cluster, and say what was found as soon as it is."""
+    """Evaluate every machine on a cluster, and print each result as soon as it is available."""
     from service.runtime.archive import on_cluster  # noqa: PLC0415  # keeps --help quick
 
     begin_s, data_s = time.monotonic(), 0.0
@@ -288,7 +288,7 @@ def _file_of(folder: Path, title: str) -> Path:
 
 
 def _machines_of(config: Path | None, machine: str | None) -> "Callable[[MachineKeys], str | None]":
-    """What the command line names for a recorded machine, as `choose_machine` takes it."""
+    """Function from a machine's keys to the machine file and bundle to use, in the notation of `choose_machine`."""
     if config is None:
         return lambda _: machine
     if machine is not None:
@@ -306,7 +306,7 @@ def _machines_of(config: Path | None, machine: str | None) -> "Callable[[Machine
 
 
 def summary_lines(summary: "OfflineSummary") -> list[str]:
-    """What an offline replay found, for people."""
+    """Describe the result of an offline replay in lines of text."""
     refused = ", ".join(f"{count} {reason}" for reason, count in summary.refused_blocks.items())
     lines = [
         f"{summary.site}/{summary.machine}, machine file {summary.machine_hash}, bundle {summary.bundle or 'none'}",
@@ -332,7 +332,7 @@ def _lines(out: Path | None, overwrite: bool) -> "Iterator[Callable[[str], objec
         try:
             yield lambda line: sys.stdout.write(line + "\n")
             sys.stdout.flush()
-        except BrokenPipeError:  # whoever read has seen enough
+        except BrokenPipeError:  # the reader has closed the pipe
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(1) from None
         return
@@ -347,7 +347,7 @@ def _lines(out: Path | None, overwrite: bool) -> "Iterator[Callable[[str], objec
 
 @contextmanager
 def _stoppable(control: "Control") -> Iterator[None]:
-    """SIGINT and SIGTERM end the replay in order."""
+    """Stop the replay cleanly on SIGINT and SIGTERM."""
     from service.terminal.stopping import stop_request  # noqa: PLC0415  # keeps --help quick
 
     over = threading.Event()
@@ -412,7 +412,7 @@ def _check_prefix(option: str, prefix: str) -> None:
 
 
 def link_of(connect: list[str] | None, listen: list[str] | None, link: Path | None = None) -> "LinkSettings":
-    """Link settings of a command line, or of a file whose endpoints and role those of the command line replace."""
+    """Link settings from the command line or a file; endpoints on the command line replace the file's and its role."""
     from models.mistakes import checked  # noqa: PLC0415  # keeps --help quick
     from models.signals.link import LinkSettings, load_link  # noqa: PLC0415
 

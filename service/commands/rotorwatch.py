@@ -1,4 +1,4 @@
-"""The command ``rotorwatch``: monitor machines, check settings; all other commands are in `service.commands`."""
+"""The command ``rotorwatch``: monitoring, router, demo and check of settings; for others see `service.commands`."""
 
 import sys
 from pathlib import Path
@@ -23,7 +23,7 @@ from service.commands.running import (
 )
 from service.terminal.memory import keep_loaded
 
-if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
+if TYPE_CHECKING:  # these import numpy and scipy, which would delay --help
     from service.settings.service import ServiceSettings
 
 app = typer.Typer(
@@ -97,14 +97,14 @@ def run(
         pairs = [text.partition("@") for text in machine]
         named = [{"file": file, "bundle": bundle or None} for file, _, bundle in pairs]
         update["machines"] = tuple(checked(MachineEntry, one, "--machine") for one in named)
-    # Endpoints and role replace those of the settings altogether.
+    # Endpoints and role on the command line replace all those of the settings.
     ends = settings.link if link is None else load_link(link)
     if listen or connect:
-        # A router joins clients; between peers, which it takes to know each other, it passes nothing on.
+        # A router forwards between clients, but not between peers, which it assumes to be connected to each other.
         mode = "peer" if listen else "client"
         ends = ends.model_copy(update={"mode": mode, "listen": tuple(listen or ()), "connect": tuple(connect or ())})
     if namespace is not None:
-        # What is replayed must not end up among the recordings and in the history of the live machine.
+        # Replayed data must not enter the recordings and the history of the live machine.
         update["recording"] = settings.recording.model_copy(update={"directory": None})
         update["history"] = settings.history.model_copy(update={"url": "sqlite:///:memory:"})
     if http_port is not None:
@@ -156,7 +156,7 @@ def _prepare() -> None:
 
 def _serve(settings: "ServiceSettings", config: Path | None, ray_address: str | None = None) -> None:
     from models.commissioning.commissioned import KnowledgeLevel, knowledge_of  # noqa: PLC0415  # keeps --help quick
-    from service.runtime.runtime import running  # noqa: PLC0415  # must see the variables that were set
+    from service.runtime.runtime import running  # noqa: PLC0415  # after the variables for numerics are set
     from service.terminal.logs import configure_logging  # noqa: PLC0415  # keeps --help quick
     from service.terminal.stopping import stop_request  # noqa: PLC0415
 
@@ -284,7 +284,7 @@ def demo(
 
 
 def _checked(file: Path) -> str:
-    """Check one file and say what it describes."""
+    """Check a file, and return a description of its contents."""
     from models.commissioning.commissioned import install, knowledge_of  # noqa: PLC0415  # keeps --help quick
     from models.machine import load_machine_file  # noqa: PLC0415
     from models.mistakes import read_toml  # noqa: PLC0415
@@ -295,7 +295,7 @@ def _checked(file: Path) -> str:
     fields = read_toml(file)
     if {"site", "rotor", "sensors"} & set(fields):
         machine = load_machine_file(file)
-        known = knowledge_of(machine)  # a field of [rotor] that is forgotten is no mistake, but costs the diagnosis
+        known = knowledge_of(machine)  # a missing field of [rotor] is no error, but prevents diagnosis
         channels = f"{len(machine.sensors)} channels at {machine.rate_hz:g} Hz"
         return f"machine {machine.title}, {channels}; knowledge level {known.level}: {known.text}"
     settings = load_settings(file)
@@ -304,7 +304,7 @@ def _checked(file: Path) -> str:
         machine = entry.load()
         install(machine, entry.bundle)
         names.append(machine.title)
-    # Files and variables that are read when the monitor starts.
+    # Check the files and environment variables that the monitor reads at its start.
     settings.link.zenoh_items()
     Webhooks(settings.webhooks)
     if settings.access.tls is not None:
@@ -312,7 +312,7 @@ def _checked(file: Path) -> str:
     return "; ".join((f"settings for {', '.join(names)}", *lapses(settings)))
 
 
-# After the commands of this module, which are the first in the list.
+# Added last, so that the commands of this module come first in the list.
 for module in (installation, size, watching, access, record, replay, interchange):
     app.add_typer(module.commands)
 for group in (access.tokens, webhook.commands, history.commands, plot.commands):

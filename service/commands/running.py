@@ -1,4 +1,4 @@
-"""What the commands share: exit codes, one thread for linear algebra, common options."""
+"""Common parts of the commands: exit codes, one thread for linear algebra, shared options."""
 
 import errno
 import inspect
@@ -17,19 +17,19 @@ from typer.core import TyperGroup
 from models.errors import BundleError, MachineFileError, PictureError, RecordingError, RotorwatchError
 from service.terminal.memory import prepare_memory
 
-ENDPOINT = "tcp/127.0.0.1:7447"  # where a monitor listens unless it is told otherwise
+ENDPOINT = "tcp/127.0.0.1:7447"  # where a monitor listens by default
 
 _RAGGED = re.compile(r"(?<!\n)(?<!\[/cyan\])\n(?!\n|\[cyan\])")
-"""Ends of lines within a paragraph of a help text, but for those around an example."""
+"""Line breaks within a paragraph of a help text, except around examples."""
 _FILES = 65_536
 _UNUSABLE = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.EROFS}
-"""What the system says of a file that somebody has named, and that this program cannot use."""
+"""System errors for a file that the user has named and this program cannot use."""
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-"""What it says of a file that has no room; of no name, it is the one to which the output goes."""
+"""System errors for a full disk; if the error has no file name, it concerns standard output."""
 _NO_THREAD = "can't start new thread"
 _MB = 1_000_000
 _ADDRESS_SPACE_MB = 2_000
-_OF_A_MACHINE_MB = 100  # little of it is memory: stacks of threads and what libraries set aside
+_OF_A_MACHINE_MB = 100  # mostly thread stacks and reservations of libraries, of which little is used
 
 HistoryOption = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor; \\[history] counts.")
@@ -61,7 +61,7 @@ ToOption = Annotated[str | None, typer.Option("--to", metavar="TIME", help="Data
 
 def _say_version(wanted: bool) -> None:
     if wanted:
-        from rotorwatch import __version__  # noqa: PLC0415  # brings an HTTP client, which nothing else waits for
+        from rotorwatch import __version__  # noqa: PLC0415  # imports an HTTP client, only needed here
 
         typer.echo(f"rotorwatch {__version__}")
         raise typer.Exit
@@ -73,17 +73,17 @@ VersionOption = Annotated[
 
 
 def finite(value: float | None) -> float | None:
-    """Refuse NaN, which no limit of an option does."""
+    """Refuse NaN and infinities; limits of an option let NaN through."""
     if value is not None and not math.isfinite(value):
         raise typer.BadParameter(f"{value} is not a finite number.")
     return value
 
 
 class Commands(TyperGroup):
-    """The commands of a program, with their exit codes; a refused argument is told like a field of a file."""
+    """The commands of a program, with exit codes; refused arguments are reported in the style of fields of a file."""
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command by its name, with a help text whose lines end where the terminal does."""
+        """Return a command by its name, with a help text that wraps at the terminal's width."""
         found = super().get_command(ctx, cmd_name)
         for one in (found, *getattr(found, "commands", {}).values()):
             if one is not None and one.help:
@@ -96,16 +96,16 @@ class Commands(TyperGroup):
             with exit_codes():
                 return super().invoke(ctx)
         except typer.BadParameter as error:
-            from models.mistakes import argument_text  # noqa: PLC0415  # pydantic, which --help must not wait for
+            from models.mistakes import argument_text  # noqa: PLC0415  # imports pydantic, which would delay --help
 
             error.message = argument_text(error) or error.message
             raise
 
 
 def prepare_numerics() -> None:
-    """Settings of the process for numerics: threads and memory. Works only before numpy is imported.
+    """Configure threads and memory of the process for numerics; must be called before numpy is imported.
 
-    One thread for linear algebra: results do not depend on the number of cores, and workers do not compete.
+    With one thread for linear algebra, results do not depend on the number of cores, and workers do not compete.
     """
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"
@@ -113,16 +113,16 @@ def prepare_numerics() -> None:
 
 
 def raise_file_limit() -> None:
-    """Let this program open as many files and connections as the system allows it, up to 65 536."""
+    """Raise the limit of open files and connections to what the system allows, at most 65 536."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _FILES if hard == resource.RLIM_INFINITY else min(hard, _FILES)
     if soft != resource.RLIM_INFINITY and soft < wanted:
-        with suppress(OSError, ValueError):  # where even this is forbidden, it goes on with what there is
+        with suppress(OSError, ValueError):  # if the system forbids it, the limit stays
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def check_address_space() -> None:
-    """Refuse to start where a monitor would end, or hang, in the middle of some library that gets no memory.
+    """Refuse to start with too little address space: libraries that get no memory would crash or hang.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def _too_small(limit: int) -> str:
 
 
 def exit_code(error: RotorwatchError) -> int:
-    """2 for a file or argument that cannot be used, such as a recording that is not there; 1 for everything else."""
+    """Exit code: 2 for an unusable file or argument, such as a missing recording; 1 for all other errors."""
     kinds = FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError
     unusable = isinstance(error, RecordingError | PictureError) and isinstance(error.__cause__, kinds)
     return 2 if unusable or isinstance(error, MachineFileError | BundleError) else 1
@@ -150,7 +150,7 @@ def exit_code(error: RotorwatchError) -> int:
 
 @contextmanager
 def exit_codes() -> Iterator[None]:
-    """Exit 2 for a file or argument that cannot be used, 1 for what goes wrong later, each with one message."""
+    """Exit with code 2 for an unusable file or argument, 1 for later errors, after printing one message."""
     try:
         yield
     except RotorwatchError as error:
@@ -159,7 +159,7 @@ def exit_codes() -> Iterator[None]:
     except OSError as error:
         if error.errno in _FULL and error.filename is None:
             typer.echo(f"the output cannot be written ({error.strerror})", err=True)
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # where what is still to be written goes
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # discards output that is still buffered
             raise typer.Exit(1) from error
         if error.errno not in _UNUSABLE or error.filename is None:
             raise

@@ -1,4 +1,4 @@
-"""``rotorwatch size``: what a plant will take, from measured figures."""
+"""``rotorwatch size``: estimates the resources that a plant needs, from measured costs."""
 
 import dataclasses
 import json
@@ -9,7 +9,7 @@ import typer
 
 from service.commands.running import finite, prepare_numerics
 
-if TYPE_CHECKING:  # imports numpy and scipy, which --help must not wait for
+if TYPE_CHECKING:  # imports numpy and scipy, which would delay --help
     from service.history.records import Retention
     from service.runtime.sizing import Costs, Kind, Size
 
@@ -85,7 +85,7 @@ def size(
 def _lines(
     costs: "Costs", kind: "Kind", found: "Size", retention: "Retention", cores: int, busy: float
 ) -> Iterator[str]:
-    """The result for people, at most 80 characters wide."""
+    """The result as lines of text, at most 80 characters wide."""
     diagnosed = "diagnosed, networks" if kind.networks else "diagnosed, no networks"
     made = diagnosed if kind.diagnosed else "levels only"
     stream = f"{kind.channels} channel{'s' * (kind.channels > 1)} at {kind.rate_hz:g} Hz"
@@ -123,7 +123,7 @@ def _lines(
 
 
 def _amount(value: float, unit: str) -> str:
-    """A number with three digits and its unit; bytes with the prefix that suits them."""
+    """Format a number to about three digits with its unit; bytes get a decimal prefix."""
     if unit.startswith("B"):
         value, unit = next(
             ((value / size, f"{prefix}{unit}") for size, prefix in _PREFIXES if value >= size), (value, unit)

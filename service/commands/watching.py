@@ -1,4 +1,4 @@
-"""``rotorwatch watch`` and ``rotorwatch status``: look at what monitors say."""
+"""``rotorwatch watch`` and ``rotorwatch status``: show what monitors report."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from models.errors import MachineFileError, RotorwatchError
 from service.commands.replay import NamespaceOption, in_namespace
 from service.commands.running import ENDPOINT, ConnectOption, LinkOption
 
-if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
+if TYPE_CHECKING:  # these import numpy and scipy, which would delay --help
     from rotorwatch.records.health import Health
     from service.stream.transport import TopicMessage
 
@@ -77,7 +77,7 @@ def watch(
     def show(message: "TopicMessage") -> None:
         try:
             say(message)
-        except (BrokenPipeError, SystemExit):  # whoever read has seen enough; rich makes the one of the other
+        except (BrokenPipeError, SystemExit):  # the reader has closed the pipe; rich turns the error into SystemExit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             stop.ask()
 
@@ -159,7 +159,7 @@ def status(
         growth = None if health.report is None else health.report.level_growth
         remarks += [] if growth is None else [f"{place}: {growth.text}"]
         remarks += [f"{place}: {alarm.name} is {alarm.state}" for alarm in health.alarms if alarm.state in _SILENT]
-    # Only names of machines are folded, to no less than a few characters: a line may be longer than the terminal's.
+    # Only machine names are folded, to no less than `_FOLDED` characters, so lines may exceed the terminal's width.
     longest = max((len(f"{health.site}/{health.machine}") for health in healths), default=0)
     least = Console(width=_WIDEST).measure(table).maximum - max(0, longest - _FOLDED)
     Console(soft_wrap=True, width=max(Console().width, least)).print(table)
@@ -169,7 +169,7 @@ def status(
 
 
 def _exit_code(health: "Health") -> int:
-    """What a machine alone would make `status` end with: an alarm hides missing data, and never the other way round."""
+    """Exit code of `status` for one machine; an alarm takes precedence over missing data."""
     from models.alarm_names import STREAM_LOST  # noqa: PLC0415  # keeps --help quick
 
     raised = {alarm.name for alarm in health.alarms if alarm.raised}
@@ -221,7 +221,7 @@ def _show_json(message: "TopicMessage") -> None:
 def _fetch_healths(
     url: str, token: str | None, ca: Path | None, certificate: tuple[Path, Path] | None
 ) -> "list[Health]":
-    # An HTTP client, for which --help must not wait.
+    # Imports an HTTP client, which would delay --help.
     from rotorwatch import AccessRefused, Client, ClientError, NoAnswer, RequestRefused  # noqa: PLC0415
 
     try:

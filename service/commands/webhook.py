@@ -1,4 +1,4 @@
-"""``rotorwatch webhook``: secrets, and whether a receiver can be reached."""
+"""``rotorwatch webhook``: creates secrets, and tests whether a receiver can be reached."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,1 +1,1 @@
-"""What the programs say where they are started: log lines, lines of text, and Ctrl-C."""
+"""The programs' terminal: log lines, lines of text, stop requests (Ctrl-C); and memory settings of the process."""

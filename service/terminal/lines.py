@@ -37,10 +37,10 @@ def report_line(report: Report) -> str:
         tail = "  |  ".join(parts)
     else:
         told = [one.text for one in report.levels if report.state == "watching" or one.beyond]
-        if report.shapes:  # no parameter will ever be read here: what has changed, or would have been seen
+        if report.shapes:  # no parameter can be read on this machine: growth of levels, or the reason
             told.append(report.level_growth.text if report.level_growth else report.reason)
         tail = "  |  ".join(told) or report.reason or f"window {report.filled:.0%} full"
-    # No alarm yet, or none at all if the change stays below its limit; but healthy is what nothing is found on.
+    # A change was found, but no alarm is raised (yet): "healthy" would contradict the finding.
     state = "no alarm" if report.state == "healthy" and _found(verdict) else report.state
     return f"{_clock(report.end_ns)}  {report.site}/{report.machine}  {state:<13}  {tail}"
 
@@ -51,7 +51,7 @@ def report_heading() -> str:
 
 
 def report_row(report: Report) -> str:
-    """One window in a row of a table: the time, each parameter in percent, what was found; hardly ever over 80 columns.
+    """One window in a row of a table: time, each parameter in percent, finding; rarely wider than 80 columns.
 
     Examples
     --------
@@ -73,7 +73,7 @@ def report_row(report: Report) -> str:
 
 
 def with_minus_signs(text: str) -> str:
-    """The text with true minus signs before its numbers, which are as wide as the plus sign.
+    """Replace hyphens before numbers with true minus signs, which are as wide as plus signs.
 
     Examples
     --------
@@ -94,7 +94,7 @@ def alarm_event_line(event: AlarmCloudEvent) -> str:
     '00:03:25  demo/lab  ALERT: bearing stiffness, horizontal (k_by) changed by −24.7% ± 1.4%'
     """
     data = event.data
-    # Where the text has no name, as that of some that cleared, it must be seen which alarm it is about.
+    # Some texts, such as those of cleared alarms, lack the alarm's name, so it is appended.
     name = "" if f"({data.name})" in data.text else f" ({data.name})"
     return f"{_clock(data.time_ns)}  {data.site}/{data.machine}  {with_minus_signs(data.text)}{name}"
 
@@ -126,7 +126,7 @@ def health_line(health: Health) -> str:
 
 
 def _known(alarm: Alarm) -> str:
-    """The change of a parameter; of any other alarm, what has been noted."""
+    """Change of the parameter that the alarm is about, or the note of any other alarm."""
     if alarm.relative_change is not None:
         return f"  {_change(alarm.name, alarm.relative_change, alarm.standard_error)}"
     return f": {alarm.note}" if alarm.note else ""
@@ -139,7 +139,7 @@ def _shown(report: Report) -> tuple[Parameter, ...]:
 
 
 def _found(verdict: Verdict | None) -> bool:
-    """Whether the machine is said to have changed; that it had, before the data of this window, is no such finding."""
+    """Whether a change was found; one before the data of this window, without named parameters, does not count."""
     return verdict is not None and bool(verdict.changed or (verdict.detected and not verdict.settled))
 
 

@@ -1,4 +1,4 @@
-"""Logging to standard error: structlog for our own lines, the standard library's loggers through the same formatter."""
+"""Logging to standard error: structlog for our own lines, and the same formatter for the standard library's loggers."""
 
 import logging
 import sys
@@ -33,10 +33,10 @@ def configure_logging(settings: LogSettings) -> None:
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(settings.level.upper())
-    # The chatter of libraries is of interest only when something is wrong.
+    # Libraries log warnings and errors only.
     for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "asyncio", "httpx", "alembic"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    # It warns of every request that is no HTTP, which anybody can send: once a minute will do.
+    # Uvicorn warns of every request that is not HTTP, which anybody can send: once a minute is enough.
     minute = Limiter(quiet_s=60.0)
     logging.getLogger("uvicorn.error").filters[:] = [
         lambda record: record.levelno >= logging.ERROR or minute.admit(str(record.msg)) is not None
@@ -56,12 +56,12 @@ def logger(**context: str) -> FilteringBoundLogger:
 
 
 class Limiter:
-    """Lets one line of a kind through now and then and says how many were left out.
+    """Limits the rate of log lines of each kind, and counts those withheld.
 
     Parameters
     ----------
     quiet_s : float
-        How long after a line the next one of its kind is let through.
+        Least time between two lines of a kind.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, quiet_s: float = _QUIET_S) -> None:
@@ -71,7 +71,7 @@ class Limiter:
         self._withheld: dict[str, int] = {}
 
     def admit(self, kind: str) -> int | None:
-        """How many lines of this kind were withheld before this one, or None if it is to be withheld as well."""
+        """Number of lines of this kind withheld since the last one, or None if this one must be withheld too."""
         now_s = self._clock()
         if now_s < self._next_s.get(kind, float("-inf")):
             self._withheld[kind] = self._withheld.get(kind, 0) + 1
@@ -80,6 +80,6 @@ class Limiter:
         return self._withheld.pop(kind, 0)
 
     def say(self, kind: str, write: Callable[..., object], text: str, /, **details: object) -> None:
-        """Write a line of a kind, with how many were withheld before it, unless it is to be withheld as well."""
+        """Write a line unless it must be withheld, with the number of lines of its kind withheld before it."""
         if (withheld := self.admit(kind)) is not None:
             write(text, **details, **({"withheld": withheld} if withheld else {}))

@@ -1,4 +1,4 @@
-"""How the memory of a process is handed out, and looked through."""
+"""Settings of a process's memory allocator and garbage collector."""
 
 import ctypes
 import gc
@@ -8,27 +8,26 @@ _KEPT_BYTES, _LARGE_BYTES = 64 << 20, 32 << 20
 
 
 def prepare_memory() -> None:
-    """Settings for numerics in many threads.
+    """Configure glibc's allocator for numerics in many threads.
 
-    Two arenas of the C library's memory for all threads: by default glibc gives each thread of up to eight per core one
-    of its own, and each keeps what it once needed. After hundreds of thousands of messages of all sizes the monitor
-    held twice the memory that it used.
+    All threads share two arenas. By default, glibc creates up to eight arenas per core, and each keeps its peak memory:
+    after hundreds of thousands of messages of all sizes, the monitor held twice the memory that it used.
 
-    What a hop has freed is kept for the next one: by default glibc hands arrays of more than 128 kB back to the kernel,
-    and getting them again, page by page, took longer than the arithmetic of a hop.
+    Memory freed by a hop is kept for the next. By default, glibc returns arrays of more than 128 kB to the kernel, and
+    obtaining them again, page by page, took longer than the arithmetic of a hop.
     """
     library = ctypes.CDLL(None)
-    if hasattr(library, "mallopt"):  # not everywhere
+    if hasattr(library, "mallopt"):  # not in every C library
         library.mallopt(_M_ARENA_MAX, 2)
         library.mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
         library.mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
 
 
 def keep_loaded() -> None:
-    """Spare the garbage collector what a process has loaded by now, which stays to its end.
+    """Exclude all objects loaded so far, which live until the process ends, from garbage collection.
 
-    A full collection looked through all of it, a tenth of a second in which no thread runs, and each answer of twenty
-    thousand records made one likely.
+    A full collection traversed all of them, which stopped all threads for a tenth of a second, and each answer of
+    twenty thousand records made one likely.
     """
     gc.collect()
     gc.freeze()

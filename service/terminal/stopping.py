@@ -1,4 +1,4 @@
-"""The request to stop that a program gets as a signal."""
+"""Requests to stop a program by a signal."""
 
 import queue
 import signal
@@ -13,7 +13,7 @@ class StopRequest:
     """Whether SIGINT, SIGTERM or SIGHUP has come."""
 
     def __init__(self) -> None:
-        # Not an event: the handler may interrupt the main thread where it holds the event's lock, and wait for ever.
+        # A threading.Event could deadlock: the handler may interrupt the main thread while that holds the event's lock.
         self._asked: queue.SimpleQueue[bool] = queue.SimpleQueue()
 
     def ask(self) -> None:
@@ -21,15 +21,15 @@ class StopRequest:
         self._asked.put(True)
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait for the stop, at most so long, and say whether it was asked for.
+        """Wait for the stop, at most `timeout_s`, and return whether it was requested.
 
-        Looks up again and again: the system may hand the signal to one of Zenoh's threads, and Python runs the handler
-        only when the main thread next does something.
+        Polls, because the system may deliver the signal to one of Zenoh's threads, and Python runs the handler only
+        when the main thread next executes bytecode.
         """
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             try:
-                self._asked.put(self._asked.get(timeout=_TICK_S))  # back again, for whoever asks next
+                self._asked.put(self._asked.get(timeout=_TICK_S))  # put back for the next caller
             except queue.Empty:
                 if deadline_s is not None and time.monotonic() >= deadline_s:
                     return False
@@ -39,9 +39,9 @@ class StopRequest:
 
 @contextmanager
 def stop_request() -> Iterator[StopRequest]:
-    """Turn SIGINT, SIGTERM and SIGHUP into a request to stop; the signals' former handlers come back afterwards.
+    """Turn SIGINT, SIGTERM and SIGHUP into a request to stop; the previous handlers are restored afterwards.
 
-    SIGHUP comes when the terminal is closed; what was started with nohup goes on.
+    SIGHUP is sent when the terminal is closed; if it is ignored (nohup), it stays ignored.
     """
     stop = StopRequest()
     numbers = [signal.SIGINT, signal.SIGTERM]
