@@ -1,1 +1,1 @@
-"""The HTTP API: one module for each group of routes, put together in `service.api.app`."""
+"""The HTTP API: one module for each group of routes, assembled in `service.api.app`."""

@@ -1,4 +1,4 @@
-"""The HTTP API over what the service knows; ``docs/api.md`` lists the routes."""
+"""The HTTP API of the service; ``docs/api.md`` lists the routes."""
 
 from typing import Annotated, Any
 
@@ -79,7 +79,7 @@ _Change = Annotated[_Sizeable | None, Query(description="relative change to be f
 
 
 def create_app(service: ServiceView, guard: Guard) -> FastAPI:
-    """Build the application; its answers come from `service`, called from the server's worker threads."""
+    """Build the application, which answers from `service` in the server's worker threads."""
     app = DescribedApp(
         title="rotorwatch",
         version=__version__,
@@ -87,7 +87,7 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
         openapi_tags=_TAGS,
         dependencies=[guard.gate, Depends(only_known_arguments)],
         openapi_url=None,  # the guard serves it
-        docs_url=None,  # the usual pages load their scripts from elsewhere; `add_docs_routes` does not
+        docs_url=None,  # the default pages load scripts from the internet; those of `add_docs_routes` do not
         redoc_url=None,
     )
     app.state.service = service

@@ -1,11 +1,12 @@
-"""Connections of the HTTP server: how many there may be, and how long one may keep the server waiting.
+"""Limits on the HTTP server's connections: their number, and how long each may keep the server waiting.
 
-uvicorn limits neither (docs/decisions/0022-http-connections.md). Connections are counted where they are accepted, so
-that those whose TLS handshake never ends count as well, and looked at a few times a second::
+uvicorn limits neither (docs/decisions/0022-http-connections.md). Connections are counted when they are accepted, so
+that those whose TLS handshake never ends count too, and are checked a few times per second::
 
     handshake --> head --> body --> answering --> head ...
-       '------------'--------'---------------------'      these wait for the other side: for so long, and
-                                                          whoever waits longest goes when there is no more room
+       '------------'--------'---------------------'      in these phases the server waits for the client, up to
+                                                          a time limit; if there is no more room, the connection
+                                                          with the longest wait is ended
 
 Everything here runs in the event loop of the server.
 """
@@ -35,7 +36,7 @@ from service.terminal.logs import Limiter, logger
 _LOOK_S = 0.2
 _MINUTE_S = 60.0
 _MOMENTS_S = 5.0
-"""A reader that takes nothing for longer makes room when there is none."""
+"""A client that acknowledges nothing of its answer for longer is ended when there is no more room."""
 _NO_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 _BUSY = Problem(
     title="Service Unavailable",
@@ -48,7 +49,7 @@ _REFUSAL = (
     f"connection: close\r\ncontent-length: {len(_BUSY)}\r\n\r\n{_BUSY}"
 ).encode()
 _BYTES_ACKED = 120
-"""Where ``tcpi_bytes_acked`` is in ``struct tcp_info`` (linux/tcp.h), since Linux 4.1."""
+"""Offset of ``tcpi_bytes_acked`` in ``struct tcp_info`` (linux/tcp.h), since Linux 4.1."""
 
 _AT_ONCE = struct.pack("ii", 1, 0)
 _log = logger(part="http")
@@ -58,7 +59,7 @@ _Doing = Literal["handshake", "head", "body", "answering"]
 
 @dataclass(slots=True, eq=False)
 class _Connection:
-    """One connection, and since when it does what it does."""
+    """A connection, its current phase, and the times of its latest progress."""
 
     accepted: socket.socket
     address: str
@@ -73,7 +74,7 @@ class _Connection:
     protocol: H11Protocol | None = None
 
     def look(self, now_s: float) -> None:
-        """Find out what it does now, and whether anything of an answer was taken."""
+        """Update the phase, and whether the client has taken any of the answer."""
         request: RequestResponseCycle | None = None
         doing: _Doing = "handshake"
         unsent = taken = 0
@@ -95,29 +96,29 @@ class _Connection:
 
     @property
     def idle(self) -> bool:
-        """Whether its latest request is answered and the next has not begun, which is no trouble.
+        """Whether the latest request is answered and the next has not begun, which is normal.
 
-        Over TLS such a connection outlives uvicorn's own limit: it waits for a farewell of the other side.
+        Over TLS such a connection outlives uvicorn's own limit, waiting for the client to close the TLS session.
         """
         protocol = self.protocol
         answered = self.doing == "head" and self.request is not None
         return answered and protocol is not None and not protocol.conn.trailing_data[0]
 
     def waited_for(self, now_s: float) -> float | None:
-        """Since when the server waits for the other side; None if it does not, or for moments."""
+        """Time since which the server has waited for the client; None if it does not, or only for `_MOMENTS_S`."""
         if self.doing != "answering":
             return self.since_s
         return self.taken_s if now_s - self.taken_s > _MOMENTS_S else None
 
     def end(self) -> None:
-        """End it at once; what is unsent is dropped, or the system would keep it for who knows how long."""
+        """End the connection at once and drop unsent data, which the system might otherwise keep indefinitely."""
         self.ended = True
         with suppress(OSError):
             self.accepted.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
         if self.protocol is not None:
             self.protocol.transport.abort()
             return
-        with suppress(OSError):  # the other side was faster
+        with suppress(OSError):  # the client has already closed it
             self.accepted.shutdown(socket.SHUT_RDWR)
 
 
@@ -127,13 +128,13 @@ class HttpConnections:
     Parameters
     ----------
     proxies : sequence of str
-        Addresses and networks of whom only the connections in all count.
+        Addresses and networks without a limit per address; only the limit of all connections applies to them.
     plain : bool
-        Whether a refusal can be said in plain HTTP.
+        Whether connections are plain HTTP, so that a refusal can be sent as such.
     """
 
     def __init__(self, settings: HttpSettings, most: int, proxies: Sequence[str], *, plain: bool = True) -> None:
-        self.exhausted = 0  # how often none could be accepted because the process or the system has no file left
+        self.exhausted = 0  # number of failures to accept because the process or the system had no file left
         self._most = most
         self._per_address = settings.connections_per_address
         self._longest_s = {
@@ -149,7 +150,7 @@ class HttpConnections:
         self._open: dict[Any, _Connection] = {}
 
     def listener(self, listening: socket.socket) -> socket.socket:
-        """Take a listening socket over; what it accepts is counted."""
+        """Take over a listening socket; the connections that it accepts are counted."""
         return _Listener(listening, self)
 
     def protocol(self) -> type[asyncio.Protocol]:
@@ -157,7 +158,7 @@ class HttpConnections:
         connections = self
 
         class Protocol(H11Protocol):
-            """Tells when a connection is ready for requests."""
+            """Reports when a connection is ready for requests."""
 
             def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn has it
                 super().connection_made(transport)
@@ -166,13 +167,13 @@ class HttpConnections:
         return Protocol
 
     def watch(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Look at all connections a few times a second from now on; accept errors are logged once a minute."""
+        """Start checking all connections a few times per second; accept errors are logged once a minute."""
         self._looked_s = time.monotonic()
         loop.set_exception_handler(self._on_error)
         loop.call_later(_LOOK_S, self._look, loop)
 
     def made(self, address: Any, protocol: H11Protocol) -> None:
-        """A connection has got past its handshake."""
+        """Note that a connection has completed its handshake."""
         if found := self._open.get(address):
             found.protocol = protocol
             found.look(time.monotonic())
@@ -180,9 +181,10 @@ class HttpConnections:
                 found.end()
 
     def admit(self, accepted: socket.socket, address: Any) -> bool:
-        """Count a connection, and say whether there was room for it without ado.
+        """Count a new connection, and return whether there was room for it without closing another.
 
-        If there is not, the one goes of which the service has waited longest; if it waits for none, the new one goes.
+        If there is no room, the connection for which the server has waited longest is ended; if it waits for none, the
+        new one is refused.
         """
         now_s = time.monotonic()
         present = self._present()
@@ -218,7 +220,7 @@ class HttpConnections:
     def _look(self, loop: asyncio.AbstractEventLoop) -> None:
         loop.call_later(_LOOK_S, self._look, loop)
         now_s = time.monotonic()
-        # What the loop was late itself, because the computer is busy, is not charged to the other side.
+        # Delay of the event loop itself, on a busy computer, does not count as waiting for the client.
         late_s = max(0.0, now_s - self._looked_s - _LOOK_S)
         self._looked_s = now_s
         for one in self._present():
@@ -253,7 +255,7 @@ class HttpConnections:
 
 
 class _Listener(socket.socket):
-    """A listening socket that counts what it accepts."""
+    """A listening socket that counts the connections that it accepts."""
 
     def __init__(self, listening: socket.socket, connections: HttpConnections) -> None:
         super().__init__(fileno=listening.detach())
@@ -261,10 +263,10 @@ class _Listener(socket.socket):
         self._pause = False
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Accept a connection that there is room for.
+        """Accept a connection for which there is room.
 
-        asyncio accepts until nobody waits any more, thousands in one go. It is told that nobody does when something
-        has to be done first: connections to be closed, or a second to pass until there may be a file again.
+        asyncio accepts thousands of waiting connections in one go, until BlockingIOError. It is raised early if the
+        event loop must first close connections, or if asyncio must wait a second because no file was left.
         """
         if self._pause:
             self._pause = False
@@ -282,9 +284,9 @@ class _Listener(socket.socket):
 
 
 def _taken_and_queued(connection: socket.socket) -> tuple[int, int]:
-    """Bytes that the other side has acknowledged, and those that the system keeps for it; zeros if it does not tell.
+    """Bytes that the client has acknowledged, and those queued in the system; zeros if the system is not Linux.
 
-    The system takes megabytes off our hands: our own buffer may stand still for long although the other side reads.
+    The system buffers megabytes, so our own buffer may not change for long although the client reads.
     """
     if sys.platform != "linux":
         return 0, 0

@@ -1,4 +1,4 @@
-"""The application's description of itself (OpenAPI), with whole examples; nothing else can be asked for."""
+"""The OpenAPI description of the application, with complete examples; refuses undeclared query arguments."""
 
 import threading
 from collections.abc import Mapping
@@ -16,10 +16,10 @@ _STRICT = "/api/"
 
 
 class DescribedApp(FastAPI):
-    """An application with a description that programs can be generated from.
+    """An application whose description is suitable for code generators.
 
-    Operations are called as their functions, problems are described once, and examples keep their nulls, which FastAPI
-    leaves out wherever they are.
+    Operations have the names of their functions, problems are described once, and examples keep their nulls, which
+    FastAPI would remove.
     """
 
     def __init__(self, **arguments: Any) -> None:
@@ -36,7 +36,7 @@ class DescribedApp(FastAPI):
         }
 
     def openapi(self) -> dict[str, Any]:
-        """Return the description; made once, while others who ask wait for it: half made it is not to be seen."""
+        """Return the description, built once under a lock, so that no thread sees it incomplete."""
         with self._describing:
             if self.openapi_schema is None:
                 self.openapi_schema = self._described()
@@ -56,12 +56,12 @@ class DescribedApp(FastAPI):
 
 
 def only_known_arguments(request: Request) -> None:
-    """Refuse a query argument that the route does not take: misspelt, it would be left out without a word.
+    """Refuse a query argument that the route does not have: a misspelt one would otherwise be silently ignored.
 
     Raises
     ------
     RequestValidationError
-        Naming it, and those that there are.
+        Naming the argument and those of the route.
     """
     given = request.query_params.keys()
     if not given or not request.scope["path"].startswith(_STRICT) or not isinstance(request.app, DescribedApp):
@@ -78,7 +78,7 @@ def only_known_arguments(request: Request) -> None:
 
 
 def _queried(dependant: Dependant) -> set[str]:
-    """Names of the query arguments of a route, those of what it depends on included."""
+    """Names of the query arguments of a route, including those of its dependencies."""
     return {one.alias for one in dependant.query_params}.union(*map(_queried, dependant.dependencies))
 
 
@@ -90,11 +90,10 @@ def _restore(described: dict[str, Any], declared: dict[int | str, dict[str, Any]
 
 
 def _simplify(schema: Any) -> None:
-    """Make a schema such that programs can be generated from it, and small.
+    """Make a schema smaller and suitable for code generators.
 
-    Says of every tuple also what all of its values are, which generators read that do not know `prefixItems`, and
-    leaves out titles that only repeat the name of a field, and the null of an argument that may be left out: nobody
-    could send it.
+    Adds `items` to every tuple, for generators that do not know `prefixItems`, and removes titles that only repeat the
+    name of a field, and null as a value of optional query arguments, which nobody can send.
     """
     if isinstance(schema, list):
         for one in schema:
@@ -106,7 +105,7 @@ def _simplify(schema: Any) -> None:
         for field in (*(properties.values() if isinstance(properties, dict) else ()), own):
             if isinstance(field, dict):
                 field.pop("title", None)
-        if isinstance(own, dict) and own.get("description") == schema.get("description"):  # an argument's
+        if isinstance(own, dict) and own.get("description") == schema.get("description"):  # that of a query argument
             own.pop("description", None)
         if isinstance(own, dict) and "in" in schema and isinstance(choice := own.get("anyOf"), list):
             own["anyOf"] = choice = [one for one in choice if one != {"type": "null"}]

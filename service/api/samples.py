@@ -1,4 +1,4 @@
-"""Which samples an answer is made of: what a monitor holds now, those of recordings, or those of a replay."""
+"""Selects the samples of an answer: those a monitor holds now, those of recordings, or those of a replay."""
 
 import threading
 from collections import OrderedDict
@@ -57,7 +57,7 @@ _End = Annotated[int | None, time_query("of recorded samples, what ends then")]
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """What was asked for; without recordings and a replay what is live."""
+    """Selection of samples; live ones if neither recordings nor a replay are given."""
 
     recordings: tuple[str, ...] = ()
     replay: str | None = None
@@ -66,12 +66,12 @@ class Chosen:
 
     @property
     def recorded(self) -> bool:
-        """Whether it is not what is live."""
+        """Whether recorded rather than live samples are selected."""
         return bool(self.recordings) or self.replay is not None
 
 
 def _chosen_window(recording: Recordings = _NONE, replay: _Replay = None, until_ns: _End = None) -> Chosen:
-    """What a window is to be of, as query arguments. Raises HTTPException 422 if they contradict each other."""
+    """Query arguments that select a window. Raises HTTPException 422 if they contradict each other."""
     return _chosen_samples(recording, replay, None, until_ns)
 
 
@@ -92,7 +92,7 @@ ChosenSamples = Annotated[Chosen, Depends(_chosen_samples)]
 
 
 class SampleReader:
-    """Reads recorded samples for one caller at a time; any thread may ask."""
+    """Reads recorded samples for one caller at a time; thread-safe."""
 
     def __init__(self, service: ServiceView) -> None:
         self._service = service
@@ -100,19 +100,19 @@ class SampleReader:
 
     @contextmanager
     def samples(self, view: Monitored, chosen: Chosen, reach_s: float | None = None) -> Iterator[Sampled]:
-        """Samples as they were chosen.
+        """The selected samples.
 
         Parameters
         ----------
         reach_s : float, optional
-            How much before `Chosen.until_ns` is wanted, where nothing else says it.
+            Length of data before `Chosen.until_ns`, used if `Chosen.since_ns` is not given.
 
         Raises
         ------
         RotorwatchError
-            If there are none.
+            If there are no samples.
         HTTPException
-            If there is no such recording or replay, or too much to be read.
+            If there is no such recording or replay, or too much data would be read.
         """
         if not chosen.recorded:
             if not view.latest.blocks:
@@ -130,12 +130,12 @@ class SampleReader:
             yield Recorded(source, keys, *source.between(_moment(since_ns), _moment(until_ns), keys))
 
     def window(self, view: Monitored, chosen: Chosen) -> tuple[MachineSnapshots, LatestData]:
-        """A window as it was chosen, and what shows it; of those that were recorded the newest few are kept.
+        """The selected window, and the object that makes its snapshots; the last few recorded windows are cached.
 
         Raises
         ------
         HTTPException
-            If there is no such recording or replay, or too much to be read.
+            If there is no such recording or replay, or too much data would be read.
         """
         if not chosen.recorded:
             return view.snapshots, view.latest
@@ -193,7 +193,7 @@ def _taking_turns() -> Iterator[None]:
 
 @lru_cache(maxsize=_SOURCES)
 def _source(files: _Files) -> RecordingSource:
-    """Files, whose indexes are read once; with their sizes, which change with them."""
+    """Recordings with their indexes, which are read once; file sizes are part of the cache key, to detect changes."""
     return RecordingSource([path for path, _ in files])
 
 

@@ -27,7 +27,7 @@ class HttpError(RotorwatchError):
 
 
 class HttpServer:
-    """Serves an application; the address is taken when it is built.
+    """Serves an application; the constructor binds the address.
 
     Raises
     ------
@@ -52,7 +52,7 @@ class HttpServer:
             listening = socket.create_server((settings.host, settings.port), family=family)
         except OSError as error:
             raise HttpError(f"HTTP cannot listen on {settings.host} port {settings.port}: {_why(error)}") from error
-        # Without it the end of every answer waits for the other side's acknowledgement, 40 ms.
+        # Without TCP_NODELAY, the end of every answer waits for the client's acknowledgement, 40 ms.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket = self._connections.listener(listening)
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
@@ -62,7 +62,7 @@ class HttpServer:
 
     @property
     def exhausted(self) -> int:
-        """How often no connection could be accepted, because there was no file left."""
+        """Number of failures to accept a connection because no file was left."""
         return self._connections.exhausted
 
     def start(self, app: FastAPI) -> None:
@@ -75,7 +75,7 @@ class HttpServer:
             log_config=None,
             access_log=False,
             lifespan="off",
-            timeout_graceful_shutdown=_LAST_ANSWERS_S,  # for whoever has stopped reading
+            timeout_graceful_shutdown=_LAST_ANSWERS_S,  # for clients that have stopped reading
             **self._arguments,
         )
         server = self._server = _Server(config, self._connections)
@@ -86,13 +86,13 @@ class HttpServer:
         """Finish present requests and free the address."""
         if self._server is not None and self._thread is not None:
             self._server.should_exit = True
-            if self._thread.is_alive():  # else it could not be started, and that is what is to be told
+            if self._thread.is_alive():  # otherwise starting it failed, and that error must be reported
                 self._thread.join(_JOIN_S)
         self._socket.close()
 
 
 class _Server(uvicorn.Server):
-    """uvicorn's, whose connections are watched."""
+    """A uvicorn server whose connections are watched."""
 
     def __init__(self, config: uvicorn.Config, connections: HttpConnections) -> None:
         super().__init__(config)
@@ -104,10 +104,10 @@ class _Server(uvicorn.Server):
 
 
 def http_connections(settings: HttpSettings, files: int) -> int:
-    """How many connections there may be in a process that may open so many files.
+    """Most connections of a process that may open `files` files.
 
-    A third: a connection may need a file of its own besides, as a download does, and the last third is for the history,
-    Zenoh and recordings.
+    At most a third of them: a connection may need another file, as a download does, and the last third is for the
+    history, Zenoh and recordings.
     """
     return max(1, min(settings.connections, files // _SHARE))
 

@@ -1,4 +1,4 @@
-"""What the HTTP API needs to know about the service and its machines, and the arguments its routes share."""
+"""Interface of the HTTP API to the service and its machines, and arguments that several routes share."""
 
 import re
 from typing import Annotated, Any, Protocol
@@ -23,7 +23,7 @@ MachineName = Annotated[str, Path(description="name of the machine", examples=["
 
 
 def time_query(text: str) -> Any:
-    """A query argument that is a time, of which `text` says what it is for."""
+    """A query argument that is a time; `text` describes its purpose."""
     return Query(ge=0, le=_LATEST_NS, description=f"{text}, ns since 1970-01-01 UTC")
 
 
@@ -47,7 +47,7 @@ AlarmName = Annotated[
 
 
 class ServiceView(MeasuredService, Protocol):
-    """What the API needs to know about the service; `service.runtime.runtime.Runtime` is one."""
+    """Parts of the service that the API uses; implemented by `service.runtime.runtime.Runtime`."""
 
     settings: ServiceSettings
     metrics: Metrics
@@ -63,7 +63,7 @@ def found_machine(service: ServiceView, site: str, name: str) -> Monitored:
     Raises
     ------
     HTTPException
-        404, with the machines there are.
+        404, with a list of the machines.
     """
     machines = {one.machine.title: one for one in service.machines()}
     machine = machines.get(f"{site}/{name}")
@@ -78,7 +78,7 @@ def check_alarm(view: Monitored, name: str, status: int) -> None:
     Raises
     ------
     HTTPException
-        With this status, and the alarms there are.
+        With the given status, and a list of the machine's alarms.
     """
     levels = [f"{LEVEL}{channel.name}" for channel in view.machine.sensors if channel.quantity != "shaft_angle"]
     if name not in ALARMS and name not in levels:
@@ -91,4 +91,4 @@ async def _in_path(request: Request, site: SiteName, machine: MachineName) -> Mo
 
 
 InPath = Annotated[Monitored, Depends(_in_path)]
-"""The machine that the path of a request names."""
+"""The machine named in the path of a request."""

@@ -1,4 +1,4 @@
-"""Server-sent events of all machines: what happens to alarms, and changes of health."""
+"""Server-sent events of all machines: alarm events, and changes of health."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal
@@ -19,7 +19,7 @@ from service.delivery.event_feed import CURSOR_PATTERN, Cursor, CursorError, cur
 from service.history.machine import MachineStore
 
 _LONGEST = 20_000
-_FORM = {"pattern": CURSOR_PATTERN}  # described here, refused in words that say more
+_FORM = {"pattern": CURSOR_PATTERN}  # for the description only; the check in `_cursor` has a clearer message
 
 _Machines = Annotated[
     list[str],
@@ -56,7 +56,7 @@ _InFull = Annotated[
 
 
 def stream_example() -> str:
-    """What a stream looks like."""
+    """Example of a stream of server-sent events."""
     event = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
     return (
         "retry: 2000\nid: demo/lab=-1\nevent: start\ndata: {}\n\n"
@@ -94,7 +94,7 @@ def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
         async def admitted() -> bool:
             try:
                 return await run_in_threadpool(guard.still_valid, caller)
-            except RotorwatchError:  # the database: nothing but health can be told meanwhile
+            except RotorwatchError:  # the database fails: meanwhile only health can be sent
                 return True
 
         def health(place: str) -> Health:
@@ -116,9 +116,9 @@ def _logs(service: ServiceView, wanted: list[str]) -> Mapping[str, MachineStore]
 
 
 def _cursor(logs: Mapping[str, MachineStore], texts: tuple[str, ...], begin: str) -> Cursor:
-    """Where to begin in each log; a machine that the first text does not name is new to the listener, who gets it all.
+    """Where to begin in each log: after the first cursor in `texts`; a machine missing from it is sent from the start.
 
-    Texts after the first that is there must be understood, and do not count.
+    All non-empty texts must be valid cursors, but only the first counts.
     """
     try:
         given = [parsed_cursor(text) for text in texts if text]

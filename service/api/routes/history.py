@@ -175,7 +175,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
             buckets: Any = history.downsampled(
                 quantity=quantity, names=names or None, since_ns=since_ns, until_ns=until_ns, points=points
             )
-            # As it is: to check twenty thousand buckets that were just made takes longer than to make them.
+            # Without validation: validating twenty thousand fresh buckets takes longer than creating them.
             told = ReadingList.model_construct(quantity=quantity, readings=(), buckets=buckets, next_after=None)
             return Response(told.model_dump_json(warnings=False), media_type="application/json")
         if len(names) != 1:
@@ -234,19 +234,19 @@ def _trend(service: ServiceView, of: str, hours: int, points: int) -> Trend:
 
 
 def _check_audited(service: ServiceView, place: str | None, found: Sequence[AuditRecord]) -> None:
-    """Refuse a machine that is not there and to which nothing was ever done."""
+    """Refuse a machine that neither exists nor has an entry in the audit log."""
     if place is not None and not found and not service.store.audit.entries(None, 1, machine=place):
         found_machine(service, *place.rpartition("/")[::2])
 
 
 def _check_logged(view: Monitored, name: str | None) -> None:
-    """Refuse an alarm that a machine cannot have and never had."""
+    """Refuse an alarm that the machine cannot have and has no events of."""
     if name is not None and name not in ALARMS and not view.history.events(alarm=name, limit=1):
         check_alarm(view, name, 422)
 
 
 def _check_read(view: Monitored, quantity: str, names: Sequence[str], field: str) -> None:
-    """Refuse a name under which nothing is read of a machine, nor was before its file changed."""
+    """Refuse a name for which the machine has no readings, neither now nor in the history (of another machine file)."""
     channels = [one.name for one in view.machine.sensors if one.quantity != "shaft_angle"]
     known: Sequence[str] = (quantity,)
     if quantity == "parameter":
@@ -266,6 +266,6 @@ def _check_read(view: Monitored, quantity: str, names: Sequence[str], field: str
 
 
 def _listed(name: str, texts: Sequence[str], **cursors: int | None) -> Response:
-    """Answer with what is stored as it was published, to the byte, whichever version of the program wrote it."""
+    """Answer with stored texts, byte for byte as published, whichever version of the program wrote them."""
     tail = "".join(f',"{cursor}":{"null" if value is None else value}' for cursor, value in cursors.items())
     return Response(f'{{"{name}":[{",".join(texts)}]{tail}}}', media_type="application/json")

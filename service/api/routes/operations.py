@@ -1,4 +1,4 @@
-"""Alarms over HTTP: what they are now, and what operators do to them."""
+"""Alarms over HTTP: their current state, and operators' actions."""
 
 import re
 from typing import Annotated, Any
@@ -74,7 +74,7 @@ _IfMatch = Annotated[
 
 
 def add_operation_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
-    """Add the routes; those of the alarms' events must be there already, because ``events`` is no alarm."""
+    """Add the routes; those of alarm events must be added before, or ``events`` would be taken for an alarm's name."""
     _add_reading_routes(app, service, guard)
     for kind in _TEXTS:
         _add_operation(app, service, guard, kind)
@@ -157,7 +157,7 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
 
 
 def _present(view: Monitored, name: str) -> Alarm:
-    """An alarm as it is now; one that nothing has been seen of yet is normal."""
+    """The current state of an alarm; an alarm that never occurred is normal."""
     check_alarm(view, name, 404)
     for one in view.alarms(include_normal=True).alarms:
         if one.name == name:
@@ -172,6 +172,6 @@ def _marked(alarm: Alarm, response: Response) -> Alarm:
 
 
 def _version(if_match: str | None) -> int | None:
-    """Version that an ETag stands for; a proxy that packs answers may have made it a weak one."""
+    """Version in an ETag, which a compressing proxy may have turned into a weak one."""
     found = re.search(r"-?[0-9]+", if_match or "")
     return None if found is None else int(found[0])

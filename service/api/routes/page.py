@@ -1,6 +1,7 @@
-"""The page for people: files that ask the API for everything they show, and so are anybody's; and the API as a page.
+"""Routes of the web page, and of the page that documents the API.
 
-Files are served below the digest of all of them, so that a browser keeps them for good and never mixes two versions.
+The page's files contain no data, which they request from the API, so anybody may load them. They are served below a
+digest of all files, so that a browser can cache them indefinitely and never mixes two versions.
 """
 
 import base64
@@ -43,8 +44,8 @@ _DOCS_POLICY = (
 
 
 def page_files() -> dict[str, bytes]:
-    """Everything the page is made of, by name, the library of charts included."""
-    # The package itself is not imported: it brings a shell for notebooks along.
+    """All files of the page by name, including the chart library."""
+    # The package itself is not imported, because it would import a notebook shell.
     charts = Path(str(distribution("uplot-python").locate_file("uplot/static")))
     found = {path.relative_to(_FOLDER).as_posix(): path for path in _FOLDER.rglob("*") if path.suffix in _TYPES}
     found |= {name: charts / name for name in _CHARTS}
@@ -52,7 +53,7 @@ def page_files() -> dict[str, bytes]:
 
 
 def add_page_routes(app: FastAPI) -> None:
-    """Add the page and what it loads."""
+    """Add the page and the files that it loads."""
     found = page_files()
     digest = hashlib.sha256(repr(found).encode()).hexdigest()[:16]
     index = (_FOLDER / _INDEX).read_text(encoding="utf-8").replace(PAGE_FILES, f"{PAGE_FILES}{digest}/")
@@ -68,7 +69,7 @@ def add_page_routes(app: FastAPI) -> None:
     ) -> Response:
         if version != digest or name not in found:
             raise HTTPException(404, f"the page has no file {name[:80]} in this version; reload /")
-        # What runs as a worker goes by the policy it comes with.
+        # A worker script is subject to the policy in its own response.
         keep = {"Content-Security-Policy": _POLICY, "Cache-Control": "public, max-age=31536000, immutable"}
         return Response(found[name], media_type=_TYPES[Path(name).suffix], headers=keep)
 

@@ -32,7 +32,7 @@ from service.stream.monitored import Monitored
 
 _MOST_REPORTS = 400
 _SOON_S = 120.0
-"""Before the end of a time that was chosen: the newest revolutions and seconds are in it."""
+"""Data read before a chosen end time, s: enough for the newest revolutions and seconds."""
 _NO_ANGLE = "the shaft angle is not measured (keyphasor), and without it vibration has no phase"
 
 _NONE: list[str] = []
@@ -63,9 +63,9 @@ def _made(
     of_history: bool = False,
     **asked: Any,
 ) -> _Values:
-    """What is made of samples, or of the history; where there is nothing to make it of, why, beside what was asked for.
+    """Make a plot's values from samples or the history; if that is impossible, return the reason with `asked`.
 
-    Without recordings it is of the newest samples, or of the history: every so many windows of a long time.
+    Without recordings, the values are those of the newest samples or, `of_history`, of the history, thinned out.
     """
     source = "recordings" if chosen.recorded else "history" if of_history else "newest samples"
     try:

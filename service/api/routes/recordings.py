@@ -1,4 +1,4 @@
-"""Recordings over HTTP: list, look at, download."""
+"""Recordings over HTTP: list, describe, download."""
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -40,7 +40,7 @@ def add_recording_routes(
 ) -> None:
     """Add the routes; without an index they answer with a problem that names the setting.
 
-    Of machines that are `monitored`, as site/machine, there may be no recordings yet.
+    `monitored` lists machines as site/machine that are known even if they have no recordings yet.
     """
     common: dict[str, Any] = {"tags": ["recordings"], "dependencies": [guard.read]}
 
@@ -111,9 +111,9 @@ def _with_data_times(recording: Recording) -> Recording:
     return recording.model_copy(update={"data_start_ns": span.start_ns, "data_end_ns": span.end_ns})
 
 
-@lru_cache(maxsize=10_000)  # a file that grows is another one each time
+@lru_cache(maxsize=10_000)  # the size is part of the key, because a file may still grow
 def _data_span(path: Path, _size_bytes: int) -> DataSpan | None:
-    """Which data a file holds, read once for as long as it has the same size; None where it is damaged or gone."""
+    """Time span of the data in a file, cached while its size stays the same; None if the file is damaged or gone."""
     try:
         return RecordingSource([path]).span()
     except RecordingError:
@@ -121,7 +121,7 @@ def _data_span(path: Path, _size_bytes: int) -> DataSpan | None:
 
 
 class _RecordingFile(FileResponse):
-    """A file, or a range of it; a range that cannot be had is a problem like any other."""
+    """A file or a range of it; an invalid range is answered with problem details."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         refused: int | None = None
@@ -144,7 +144,7 @@ def found_recording(index: Catalogue | None, recording_id: str) -> Recording:
     Raises
     ------
     HTTPException
-        404 if there is none, or no directory of recordings is set.
+        404 if there is no such recording, or no directory for recordings is set.
     """
     found = _present(index).find(recording_id)
     if found is None:

@@ -1,4 +1,4 @@
-"""Replays over HTTP: start, watch, steer and stop them, and read what they found."""
+"""Replays over HTTP: start, watch, control and stop them, and read their results."""
 
 import asyncio
 import re
@@ -47,10 +47,10 @@ form(TOML_NAME, "a file name that ends in .toml")
 _JOB = f"{_PLACE}/{{replay_id}}"
 _END = re.compile(r'"end_ns":(\d+)')
 _SAME_NS = 1000
-"""Numbers of JavaScript hold times of today to 256 ns."""
+"""Tolerance for times from JavaScript, whose numbers resolve present times to 256 ns."""
 _LOOK_S = 0.25
 _QUIET_S = 15.0
-_UNSPECIFIED = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104  # what to connect to, nothing listens there
+_UNSPECIFIED = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104  # addresses to connect to; nothing listens on them
 
 
 class NoOrder(Record):
@@ -58,7 +58,7 @@ class NoOrder(Record):
 
 
 class ReplayRequests:
-    """Takes requests for replays of what is in the index, if there is one, and turns them into jobs."""
+    """Turns requests for replays of recordings in the index (if any) into jobs."""
 
     def __init__(self, settings: ServiceSettings, index: Catalogue | None) -> None:
         self._settings = settings
@@ -79,7 +79,7 @@ class ReplayRequests:
         Raises
         ------
         HTTPException
-            With what is wrong with the request.
+            If the request is invalid or cannot be fulfilled.
         """
         recordings = [found_recording(self._index, name) for name in request.recordings]
         for recording in recordings:
@@ -94,7 +94,7 @@ class ReplayRequests:
             raise HTTPException(422, f"to_ns: {request.to_ns} is not later than from_ns, {request.from_ns}")
         offline = request.mode == "offline"
         link = self._settings.link
-        if not offline and (link.grants or link.tls or link.user or link.passwords_file):  # it would not be let in
+        if not offline and (link.grants or link.tls or link.user or link.passwords_file):  # it could not connect
             raise HTTPException(
                 409,
                 "mode: a paced replay needs a network without grants, passwords and certificates; expected "
@@ -147,23 +147,23 @@ class ReplayRequests:
         return found
 
     def installed(self, job: ReplayJob) -> Installed:
-        """What an offline replay is evaluated with.
+        """Machine file and bundle of an offline replay.
 
         Raises
         ------
         HTTPException
-            404 if that cannot be read any more.
+            404 if they cannot be read any more.
         """
         keys = MachineKeys(*job.recordings[0].split("/")[:2])
         found = self.jobs.find(job.id)
         sent = None if found is None else found.machine_file
         try:
             return choose_machine(keys, sent or job.machine, "\n".join(job.changes))
-        except RotorwatchError as error:  # where the file is concerns nobody who asks over HTTP
+        except RotorwatchError as error:  # its text has the file's path, which must not be shown over HTTP
             raise HTTPException(404, f"what replay {job.id} was evaluated with can no longer be read") from error
 
     def report(self, job: ReplayJob, end_ns: int) -> Report | None:
-        """What an offline replay found in the window that ends at a time, which may be rounded to a microsecond."""
+        """Report of an offline replay on the window that ends at `end_ns`, which may be rounded to a microsecond."""
         for message in _messages(self.jobs.find(job.id), "/report"):
             end = _END.search(message)
             if end is not None and abs(int(end[1]) - end_ns) < _SAME_NS:
@@ -171,7 +171,7 @@ class ReplayRequests:
         return None
 
     def _machine(self, request: ReplayRequest, recorded: str) -> str | None:
-        """FILE or FILE@BUNDLE; None leaves the choice to the recorded name."""
+        """Machine as FILE or FILE@BUNDLE; None if it is to be chosen by the recorded name."""
         monitored = self._monitored
         name, bundle = request.machine, request.bundle
         if name is None:
@@ -190,7 +190,7 @@ class ReplayRequests:
         )
 
     def _beside_sent(self, request: ReplayRequest, recorded: str) -> str | None:
-        """What a machine file that was sent is evaluated with: networks by name, or what was commissioned."""
+        """Bundle for a machine file sent with the request: shipped networks by name, or the commissioned bundle."""
         if request.machine_file is None:
             return None
         if request.mode != "offline":
@@ -215,7 +215,7 @@ class ReplayRequests:
 
 
 def _check_changes(request: ReplayRequest, machine: str | None) -> None:
-    """Say at once what is wrong with changes; a machine that only the recording knows is looked at by the replay."""
+    """Check changes before the replay starts; if only the recording names the machine, the replay checks them fully."""
     if request.changes and request.mode != "offline":
         raise HTTPException(422, "changes: nothing is evaluated in a paced replay")
     changes = "\n".join(request.changes)
@@ -225,7 +225,7 @@ def _check_changes(request: ReplayRequest, machine: str | None) -> None:
         else:
             changed({}, changes)
     except MachineFileError as error:
-        # Where the file is concerns nobody who asks over HTTP.
+        # The path of the file must not be shown over HTTP.
         raise HTTPException(422, re.sub(r"(?m)^[^:\n]*\.toml: ", "changes: ", str(error))) from error
 
 
@@ -349,7 +349,7 @@ def _order(desk: ReplayRequests, replay_id: str, order: str) -> ReplayJob:
 def _results(
     desk: ReplayRequests, replay_id: str, topic: str, offset: int, limit: int, every: int = 1
 ) -> tuple[list[str], int | None]:
-    """Messages of one topic, and where those that follow begin."""
+    """Messages of one topic, and the offset of the next page, or None at the end."""
     job = desk.found(replay_id)
     if job.view.mode != "offline":
         raise HTTPException(404, "a paced replay only publishes: ask the monitor in its namespace what it found")
@@ -363,9 +363,9 @@ def _messages(job: RunningJob | None, topic: str) -> Iterator[str]:
         return
     with job.results.open(encoding="utf-8") as lines:
         for line in lines:
-            if not line.endswith("\n"):  # being written
+            if not line.endswith("\n"):  # still being written
                 return
-            head, _, message = line.partition('", "message": ')  # `result_lines` writes them so
+            head, _, message = line.partition('", "message": ')  # format of `result_lines`
             if head.endswith(topic):
                 yield message.rstrip("\n")[:-1]
 
@@ -392,16 +392,16 @@ async def _events(look: Callable[[], ReplayJob]) -> AsyncIterator[str]:
 
 
 def _spec(file: str, bundle: str | None) -> str:
-    """Words for ``--machine``; paths that hold for any folder."""
+    """Value for ``--machine``, with absolute paths."""
     file = str(Path(file).resolve()) if file.endswith(".toml") else file
     return file if bundle is None else f"{file}@{Path(bundle).resolve() if Path(bundle).is_dir() else bundle}"
 
 
 def _endpoints(link: LinkSettings) -> tuple[str, ...]:
-    """Where a client reaches the network of this service."""
+    """Endpoints at which a client on this computer reaches the service's network."""
     found = []
     for end in link.listen:
         for unspecified, here in _UNSPECIFIED.items():
-            end = end.replace(f"/{unspecified}:", f"/{here}:")  # noqa: PLW2901  # the same endpoint, nearer
+            end = end.replace(f"/{unspecified}:", f"/{here}:")  # noqa: PLW2901  # the same endpoint via loopback
         found.append(end)
     return tuple(found[:1]) or link.connect

@@ -1,6 +1,6 @@
-"""Windows over HTTP, the latest one or one that was recorded: correlations and spectra beside theory, and orbits.
+"""Snapshots of the latest or a recorded window over HTTP: correlations and spectra with theory, and orbits.
 
-An answer is made once for all who ask the same: many pages show the same machine.
+Answers are cached, because many pages show the same machine.
 """
 
 import threading
@@ -42,25 +42,25 @@ _Revolutions = Annotated[
 class _Kept:
     lock: threading.Lock = field(default_factory=threading.Lock)
     body: bytes | None = None
-    mark: object = None  # of what it was made
-    newest_ns: int | None = None  # and the newest samples then
+    mark: object = None  # `LatestData.mark` of the data that it was made from
+    newest_ns: int | None = None  # start of their newest block
     made_s: float = 0.0
 
 
 class WindowAnswers:
-    """Answers that hold until another window is evaluated; any thread may ask."""
+    """Cache of answers that are valid until another window is evaluated; thread-safe."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._lock = threading.Lock()
-        self._kept: dict[Hashable, _Kept] = {}  # in the order in which they were asked for
+        self._kept: dict[Hashable, _Kept] = {}  # least recently requested first
 
     def of(
         self, question: Hashable, data: LatestData, make: Callable[[], BaseModel], *, of_samples: bool = False
     ) -> Response:
-        """What is kept if it still holds, else what is made.
+        """Return the cached answer if it is still valid, else make it.
 
-        With the newest samples in it an answer holds for a second only, and not across a gap.
+        An answer `of_samples` contains the newest samples; it is valid for one second only, and not across a gap.
         """
         with self._lock:
             kept = self._kept[question] = self._kept.pop(question) if question in self._kept else _Kept()

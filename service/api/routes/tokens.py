@@ -1,6 +1,6 @@
-"""Who calls over HTTP and what that caller may do: tokens, and how a browser signs in, with one in a cookie, and out.
+"""Callers over HTTP and their rights: tokens, and a browser's sign-in (with a token in a cookie) and sign-out.
 
-``rotorwatch token`` does the same with tokens in a terminal.
+``rotorwatch token`` manages tokens in a terminal.
 """
 
 import threading
@@ -28,7 +28,7 @@ _SHOWN: Any = {"example": {"summary": "for the control room", "value": example(T
 
 def add_token_routes(app: FastAPI, guard: Guard) -> None:
     """Add the routes."""
-    one_at_a_time = threading.Lock()  # two that come at once do not get the same name
+    one_at_a_time = threading.Lock()  # so that two simultaneous requests cannot take the same name
 
     @app.get(_PLACE, tags=["service"], dependencies=[guard.configure], responses=responses(TokenList))
     def tokens() -> TokenList:
@@ -87,7 +87,7 @@ def add_token_routes(app: FastAPI, guard: Guard) -> None:
 
 
 def _outlasts(made: TokenRecord, own: TokenRecord | None) -> bool:
-    """Whether a token is valid for longer than that of who creates it."""
+    """Whether a new token is valid for longer than the token of its creator."""
     if own is None or own.expires_ns is None:
         return False
     return made.expires_ns is None or made.expires_ns > own.expires_ns
