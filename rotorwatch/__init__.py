@@ -1,6 +1,6 @@
-"""What a rotorwatch monitor says, as records, and its client.
+"""Records that a rotorwatch monitor publishes, and clients for it.
 
-`Client` asks a monitor over HTTP; ``rotorwatch.client.alarm_log`` follows alarm logs over Zenoh instead, and needs
+`Client` uses the HTTP API; ``rotorwatch.client.alarm_log`` follows alarm logs over Zenoh instead, and needs
 eclipse-zenoh. ``docs/client.md`` shows both.
 """
 
@@ -88,7 +88,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    """Import the client where it is asked for: who wants records alone does not wait for an HTTP client."""
+    """Import the client on first access, so that users of the records alone do not import an HTTP client."""
     if name == "Client":
         from rotorwatch.client.client import Client  # noqa: PLC0415
 

@@ -1,1 +1,1 @@
-"""A monitor's HTTP API in Python, and its alarm logs over Zenoh."""
+"""Clients for a monitor's HTTP API, and for its alarm logs over Zenoh."""

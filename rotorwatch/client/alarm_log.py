@@ -1,4 +1,4 @@
-"""Follows the alarm logs of machines over Zenoh: every event once, in order, from a given number on."""
+"""Follows the alarm logs of machines over Zenoh: every event once, in order, from a given sequence number on."""
 
 import logging
 import queue
@@ -32,33 +32,33 @@ def follow_alarms(
     stop: threading.Event | None = None,
     ask_every_s: float = 2.0,
 ) -> None:
-    """Hand over every alarm event of some machines, once and in order, until told to stop.
+    """Pass every alarm event of the given machines to `on_event`, once and in order, until `stop` is set.
 
-    Events come as they happen. What was missed, because this program, the connection or the monitor was away, is
-    asked for; while nobody answers this waits. Whoever keeps the sequence number of the last event handed over and
-    gives it back as `after` has the log without a hole and without a repetition.
+    Events are passed on as they happen. Events missed while this program, the connection or the monitor was down are
+    requested from the log; while no monitor answers, this function waits. A program that stores the sequence number of
+    the last event and passes it as `after` gets the log without a gap and without a repetition.
 
     Parameters
     ----------
     session : zenoh.Session
-        An open session with the network of the monitors. It stays open; a connection that is lost comes back by itself.
+        An open session with the monitors' network. It stays open; a lost connection is restored automatically.
     machines : sequence of str
         ``<site>/<machine>``, where ``*`` stands for any.
     after : mapping of str to int
-        Sequence number of the last event already taken, by machine; a machine that is not in it is followed from the
+        Sequence number of the last event already taken, by machine; machines not in it are followed from the
         beginning.
     on_event : callable
-        Takes one event after the other, in this thread; the next one comes after it has returned. If it raises, this
-        ends with the same exception, and the event counts as not taken.
+        Called in this thread with one event after the other. If it raises, this function ends with the same exception,
+        and the event counts as not taken.
     stop : threading.Event, optional
-        Set it to end; without it this goes on for ever.
+        Set it to end; without it this function runs for ever.
     ask_every_s : float
-        How often each log is asked for what may have been missed, in seconds.
+        Interval at which each log is queried for missed events, in seconds.
 
     Raises
     ------
     LogReplaced
-        If a log is not the one that was followed: it ends before `after`, or its last event has changed.
+        If a log has been replaced: it ends before `after`, or the last event taken has changed.
     ClientError
         If a monitor sends something that this version does not understand.
     """
@@ -98,7 +98,7 @@ class _Follower:
                 self._listen(min(_STOP_S, max(0.0, next_s - time.monotonic())))
 
     def _hear(self, message: AlarmMessage) -> None:
-        """Put a message into the queue, on Zenoh's thread; what does not fit in is a hole like any other."""
+        """Put a message into the queue, on Zenoh's thread; if the queue is full, it is read from the log later."""
         try:
             self._heard.put_nowait(message)
         except queue.Full:
@@ -125,13 +125,13 @@ class _Follower:
             else:
                 order.announce(understood(AlarmStates, message.text, message.place).sequence)
         except ClientError as error:
-            # Whoever sent it: what counts is what the log says.
+            # A malformed message, from whatever sender: read the log, which is authoritative.
             _log.warning("%s", error)
             self._due_s[message.place] = 0.0
             return
         self._hand_over(order)
         if order.incomplete:
-            # A moment's patience: what is missing may be on its way.
+            # Wait a moment before asking the log: the missing events may still arrive.
             self._due_s[message.place] = min(self._due_s[message.place], time.monotonic() + _HOLE_S)
 
     def _ask(self, topics: AlarmTopics, order: LogOrder) -> None:
@@ -146,7 +146,7 @@ class _Follower:
             self._hand_over(order)
             if not order.incomplete:
                 return
-            if order.last == before:  # announced and not committed yet
+            if order.last == before:  # announced, but not committed yet
                 self._due_s[order.place] = time.monotonic() + min(1.0, self._ask_every_s)
                 return
 

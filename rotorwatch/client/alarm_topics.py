@@ -1,4 +1,4 @@
-"""A follower's side of Zenoh: what happens to alarms as it is published, and the alarm log by query."""
+"""A follower's access over Zenoh: published alarm events and states, and queries to the alarm log."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -16,25 +16,25 @@ _ANSWER_S = 5.0
 _CACHED_EVENTS = 200
 
 
-class LogUnavailable(ClientError):  # noqa: N818  # said to whoever follows, by its name
+class LogUnavailable(ClientError):  # noqa: N818  # public name
     """A monitor could not answer from its alarm log; the message is the monitor's."""
 
 
 @dataclass(frozen=True, slots=True)
 class AlarmMessage:
-    """Something heard of a machine's alarms."""
+    """A message about a machine's alarms."""
 
     place: str  # ``<site>/<machine>``
-    kind: Literal["event", "state", "monitor"]  # an alarm event, the alarms as they are now, or a monitor that has come
+    kind: Literal["event", "state", "monitor"]  # an alarm event, the current alarms, or a monitor that has appeared
     text: bytes  # JSON; empty for a monitor
 
 
 class AlarmTopics:
-    """Subscriptions to the alarms of some machines, and questions to their monitors.
+    """Subscriptions to the alarms of machines, and queries to their monitors.
 
-    A connection that is lost comes back by itself; what was published in between is not heard. `hear` takes each
-    message, on a thread of Zenoh's: be short. Latest states and events that monitors still have come at once, possibly
-    out of order and more than once.
+    A lost connection is restored automatically, but messages published meanwhile are missed. `hear` is called with each
+    message on a Zenoh thread, and must return quickly. Latest states and events cached by monitors are delivered at
+    once, possibly out of order and repeatedly.
     """
 
     def __init__(self, session: zenoh.Session, machines: Sequence[str], hear: Callable[[AlarmMessage], None]) -> None:
@@ -50,9 +50,9 @@ class AlarmTopics:
         self._undo.close()
 
     def ask(self, place: str, after: int, limit: int) -> str | None:
-        """Ask a monitor for an alarm log, JSON of an `AlarmLogPage`; None if nobody answers within five seconds.
+        """Query a monitor's alarm log: JSON of an `AlarmLogPage`, or None without an answer within five seconds.
 
-        It has at most `limit` events, up to 1000, after this sequence number; -1 for the beginning.
+        The page has at most `limit` events, up to 1000, after sequence number `after`; -1 is the beginning.
 
         Raises
         ------
@@ -96,7 +96,7 @@ class AlarmTopics:
 
 
 def _refusal(payload: bytes) -> str:
-    """What a monitor says; empty for what Zenoh itself says, such as that time is up."""
+    """A monitor's error message; empty for errors of Zenoh itself, such as a timeout."""
     try:
         said = json.loads(payload)
     except ValueError:

@@ -1,4 +1,4 @@
-"""What the service answers: models, or problems as exceptions."""
+"""Converts the service's answers to models, and problems to exceptions."""
 
 from typing import TypeVar
 
@@ -23,22 +23,22 @@ _SHOWN = 200
 
 
 def refusal(answer: httpx.Response) -> RequestRefused:
-    """Turn an answer that has been read, and is not what was asked for, into an exception with the problem's text."""
+    """Convert an error answer, whose body has been read, to an exception with the problem's text."""
     try:
         detail = Problem.model_validate_json(answer.content).detail
-    except ValidationError:  # from something in between, a proxy for example
+    except ValidationError:  # not from the service, but from a proxy for example
         detail = answer.text.strip()[:_SHOWN] or answer.reason_phrase
     text = f"{answer.request.method} {answer.request.url.path}: {detail}"
     return _KINDS.get(answer.status_code, RequestRefused)(answer.status_code, text)
 
 
 def understood(model: type[M], text: str | bytes, place: str) -> M:
-    """Read JSON as a model.
+    """Parse JSON as a model.
 
     Raises
     ------
     ClientError
-        If it is another JSON, which happens if service and client are of different versions.
+        If it does not match, for example because service and client have different versions.
     """
     try:
         return model.model_validate_json(text)

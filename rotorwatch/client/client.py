@@ -1,4 +1,4 @@
-"""A monitor's HTTP API in Python."""
+"""Client for a monitor's HTTP API."""
 
 import os
 import re
@@ -43,27 +43,27 @@ _Parameter = str | int | float | bool | None | Sequence[str]
 class Client:
     """A connection to a monitor.
 
-    Machines are named as ``<site>/<machine>``. What changes an alarm takes the `Alarm` as it was seen: it is done only
-    if nothing has happened to the alarm since, and otherwise raises `Conflict`.
+    Machines are named ``<site>/<machine>``. Methods that change an alarm take the `Alarm` as the operator saw it; if it
+    has changed since, nothing is done and `Conflict` is raised.
 
     Parameters
     ----------
     url : str
-        Where the monitor's API is.
+        Address of the monitor's API.
     token : str, optional
-        Access token; if left out, what the environment variable ``ROTORWATCH_TOKEN`` holds.
+        Access token; by default, the value of the environment variable ``ROTORWATCH_TOKEN``.
     ca : Path, optional
-        Certificates (PEM) of the authority that issued the monitor's; if left out, those this computer trusts.
+        Certificates (PEM) of the authority that issued the monitor's; by default, those this computer trusts.
     certificate : tuple of Path, optional
-        Own certificate and its key (PEM), where the monitor asks for one.
+        Own certificate and its key (PEM), if the monitor requires one.
     timeout_s : float
-        How long to wait for an answer, in seconds.
+        Longest time to wait for an answer, in seconds.
 
     Raises
     ------
     ClientError
-        If the address or the token cannot be one, or a certificate cannot be read. Every method raises `NoAnswer` if
-        nobody answers in time, and `RequestRefused` or one of its kinds with the service's own words if it says no.
+        If the address or the token is malformed, or a certificate cannot be read. Every method raises `NoAnswer` if
+        there is no answer in time, and `RequestRefused` or a subclass with the service's message if it refuses.
 
     Examples
     --------
@@ -101,7 +101,7 @@ class Client:
         """Close the connection."""
         self._http.close()
 
-    # What there is
+    # Machines
 
     def machines(self) -> tuple[MachineDescription, ...]:
         """Every monitored machine with its state."""
@@ -116,11 +116,11 @@ class Client:
         return self._get(MachineConfiguration, place, "configuration")
 
     def health(self, place: str) -> Health:
-        """Where a machine stands now."""
+        """The current health of a machine."""
         return self._get(Health, place, "health")
 
     def detectable(self, place: str, change: float | None = None) -> DetectableChanges:
-        """What would be found on the machine as it runs now, and the data that a wished relative change takes."""
+        """Minimum detectable changes as the machine runs now, and the data needed to find a relative `change`."""
         return self._get(DetectableChanges, place, "detectable", change=change)
 
     # Alarms
@@ -128,7 +128,7 @@ class Client:
     def alarms(
         self, place: str, *, states: Sequence[AlarmState] = (), names: Sequence[str] = (), everything: bool = False
     ) -> AlarmStates:
-        """Alarms that are not normal, or those in some states, of some names, or all there have been."""
+        """Alarms that are not normal; or those with given states or names, or all that ever occurred."""
         wanted = [AlarmState(state).value for state in states]
         return self._get(AlarmStates, place, "alarms", state=wanted, name=names, all=everything)
 
@@ -137,11 +137,11 @@ class Client:
         return self._get(Alarm, place, f"alarms/{name}")
 
     def acknowledge(self, place: str, seen: Alarm, reason: str = "") -> OperationDone:
-        """Say that an alarm has been seen."""
+        """Acknowledge an alarm: state that it has been seen."""
         return self._operate(place, seen, "acknowledge", reason=reason)
 
     def reset(self, place: str, seen: Alarm, reason: str = "") -> OperationDone:
-        """Let a latched alarm go."""
+        """Reset a latched alarm."""
         return self._operate(place, seen, "reset", reason=reason)
 
     def shelve(
@@ -181,11 +181,11 @@ class Client:
         Parameters
         ----------
         after : int, optional
-            -1 for the whole log. Ends with the latest event there is.
+            Sequence number; -1 for the whole log. The iterator ends with the latest event.
         since_ns, until_ns : int, optional
-            Only those with since_ns ≤ time_ns < until_ns.
+            Only events with since_ns ≤ time_ns < until_ns.
         name, kind, severity : optional
-            Only of this alarm, kind, severity.
+            Only events of this alarm, kind or severity.
         """
         chosen = {"since_ns": since_ns, "until_ns": until_ns, "name": name, "kind": kind, "severity": severity}
         path = _path(place, "alarms/events")
@@ -220,16 +220,16 @@ class Client:
         since_ns: int | None = None,
         until_ns: int | None = None,
     ) -> tuple[ReadingBucket, ...]:
-        """Readings reduced to at most so many points for each name; all names if none is given."""
+        """Readings reduced to at most `points` buckets for each name; all names if none is given."""
         wanted: dict[str, _Parameter] = {"quantity": quantity, "name": names, "points": points}
         return self._get(ReadingList, place, "readings", since_ns=since_ns, until_ns=until_ns, **wanted).buckets
 
     def audit(self, *, machine: str | None = None, actor: str | None = None) -> Iterator[AuditRecord]:
-        """Who asked for what and what came of it, newest first, fetched page by page."""
+        """Entries of the audit log (callers, requests and outcomes), newest first, fetched page by page."""
         for page in self._pages(AuditList, "/api/v1/audit", "before", None, machine=machine, actor=actor, limit=_PAGE):
             yield from page.entries
 
-    # What the monitor holds now
+    # Snapshots
 
     def correlations(
         self,
@@ -241,22 +241,22 @@ class Client:
         replay: str | None = None,
         until_ns: int | None = None,
     ) -> CorrelationSnapshot:
-        """Correlation functions of a window, measured and as theory predicts them.
+        """Correlation functions of a window, measured and predicted by theory.
 
         Parameters
         ----------
         recordings : sequence of str
-            File names of recordings of the machine, instead of what is live.
+            File names of recordings of the machine, instead of live data.
         replay : str, optional
-            Id of a replay of the machine, instead of its recordings: theory is that of what it read.
+            Id of a replay of the machine, instead of recordings; theory then uses the readings of the replay.
         until_ns : int, optional
-            The window of them that ends then; the last one without it.
+            End of the window in recorded data; by default the last window.
         """
         first, second = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
         wanted: dict[str, _Parameter] = {"recording": recordings, "replay": replay, "until_ns": until_ns}
         return self._get(CorrelationSnapshot, place, "correlations", first=first, second=second, units=units, **wanted)
 
-    def spectra(  # noqa: PLR0913  # what may be asked for
+    def spectra(  # noqa: PLR0913  # options of the request
         self,
         place: str,
         channels: Sequence[str] = (),
@@ -269,7 +269,7 @@ class Client:
         replay: str | None = None,
         until_ns: int | None = None,
     ) -> SpectrumSnapshot:
-        """Power spectral densities of a window, live or as `correlations` has it, cross-spectra and theory."""
+        """Power spectral densities and cross-spectra of a window, chosen as in `correlations`, with theory."""
         first, second = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
         chosen: dict[str, _Parameter] = {"channel": channels, "first": first, "second": second, "units": units}
         wanted: dict[str, _Parameter] = {"recording": recordings, "replay": replay, "until_ns": until_ns}
@@ -285,31 +285,31 @@ class Client:
         replay: str | None = None,
         until_ns: int | None = None,
     ) -> OrbitSnapshot:
-        """Orbits at running speed of a window, live or as `correlations` has it, and some revolutions as measured."""
+        """1x orbits of a window, chosen as in `correlations`, and `revolutions` unfiltered revolutions."""
         wanted: dict[str, _Parameter] = {"recording": recordings, "replay": replay, "until_ns": until_ns}
         return self._get(OrbitSnapshot, place, "orbits", revolutions=revolutions, units=units, **wanted)
 
-    # What happens
+    # Events
 
     def events(self, *machines: str, after: str = "", from_beginning: bool = False) -> Iterator[ServiceEvent]:
-        """Alarm events and changes of health as they happen; goes on by itself after a lost connection.
+        """Alarm events and changes of health as they happen; continues automatically after a lost connection.
 
-        Every alarm event comes once and in the order of its machine's log. Whoever keeps the cursor of the last event
-        and gives it back has all of them without a hole; of health, the latest comes first.
+        Every alarm event is delivered once, in the order of its machine's log. A program that stores the cursor of the
+        last event and passes it as `after` gets all events without a gap. The latest health is delivered at the start.
 
         Parameters
         ----------
         *machines : str
-            Only of these.
+            Only events of these machines; all by default.
         after : str
             Cursor of the last event that was taken; empty to begin now.
         from_beginning : bool
-            Without `after`: begin with the first event there is.
+            Without `after`, begin with the first event in the log.
 
         Raises
         ------
         LogReplaced
-            If the log is not the one that was followed.
+            If the log is not the one that was followed before.
         """
         parameters: dict[str, str | list[str]] = {"from": "beginning" if from_beginning else "now"}
         if machines:
@@ -323,7 +323,7 @@ class Client:
     def _pages(
         self, model: type[M], path: str, cursor: str, begin: int | None, **parameters: _Parameter
     ) -> Iterator[M]:
-        """One page after the other, as long as each says where the next begins."""
+        """Fetch pages until one has no cursor of a next page."""
         while True:
             page = understood(model, self._ask("GET", path, **{cursor: begin}, **parameters).content, path)
             yield page
@@ -350,13 +350,13 @@ class Client:
         try:
             answer = self._http.request(method, path, params=given, json=body, headers=headers)
         except httpx.TransportError as error:
-            # Of TLS, 1.3 at least, nothing comes back that would say so.
+            # With TLS 1.3 at least, a client without the required certificate gets no error message.
             dropped = isinstance(error, httpx.RemoteProtocolError | httpx.ReadError | httpx.WriteError)
             secure = self._http.base_url.scheme == "https"
             why = "it requires a certificate from an authority it trusts" if secure else "the address begins with https"
             hint = f"; perhaps {why}" if dropped else ""
             raise NoAnswer(f"{self._http.base_url}: {str(error) or type(error).__name__}{hint}") from error
-        except ValueError as error:  # NaN and infinity are no JSON
+        except ValueError as error:  # NaN and infinity cannot be written as JSON
             raise ClientError(f"{path}: expected finite numbers (found {body})") from error
         if answer.status_code != httpx.codes.OK:
             raise refusal(answer)
@@ -364,12 +364,12 @@ class Client:
 
 
 def _checked(url: str) -> httpx.URL:
-    """An address that a service can have.
+    """Parse the address of a service.
 
     Raises
     ------
     ClientError
-        With what was expected.
+        If it is not a valid HTTP address.
     """
     with suppress(httpx.InvalidURL):
         found = httpx.URL(url)
@@ -380,12 +380,12 @@ def _checked(url: str) -> httpx.URL:
 
 
 def _path(place: str, below: str) -> str:
-    """Path of something of a machine.
+    """URL path of a machine, or of a resource below it.
 
     Raises
     ------
     ClientError
-        If a name in it cannot be one: it must not lead anywhere else.
+        If a name in it is invalid and might lead to another path.
     """
     if not _PLACE.fullmatch(place):
         raise ClientError(f"{place!r}: expected a machine as site/machine, such as demo/lab")
@@ -395,13 +395,13 @@ def _path(place: str, below: str) -> str:
 
 
 def _tls(url: str, ca: Path | None, certificate: tuple[Path, Path] | None) -> ssl.SSLContext:
-    """What to trust, and what to show; without TLS nobody, since to read all that a computer trusts takes its time."""
+    """TLS context with trusted authorities and own certificate; for plain HTTP without authorities, to save time."""
     plain = ca is None and url.startswith("http:")
     try:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT) if plain else ssl.create_default_context(cafile=ca)
         if certificate is not None:
             context.load_cert_chain(*certificate)
-    except OSError as error:  # of which errors in certificates are a kind
+    except OSError as error:  # includes ssl.SSLError for invalid certificates
         files = ", ".join(str(file) for file in (ca, *(certificate or ())) if file is not None)
         raise ClientError(f"certificates {files}: cannot be used: {error.strerror or error}") from error
     return context

@@ -1,28 +1,28 @@
-"""What can go wrong for a client.
+"""Exceptions of the clients.
 
 ::
 
     ClientError
-    ├── LogReplaced           the alarm log is another one than that which was followed
-    ├── NoAnswer              nobody answered, or not in time
-    └── RequestRefused        the service said no: `status` and the problem's text
+    ├── LogReplaced           the alarm log is not the one that was followed before
+    ├── NoAnswer              no answer, or not in time
+    └── RequestRefused        the service refused: `status` and the problem's text
         ├── AccessRefused         401, 403: no token, or one without the scope
         ├── NotFound              404: no such machine, alarm, ...
-        ├── Conflict              409, 412: the alarm is no longer as it was seen, or its state does not allow it
+        ├── Conflict              409, 412: the alarm has changed since it was seen, or its state does not allow it
         └── Unavailable           429, 503: try again later
 """
 
 
 class ClientError(Exception):
-    """Everything a client raises."""
+    """Base class of all exceptions that the clients raise."""
 
 
-class LogReplaced(ClientError):  # noqa: N818  # named after what happened, as all below
-    """The alarm log is not the one that was followed; the message says how that was seen."""
+class LogReplaced(ClientError):  # noqa: N818  # named after the event, like those below
+    """The alarm log is not the one that was followed before; the message states the evidence."""
 
 
 class NoAnswer(ClientError):  # noqa: N818
-    """Nobody answered, not in time, or with something that is no answer; the message names the address."""
+    """There was no answer, not in time, or an unreadable one; the message names the address."""
 
 
 class RequestRefused(ClientError):  # noqa: N818
@@ -34,7 +34,7 @@ class RequestRefused(ClientError):  # noqa: N818
 
 
 class AccessRefused(RequestRefused):
-    """There is no token, it is not valid, or its scopes do not include the route's."""
+    """There is no token, it is invalid, or it lacks the scope of the route."""
 
 
 class NotFound(RequestRefused):
@@ -42,8 +42,8 @@ class NotFound(RequestRefused):
 
 
 class Conflict(RequestRefused):
-    """The alarm is no longer as it was seen, or its state does not allow what was asked for."""
+    """The alarm has changed since it was seen, or its state does not allow the operation."""
 
 
 class Unavailable(RequestRefused):
-    """Too many requests, or the service could not do it in time: try again later."""
+    """There were too many requests, or the service could not answer in time: try again later."""

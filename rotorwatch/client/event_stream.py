@@ -1,4 +1,4 @@
-"""Server-sent events as they come, across lost connections."""
+"""Receives server-sent events, reconnecting after a lost connection."""
 
 import logging
 import time
@@ -14,7 +14,7 @@ from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import Health
 
 _PATH = "/api/v1/events"
-_SILENCE_S = 60.0  # the service says something every 15 s, if only that it is there
+_SILENCE_S = 60.0  # the service sends an event or a keep-alive comment every 15 s
 _FIRST_PAUSE_S = 0.5
 _LONGEST_PAUSE_S = 30.0
 
@@ -23,26 +23,26 @@ _log = logging.getLogger("rotorwatch.client")
 
 @dataclass(frozen=True, slots=True)
 class ServiceEvent:
-    """Something that happened: one of `alarm` and `health` is there."""
+    """An event of the service; either `alarm` or `health` is set."""
 
-    cursor: str  # where to go on after this event: keep it, and give it back as `after`
-    alarm: AlarmCloudEvent | None = None  # what happened to an alarm
-    health: Health | None = None  # health of a machine that has changed
+    cursor: str  # position after this event: store it, and pass it as `after` to continue
+    alarm: AlarmCloudEvent | None = None  # alarm event
+    health: Health | None = None  # changed health of a machine
 
 
 def service_events(http: httpx.Client, parameters: Mapping[str, str | list[str]], after: str) -> Iterator[ServiceEvent]:
-    """Listen for ever; a connection that is lost is made again, and goes on right after the last event.
+    """Yield events for ever; a lost connection is restored, continuing right after the last event.
 
     `after` is the cursor of the last event that was taken; empty for none.
 
     Raises
     ------
     NoAnswer
-        If the first connection cannot be made. Later ones are tried again and again.
+        If the first connection fails. Later ones are retried.
     RequestRefused
-        If the service does not want to be listened to: no token, no such machine.
+        If the service refuses the request: no token, or no such machine.
     LogReplaced
-        If the log is not the one that was followed.
+        If the log is not the one that was followed before.
     """
     cursor, pause_s, connected = after, _FIRST_PAUSE_S, False
     while True:

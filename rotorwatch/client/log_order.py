@@ -1,7 +1,7 @@
-"""Puts what is heard of one machine's alarm log in order: each event once, none left out.
+"""Puts events of one machine's alarm log in order: each once, without a gap.
 
-Events arrive over three ways, each with its own weakness: as they are published (some may be missed), from the
-publisher's cache (only the latest), and from the log itself by query (always complete, but it has to be asked)::
+Events arrive in three ways, each with a weakness: as they are published (some may be missed), from the publisher's
+cache (only the latest), and from the log itself by query (complete, but only on request)::
 
     published, cached --> hear(event)      ┐                  ┌ next() --> the caller --> taken()
     log, by query ------> read(page)       ├--> waiting[seq] -┤
@@ -15,7 +15,7 @@ _MOST_WAITING = 2000
 
 
 class LogOrder:
-    """How far one machine's alarm log has been followed."""
+    """Position in one machine's alarm log, with events received ahead of it."""
 
     def __init__(self, place: str, last: int) -> None:
         self.place = place  # ``<site>/<machine>``
@@ -26,33 +26,33 @@ class LogOrder:
 
     @property
     def incomplete(self) -> bool:
-        """There are events that have not been taken, as far as is known."""
+        """Whether events are known that have not been taken."""
         return self._latest > self.last
 
     @property
     def ask_after(self) -> int:
-        """What to ask the log for: the last event once more, if it is known, to see that the log is still the same."""
+        """Sequence number for the query: the last event, if known, is read again to check that the log is the same."""
         return self.last if self._newest is None else self.last - 1
 
     def announce(self, latest: int) -> None:
-        """Take note that there are events up to this sequence number."""
+        """Note that events up to this sequence number exist."""
         self._latest = max(self._latest, latest)
 
     def hear(self, event: AlarmCloudEvent) -> None:
-        """Take note of an event that was published, in any order and however often."""
+        """Add a published event, in any order and possibly repeated."""
         sequence = event.data.sequence
         self.announce(sequence)
-        # What is far ahead will be read from the log when its turn comes.
+        # Events far ahead are read from the log when their turn comes.
         if self.last < sequence <= self.last + _MOST_WAITING:
             self._waiting.setdefault(sequence, event)
 
     def read(self, page: AlarmLogPage) -> None:
-        """Take note of what the log says; it outranks what was heard.
+        """Add events read from the log, which take precedence over published ones.
 
         Raises
         ------
         LogReplaced
-            If it is not the log that was followed so far.
+            If the log is not the one that was followed so far.
         """
         if page.latest < self.last:
             raise LogReplaced(
@@ -71,10 +71,10 @@ class LogOrder:
                 self._waiting[sequence] = event
 
     def next(self) -> AlarmCloudEvent | None:
-        """Return the event that comes next, or None if it is not there yet."""
+        """Return the next event, or None if it has not arrived yet."""
         return self._waiting.get(self.last + 1)
 
     def taken(self) -> None:
-        """Go on to the event after the next one."""
+        """Mark the event returned by `next` as taken."""
         self.last += 1
         self._newest = self._waiting.pop(self.last)

@@ -46,7 +46,7 @@ class AlarmState(StrEnum):
 
     @property
     def annunciated(self) -> bool:
-        """Whether operators are told of what happens to the alarm."""
+        """Whether operators are notified of the alarm."""
         return self not in {AlarmState.SHELVED, AlarmState.SUPPRESSED, AlarmState.OUT_OF_SERVICE}
 
 

@@ -1,4 +1,4 @@
-"""Fields that many records have."""
+"""Fields and base classes that many records share."""
 
 import math
 from typing import Annotated
@@ -6,23 +6,23 @@ from typing import Annotated
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 REQUEST = ConfigDict(extra="forbid", frozen=True)
-"""Of what a monitor is asked for: a field that it does not know is a mistake of whoever asks."""
+"""Configuration of requests to a monitor: unknown fields are refused as mistakes."""
 
 EXAMPLE_NS = 1767225805000000000
 
 
 class Record(BaseModel):
-    """Whoever reads one passes over fields that a later version has added."""
+    """Base class of published records; unknown fields, such as those of a later version, are ignored."""
 
     model_config = ConfigDict(frozen=True, json_schema_serialization_defaults_required=True)
 
 
 def finite(value: float | None) -> float | None:
-    """Neither JSON nor the history has infinity and NaN: both become null."""
+    """Replace infinity and NaN, which neither JSON nor the history can hold, by None."""
     return value if value is not None and math.isfinite(value) else None
 
 
-Number = Annotated[float | None, AfterValidator(finite)]  # a finite number or null, whatever it is made of
+Number = Annotated[float | None, AfterValidator(finite)]  # infinity and NaN become null
 
 Site = Annotated[str, Field(description="site of the machine", examples=["demo"])]
 
@@ -40,7 +40,7 @@ MachineHash = Annotated[
 
 
 class OfMachine(Record):
-    """A record that says first which machine it is of."""
+    """A record that starts with the machine that it belongs to."""
 
     site: Site
     machine: Name

@@ -1,4 +1,4 @@
-"""How a machine is: window by window, and where it stands now."""
+"""A machine's report of each window, and its current health."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class HealthState(StrEnum):
 
     @property
     def alarmed(self) -> bool:
-        """Whether an alarm on the machine is raised: silence hides nothing of that."""
+        """Whether an alarm on the machine is raised; other states, such as missing data, do not hide it."""
         return self in {HealthState.ALERT, HealthState.DANGER}
 
 
@@ -39,9 +39,9 @@ State = Annotated[HealthState, Field(description="health in one word", examples=
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """Marks a number of the window that is kept over time, exported and shown."""
+    """Marks a field of a report as a measure, which is kept over time, exported and shown."""
 
-    name: str  # what it is asked for by
+    name: str  # name in requests
     unit: str
 
 

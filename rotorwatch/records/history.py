@@ -1,4 +1,4 @@
-"""What has been: lists with cursors, readings over time, the audit log."""
+"""The history: lists with cursors, readings over time, the audit log."""
 
 from pydantic import Field
 

@@ -115,19 +115,19 @@ class ChannelLevels(Record):
     limits: tuple[LevelLimits, ...] = Field(default=(), description="limits of those levels that have any")
 
     def values(self) -> dict[str, float]:
-        """The levels that there are, by measure."""
+        """Levels that have a value, by measure."""
         found = {name: getattr(self, name) for name in LEVEL_MEASURES}
         return {name: value for name, value in found.items() if value is not None}
 
     @property
     def beyond(self) -> Literal["", "alert", "danger"]:
-        """The worse of the limits that a level is beyond; empty if all are within."""
+        """The worst state of any level; empty if all are within their limits."""
         states = {limit.state for limit in self.limits}
         return "danger" if "danger" in states else "alert" if "alert" in states else ""
 
     @property
     def text(self) -> str:
-        """The levels that are read first, in words.
+        """The most important levels, in words.
 
         Examples
         --------

@@ -1,4 +1,4 @@
-"""Machines: what they are, what they are monitored with, what would be found on them."""
+"""Machines: description, configuration, and detectable changes."""
 
 from pydantic import Field, JsonValue
 

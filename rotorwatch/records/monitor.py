@@ -1,4 +1,4 @@
-"""The monitor itself: whether it is alive and ready, how its webhooks stand, what was wrong with a request."""
+"""The monitor itself: liveness and readiness, tokens, history, settings, webhooks, and problems with requests."""
 
 from typing import Literal
 

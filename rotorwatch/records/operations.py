@@ -1,4 +1,4 @@
-"""What operators do to alarms: orders, and what came of them."""
+"""Operators' actions on alarms: orders and their results."""
 
 from typing import Annotated, Literal
 

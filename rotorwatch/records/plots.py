@@ -1,8 +1,8 @@
-"""Values of the plots of a machine: its newest samples, and what was over time or speed.
+"""Values of the plots of a machine: of its newest samples, and over time or speed.
 
-They come from the newest samples a monitor holds, from its history, or from recordings; `source` says which. Phase is
-the lag from the phase reference's mark to the positive peak, as API 670 and ISO 13373-2 have it. Numbers have six
-significant digits; null stands for what is not known.
+They come from the newest samples of a monitor, from its history, or from recordings, as `source` states. Phase is the
+lag from the phase reference's mark to the positive peak, as in API 670 and ISO 13373-2. Numbers have six significant
+digits; null stands for unknown values.
 """
 
 from typing import Annotated, Literal

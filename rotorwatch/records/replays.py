@@ -1,4 +1,4 @@
-"""Replays: how one is asked for, how far one is, what it found."""
+"""Replays: requests, progress and results."""
 
 from typing import Annotated, Literal, Self
 

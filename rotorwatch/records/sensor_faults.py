@@ -1,4 +1,4 @@
-"""What can be wrong with a sensor: one row per kind."""
+"""Kinds of sensor faults: one row per kind."""
 
 from enum import StrEnum
 from typing import Self
@@ -7,18 +7,18 @@ from typing import Self
 class FaultKind(StrEnum):
     """Kind of a sensor's fault."""
 
-    text: str  # the same in words, for its alarm
-    measure: str  # what the value of a fault of this kind is
+    text: str  # in words, for the alarm
+    measure: str  # unit or meaning of the value of such a fault
 
     def __new__(cls, name: str, text: str, measure: str) -> Self:
-        """A row: name in records, words, meaning of the value."""
+        """Create a member from its name in records, words, and the unit or meaning of its value."""
         kind = str.__new__(cls, name)
         kind._value_, kind.text, kind.measure = name, text, measure
         return kind
 
     @classmethod
     def _missing_(cls, value: object) -> "FaultKind | None":
-        """A kind that only a later version has is told by its name."""
+        """Create a member for an unknown kind, from a later version, with its name as text."""
         if not isinstance(value, str):
             return None
         kind = str.__new__(cls, value)
@@ -35,7 +35,7 @@ class FaultKind(StrEnum):
     SWAPPED = "swapped", "channels swapped", "share of motion that the sensors have in common"
     INCOHERENT = (
         "incoherent",
-        "sensors contradict each other",  # and no other kind explains it
+        "sensors contradict each other",  # if no other kind explains it
         "share of motion that the sensors have in common",
     )
     NOISE = "noise", "noise level", "its rms over that of the channel (rad for the shaft angle)"

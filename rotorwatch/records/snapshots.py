@@ -1,7 +1,7 @@
-"""Snapshots of a machine: of what is live, or of a window that was recorded.
+"""Snapshots of a machine, live or of a recorded window.
 
-What has the unit of a channel, or of two channels' product, says in `unit` which that is. Arrays that belong together
-have one length, which their descriptions name. Numbers have six significant digits; null stands for what is not known.
+Values in the unit of a channel, or of a product of two channels, state it in `unit`. Arrays that belong together have
+the same length, which their descriptions name. Numbers have six significant digits; null stands for unknown values.
 """
 
 from typing import Annotated, Literal

@@ -1,4 +1,4 @@
-"""What is said of a window: parameters, equations, opinions, verdict, sensors."""
+"""Results for a window: parameters, equations, opinions, verdict, sensor faults."""
 
 from typing import Literal
 
