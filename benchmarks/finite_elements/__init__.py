@@ -1,1 +1,1 @@
-"""Rotors of another model class than the monitor's own: finite elements, more discs and bearings, cubic stiffness."""
+"""Rotors of another model class than the monitor's: finite elements, several discs and bearings, cubic stiffness."""

@@ -1,4 +1,4 @@
-"""From a rotor to its equations of motion, its modes, and its response to harmonic forces.
+"""Equations of motion of a rotor, its modes, and its response to harmonic forces.
 
 Coordinates are (v, v') of all nodes in the horizontal plane y, then in the vertical plane z, then y and z of a stand. A
 positive speed turns from y to z.
@@ -52,7 +52,7 @@ def probed(rotor: BeamRotor) -> tuple[int, int, int, int]:
 
 
 def assemble(rotor: BeamRotor, speed_rad_s: float) -> Equations:
-    """Equations of motion at a speed, cubic stiffness left out."""
+    """Linear equations of motion at a speed, without cubic stiffness."""
     length_m, EI = rotor.length_m / rotor.elements, rotor.bending_stiffness
     kappa = 6 * (1 + rotor.poisson) / (7 + 6 * rotor.poisson)  # Cowper's, of a solid round section
     shear_stiffness_N = kappa * rotor.E_Pa / (2 * (1 + rotor.poisson)) * rotor.area_m2
@@ -97,7 +97,7 @@ def assemble(rotor: BeamRotor, speed_rad_s: float) -> Equations:
 
 
 def modes(equations: Equations) -> tuple[Mode, ...]:
-    """Oscillating modes, slowest first."""
+    """Oscillating modes in order of frequency."""
     roots = np.linalg.eigvals(equations.A)
     found = [Mode(float(abs(s) / (2 * np.pi)), float(-s.real / abs(s))) for s in roots if s.imag > 0]
     return tuple(sorted(found, key=lambda mode: mode.frequency_hz))
@@ -112,7 +112,7 @@ def harmonic_response(equations: Equations, frequency_rad_s: float, force: Compl
 
 
 def unbalance_force(rotor: BeamRotor, speed_rad_s: float) -> ComplexArray:
-    """Rotating force of all discs, q of f = Re{q e^{jθ}}, shape (n,)."""
+    """Unbalance force of all discs, q of f = Re{q e^{jθ}}, N, shape (n,)."""
     force = np.zeros(rotor.size, dtype=np.complex128)
     for disc in rotor.discs:
         q = disc.unbalance_kg_m * speed_rad_s**2 * np.exp(1j * disc.phase_rad)
@@ -122,7 +122,7 @@ def unbalance_force(rotor: BeamRotor, speed_rad_s: float) -> ComplexArray:
 
 
 def unbalance_response(rotor: BeamRotor, speed_rad_s: float) -> ComplexArray:
-    """Synchronous vectors of all coordinates, q of ξ = Re{q e^{jθ}}, shape (n,); of the linear rotor."""
+    """1x vectors of all coordinates of the linear rotor, q of ξ = Re{q e^{jθ}}, shape (n,)."""
     return harmonic_response(assemble(rotor, speed_rad_s), speed_rad_s, unbalance_force(rotor, speed_rad_s))
 
 

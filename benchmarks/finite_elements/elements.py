@@ -1,4 +1,4 @@
-"""The beam element: Timoshenko's, which is Euler and Bernoulli's where shear is left out.
+"""The Timoshenko beam element, which becomes the Euler–Bernoulli element without shear.
 
 References
 ----------
@@ -11,7 +11,7 @@ from models.signals.block import FloatArray
 
 
 def shear_ratio(EI: float, shear_stiffness_N: float, length_m: float) -> float:
-    """Φ = 12 EI / (κGA L²): bending over shear stiffness of an element; 0 leaves shear out."""
+    """Φ = 12 EI / (κGA L²), the ratio of an element's bending to its shear stiffness; 0 neglects shear."""
     return 12 * EI / (shear_stiffness_N * length_m**2)
 
 
@@ -43,8 +43,8 @@ def beam_mass(length_m: float, mass_per_m: float, phi: float) -> FloatArray:
 def beam_inertia(length_m: float, inertia_kg_m: float, phi: float) -> FloatArray:
     """Consistent rotary inertia, shape (4, 4); twice that times the speed is the shaft's gyroscopic matrix.
 
-    `inertia_kg_m`: density times second moment of area, moment of inertia about a diameter per length; `phi` is that of
-    `shear_ratio`.
+    `inertia_kg_m` is density times second moment of area, i.e. the moment of inertia about a diameter per length; `phi`
+    is from `shear_ratio`.
     """
     L, p = length_m, phi
     a = 36.0

@@ -1,6 +1,6 @@
-"""The oil film of a plain cylindrical bearing: eight coefficients that depend on the speed, in closed form.
+"""The oil film of a plain cylindrical bearing: eight speed-dependent coefficients in closed form.
 
-Short-bearing theory (Ocvirk): pressure falls to both sides alone, and half of the film carries.
+Short-bearing theory (Ocvirk): pressure gradients are axial only, and half of the film carries load.
 
 References
 ----------
@@ -33,13 +33,13 @@ class Film:
         return viscous / (8 * self.load_N * self.clearance_m**2)
 
     def eccentricity(self, speed_rad_s: float) -> float:
-        """How far the journal stands from the middle, over the clearance."""
+        """Eccentricity of the journal over the clearance."""
         S2 = self.sommerfeld(speed_rad_s) ** 2
         roots = np.roots([1, -4, 6 - S2 * (16 - math.pi**2), -(4 + math.pi**2 * S2), 1])
         return math.sqrt(min(root.real for root in roots if abs(root.imag) < 1e-9 and 0 < root.real < 1))
 
     def coefficients(self, speed_rad_s: float) -> tuple[FloatArray, FloatArray]:
-        """Stiffness, N/m, and damping, Ns/m, on (y, z), shape (2, 2) each; turning from y to z."""
+        """Stiffness, N/m, and damping, Ns/m, on (y, z), shape (2, 2) each, for rotation from y to z."""
         e = self.eccentricity(speed_rad_s)
         p, q = math.pi**2, math.sqrt(1 - e**2)
         h = 1 / (p * (1 - e**2) + 16 * e**2) ** 1.5

@@ -1,4 +1,4 @@
-"""Coloured forces at any coordinates of a rotor, and what they do in the long run.
+"""Coloured forces at any coordinates of a rotor, and the stationary covariance of its response.
 
 The colour is that of `models.physics.excitation`: white noise through a Butterworth low-pass.
 """
@@ -15,9 +15,9 @@ from models.signals.block import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Force:
-    """One independent source; it may act at several places, shared with signs and weights.
+    """One independent source, which may act at several coordinates with signs and weights.
 
-    A share is of a coordinate (`benchmarks.finite_elements.assembly.place`): the part of the force there.
+    `share` holds coordinates (`benchmarks.finite_elements.assembly.place`) with the fraction of the force there.
     """
 
     cutoff_hz: float
@@ -26,7 +26,7 @@ class Force:
 
     @property
     def colour(self) -> ColouringFilter:
-        """White noise to a force of unit variance."""
+        """Filter from white noise to a force of unit variance."""
         return colouring_filter(Source(cutoff_hz=self.cutoff_hz, direction=(0.0,) * 6, force_rms_N=1.0))
 
 
@@ -46,7 +46,7 @@ def distribution(forces: tuple[Force, ...]) -> FloatArray:
 
 
 def force_samples(forces: tuple[Force, ...], count: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Force at the `forced` coordinates, sampled exactly and stationary from the first sample; shape (count, n), N."""
+    """Samples of the force at the `forced` coordinates, exact and stationary from the start; shape (count, n), N."""
     if not forces:
         return np.zeros((count, 0))
     drives = np.empty((count, len(forces)))
@@ -62,7 +62,7 @@ def force_samples(forces: tuple[Force, ...], count: int, rate_hz: float, rng: np
 
 
 def covariance_under(equations: Equations, forces: tuple[Force, ...]) -> FloatArray:
-    """Stationary covariance of (ξ, ξ̇) under coloured forces, from the Ljapunov equation; shape (2n, 2n), SI.
+    """Stationary covariance of (ξ, ξ̇) under coloured forces, from the Lyapunov equation; shape (2n, 2n), SI.
 
     Raises EstimationError if the rotor is unstable.
     """

@@ -1,4 +1,4 @@
-"""Rotors that nobody has to know: a table of machines of realistic size, all unlike the six-degree-of-freedom model."""
+"""Rotors with parameters unknown to the monitor: machines of realistic size, all unlike its six-degree model."""
 
 import math
 from dataclasses import replace
@@ -138,5 +138,5 @@ ROTORS: tuple[BeamRotor, ...] = (
 
 
 def rotor_named(name: str) -> BeamRotor:
-    """Take a machine from the table; raises KeyError if it is not there."""
+    """Return a machine of the table; raises KeyError if there is none of this name."""
     return {rotor.name: rotor for rotor in ROTORS}[name]

@@ -1,12 +1,12 @@
-"""How a finite-element rotor moves, sample by sample.
+"""Simulates the motion of a finite-element rotor, sample by sample.
 
-The force is linear between samples. For such a force the linear rotor advances exactly, mode by mode, and its
-accelerations are continuous; displacement, velocity and acceleration belong together to the last digit. The unbalance
-response is the stationary one, in closed form, and so is a mesh tone.
+The force is linear between samples. For such a force the linear rotor is advanced exactly, mode by mode, and its
+accelerations are continuous; displacement, velocity and acceleration are exactly consistent. The responses to unbalance
+and to the mesh tone are the stationary ones, in closed form.
 
-A rotor with cubic stiffness advances by the same exact step of its linear part on a finer grid, unbalance included; the
-cubic force joins it as a force that is linear over the step, extrapolated from its last two values. The error falls
-with the square of the step.
+A rotor with cubic stiffness is advanced by the same exact step of its linear part on a finer grid, unbalance included;
+the cubic force is taken as linear over the step, extrapolated from its last two values. The error is proportional to
+the square of the step.
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ PROBES = (
     *("y1_dot", "y2_dot", "z1_dot", "z2_dot"),
     *("y1_ddot", "y2_ddot", "z1_ddot", "z2_ddot"),
 )
-"""What can be measured: motions of the first bearing (1) and the first disc (2)."""
+"""Quantities that can be measured: motions of the first bearing (1) and the first disc (2)."""
 
 _DECAYS = 6.0
 _LONGEST_WARM_S = 30.0
@@ -45,13 +45,13 @@ _PIECE = 20_000
 class Motion:
     """Samples of a run."""
 
-    values: FloatArray  # (n_samples, 12): of `PROBES`, SI
+    values: FloatArray  # (n_samples, 12), in the order of `PROBES`, SI
     angle_rad: FloatArray  # shaft angle, unwrapped
 
 
 @dataclass(frozen=True, slots=True)
 class _Modal:
-    """A = V diag(s) V⁻¹, and V⁻¹B of forces at some coordinates."""
+    """Modal form of the state equations: A = V diag(s) V⁻¹, and V⁻¹B for forces at some coordinates."""
 
     roots: ComplexArray
     shapes: ComplexArray
@@ -69,9 +69,9 @@ def move(
     *,
     oversampling: int = 2,
 ) -> Motion:
-    """Run a rotor at constant speed; one with cubic stiffness in several steps a sample.
+    """Simulate a rotor at constant speed; one with cubic stiffness takes `oversampling` steps per sample.
 
-    Raises EstimationError if the rotor is unstable at this speed, or its cubic stiffness throws it out of range.
+    Raises EstimationError if the rotor is unstable at this speed, or diverges because of its cubic stiffness.
     """
     equations = assemble(rotor, speed_rad_s)
     fine = 1 if rotor.linear else oversampling
@@ -99,7 +99,7 @@ def move(
         fine_angle = np.asarray(start + speed_rad_s * np.arange(count * fine) / (rate_hz * fine), dtype=np.float64)
         pull = unbalance_force(rotor, speed_rad_s)
         run = _Run(rotor, equations, modal, springs)
-        with np.errstate(over="ignore", invalid="ignore"):  # told below
+        with np.errstate(over="ignore", invalid="ignore"):  # checked below
             values = _stiffening(run, force, pull, fine_angle, rate_hz * fine)[::fine]
         if not np.all(np.isfinite(values)):
             raise EstimationError(f"{rotor.name}: the cubic stiffness throws it out of range at this force")
@@ -115,7 +115,7 @@ def _modal(equations: Equations, places: tuple[int, ...]) -> _Modal:
 
 
 def _steps(roots: ComplexArray, step_s: float) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-    """Of each mode over a step: decay, and what the force before and the force after it contribute."""
+    """Decay of each mode over a step, and the weights of the force at the beginning and at the end of the step."""
     decay = np.exp(roots * step_s)
     after = (decay - 1 - roots * step_s) / (roots**2 * step_s)
     return decay, (decay - 1) / roots - after, after
@@ -124,7 +124,7 @@ def _steps(roots: ComplexArray, step_s: float) -> tuple[ComplexArray, ComplexArr
 def _linear(modal: _Modal, rows: tuple[int, ...], force: FloatArray, rate_hz: float) -> FloatArray:
     decay, before, after = _steps(modal.roots, 1 / rate_hz)
     n = len(modal.roots) // 2
-    # one of each pair of complex roots stands for both
+    # one of each pair of complex conjugate roots is enough
     kept = np.flatnonzero(modal.roots.imag >= 0)
     output = modal.shapes[list(rows)][:, kept]
     rate = modal.shapes[[n + row for row in rows]][:, kept]
@@ -147,7 +147,7 @@ def _linear(modal: _Modal, rows: tuple[int, ...], force: FloatArray, rate_hz: fl
 
 
 def _springs(rotor: BeamRotor) -> tuple[tuple[int, float], ...]:
-    """Coordinates with cubic stiffness, and the stiffness, N/m³."""
+    """Coordinates with cubic stiffness, and its values, N/m³."""
     found: list[tuple[int, float]] = []
     for bearing in rotor.bearings:
         if bearing.cubic_N_per_m3:
@@ -176,13 +176,13 @@ def _stiffening(run: _Run, force: FloatArray, pull: ComplexArray, angle: FloatAr
     n_force = force.shape[1]
     at = np.array([where for where, _ in run.springs])
     cubic = np.array([stiffness for _, stiffness in run.springs])
-    # The cubic force over a step runs from g to g + (g - g_before): the step needs g and g_before.
+    # The cubic force over a step is extrapolated from g to g + (g - g_before), so the step needs g and g_before.
     g_now = -(first + 2 * second)[:, n_force:]
     g_old = second[:, n_force:]
     step = np.hstack([F, g_now, g_old])
     size = 2 * n
     state = np.zeros(size + 2 * len(at))
-    moving, now, old = np.split(state, [size, size + len(at)])  # views of it
+    moving, now, old = np.split(state, [size, size + len(at)])  # views of `state`
     inputs = np.hstack([force, np.cos(angle)[:, None], np.sin(angle)[:, None]])
     first_all, second_all = np.hstack([first[:, :n_force], first_1x]), np.hstack([second[:, :n_force], second_1x])
     rows = list(probed(run.rotor))

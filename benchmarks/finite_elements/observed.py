@@ -1,4 +1,4 @@
-"""A finite-element rotor as its sensors see it: samples, windows of the monitor, a stream, a machine file."""
+"""Measurements of a finite-element rotor: samples, windows of the monitor, a stream, a machine file."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -19,7 +19,7 @@ from models.signals.channels import ChannelDescriptor
 RATE_HZ = 2000.0
 SITE = "beams"
 MOTION = PROBES[:8]
-"""Displacement and velocity of bearing and disc in both planes: what is measured unless said otherwise."""
+"""Displacement and velocity of bearing and disc in both planes, measured by default."""
 
 _START_NS = 1_767_225_600_000_000_000
 _UNITS = {"displacement": "um", "velocity": "mm/s", "acceleration": "m/s2"}
@@ -27,13 +27,13 @@ _UNITS = {"displacement": "um", "velocity": "mm/s", "acceleration": "m/s2"}
 
 @dataclass(frozen=True, slots=True)
 class RunCondition:
-    """How a rotor runs and how it is measured."""
+    """Operating and measuring conditions of a rotor."""
 
     forces: tuple[Force, ...]
     speed_rad_s: float
-    changes: Mapping[str, float] = field(default_factory=dict)  # relative, of `rotor.CHANGEABLE`
-    noise_relative: float = 0.02  # over each channel's own rms
-    noise_corner_hz: float | None = None  # of first-order coloured noise; none is white
+    changes: Mapping[str, float] = field(default_factory=dict)  # relative changes of `rotor.CHANGEABLE`
+    noise_relative: float = 0.02  # rms over each channel's own rms
+    noise_corner_hz: float | None = None  # corner of first-order coloured noise; None for white noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ def sampled(
     seed: int | list[int],
     probes: tuple[str, ...] = MOTION,
 ) -> FloatArray:
-    """Samples in SI, the shaft angle last; shape (n_samples, n_probes + 1).
+    """Simulated samples of all probes in SI, and the shaft angle last; shape (n_samples, n_probes + 1).
 
     Raises EstimationError if the rotor is unstable.
     """
@@ -79,7 +79,7 @@ def _noise(shape: tuple[int, int], corner_hz: float | None, rng: np.random.Gener
 def machine_of(
     rotor: BeamRotor, sizes: WindowSizes, probes: tuple[str, ...] = MOTION, *, phase_reference: bool = True
 ) -> MachineFile:
-    """Machine file with channels, in usual units, and sampling alone: nothing about the rotor."""
+    """Machine file with channels in usual units, rate and window only, without parameters of the rotor."""
     sensors = [_channel(name) for name in probes]
     if phase_reference:
         theta = {"name": "theta", "quantity": "shaft_angle", "location": "shaft", "direction": "rotation"}
@@ -104,13 +104,13 @@ def _channel(probe: str) -> dict[str, str]:
 
 
 def plan(rotor: BeamRotor, sizes: WindowSizes, probes: tuple[str, ...] = MOTION) -> Plan:
-    """Sizes of the monitor's sliding window, for SI samples as `sampled` gives them."""
+    """Plan of the monitor's sliding window for SI samples from `sampled`."""
     monitored = plan_for(machine_of(rotor, sizes, probes))
     return replace(monitored, scales=np.ones(len(monitored.states)))
 
 
 def windows_of(samples: FloatArray, sizes: Plan) -> list[WindowStatistics]:
-    """Windows of a run that do not overlap."""
+    """Non-overlapping windows of a run."""
     sliding, found = SlidingWindow(sizes), []
     for number, _ in enumerate(sliding.feed(sizes.to_si(samples), _START_NS), start=1):
         statistics = sliding.statistics() if number % sizes.hops == 0 else None
@@ -120,7 +120,7 @@ def windows_of(samples: FloatArray, sizes: Plan) -> list[WindowStatistics]:
 
 
 def blocks(samples: FloatArray, described: ChannelDescriptor, block_s: float = 0.5) -> Iterator[SampleBlock]:
-    """The stream that a live machine would have sent of what `sampled` gives."""
+    """Convert samples from `sampled` to the stream that a live machine would send."""
     factors = np.array([channel.to_si for channel in described.channels])
     scaled = np.asarray(samples / factors, dtype=np.float32)
     if described.states[-1] == "theta":

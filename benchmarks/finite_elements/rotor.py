@@ -1,4 +1,4 @@
-"""What a finite-element rotor is made of, and its changes."""
+"""Components of a finite-element rotor, and its changes."""
 
 import math
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ class Disc:
     mass_kg: float
     radius_m: float
     unbalance_kg_m: float = 0.0
-    phase_rad: float = 0.0  # of the heavy spot from the phase reference
+    phase_rad: float = 0.0  # angle of the heavy spot from the phase reference
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +35,13 @@ class Bearing:
     c_z: float
     k_yz: float = 0.0  # force in the first direction per displacement in the second
     k_zy: float = 0.0
-    housing_kg: float = 0.0  # moves with it
+    housing_kg: float = 0.0  # mass that moves with the bearing
     cubic_N_per_m3: float = 0.0  # force over the third power of the displacement, in y
-    cubic_ratio_z: float = 1.0  # the same in z over that in y
-    film: Film | None = None  # what carries; k and c are then factors on its own, and k_yz and k_zy are left out
+    cubic_ratio_z: float = 1.0  # cubic stiffness in z over that in y
+    film: Film | None = None  # oil film; k and c are then factors on its coefficients, and k_yz and k_zy are ignored
 
     def coefficients(self, speed_rad_s: float) -> tuple[FloatArray, FloatArray]:
-        """Stiffness, N/m, and damping, Ns/m, on (y, z), shape (2, 2) each; cubic stiffness left out."""
+        """Stiffness, N/m, and damping, Ns/m, on (y, z), shape (2, 2) each, without cubic stiffness."""
         own = np.diag([self.k_y, self.k_z]), np.diag([self.c_y, self.c_z])
         coupling = np.array([[0.0, self.k_yz], [self.k_zy, 0.0]])
         if self.film is None:
@@ -53,24 +53,24 @@ class Bearing:
 
 @dataclass(frozen=True, slots=True)
 class Stand:
-    """What all bearings stand on: a mass that yields sideways, alike in y and z."""
+    """Stand of all bearings: a mass that moves in y and z, with the same stiffness and damping in both."""
 
     mass_kg: float
-    k: float  # stiffness, N/m, and damping, Ns/m, between it and the ground
+    k: float  # stiffness, N/m, and damping, Ns/m, between stand and ground
     c: float
 
 
 @dataclass(frozen=True, slots=True)
 class Gear:
-    """A wheel in mesh with one that does not move sideways: a spring along the line of pressure, and its tone.
+    """A gear wheel in mesh with one that does not move sideways: a spring along the line of pressure, and a mesh tone.
 
-    What turns is left out: torsion, and how the mesh's stiffness varies from tooth to tooth but for the tone.
+    Torsion is neglected, and variation of the mesh stiffness from tooth to tooth is modelled by the tone alone.
     """
 
     node: int
     k: float  # mean stiffness, N/m, and damping, Ns/m, of the mesh
     c: float
-    pressure_rad: float  # of the line of pressure from y towards z
+    pressure_rad: float  # angle of the line of pressure from y towards z
     teeth: int
     error_m: float  # amplitude of the transmission error at the tooth frequency
 
@@ -88,26 +88,26 @@ class BeamRotor:
     description: str
     length_m: float
     diameter_m: float
-    elements: int  # nodes are numbered from 0 to this
+    elements: int  # nodes are numbered from 0 to this number
     bearings: tuple[Bearing, ...]
     discs: tuple[Disc, ...]
     speed_rad_s: float  # nominal
-    shaft_damping_s: float = 2.0e-5  # distributed damping: this times the shaft's stiffness matrix
+    shaft_damping_s: float = 2.0e-5  # distributed damping matrix over the shaft's stiffness matrix
     E_Pa: float = 2.1e11
     poisson: float = 0.3
     density_kg_m3: float = 7850.0
-    shear: bool = True  # Timoshenko's beam with rotary inertia; otherwise Euler and Bernoulli's
-    stand: Stand | None = None  # none is the ground
+    shear: bool = True  # Timoshenko beam with rotary inertia; otherwise Euler–Bernoulli
+    stand: Stand | None = None  # None is rigid ground
     gear: Gear | None = None
 
     @property
     def size(self) -> int:
-        """Number of coordinates: four of every node, and two of a stand."""
+        """Number of coordinates: four for every node, and two for a stand."""
         return 4 * (self.elements + 1) + (2 if self.stand else 0)
 
     @property
     def linear(self) -> bool:
-        """Whether no bearing stiffens with its displacement."""
+        """Whether no bearing has cubic stiffness."""
         return all(bearing.cubic_N_per_m3 == 0 for bearing in self.bearings)
 
     @property
@@ -122,9 +122,9 @@ class BeamRotor:
 
 
 def changed_rotor(rotor: BeamRotor, changes: Mapping[str, float]) -> BeamRotor:
-    """The rotor with relative changes of `CHANGEABLE` parameters; a bearing's cubic stiffness changes with its linear.
+    """The rotor with relative changes of `CHANGEABLE` parameters; cubic stiffness changes with the linear stiffness.
 
-    Raises ValueError if a parameter is not known, or would become negative.
+    Raises ValueError if a parameter is unknown or would become negative.
     """
     for name, change in changes.items():
         if name not in CHANGEABLE or change < -1:

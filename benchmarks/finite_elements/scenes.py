@@ -1,4 +1,4 @@
-"""Conditions of a finite-element rotor drawn at random: where the forces act, their colour and level, speed, noise."""
+"""Random conditions of a finite-element rotor: places, colour and level of the forces, speed, noise."""
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -12,32 +12,32 @@ from benchmarks.finite_elements.rotor import BeamRotor
 
 
 class SourceLayout(StrEnum):
-    """How the stochastic force reaches the machine."""
+    """Layout of the stochastic forces."""
 
     ONE_SOURCE = "one source"
-    """One source, shared by all bearings and discs in both planes with random signs and weights."""
+    """One source that acts at all bearings and discs in both planes with random signs and weights."""
     INDEPENDENT = "independent sources"
-    """An independent source of random level at every bearing and disc in either plane."""
+    """An independent source of random level at every bearing and disc in each plane."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneRange:
-    """From and to of everything that is drawn, uniformly."""
+    """Limits of the uniform distributions from which conditions are drawn."""
 
     cutoff_hz: tuple[float, float] = (25.0, 200.0)
-    stochastic_to_1x: tuple[float, float] = (0.7, 3.0)  # displacement of the measured disc, both rms
+    stochastic_to_1x: tuple[float, float] = (0.7, 3.0)  # displacement of the measured disc, rms over rms
     noise_relative: tuple[float, float] = (0.01, 0.05)
     speed_relative: tuple[float, float] = (0.99, 1.01)  # over nominal
 
 
 COMMISSIONED = SceneRange(cutoff_hz=(80.0, 80.0), stochastic_to_1x=(1.5, 1.5), noise_relative=(0.02, 0.02))
-"""One cutoff and one level, as a healthy recording has them."""
+"""A single cutoff and level, as in one healthy recording."""
 
 
 def drawn_condition(
     rotor: BeamRotor, layout: SourceLayout, limits: SceneRange, changes: dict[str, float], rng: np.random.Generator
 ) -> RunCondition:
-    """Draw a condition; the level is that of the linear, unchanged rotor, so that a change shows as it would.
+    """Draw a condition; force levels are set for the linear, unchanged rotor, so a change alters only the rotor.
 
     Raises EstimationError if the rotor is unstable.
     """

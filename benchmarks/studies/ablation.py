@@ -1,6 +1,6 @@
-"""What each ingredient of the relation networks buys: the same windows, read by variants of the same equations.
+"""Ablation study of the relation networks: variants of the same equations read the same windows.
 
-Every variant alarms at the same rate of false alarms, by a limit from the same calibration windows.
+Every variant's limit is set for the same false-alarm rate, with the same calibration windows.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,32 +29,32 @@ _FAULTS: tuple[dict[str, float], ...] = (
     {}, {"k_by": -0.2}, {"k_by": -0.05}, {"c_by": -0.2}, {"k_bz": -0.2}, {"k_bz": -0.05}, {"c_bz": -0.2},
     {"e": 0.2}, {"e": 0.05},
 )  # fmt: skip
-"""True changes; their place is part of the seed."""
+"""True changes; their index is part of the seed."""
 _NUMBERS = ("28", "29", "31")
 _OWN = {equation.number: equation.parameters for equation in EQUATIONS}
 _FIXED_STREAM = 90
-_EVERY_LAG = 3  # training takes every third lag: neighbours 1 ms apart are nearly the same numbers, up to 150 Hz
+_EVERY_LAG = 3  # training takes every third lag: below 150 Hz, adjacent lags (1 ms) are nearly identical
 
 _Values = dict[str, Value]
-"""Columns: test values of parameters (or of the MSD), and their relative changes where they are read."""
+"""Columns of a record: test values of parameters (or of the MSD), and relative changes of parameters if read."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Fitted:
-    """A fitted variant of one equation, with the machine file that has its lags."""
+    """A fitted variant of one equation, with the machine file whose window settings it uses."""
 
     variant: Variant
     machine: Machine
     network: EquationNetwork | PaperNetwork
 
     def values(self, window: WindowStatistics) -> dict[Measure, _Values]:
-        """What every measure makes of a window."""
+        """Columns of a window for every measure."""
         if isinstance(self.network, PaperNetwork):
             return {Measure.MSD: {"msd value": self.network.deviation(window)}}
         window = v.as_seen(self.variant, window)
         reading = read_equation(self.network, window, self.machine)
         rows = self.network.equation.rows(window_view(window, self.machine), self.machine)
-        power = float(np.mean((rows.target / rows.norm) ** 2))  # 1 where the window is normalised
+        power = float(np.mean((rows.target / rows.norm) ** 2))  # 1 if the window is normalised
         changes = {one.name: one.relative_change or 0.0 for one in reading.parameters}
         return {
             Measure.MSD: {"msd value": (reading.msd or 0.0) / power},
@@ -92,7 +92,7 @@ def _learn(machine: Machine, options: Options, over: Over) -> _Networks:
 
 
 def _training_window(job: tuple[Draw, int]) -> WindowStatistics:
-    """Simulate one window and keep what training looks at."""
+    """Simulate one window, and keep only the data that training uses."""
     window = simulate_window(*job)
     return replace(
         window,
@@ -118,7 +118,7 @@ def _fit(task: tuple[Variant, str, Sequence[WindowStatistics], Machine, int]) ->
         equation = replace(equation, unit=float(np.sqrt(np.mean(np.square(norms)))))
     if variant.reader is Reader.LINEAR:
         return _Fitted(variant, machine, EquationNetwork(equation, v.linear_fit(equation, windows, machine), None))
-    from models.diagnosis.networks.training import train_network  # noqa: PLC0415  # with torch, which takes seconds
+    from models.diagnosis.networks.training import train_network  # noqa: PLC0415  # imports torch, which takes seconds
 
     return _Fitted(variant, machine, train_network(equation, windows, machine, seed))
 
@@ -138,11 +138,11 @@ def _measure(trained: Trained, draw: Draw, networks: _Networks, number: int) -> 
 
 
 def _others(trained: Trained, reader: Reader, window: WindowStatistics) -> dict[str, _Values]:
-    """What shipped networks or the likelihood say of each equation's own parameters; nothing where they refuse."""
+    """Readings by the shipped networks or the likelihood of each equation's own parameters; empty if refused."""
     parameters: Sequence[Parameter] = ()
     with suppress(EstimationError):
         said = next(one for one in trained.diagnosticians() if one.by == reader).diagnose(window)
-        # As of all networks of equations, a size that cannot be counts as none.
+        # As for all equation networks, parameters that are not evaluable get the value 0.
         parameters = said.parameters if reader is Reader.SHIPPED else said.evaluable
     values = {one.name: one.z or 0.0 for one in parameters}
     changes = {one.name: one.relative_change or 0.0 for one in parameters}
@@ -157,7 +157,7 @@ def _test_values(row: Record) -> dict[str, float]:
 
 
 def _judged(false_alarm_rate: float, records: Sequence[Record]) -> Iterator[Record]:
-    """Evaluation windows with the verdict of the limits that the calibration windows of the same row set."""
+    """Evaluation windows, judged by the limits from the calibration windows of the same variant."""
     for rows in r.grouped(records, "layout", "equation", "group", "variant").values():
         limits = r.limits_of([_test_values(row) for row in rows if row["purpose"] == "calibration"], false_alarm_rate)
         for row in rows:
@@ -197,7 +197,7 @@ def _spread(rows: Sequence[Record]) -> str:
 
 
 def _short(rows: Sequence[Record]) -> str:
-    """Found at 20 % of its own parameters, and what it reads there."""
+    """Per cent of windows in which changes of own parameters by 20 % are found, and the median readings."""
     text = " / ".join(f"{100 * one.value:.0f}" for kind in _LARGE if (one := _found(kind)(rows)) is not None)
     return text + (f" ({_reads(rows)})" if rows and _reads(rows) else "")
 
@@ -236,7 +236,7 @@ def ablation(options: Options) -> Study:
     calibration = 9 if options.small else 199
     cells = []
     for layout in (None, Layout.INDEPENDENT):
-        few = not options.small and layout is not None  # as many again with both layouts mixed
+        few = not options.small and layout is not None  # the mixed layouts have the same number again
         drawn = partial(Draw, trained.machine, options.seed, layout=layout)
         plan = [("calibration", "healthy", 99 if few else calibration, drawn(Purpose.CALIBRATION, _FIXED_STREAM))]
         windows = options.windows if layout is None else max(2, options.windows // 2)

@@ -1,4 +1,4 @@
-"""How often the networks are said to disagree with the likelihood, on machines that are healthy or have settled."""
+"""How often networks are reported to disagree with the likelihood, on healthy machines and after settled changes."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial

@@ -1,4 +1,4 @@
-"""What alarms quote of a step while the monitor watches it, beside the truth: how large it is, and when it came."""
+"""Compares size and time of a step change as stated in the monitor's alarms with the truth."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -24,16 +24,16 @@ from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 
 _NAMES = ("k_by", "c_by", "k_bz", "c_bz", "e")
-_TWO = 1 / 3  # of the streams have two changes
-_LEAST = {"k": 0.03, "c": 0.1, "e": 0.1}  # smallest changes; twice that where the parameters are not known
+_TWO = 1 / 3  # fraction of streams with two changes
+_LEAST = {"k": 0.03, "c": 0.1, "e": 0.1}  # smallest changes; twice that if the parameters are not known
 _LOSS, _GAIN = 0.25, 0.5
-_CONDITIONS, _STREAMS = 3, 10  # healthy conditions of a commissioning, and streams that are watched with it
+_CONDITIONS, _STREAMS = 3, 10  # healthy conditions per commissioning, and streams watched with it
 _HEALTHY_WINDOWS, _WATCHED_WINDOWS, _STREAM, _BLOCK_S = 4.1, 2.1, 91, 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A machine of one level of knowledge and the seed of its streams."""
+    """A machine with its knowledge level and the seed of its streams."""
 
     name: str
     level: KnowledgeLevel
@@ -41,11 +41,11 @@ class Told:
 
     @property
     def machine(self) -> Machine:
-        """With all of its parameters."""
+        """The machine with all its parameters."""
         return load_machine(self.name)
 
     def changes(self, number: int) -> tuple[dict[str, float], float]:
-        """What changes in a stream, and when, s."""
+        """Relative changes in a stream, and their time, s."""
         rng, window = np.random.default_rng([self.seed, number, 77]), self.machine.window
         names = rng.choice(_NAMES, 1 if rng.random() > _TWO else 2, replace=False).tolist()
         found = {}
@@ -57,7 +57,7 @@ class Told:
         return found, 2 * window.length_s + window.hop_s * float(rng.uniform(1, 4))
 
     def stream(self, number: int, changes: dict[str, float], step_s: float) -> Iterator[SampleBlock]:
-        """The machine in a condition of its own, or in one of the commissioned ones."""
+        """Blocks of the machine in a new condition or, without its parameters, in a commissioned one."""
         if self.level is KnowledgeLevel.FULL:
             condition = number
             draw = Draw(self.machine, self.seed, Purpose.EVALUATION, _STREAM, layout=Layout(number % 2))
@@ -88,7 +88,7 @@ def _installed(case: Told, commissioning: int) -> Installed | str:
 
 
 def told(case: Told, _: None, number: int) -> list[dict[str, Value]]:
-    """One record for each changed parameter, each wrong name, and each parameter that is read before the step."""
+    """One record for each changed parameter, each wrongly named one, and each parameter read before the step."""
     installed = _installed(case, 0 if case.level is KnowledgeLevel.FULL else number // _STREAMS)
     if isinstance(installed, str):
         return [{"refused": installed}]
@@ -130,7 +130,7 @@ def _at_rest(verdict: Verdict | None) -> list[dict[str, Value]]:
 
 
 def _standing(alarm: Alarm, row: dict[str, Value], windows: float) -> None:
-    """Add what an alarm quotes at a hop, so many windows after the step; the first of a full one stay."""
+    """Add the reading in an alarm at a hop, `windows` windows after the step; keep the first after 1 and 2 windows."""
     row["hops"] = int(row.get("hops") or 0) + 1
     row["hops covered"] = int(row.get("hops covered") or 0) + bool(_quoted("now", alarm, row)["now"])
     for tag, after in (("window", 1), ("settled", 2)):
@@ -139,7 +139,7 @@ def _standing(alarm: Alarm, row: dict[str, Value], windows: float) -> None:
 
 
 def _quoted(tag: str, alarm: Alarm, row: dict[str, Value]) -> dict[str, Value]:
-    """Whether the interval of an alarm holds the truth, and how many of its errors it is off."""
+    """Whether the 95 % interval of an alarm covers the truth, and the deviation in standard errors."""
     z = ((alarm.change or 0.0) - float(row["true"] or 0.0)) / (alarm.standard_error or np.nan)
     return {tag: bool(abs(z) <= Z95), f"{tag} z": float(f"{z:.5g}")}
 
@@ -178,7 +178,7 @@ TABLES = (
 
 
 def goals(records: Sequence[Record]) -> Iterator[Goal]:
-    """What is wanted of the quotations."""
+    """Goals for the readings stated in alarms."""
     rows = _alarms(records)
     for what, column in (("first raised", "first"), ("after a window", "window"), ("settled", "settled")):
         yield r.within(f"alarms cover, {what}", r.each(rows, ("level",), r.share(column)), 0.93, 1.0)

@@ -1,7 +1,7 @@
-"""Damping of a machine without parameters, in the condition it was commissioned in, against what its data hold.
+"""Detection of damping changes without known parameters, compared with the Cramér-Rao bound of the data.
 
-An overhung rotor of finite elements, one source. Every stream is a machine that was commissioned on a healthy recording
-and runs again under the same force, from its first sample with what has changed. The monitor itself watches it.
+The machine is an overhung rotor of finite elements with one source. For every stream it is commissioned on a healthy
+recording, and then runs under the same force with the changes present from the first sample, watched by the monitor.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,10 +32,10 @@ from service.monitor.monitor import MachineMonitor
 _SIZES = WindowSizes(length_s=30.0, hop_s=2.5, segment_s=2.5)
 _HEALTHY_S = (60.0, 120.0)
 _WITHIN_S = 120.0
-_DELAY_S = 15.0  # on-delay of an alarm, and the hop it is seen at: a verdict of 120 s is an alarm by then
+_DELAY_S = 15.0  # on-delay of an alarm and the next hop: a verdict at 120 s has raised an alarm by then
 _SETTLING_S = 0.1
 _OWN = ("c_by", "c_bz")
-_HOLDS = 10.0  # χ² on average, beyond chance, up to which the relation is taken to be true of a recording
+_HOLDS = 10.0  # largest mean excess χ² over chance at which the relation counts as valid for a recording
 _CHANGES: tuple[dict[str, float], ...] = (
     {},
     {"c_by": -0.2},
@@ -44,7 +44,7 @@ _CHANGES: tuple[dict[str, float], ...] = (
     {"k_by": -0.1},
     {"e": 0.2},
 )
-"""Their place is part of the seed; after the shorter recording damping alone is looked at."""
+"""True changes; their index is part of the seed. After the shorter recording only those of damping are measured."""
 _DAMPING = slice(1, 4)
 
 
@@ -54,7 +54,7 @@ def _measure(options: Options, name: str, healthy_s: float, _: None, number: int
     file, sizes = machine_of(rotor, _SIZES), plan(rotor, _SIZES)
     lead_s = sizes.preamble / sizes.rate_hz + _SETTLING_S
     chosen = _CHANGES[:2] if options.small else _CHANGES[_DAMPING] if healthy_s < _HEALTHY_S[-1] else _CHANGES
-    # Of the longest recording, so that shorter ones are its beginning.
+    # Simulate the longest recording, so that shorter ones are its beginning.
     recording = sampled(rotor, condition, _HEALTHY_S[-1] + lead_s, [*seed, 1])
     recording = recording[: round((healthy_s + lead_s) * sizes.rate_hz)]
     installed = commissioned(file, blocks(recording, file.descriptor))
@@ -80,7 +80,7 @@ def _measure(options: Options, name: str, healthy_s: float, _: None, number: int
 def _read(
     installed: Installed, window: WindowStatistics, own: Mapping[str, Value], changes: Mapping[str, float]
 ) -> dict[str, Value]:
-    """Readings of damping in the first window, their errors and stated errors in units of the bound."""
+    """Errors and stated standard errors of the damping readings in the first window, in units of the bound."""
     baselines = () if installed.commissioned is None else installed.commissioned.baselines
     readings = baselines[0].baseline.diagnostician().diagnose(window).evaluable if baselines else ()
     found: dict[str, Value] = {}
@@ -109,7 +109,7 @@ def _bounds(
     healthy: Sequence[WindowStatistics],
     window: WindowStatistics,
 ) -> dict[str, Value]:
-    """Of the damping in one window, and of the verdict at the end; and what an oracle makes of the window."""
+    """Bounds of the damping's error in one window and at the end of the stream; and an oracle's error in the window."""
     before, after = (expected(rotor, replace(condition, changes=one), window) for one in ({}, changes))
     parameter = row.own[1].parameter
 
@@ -127,7 +127,7 @@ def _bounds(
 
 
 def _by_the_bound(own: Mapping[str, Value], changes: Mapping[str, float], settings: SequentialSettings) -> float | None:
-    """Probability that all damping that changed is named at the end of a stream, if errors are those of the bound."""
+    """Probability that all changed damping is named at the end of a stream if errors equal the bound."""
     damping = [name for name in changes if name.startswith("c")]
     limits = settings.thresholds(round(_WITHIN_S / _SIZES.length_s) * settings.window_hops)
     probability = 1.0

@@ -1,8 +1,8 @@
-"""Time to detection of step changes on streams, and the bound's time beside them.
+"""Time to detection of step changes on streams, compared with the bound's time.
 
-A stream is simulated sample by sample and fed to the sliding window, the likelihood and the sequential test as the
-monitor feeds them. The bound's time is the data that a test of one fixed length needs for a power of 95 % if it reads
-the parameter with the Cramér-Rao standard error, which falls as 1/√T.
+A stream is simulated sample by sample and fed to the sliding window, the likelihood and the sequential test as in the
+monitor. The bound's time is the length of data that a test of one fixed length needs for a power of 95 % if it reads
+the parameter with the Cramér-Rao standard error, which is proportional to 1/√T.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -33,8 +33,8 @@ from simulator.stream import DEFAULT_START_NS, blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 
 _CHANGES = (("k_by", -0.05), ("c_by", -0.2), ("c_by", -0.1), ("e", 0.2))
-"""Steps that are timed; their place is part of the seed."""
-_POWER = 0.95  # how often a change that takes the bound's time is found
+"""Steps whose detection is timed; their index is part of the seed."""
+_POWER = 0.95  # probability of finding a change within the bound's time
 _HEALTHY_HOPS = 3
 _AFTER_S = 120.0
 _BLOCK_S = 0.5
@@ -43,14 +43,14 @@ _STREAM = 40
 
 @dataclass(frozen=True, slots=True)
 class _Case:
-    """One change in one layout at one hop: what trials have in common."""
+    """One change in one layout at one hop, common to all trials of a cell."""
 
     draw: Draw
     parameter: str
     change: float
 
     def trial(self, number: int) -> tuple[Scenario, float, dict[str, float]]:
-        """The stream with its step, when that comes, and the bound of a window of the unchanged machine."""
+        """The stream with its step, the time of the step, s, and the bound for one window of the unchanged machine."""
         draw, healthy = self.draw, draw_condition(self.draw, number)
         rng = np.random.default_rng([draw.seed, Purpose.EVALUATION, draw.stream, number, _STREAM])
         step_s = healthy.duration_s + draw.machine.window.hop_s * float(rng.uniform(0, _HEALTHY_HOPS))
@@ -58,7 +58,7 @@ class _Case:
         return healthy.overridden(duration_s=step_s + _AFTER_S, faults=[step]), step_s, bound_of(healthy, draw.machine)
 
     def times(self, settings: SequentialSettings, bound: dict[str, float]) -> dict[str, Value]:
-        """The bound's time at the threshold of a test of the window alone, and at this test's."""
+        """The bound's time at the threshold of a test of whole windows only, and at the sequential test's threshold."""
         hops, own = settings.window_hops, settings.thresholds(settings.window_hops).first
         fixed = month_thresholds(settings.false_alarms_per_month, settings.hop_s, hops, len(PARAMETERS)).first
         length_s, error = self.draw.machine.window.length_s, bound[self.parameter]
@@ -69,7 +69,7 @@ class _Case:
 
 
 def with_hop(machine: Machine, hop_s: float) -> Machine:
-    """The machine with another hop; a ValueError if its window cannot be cut so."""
+    """The machine with another hop; raises ValueError if its window cannot be divided so."""
     fields = machine.model_dump()
     return type(machine).model_validate(fields | {"window": fields["window"] | {"hop_s": hop_s}})
 
@@ -83,7 +83,7 @@ def bound_time_s(error: float, duration_s: float, parameter: str, change: float,
 
 
 class _Watch:
-    """One sequential test on one stream, and what it says as columns of a record."""
+    """One sequential test on one stream, with its results as columns of a record."""
 
     def __init__(self, settings: SequentialSettings, step_ns: int, parameter: str) -> None:
         self.settings, self.test = settings, SequentialTest(settings)
@@ -130,7 +130,7 @@ def _measure(case: _Case, _: None, number: int) -> list[dict[str, Value]]:
         try:
             read = fits.window(statistics) if hops == whole else fits.short(hops, statistics)
         except (EstimationError, np.linalg.LinAlgError):
-            return None  # refused, as the monitor refuses it
+            return None  # refused, as in the monitor
         known = determined(read, statistics, machine.window.length_s)
         return stretch_of(known, statistics.start_ns, statistics.end_ns)
 
@@ -155,7 +155,7 @@ def _rounded(value: float) -> float | None:
 
 
 def _judged(records: Sequence[Record]) -> Iterator[Record]:
-    """With the delay over the bound's time; infinite where it was not found while it was watched."""
+    """Records with the ratio of delay to bound's time, infinite if the change was not found within the stream."""
     for row in (row for row in records if "detected_s" in row):
         found, named = (np.inf if row[name] is None else float(row[name] or 0.0) for name in ("detected_s", "named_s"))
         ratio, fixed = (found / float(row[bound] or 1.0) for bound in ("bound_s", "bound_fixed_s"))
@@ -184,7 +184,7 @@ _COLUMNS = {
 
 
 def _tables(own_s: float) -> tuple[Table, ...]:
-    """With a short one for the page, of the machine's own hop."""
+    """All tables, including a short one for the page with the machine's own hop."""
     return (
         Table(
             "delay",
@@ -220,7 +220,7 @@ def _goals(own_s: float, records: Sequence[Record]) -> Iterator[Goal]:
 
 
 def _shares(rows: Sequence[Record]) -> list[tuple[float, float]]:
-    """Delays, and the share of streams in which the change was found by then."""
+    """Delays, s, and the cumulative fraction of streams in which the change was found."""
     found = np.sort([float(row["found"] or 0.0) for row in rows])
     return [(float(x), (n + 1) / found.size) for n, x in enumerate(found) if np.isfinite(x)]
 

@@ -1,4 +1,4 @@
-"""How sharp the readings are, whether their intervals hold what they promise, what is named and how often falsely."""
+"""Spread of the readings, coverage of their intervals, parameters named, and false alarms."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -36,13 +36,13 @@ _ANOMALIES = {
     Anomaly.GAIN_DRIFT: "gain of a sensor",
 }
 _PAPER = (("k_by",), ("c_by",), ("c_bz",), ("e",), ("c_by", "c_bz"), ("k_by", "k_bz"), ("e", "c_bz"), ("e", "c_by"))
-"""The paper's eight fault conditions (its Table 2, as far as its section 4.2 tells), in physical parameters."""
+"""The paper's eight fault conditions (its Table 2, as far as section 4.2 describes it), in physical parameters."""
 _LARGE = {name: 0.2 if name == "e" else -0.2 for name in PARAMETERS}
 _TOGETHER = ({"k_by": -0.02, "c_bz": -0.10, "e": 0.10}, {"k_bz": -0.05, "c_by": -0.05, "e": 0.05})
 _ALONE = ({"k_by": -0.02}, {"c_bz": -0.10}, {"e": 0.10}, {"c_by": -0.05}, {"e": 0.05}, {"k_bz": -0.05})
 _LENGTHS_S = {15.0: 0.2, 30.0: 0.2, 120.0: 0.1, 300.0: 0.06, 600.0: 0.04}
-"""Window lengths with their share of windows: a ten-minute window costs forty 15-second ones."""
-_WHOLE = ("lab",)  # machines with all topics; the others have healthy windows and small changes
+"""Window lengths with their share of windows: a ten-minute window costs as much as forty of 15 s."""
+_WHOLE = ("lab",)  # machines with all topics; the others only have healthy windows and small changes
 _OTHER_REALISATION = 7919
 _LARGEST_LOSS = -0.9
 
@@ -59,7 +59,7 @@ class _Kind:
 
 
 def _kinds(*, whole: bool) -> Iterator[_Kind]:
-    """What is drawn; the place in this order is part of the seed."""
+    """Kinds of windows that are drawn; the index in this order is part of the seed."""
     yield from (_Kind("healthy", layout=layout, share=1.6 if whole else 1.0) for layout in Layout)
     yield from (_Kind("small", faults, layout, share=0.5) for faults in _TOGETHER for layout in Layout)
     if not whole:
@@ -107,19 +107,19 @@ def _measure(trained: o.Trained, seed: int, stream: int, kind: _Kind, _: None, n
 
 
 def _quoted(draw: Draw, number: int) -> dict[str, float]:
-    """Change of one parameter, drawn at random, that the likelihood quotes as just detectable in this condition."""
+    """Minimum detectable change of a random parameter, as stated by the likelihood in this condition."""
     diagnosis = LikelihoodFit(draw.machine).diagnose(simulate_scenario(draw_condition(draw, number), draw.machine))
     rng = np.random.default_rng([draw.seed, _OTHER_REALISATION, number])
     stretch = stretch_of(diagnosis, 0, 0)
     thresholds = window_thresholds(o.RATES[0], len(stretch.known))
     quoted = detectable_changes(stretch, thresholds, draw.machine.window.length_s)
     one = quoted[int(rng.integers(len(quoted)))]
-    # A loss of everything, quoted where not even that would be found for certain, cannot be simulated.
+    # A total loss, stated if not even that would be found with certainty, cannot be simulated.
     return {one.name: one.gain if rng.random() < 0.5 or one.loss < _LARGEST_LOSS else one.loss}
 
 
 def _with_length(machine: Machine, length_s: float) -> Machine:
-    """The machine with another window length; the hop gives way where the window would hold fewer than four."""
+    """The machine with another window length; the hop is shortened if the window would hold fewer than four."""
     window = machine.window
     hop_s = window.hop_s if length_s >= 4 * window.hop_s else window.segment_s
     changed = {"length_s": round(length_s / hop_s) * hop_s, "hop_s": hop_s, "max_span_s": 2 * length_s}
@@ -168,7 +168,7 @@ _READ = ("k_by", "k_bz", "c_by", "c_bz", "e")
 
 
 def _goals(records: Sequence[Record]) -> Iterator[Goal]:
-    """The declared goals; what asked for more than the bound allows is held to what a reading at the bound finds."""
+    """The declared goals; those beyond the Cramér-Rao bound are replaced by the rate of a reading at the bound."""
     rows, windows = list(o.readings(records)), list(o.judged(records))
     asked = [by for by in ("likelihood", "network") if r.where(records, method=by)]
     lab, whole = r.where(rows, machine="lab"), r.where(windows, machine="lab")
@@ -224,7 +224,7 @@ def _detection(lab: Sequence[Record], asked: Sequence[str]) -> Iterator[Goal]:
 
 
 def _strained(lab: Sequence[Record]) -> Iterator[Goal]:
-    """The likelihood at the quoted minimum detectable change, under other excitations, in windows of other lengths."""
+    """Goals for the likelihood at the stated minimum detectable change, under other excitations and window lengths."""
     own = r.where(lab, method="likelihood")
     power = r.rate(row["is named"] for row in r.where(own, topic="detectable") if row["true"])
     yield r.within("likelihood: found at the quoted minimum detectable change", {"all": power}, 0.92, 0.98)
@@ -242,16 +242,16 @@ def _strained(lab: Sequence[Record]) -> Iterator[Goal]:
 
 
 def _changed(rows: Iterable[Record], by: str, layout: str, name: str, true: float) -> list[Record]:
-    """Readings of a change; alone, where that was measured: beside another it needs stronger evidence."""
+    """Readings of a change; of windows without other changes if measured, because several need stronger evidence."""
     same = r.where(rows, method=by, layout=layout, parameter=name, true=true, topic=("small", "paper"))
     alone = [row for row in same if sum(bool(row[f"{other} true"]) for other in PARAMETERS) == 1]
     return alone or r.where(same, topic="small")
 
 
 def _found_at_bound(windows: Iterable[Record], name: str, true: float) -> float:
-    """Share of these windows in which a normal reading with the bound's standard error would cross the threshold.
+    """Fraction of windows in which a normally distributed reading at the bound would exceed the threshold.
 
-    The bound is that of the changed machine in the window's own condition.
+    The bound is that of the changed machine in each window's own condition.
     """
     threshold = window_thresholds(o.RATES[0], len(PARAMETERS)).first
     scaled = to_scale(name, true)
@@ -260,10 +260,10 @@ def _found_at_bound(windows: Iterable[Record], name: str, true: float) -> float:
 
 
 def _exponent(rows: Sequence[Record]) -> Estimate | None:
-    """Exponent of the window length in the spread.
+    """Exponent of the window length in the spread; None with fewer than three lengths.
 
-    Fitted to the spread over the bound, which is itself proportional to 1/√T, so that windows of different conditions
-    can be compared. None with fewer than three lengths.
+    It is fitted to the spread over the bound, which is itself proportional to 1/√T, so that windows of different
+    conditions can be compared.
     """
     points = {float(length): one for length, one in r.each(rows, ("length_s",), r.scatter("in bounds")).items() if one}
     known = {length: one for length, one in points.items() if one.low > 0}
@@ -278,7 +278,7 @@ def _exponent(rows: Sequence[Record]) -> Estimate | None:
 
 
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
-    """What is named over the size of the change, and what would be named at the bound."""
+    """Fraction of windows in which a change is named, by its size, and the fraction expected at the bound."""
     lab = list(o.readings(r.where(records, machine="lab")))
     if not lab:
         return

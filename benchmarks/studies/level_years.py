@@ -1,9 +1,9 @@
-"""How often levels of healthy machines are beyond their limits, over years: windows are drawn, not simulated in time.
+"""How often levels of healthy machines exceed their limits over years; windows are drawn, not simulated in time.
 
-What a hop adds to the levels of a window is drawn from its sampling distribution: of every band its mean square, gamma
-distributed for noise, with the lines in it and the product of both; of every order its vector, complex normal. What
-becomes of the hops is the program's own: windows, reference, limits. Hours simulated in time stand beside hours drawn
-of the same machines.
+The contribution of a hop to a window's levels is drawn from its sampling distribution: for every band a mean square,
+gamma distributed for noise, plus lines and their product with the noise; for every order a complex normal vector.
+Windows, reference and limits are then computed by the program's own code. As a check, hours of the same machines are
+also simulated in time.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,7 +31,7 @@ from rotorwatch.records.levels import ChannelLevels
 
 REFERENCES = ("first windows", "commissioned")
 SPREADS, DRAWN = (0.1, 0.2), ("inside the reference's range", "same distribution")
-_LENGTH_S, _HOP_S = 60.0, 5.0  # a machine file's own, if it says nothing
+_LENGTH_S, _HOP_S = 60.0, 5.0  # defaults of a machine file
 _HOPS = round(_LENGTH_S / _HOP_S)
 _DAY_S = 86400.0
 _KIND = replace(KINDS["velocity sensors, speed in the machine file"], rate_hz=1280.0)
@@ -40,18 +40,18 @@ _COMPARED = ("overall", "x1", "x2", "bands")
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """Sampling distribution of what one hop of a scene adds to levels; SI units, by channel."""
+    """Sampling distribution of the contribution of one hop of a scene to the levels; SI units, by channel."""
 
     plan: LevelPlan
     n_samples: int
     speed_rad_s: float
-    noise: FloatArray  # (n_bands, n): mean squares
-    averages: FloatArray  # (n_bands,): of how many independent squares each is a mean
+    noise: FloatArray  # (n_bands, n): mean squares of the noise
+    averages: FloatArray  # (n_bands,): number of independent squares in each mean
     line: FloatArray  # (n_bands, n): mean squares of the lines
-    product: FloatArray  # (n_bands, n): standard deviation of twice their product with the noise
+    product: FloatArray  # (n_bands, n): standard deviation of twice the product of lines and noise
     orders: FloatArray  # (4, n): amplitudes at the orders of `ORDERS`
-    order_noise: FloatArray  # (4, n): mean squares of the noise of a vector there
-    in_band: FloatArray  # (n_bands,): part of each band that is inside that of velocities
+    order_noise: FloatArray  # (4, n): mean squares of the noise of a vector at these orders
+    in_band: FloatArray  # (n_bands,): fraction of each band inside the band of velocity levels
 
     @classmethod
     def of(cls, scene: Scene) -> Self:
@@ -61,17 +61,17 @@ class Drawing:
         n, to_si = round(_HOP_S * rate_hz), np.array([one.to_si for one in sensors])
         taper = np.hanning(n + 1)[:-1]
         scale = 2 / (n * float(taper @ taper))
-        edges = np.append(band_edges(n), int(NYQUIST_PART * (n // 2)) + 1)  # and what is left of the band of velocities
+        edges = np.append(band_edges(n), int(NYQUIST_PART * (n // 2)) + 1)  # plus the rest of the velocity band
         bins = np.arange(edges[-1])
         poles, rms = scene.poles, scene.noise * to_si
 
         def density(cycles: FloatArray) -> FloatArray:
-            """Power of the noise over that of white noise of one unit, at some cycles in a sample; shape (.., n)."""
+            """Power of the noise relative to white noise of unit power, at frequencies in cycles per sample."""
             response = np.abs(1 - poles * np.exp(-2j * np.pi * cycles[:, None])) ** -2
             return np.asarray(rms**2 * (1 - poles**2) * response, dtype=np.float64)
 
         power = density(bins / n)
-        # Neighbours of a spectrum with Hann's taper are correlated by -2/3, the next but one by 1/6.
+        # Adjacent bins of a Hann-windowed spectrum are correlated by -2/3, bins two apart by 1/6.
         counts = np.diff(edges).astype(np.float64)
         pairs = counts + 2 * np.maximum(counts - 1, 0) * (2 / 3) ** 2 + 2 * np.maximum(counts - 2, 0) / 6**2
         angles = 2 * np.pi * scene.speed_hz / rate_hz * np.outer(np.arange(1.0, 4.0), np.arange(n))
@@ -96,7 +96,7 @@ class Drawing:
         )
 
     def windows(self, rng: np.random.Generator, gains: FloatArray) -> Iterator[WindowLevels]:
-        """Levels of windows that do not overlap, in each of which the noise has a gain of its own."""
+        """Levels of non-overlapping windows, with one gain of the noise for each window."""
         for part in np.array_split(gains, max(1, gains.size // 256)):
             gain = np.repeat(part, _HOPS)[:, None, None]
             shape = (gain.size, *self.noise.shape)
@@ -124,7 +124,7 @@ def _windows(plan: LevelPlan, hops: Sequence[HopLevels], speed_rad_s: float) -> 
 def _years(
     options: Options, reference: str, spread: float, how: str, case: int, _: None, number: int
 ) -> Iterator[dict[str, Value]]:
-    """A machine's day, in windows that do not overlap; the noise of each has a level of its own."""
+    """One day of a machine in non-overlapping windows, each with its own level of noise."""
     scene = drawn(_KIND, generator(options.seed, case, number, At.CONDITION), noise_over_1x=(1.0, 3.0))
     learned, watched = (generator(options.seed, case, number, at) for at in (At.REFERENCE, At.EVALUATION))
     drawing, given = Drawing.of(scene), LevelSettings()
@@ -148,7 +148,7 @@ def _beyond(levels: Sequence[ChannelLevels]) -> set[str]:
 
 
 def _beside(options: Options, case: int, _: None, number: int) -> Iterator[dict[str, Value]]:
-    """Two hours of one machine simulated in time, beside as many drawn: mean and scatter of the levels' logarithms."""
+    """Compare two hours of one machine simulated in time with drawn ones: mean and scatter of the log levels."""
     scene = drawn(_KIND, generator(options.seed, case, number, At.CONDITION), noise_over_1x=(1.0, 3.0))
     rng, own = (generator(options.seed, case, number, at) for at in (At.REFERENCE, At.EVALUATION))
     drawing = Drawing.of(scene)
@@ -186,7 +186,7 @@ def _level(levels: WindowLevels, name: str) -> FloatArray:
 
 
 def per_month(rows: Sequence[Record]) -> Estimate | None:
-    """Alarms per machine and month, with the exact interval of a Poisson count."""
+    """Alarms per machine and month, with the exact 95 % interval of a Poisson count."""
     hours = r.statistic("hours", np.sum)(rows)
     if not hours:
         return None

@@ -1,6 +1,6 @@
-"""What vibration levels find: doublings on machines of every kind, and the defect of a rolling bearing.
+"""Faults found by vibration levels: doubled levels on machines of every kind, and a defect of a rolling bearing.
 
-Streams are fed to the monitor itself, block by block, and what it raises is counted.
+Streams are fed to the monitor block by block, and the alarms that it raises are counted.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -22,10 +22,10 @@ from models.commissioning.commissioned import Installed, KnowledgeLevel
 from models.signals.block import FloatArray
 from service.monitor.monitor import MachineMonitor
 
-_FIRST_WINDOWS = 5  # the reference of a machine of which nothing is known
-_DOUBLED = ("overall", "1x", "2x")  # their place is part of the seed
+_FIRST_WINDOWS = 5  # windows of the reference of a machine that was not commissioned
+_DOUBLED = ("overall", "1x", "2x")  # their index is part of the seed
 _IN_NOISE = "2x, within the noise"
-_KNOWN_ERRORS = 10.0  # a 2x is known to a tenth: in the reference it is so many standard errors of one window
+_KNOWN_ERRORS = 10.0  # least 2x in the reference, in standard errors of one window; below, it is within the noise
 _BEARING, _IN_SNAPSHOTS = "accelerometers, 12.8 kHz", "accelerometers, 12.8 kHz, 0.1 s every 10 s"
 _BEARING_WINDOW_S = 20.0
 
@@ -34,7 +34,7 @@ _BEARING_WINDOW_S = 20.0
 
 
 def _outcome(doubled: str, step_s: float, length_s: float, of: Iterable[Raised], channel: str = "") -> dict[str, Value]:
-    """What was raised within two windows of a doubling, and whether anything was before."""
+    """Alarms raised within two windows after a doubling, and whether any was raised before."""
     found = list(of)
     after = [one for one in found if step_s < one.at_s <= step_s + 2 * length_s]
     of_level = [one for one in after if one.name.startswith(LEVEL + channel)]
@@ -49,7 +49,7 @@ def _outcome(doubled: str, step_s: float, length_s: float, of: Iterable[Raised],
 
 
 def _doublings(options: Options, machine: str, case: int, _: None, number: int) -> Iterator[dict[str, Value]]:
-    """One machine, in three streams of its own that differ in what doubles at one of its sensors."""
+    """Three streams of one machine, which differ in the level that doubles at one of its sensors."""
     kind = replace(KINDS[machine], window_s=20.0) if options.small else KINDS[machine]
     scene = drawn(kind, generator(options.seed, case, number, At.CONDITION))
     length_s = scene.machine.window.length_s
@@ -64,7 +64,7 @@ def _doublings(options: Options, machine: str, case: int, _: None, number: int) 
 
 
 def _stepped(doubled: str, step_s: float, channel: int, t: FloatArray) -> Gains:
-    """Gains of a step; it comes at the start of the first block after its time."""
+    """Gains of lines and noise; the step takes effect at the first block that starts after `step_s`."""
     lines, noise = np.ones((3, 2)), np.ones(2)
     if t[0] >= step_s:
         lines[{"overall": slice(None), "1x": slice(0, 1), "2x": slice(1, 2)}[doubled], channel] = 2.0
@@ -73,9 +73,9 @@ def _stepped(doubled: str, step_s: float, channel: int, t: FloatArray) -> Gains:
 
 
 def _rotor_doublings(options: Options, machine: str, case: int, _: None, number: int) -> Iterator[dict[str, Value]]:
-    """One commissioning of a rotor, and three streams against it.
+    """One commissioning of a rotor, and up to three streams watched with it.
 
-    A force at the bearing moves it at 2x by a tenth of its 1x to as much, in healthy recordings too.
+    A force at the bearing causes 2x motion of 0.1 to 1 times its 1x, in healthy recordings too.
     """
     name, level = machine.split(", level ")
     rng = generator(options.seed, case, number, At.CONDITION)
@@ -85,14 +85,14 @@ def _rotor_doublings(options: Options, machine: str, case: int, _: None, number:
     def with_2x(rotor: Rotor, seen: Seen, _: np.random.Generator) -> Seen:
         return line(rotor, seen, 2.0, force, part, start_rad)
 
-    # The theory of a linear rotor has no 2x, and is refused where there is one.
+    # The theory of a linear rotor has no 2x, and a machine with 2x is refused.
     known = level == KnowledgeLevel.FULL.value
     subject = Subject(name, KnowledgeLevel(level), options.seed, number, as_simulated if known else with_2x)
     changes = {"overall": _doubled_overall, "1x": _doubled_1x} | ({} if known else {"2x": with_2x})
     together = commissioned(subject.file, *map(subject.healthy, range(CONDITIONS)))
     for at, (doubled, change) in enumerate(changes.items()):
         installed = together
-        if isinstance(installed, str):  # the conditions contradict each other
+        if isinstance(installed, str):  # the conditions are inconsistent: commission on one alone
             installed = commissioned(subject.file, subject.healthy(subject.condition(at)))
         if isinstance(installed, str):
             yield {"doubled": doubled, "refused": installed}
@@ -113,7 +113,7 @@ def _doubled_1x(_rotor: Rotor, seen: Seen, _rng: np.random.Generator) -> Seen:
 
 
 def _errors_of_2x(installed: Installed) -> float:
-    """Size of the 2x on the healthy machine, in standard errors of one window, at the sensor that shows it best."""
+    """Largest 2x of any sensor in the healthy reference, in standard errors of one window."""
     assert installed.commissioned is not None  # noqa: S101  # for the type checker
     reference = installed.commissioned.levels
     states = () if reference is None else reference.states
@@ -129,13 +129,13 @@ def _errors_of_2x(installed: Installed) -> float:
 
 
 def _bearing(options: Options, machine: str, case: int, _: None, number: int) -> Iterator[dict[str, Value]]:
-    """A defect that grows until the first alarm, or until its impacts have twenty times the healthy rms."""
+    """A bearing defect that grows until the first alarm, or until its impacts reach twenty times the healthy rms."""
     rng = generator(options.seed, case, number, At.CONDITION)
     kind = replace(KINDS["accelerometers, speed in the machine file"], rate_hz=12800.0, window_s=_BEARING_WINDOW_S)
     if machine == _IN_SNAPSHOTS:
         kind = replace(kind, schedule=(0.1, 10.0))
     scene = drawn(kind, rng)
-    # Everything goes on so many times more slowly where windows are longer.
+    # The growth is slower in proportion to the length of the window.
     length_s = scene.machine.window.length_s
     slower = length_s / _BEARING_WINDOW_S
     defect = Defect(
@@ -158,7 +158,7 @@ def _bearing(options: Options, machine: str, case: int, _: None, number: int) ->
     }
 
 
-# What is added up
+# Tables and goals
 
 
 def _of(topic: str) -> Callable[[Sequence[Record]], list[Record]]:

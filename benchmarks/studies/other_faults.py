@@ -1,6 +1,6 @@
-"""Faults of other kinds than the diagnosed parameters: whether they are heard, and what they are blamed on.
+"""Faults other than changes of the diagnosed parameters: whether an alarm is raised, and which cause it names.
 
-A machine is commissioned on healthy recordings of three conditions and watched by the monitor itself, in one of these
+A machine is commissioned on healthy recordings of three conditions and watched by the monitor in one of these
 conditions. After a healthy stretch one fault begins.
 """
 
@@ -21,27 +21,27 @@ from models.physics.rotor import PARAMETERS
 from service.monitor.monitor import MachineMonitor
 
 _FIRST_WINDOWS = 6
-"""What is not commissioned is compared with its first five; one more fills before they are told apart."""
+"""Windows before the fault without commissioning: five for the reference, and one that fills before comparison."""
 
 
 def _measure(seed: int, name: str, level: KnowledgeLevel, _: None, number: int) -> list[dict[str, Value]]:
     subject = Subject(name, level, seed, number)
     installed = commissioned(subject.file, *map(subject.healthy, range(CONDITIONS)))
-    # The rotor of finite elements touches nothing and does not crack.
+    # Rubs and cracks are not modelled for the finite-element rotor.
     faults = [fault for fault in FAULTS if fault != ANOTHER and (name in SHIPPED or fault not in {*RUBS, CRACK})]
     said: dict[str, Value] = {}
-    if isinstance(installed, str):  # what is left is to watch its levels, against its first windows
+    if isinstance(installed, str):  # only levels can be watched, with the first windows as the reference
         said = {"refused": installed}
         subject, installed = replace(subject, windows=_FIRST_WINDOWS), Installed(subject.file)
     found = [{"fault": fault, **said, **_watched(subject, MachineMonitor(installed), fault)} for fault in faults]
-    if level is KnowledgeLevel.FULL:  # from the beginning, and nobody has commissioned it
+    if level is KnowledgeLevel.FULL:  # present from the beginning, without commissioning
         subject = replace(subject, windows=0)
         found.append({"fault": ANOTHER, **_watched(subject, MachineMonitor(Installed(subject.file)), ANOTHER)})
     return found
 
 
 def _watched(subject: Subject, monitor: MachineMonitor, fault: str) -> dict[str, Value]:
-    """What was raised of a fault, and what it was blamed on."""
+    """Alarms raised by a fault, and the causes that they name."""
     events = list(raised(monitor, subject.faulty(list(FAULTS).index(fault), fault, FAULTS[fault])))
     after = [one for one in events if one.at_s > subject.begins_s]
     named = [one for one in after if one.name in PARAMETERS]
@@ -63,7 +63,7 @@ def _watched(subject: Subject, monitor: MachineMonitor, fault: str) -> dict[str,
     }
 
 
-# What is added up
+# Tables and goals
 
 
 def _heard(rows: Sequence[Record], *, refused: bool = False) -> list[Record]:

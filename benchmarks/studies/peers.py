@@ -1,7 +1,7 @@
-"""The diagnosticians and the methods a user would otherwise pick, on the same windows.
+"""Compares the diagnosticians with alternative methods on the same windows.
 
-Two settings: in the laboratory nothing varies but the realisation, in the varying setting every window has a condition
-of its own. A change alters the machine and nothing else: force and noise are drawn for the healthy one.
+In the setting *laboratory* only the realisation varies; in *varying* every window has its own condition. A change only
+alters the machine: force and noise are drawn for the healthy one.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,7 +26,7 @@ from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 
 _BLOCK_S = 5.0
-_APART = 1_000_000  # numbers of the laboratory's windows: learning, limits and every cell have a million of their own
+_APART = 1_000_000  # offset between window numbers of learning, limits and each cell in the laboratory setting
 _SETTINGS = ("laboratory", "varying")
 _CHANGES: tuple[dict[str, float], ...] = (
     {},
@@ -36,12 +36,12 @@ _CHANGES: tuple[dict[str, float], ...] = (
 
 
 _Series = tuple[str, int, dict[str, float]]
-"""Setting, purpose (0 to learn from, 1 for the limits, 2 and up the cells), true changes."""
+"""Setting, purpose (0 for learning, 1 for the limits, 2 and up for the cells), true changes."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Learned:
-    """Of one setting: methods that have learned healthy windows, and their limits."""
+    """Methods fitted to healthy windows of one setting, and their limits."""
 
     peers: tuple[SubspaceModes | FeatureVector, ...]
     limits: tuple[float, ...]
@@ -74,7 +74,7 @@ def _simulate(machine: Machine, seed: int, series: _Series, number: int) -> tupl
 
 
 def _looked(machine: Machine, seed: int, job: tuple[_Series, int]) -> tuple[tuple[FloatArray, ...], WindowStatistics]:
-    """Features of every other method, and the statistics without hops and spectra: the printed networks need none."""
+    """Features for every other method, and statistics without hops and spectra, which printed networks do not use."""
     samples, window = _simulate(machine, seed, *job)
     kept = replace(
         window,
@@ -86,7 +86,7 @@ def _looked(machine: Machine, seed: int, job: tuple[_Series, int]) -> tuple[tupl
 
 
 def _learn(machine: Machine, options: Options, over: Over) -> Mapping[str, _Learned]:
-    """Both settings, on as many healthy windows to learn from as for the limits."""
+    """Fit the methods in both settings, with as many healthy windows for the limits as for learning."""
     count = 19 if options.small else 199
     found = {}
     for setting in _SETTINGS:
@@ -137,7 +137,7 @@ _HEADS = {"SSI-cov": "SSI-cov", "features": "features, T²", **TITLES}
 
 
 def _short(method: str, rows: Sequence[Record]) -> str:
-    """Detected, and behind it named exactly where the method says what changed; per cent."""
+    """Per cent of windows detected and, if the method names changes, of those named exactly."""
     figures = [r.share(column)(r.where(rows, method=method)) for column in ("detected", "exact")]
     return " / ".join(f"{100 * one.value:.0f}" for one in figures if one is not None)
 
@@ -159,7 +159,7 @@ _TABLES = (
 
 
 def _goals(records: Sequence[Record]) -> Iterator[Goal]:
-    """Where another method notices a change more often than the likelihood."""
+    """The goal that no other method detects a change significantly more often than the likelihood."""
     lost = []
     changed = [row for row in records if row["changed"] != "healthy"]
     for (setting, change), rows in r.grouped(changed, "setting", "changed").items():
@@ -185,7 +185,7 @@ def _charts(records: Sequence[Record]) -> Iterator[Chart]:
 
 
 def peers(options: Options) -> Study:
-    """Beside operational modal analysis, a feature vector and the networks as printed."""
+    """Comparison with operational modal analysis, a feature vector and the networks as printed."""
     trained = Trained.named(options.machine)
     changes = (_CHANGES[0], _CHANGES[3], _CHANGES[6]) if options.small else _CHANGES
     cells = tuple(

@@ -1,8 +1,8 @@
-"""The paper's study, done again: its eight fault conditions, cutoffs and noise levels, before all diagnosticians.
+"""Reproduction of the paper's study: its eight fault conditions, cutoffs and noise levels, with all diagnosticians.
 
-Everything is judged twice: on faulty runs that share their noise realisations with the healthy runs the networks were
-trained on, as the paper evidently had it, and on independent realisations. The operating condition is the same in both:
-one source of fixed direction and level, fixed speed, the paper's four cutoffs.
+Everything is evaluated twice: on faulty runs that share their noise realisations with the healthy training runs of the
+networks, as evidently in the paper, and on independent realisations. The operating condition is the same in both: one
+source of fixed direction and level, fixed speed, the paper's four cutoffs.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -25,7 +25,7 @@ from simulator.scenario import Event, NamedSource, Scenario, Sensors
 from simulator.training.draws import Purpose, scaled, simulate_scenario, with_tilt
 
 _CUTOFFS_HZ = (25.0, 50.0, 100.0, 200.0)  # cutoffs of the excitation; the paper's own four (its Table 3) are lost
-_NOISE_LEVELS = (0.01, 0.02, 0.03, 0.04, 0.05)  # coloured noise at the sensors in parts of each channel's rms (§4.2.3)
+_NOISE_LEVELS = (0.01, 0.02, 0.03, 0.04, 0.05)  # coloured sensor noise over each channel's rms (§4.2.3)
 _REALISATIONS = ("shared", "independent")
 _NOISE_CORNER_HZ, _NOISE_CUTOFF_HZ = 200.0, 100.0
 _EQUATIONS = tuple(equation.number for equation in PAPER_EQUATIONS)
@@ -42,23 +42,23 @@ CONDITIONS: dict[str, dict[str, float]] = {
     "e + c44": {"e": 0.2, "c_bz": -0.2},
     "e + c11": {"e": 0.2, "c_by": -0.2},
 }
-"""Healthy, and the paper's eight under their names there, each change 20 %; their place is part of the seed."""
+"""Healthy, and the paper's eight conditions by its names, each change 20 %; their index is part of the seed."""
 
 
 def own_equations(parameters: Iterable[str]) -> tuple[str, ...]:
-    """Equations that contain any of the parameters: of the changed ones what a right location names."""
+    """Equations that contain any of the parameters, i.e. those that a correct location names for changed parameters."""
     named = {_OWN[name] for name in parameters}
     return tuple(number for number in _EQUATIONS if number in named)
 
 
 _Run = tuple[dict[str, float], float, float, tuple[int, ...]]
-"""True changes, cutoff, noise, and all that decides the random numbers beside the seed."""
+"""True changes, cutoff, Hz, relative noise, and the key that determines the random numbers together with the seed."""
 
 
 def _source(machine: Machine, cutoff_hz: float) -> NamedSource:
-    """One source on all six degrees of freedom alike, so loud that the healthy disc moves as much as at 1x (rms).
+    """One source acting equally on all six degrees of freedom, scaled so that the disc's rms equals that at 1x.
 
-    S of Eq. 15: the tilts have a lever arm of a third of the shaft.
+    It is S of Eq. 15; the level is that of the healthy machine, and tilts have a lever arm of a third of the shaft.
     """
     lever = machine.rotor.shaft_length_m / 3
     equal = np.array([1, 1, lever, 1, 1, lever])
@@ -70,7 +70,7 @@ def _source(machine: Machine, cutoff_hz: float) -> NamedSource:
 
 
 def simulate(machine: Machine, seed: int, run: _Run) -> WindowStatistics:
-    """Simulate one window, tilt included: equation 30 needs it, and the machine's own channels stay what they are."""
+    """Simulate one window with additional tilt channels, which equation 30 needs; other channels are unaffected."""
     faults, cutoff_hz, noise, realisation = run
     rig = with_tilt(machine)
     sizes = plan_for(rig)
@@ -89,7 +89,7 @@ def simulate(machine: Machine, seed: int, run: _Run) -> WindowStatistics:
 def _learn(
     machine: Machine, seed: int, windows: int, cutoffs: tuple[float, ...], options: Options, over: Over
 ) -> dict[str, PaperDiagnostician]:
-    """The printed networks on healthy windows, with the limits of their MSD for either kind of realisation."""
+    """Train the printed networks on healthy windows, and set the limits of their MSD for both kinds of realisation."""
     count = 9 if options.small else 199
     runs: list[_Run] = [
         ({}, cutoff, _NOISE_LEVELS[0], (Purpose.TRAINING, n, r))
@@ -102,7 +102,7 @@ def _learn(
     runs = [({}, cutoffs[n % len(cutoffs)], _NOISE_LEVELS[0], (Purpose.CALIBRATION, n)) for n in range(count)]
     calibration = over("calibration windows", partial(simulate, machine, seed), runs)
     return {
-        # Who compares with the very runs that were trained on finds the largest healthy deviation among those.
+        # If test runs share the training realisations, the healthy deviations are those of the training runs.
         "shared": PaperDiagnostician.calibrated(networks, training, 1 / (len(training) + 1)),
         "independent": PaperDiagnostician.calibrated(networks, calibration, options.rate),
     }
@@ -121,7 +121,7 @@ def _measure(
     found = [_row("paper", own, " ".join(paper.flagged(msd)), msd)]
     for one in trained.diagnosticians():
         try:
-            # Equation 30 needs tilt; the likelihood and the amortised networks judge by the machine's own channels.
+            # Equation 30 needs tilt; the likelihood and the amortised networks use the machine's own channels.
             opinion = one.diagnose(whole if one.by == "relation" else seen)
         except EstimationError:  # a refused window is a result: it is counted
             found.append(_row(one.by, own, None, {}))
@@ -138,7 +138,7 @@ def _row(by: str, own: str, named: str | None, msd: Mapping[str, float | None]) 
 
 
 def _seen_by(machine: Machine, window: WindowStatistics) -> WindowStatistics:
-    """The window as the machine's own channels see it, without what was simulated besides."""
+    """The window reduced to the machine's own channels."""
     keep = [n for n, name in enumerate(window.states) if name in machine.descriptor.states]
     q, hop_q = window.synchronous, window.hop_synchronous
     return replace(
@@ -236,7 +236,7 @@ def _band(number: str, rows: Sequence[Record]) -> Estimate:
 
 
 def reproduction(options: Options) -> Study:
-    """The paper's eight conditions before its own networks and all diagnosticians."""
+    """The paper's eight conditions, evaluated by its own networks and all diagnosticians."""
     trained = Trained.named(options.machine)
     cutoffs = _CUTOFFS_HZ[1:3] if options.small else _CUTOFFS_HZ
     noises = _NOISE_LEVELS[::4] if options.small else _NOISE_LEVELS
@@ -250,7 +250,7 @@ def reproduction(options: Options) -> Study:
     plan += [("noise", kind, "healthy", noise_hz, noise) for kind in _REALISATIONS for noise in noises]
     cells = []
     for at, (part, kind, name, cutoff, noise) in enumerate(plan):
-        # The training's realisations again, or ones that no other cell has.
+        # Either the realisations of the training, or realisations of this cell only.
         own = (Purpose.TRAINING, cutoffs.index(cutoff)) if kind == "shared" else (Purpose.EVALUATION, at)
         measure = partial(_measure, trained, options, kind, (CONDITIONS[name], cutoff, noise, own))
         keys: dict[str, Value] = {"part": part, "realisation": kind, "condition": name}

@@ -1,4 +1,4 @@
-"""Sensors at fault on a healthy machine: named, called a matter of data health, or taken for a fault of the machine."""
+"""Sensor faults on a healthy machine: named, attributed to data health, or mistaken for a fault of the machine."""
 
 from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
@@ -31,7 +31,7 @@ _FAULTS = {
     "delay": ("delay of 1–5 ms", "delay"),
     "swapped": ("swapped with another channel", "swapped"),
 }
-"""What is wrong with one channel, in words and as the checks call it; its place is part of the seed."""
+"""Fault of one channel: text, and kind as named by the sensor checks; its index is part of the seed."""
 _LEVELS = (KnowledgeLevel.NONE, KnowledgeLevel.FULL)
 
 
@@ -63,14 +63,14 @@ def _measure(
         "found": " ".join(dict.fromkeys(found.kind for found in findings)),
         "right": any(found.kind == _FAULTS[fault][1] and state in found.states for found in findings),
     }
-    # Nothing is said of the machine where something is found wrong with a sensor.
+    # The machine is not diagnosed if a sensor fault is found.
     return [known if findings else known | opinion(diagnostician, window, (0.01,))]
 
 
 def _event(
     fault: str, machine: Machine, scenario: Scenario, rng: np.random.Generator
 ) -> tuple[Event | None, Channel | None, float]:
-    """The event of a fault, its channel and its size."""
+    """The event of a fault, its channel, and its size in the unit of its kind."""
     if fault == "healthy":
         return None, None, 0.0
     channels = [channel for channel in machine.sensors if channel.quantity is not Quantity.SHAFT_ANGLE]
@@ -103,7 +103,7 @@ def _event(
 
 
 def _judged(records: Sequence[Record]) -> Iterator[Record]:
-    """With what is made of every window; a name beside "outside the model" blames nothing."""
+    """Records with the outcome of every window; a parameter named while outside the model does not count as blamed."""
     for row in records:
         blamed = bool(row.get("named")) and not row.get("outside")
         yield {**row, "data": bool(row["found"]), "blamed": blamed, "at fault": row["fault"] != _FAULTS["healthy"][0]}
@@ -124,7 +124,7 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
 
 
 def sensors(options: Options) -> Study:
-    """One channel of a healthy machine at fault."""
+    """A fault of one channel of a healthy machine."""
     cells = tuple(
         Cell(
             {"machine": name, "level": level.value, "fault": text},

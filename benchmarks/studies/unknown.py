@@ -1,8 +1,7 @@
-"""How well a machine is watched that was commissioned without its parameters, or with some of them.
+"""How well a machine is diagnosed that was commissioned without its parameters, or with some of them.
 
-Every machine is commissioned several times, each time from scratch on healthy windows of its own, so that the
-commissioning's own error is sampled as well; against each commissioning, windows of later days are read, healthy and
-changed.
+Every machine is commissioned several times, each time from scratch on new healthy windows, so that the error of the
+commissioning is sampled too; with each commissioning, windows of later days are read, healthy and changed.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,10 +23,10 @@ _CHANGES: tuple[dict[str, float], ...] = (
     {"c_bz": -0.3},
     {"e": 0.2},
 )
-"""True changes; their place is part of the seed."""
+"""True changes; their index is part of the seed."""
 _COMMISSIONINGS = 5
-_RAISE_ABOVE = 0.1  # a smaller change raises no alarm, as shipped
-_HEALTHY_WEIGHT = 8  # windows of the healthy machine for each one of a change: false alarms are rare
+_RAISE_ABOVE = 0.1  # default alarm limit; a smaller change raises no alarm
+_HEALTHY_WEIGHT = 8  # healthy windows per window of each change, because false alarms are rare
 
 
 def _measure(
@@ -82,7 +81,7 @@ _TABLES = (
         {
             "any named": r.share("any"),
             "exactly right": r.share("exact"),
-            # Windows of one commissioning share its error.
+            # Windows with the same commissioning share its error.
             "least commissioning": lambda rows: min(
                 one.value for one in r.each(rows, ("commissioning",), r.share("exact")).values() if one
             ),

@@ -1,1 +1,1 @@
-"""What diagnosticians are held against: bounds, the paper's own networks, and other methods."""
+"""References for the diagnosticians: bounds, the paper's own networks, and other methods."""

@@ -1,13 +1,13 @@
-"""Cramér-Rao bound: how well any unbiased method could read the parameters from one window.
+"""Cramér-Rao bound: the smallest error with which an unbiased method can read the parameters from one window.
 
 The information of T seconds of a stationary Gaussian process with spectra S(f; θ) is (P. Whittle, J. Roy. Statist. Soc.
 B 15 (1953))
 
     J_ab = T ∫ tr(S⁻¹ ∂_a S S⁻¹ ∂_b S) df  over the band.
 
-Nothing but the rotor's other properties is taken as known: the level matrix, the cutoff of the excitation and the
-density and colour of every channel's noise are unknown beside the parameters. The excitation's shape, a second-order
-low-pass, is known here; a method that does not know it has a higher bound.
+Besides the parameters, the level matrix, the cutoff of the excitation and the density and colour of every channel's
+noise are unknown; only the rotor's other properties are known. The excitation's shape, a second-order low-pass, is
+assumed known; a method that does not know it has a higher bound.
 """
 
 from dataclasses import dataclass
@@ -27,16 +27,16 @@ from simulator.plant import theoretical_rms
 from simulator.scenario import Scenario
 from simulator.timeline import Condition
 
-_PULL = 1e-6  # keeps directions invertible that the sensors do not see at all
+_PULL = 1e-6  # keeps the information invertible in directions that no sensor measures
 
 
 @dataclass(frozen=True, slots=True)
 class TrueCondition:
-    """What is true of a window, SI units."""
+    """True condition of a window, SI units."""
 
-    changes: dict[str, float]  # relative, of parameters
+    changes: dict[str, float]  # relative changes of parameters
     speed_rad_s: float
-    cutoff_hz: float  # of the second-order low-pass that colours all forces
+    cutoff_hz: float  # cutoff of the second-order low-pass that colours all forces
     levels: FloatArray  # (6, 6): two-sided density of the forces far below the cutoff, N²/Hz and Nm²/Hz
     noise: FloatArray  # (n_states,): two-sided density of the sensor noise at the lower end of the band
     noise_colour: FloatArray  # (n_states,): exponent b of the noise's colour
@@ -66,7 +66,7 @@ def cramer_rao(
     levels = true.levels / np.outer(unit, unit)
     force_scale = float(np.sqrt(np.trace(levels) / 6))
     shapes = 0 if shape_known else SHAPES
-    # In units of the true noise the motions lose nothing of what displacement and velocity say.
+    # In units of the true noise, motions retain all information of displacement and velocity.
     motions = Motions(states, np.sqrt(true.noise))
     model = SpectralModel(machine, motions, bins, force_scale, shapes)
     theta = _theta(model, true, levels)
@@ -81,8 +81,8 @@ def cramer_rao(
     covariance = everything[: len(STRUCTURAL), : len(STRUCTURAL)]
     ratio = np.exp(theta[: len(STRUCTURAL)])
     bound = dict(zip(STRUCTURAL, (ratio * np.sqrt(np.diag(covariance))).tolist(), strict=True))
-    # The exact 1x vector, x = q1 cos(θ + φ) + q2 sin(θ + φ): how much of the structure's uncertainty e inherits depends
-    # on it.
+    # The exact 1x vector, x = q1 cos(θ + φ) + q2 sin(θ + φ): it determines how far errors of the structural parameters
+    # propagate to e.
     q1, q2 = synchronous_response(changed(machine.rotor, true.changes), true.speed_rad_s)
     order = [STATE_INDEX[name] for name in states]
     synchronous = np.asarray(
@@ -93,7 +93,7 @@ def cramer_rao(
 
 
 def _theta(model: SpectralModel, true: TrueCondition, levels: FloatArray) -> FloatArray:
-    """Parameter point of the truth in the model's units."""
+    """Parameters of the true condition in the model's units."""
     theta = np.zeros(model.size)
     theta[: len(STRUCTURAL)] = np.log1p([true.changes.get(name, 0.0) for name in STRUCTURAL])
     theta[model.cutoff_at], theta[model.order_at] = np.log(true.cutoff_hz), np.log(2)
@@ -105,7 +105,7 @@ def _theta(model: SpectralModel, true: TrueCondition, levels: FloatArray) -> Flo
 
 
 def bound_of(scenario: Scenario, machine: Machine) -> dict[str, float]:
-    """The bound for one window of a scenario, as it is from its first sample on."""
+    """The bound for one window of a scenario, in its initial condition."""
     states = plan_for(machine).states
     return cramer_rao(machine, states, _true_condition(scenario, machine), machine.window.length_s)
 

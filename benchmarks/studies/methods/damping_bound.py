@@ -1,13 +1,12 @@
-"""How well damping can be read by whoever knows only the form of a bearing's relation.
+"""Smallest error of damping readings by a method that knows only the form of a bearing's relation.
 
-The relation says that a combination of motions is a force that is unrelated to any motion further back than it
-remembers. Nothing else is known: neither the relation's coefficients, which a healthy recording of finite length has to
-teach, nor the force, nor the rest of the machine. All that such a condition holds are its moments with past motions;
-what the best weighting of them makes of a Gaussian process is the bound (L. P. Hansen, J. Econometrics 30 (1985)). It
-is worked out from the rotor's true spectra and the sensors' true noise.
+The relation states that a combination of motions equals a force that is uncorrelated with motions earlier than the
+force's memory. Nothing else is known: not the relation's coefficients, which are learned from a healthy recording of
+finite length, nor the force, nor the rest of the machine. The available information is the moments of this combination
+with past motions; the bound is the error at their optimal weighting for a Gaussian process (L. P. Hansen,
+J. Econometrics 30 (1985)). It is computed from the rotor's true spectra and the sensors' true noise.
 
-The kernels over lags are the monitor's. Half their spacing, or lags twice as long, change no error by more than a
-tenth.
+The kernels over lags are the monitor's. Halving their spacing or doubling the lags changes no error by more than 10 %.
 """
 
 from collections.abc import Sequence
@@ -32,7 +31,7 @@ _ROUNDS = 20
 
 
 def expected(rotor: BeamRotor, condition: RunCondition, like: WindowStatistics) -> WindowStatistics:
-    """What the statistics of a window are on average: true spectra, and the correlations that belong to them."""
+    """Expected statistics of a window: true spectra, and the corresponding correlation functions."""
     changed = changed_rotor(rotor, condition.changes)
     equations, at = assemble(changed, condition.speed_rad_s), list(probed(changed))
     f = np.arange(0.0, RATE_HZ / 2 + _STEP_HZ / 2, _STEP_HZ)
@@ -68,14 +67,14 @@ def expected(rotor: BeamRotor, condition: RunCondition, like: WindowStatistics) 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Score:
-    """What the moments of a window say beyond their mean, in units of the information."""
+    """Score function: deviation of a window's moments from their mean, weighted to the units of the information."""
 
     mean: LagMoments
-    combination: FloatArray  # of the terms, that is the force
+    combination: FloatArray  # coefficients of the terms whose sum is the force
     weights: FloatArray  # (n_information, n_moments)
 
     def of(self, row: Row, window: WindowStatistics) -> FloatArray:
-        """Score of a simulated window."""
+        """Compute the score of a simulated window."""
         seen = row_window(row, window, MOTION, self.mean.of.references).beyond(SHORTEST_LAG_FROM_S)
         return np.asarray(self.weights @ (seen.values - self.mean.values) @ self.combination, dtype=np.float64)
 
@@ -86,13 +85,11 @@ class DampingBound:
 
     row: Row
     information: FloatArray  # (n_own + n_coefficients, n_own + n_coefficients)
-    left: (
-        float  # χ² that the relation leaves of the healthy recording on average, beyond chance: what it is not true by
-    )
-    scores: tuple[Score, Score]  # of a later window, and of a healthy one
+    left: float  # expected excess χ² of the relation in the healthy recording over chance, i.e. its model error
+    scores: tuple[Score, Score]  # for a later window, and for a healthy one
 
     def error(self, parameter: str, *, alone: bool) -> float:
-        """Smallest standard error of a parameter's relative change; `alone`: if no other one has changed."""
+        """Smallest standard error of a parameter's relative change; `alone` if no other parameter may have changed."""
         at = [own.parameter for own in self.row.own].index(parameter)
         n = len(self.row.own)
         kept = [at, *range(n, len(self.information))] if alone else list(range(len(self.information)))
@@ -101,7 +98,7 @@ class DampingBound:
         return float(np.sqrt(covariance[where, where]))
 
     def oracle(self, parameter: str, window: WindowStatistics, healthy: Sequence[WindowStatistics]) -> float:
-        """Error of a reading that knows the truth for its weights, in one simulated window and its commissioning."""
+        """Error of an oracle that uses the true optimal weights, for one simulated window and its healthy windows."""
         later, before = self.scores
         seen = (later.of(self.row, window), *(before.of(self.row, one) for one in healthy))
         at = [own.parameter for own in self.row.own].index(parameter)
@@ -132,7 +129,7 @@ def damping_bound(
         terms = list(own.terms)
         slopes[terms, number] = combination[terms]
         changed[terms] *= 1 + changes.get(own.parameter, 0.0)
-    # y - X b, with what changed: its slopes to the changes and to the coefficients
+    # Derivatives of y - X b, with the changes applied, with respect to the changes and to the coefficients.
     to_b = -np.eye(combination.size)[:, 1:] * (changed[1:] / combination[1:])
     W_later, _rank = inverse(after.covariance(changed))
     D = after.values @ np.hstack([slopes, to_b])

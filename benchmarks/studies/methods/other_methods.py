@@ -1,11 +1,11 @@
-"""What a user would otherwise pick, on the same samples: operational modal analysis, and a feature vector.
+"""Alternative methods on the same samples: operational modal analysis, and a feature vector.
 
-Both learn how healthy windows are and say how far a window is from that (Hotelling's T²). Neither knows a parameter of
-the machine, and neither says which one changed.
+Both learn the distribution of healthy windows and measure a window's distance from it (Hotelling's T²). Neither knows
+the machine's parameters, and neither says which one changed.
 
-The subspace identification is pyOMA2's covariance-driven SSI. Its defaults are not used where they would reject the
-modes of a rotor: hard criteria on mode phase collinearity or deviation throw out complex mode shapes, which forward and
-backward whirl are, and a damping limit of 10 % throws out well-damped bearings.
+The subspace identification is pyOMA2's covariance-driven SSI. Its defaults are changed where they would reject the
+modes of a rotor: hard criteria on mode phase collinearity or deviation reject complex mode shapes, such as forward and
+backward whirl, and a damping limit of 10 % rejects well-damped bearings.
 """
 
 import logging
@@ -22,11 +22,11 @@ from models.physics.rotor import STATE_INDEX, system_A
 from models.signals.block import FloatArray
 
 _MORE_ORDERS = 16
-"""Model orders from twice the number of modes to this many above it, as in a stabilisation diagram; the median over
-them counts."""
+"""Model orders run from twice the number of modes to 16 above it, as in a stabilisation diagram; the result is their
+median."""
 _BLOCK_ROWS_PER_PERIOD = 1.4
 _MOST_DAMPING = 0.3
-_NEAREST = 0.3  # a pole further than this from a reference mode in relative frequency is not that mode
+_NEAREST = 0.3  # largest relative difference in frequency between a pole and a reference mode
 _LEAST_MAC = 0.5
 _MOST_SHARE_LOST = 0.5
 _LEAST_SHARE_THERE = 0.8
@@ -34,10 +34,10 @@ _BANDS = 6
 
 
 class Hotelling:
-    """Hotelling's T² of features from mean and covariance of healthy windows; `shrink`: after Ledoit and Wolf.
+    """Hotelling's T² of features, with the mean and covariance of healthy windows; `shrink` after Ledoit and Wolf.
 
-    Features that more than a fifth of the healthy windows lack are not used; of the others, T² of a window is that of
-    the features it has.
+    Features that more than a fifth of the healthy windows lack are not used; T² of a window is computed from those of
+    the other features that it has.
     """
 
     def __init__(self, *, shrink: bool) -> None:
@@ -61,7 +61,7 @@ class Hotelling:
         self._used = used
 
     def score(self, features: FloatArray) -> float:
-        """Distance of one window's features from healthy; nan if it has none."""
+        """T² of one window's features; NaN if it has none."""
         if not self._used.size:
             raise EstimationError("a window was to be scored before any healthy window was learned from")
         standard = (features[self._used] - self._mean) / self._scale
@@ -80,7 +80,7 @@ class SubspaceModes(Hotelling):
         super().__init__(shrink=False)
         plan = plan_for(machine)
         self._states, self._has_angle = plan.states, plan.angle_column is not None
-        # Half the new rate stays 30 % above the band, as the decimation filter needs it.
+        # The new Nyquist frequency stays 30 % above the band, as the decimation filter requires.
         self._factor = max(1, int(plan.rate_hz / (2.6 * machine.window.band_hz[1])))
         self._rate_hz = plan.rate_hz / self._factor
         self._frequency, self._shapes = reference_modes(machine)
@@ -88,7 +88,7 @@ class SubspaceModes(Hotelling):
         self._orders = range(2 * self._frequency.size, 2 * self._frequency.size + _MORE_ORDERS + 1, 2)
 
     def features(self, samples: FloatArray) -> FloatArray:
-        """Frequencies (Hz) and damping ratios of the tracked modes, shape (2 n_modes,); nan where a mode is lost."""
+        """Frequencies, Hz, and damping ratios of the tracked modes, shape (2 n_modes,); NaN where a mode is lost."""
         rest, _ = _without_rotation(samples, len(self._states), self._has_angle)
         if self._factor > 1:
             rest = scipy.signal.decimate(rest, self._factor, ftype="fir", axis=0)
@@ -107,7 +107,7 @@ class SubspaceModes(Hotelling):
         return middle.ravel()
 
     def _matched(self, frequency: FloatArray, shapes: FloatArray) -> list[tuple[int, int]]:
-        """Pairs of reference mode and pole: assignment by distance in frequency and 1 - MAC."""
+        """Pairs of reference mode and pole, assigned by the least sum of relative frequency difference and 1 - MAC."""
         away = np.abs(frequency[None, :] / self._frequency[:, None] - 1)
         mac = np.stack([_mac(reference, shapes / _units(self._states, frequency)) for reference in self._shapes])
         pairs = zip(*scipy.optimize.linear_sum_assignment(away + (1 - mac)), strict=True)
@@ -115,7 +115,7 @@ class SubspaceModes(Hotelling):
 
 
 class FeatureVector(Hotelling):
-    """Rms, kurtosis, 1× amplitude and levels in bands of equal logarithmic width, of every channel, as logarithms."""
+    """Kurtosis, and logarithms of rms, 1× amplitude and levels in bands of equal logarithmic width, per channel."""
 
     name = "features"
 
@@ -141,9 +141,10 @@ class FeatureVector(Hotelling):
 
 
 def reference_modes(machine: Machine) -> tuple[FloatArray, FloatArray]:
-    """Modes of the nominal machine within the likelihood's band: what a user would pick from the diagram.
+    """Modes of the nominal machine within the likelihood's band, as a user would select them from the diagram.
 
-    Their frequencies, Hz, and shapes at the measured states, (n_modes, n_states), velocities divided by the mode's own.
+    Returns frequencies, Hz, and shapes at the measured states, (n_modes, n_states), with velocities divided by the
+    mode's angular frequency.
     """
     values, vectors = np.linalg.eig(system_A(machine.rotor, machine.operation.speed_rad_s))
     frequency = np.abs(values) / (2 * np.pi)
@@ -156,13 +157,13 @@ def reference_modes(machine: Machine) -> tuple[FloatArray, FloatArray]:
 
 
 def _units(states: tuple[str, ...], frequency_hz: FloatArray) -> FloatArray:
-    """What velocities are divided by to stand beside displacements, shape (n_modes, n_states)."""
+    """Divisors that make velocities comparable with displacements, shape (n_modes, n_states)."""
     rates = np.array([name.endswith("_dot") for name in states])
     return np.where(rates, 2 * np.pi * frequency_hz[:, None], 1.0)
 
 
 def _without_rotation(samples: FloatArray, n_states: int, has_angle: bool) -> tuple[FloatArray, FloatArray]:
-    """Channels without mean and 1× part, and the 1× amplitudes (zero without a shaft angle)."""
+    """Channels with mean and 1× part removed, and the 1× amplitudes (zero without a shaft angle)."""
     x = samples[:, :n_states]
     angle = [np.cos(samples[:, n_states]), np.sin(samples[:, n_states])] if has_angle else []
     regressors = np.stack([np.ones(len(x)), *angle], axis=1)
@@ -173,7 +174,7 @@ def _without_rotation(samples: FloatArray, n_states: int, has_angle: bool) -> tu
 def _poles(x: FloatArray, block_rows: int, most: int, rate_hz: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Frequencies, damping ratios and shapes of all poles, one column for each even order from 0 on."""
     with np.errstate():  # the library changes numpy's error state on import
-        from pyoma2.functions.ssi import SSI_fast, SSI_poles, build_hank  # noqa: PLC0415  # for the reason above
+        from pyoma2.functions.ssi import SSI_fast, SSI_poles, build_hank  # noqa: PLC0415  # because of numpy's error state
 
         logging.getLogger("pyoma2").setLevel(logging.WARNING)  # it reports every step
         np.seterr(divide="ignore", invalid="ignore")

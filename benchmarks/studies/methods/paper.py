@@ -1,9 +1,9 @@
 """The paper's own diagnostician: equations (28)-(31) as printed, for comparison.
 
-Reference y1 alone, correlation functions from lag 0 on with the rotation-synchronous part in them, inputs and target at
-the same lag, one hidden layer of fifteen, one training row per lag, and the mean squared deviation as the measure. It
-names equations, not sizes. What had to be added for independent data stands in `models.diagnosis.networks.equations`
-and ``docs/method.md``; how far this variant carries stands in ``docs/reproduction.md``.
+It uses reference y1 only, correlation functions from lag 0 on including the synchronous part, inputs and target at the
+same lag, one hidden layer of fifteen units, one training row per lag, and the mean squared deviation as the measure. It
+names equations, not sizes of changes. For what had to be added for independent data, see
+`models.diagnosis.networks.equations` and ``docs/method.md``; for results of this variant, ``docs/reproduction.md``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,7 +35,7 @@ class PaperEquation:
     parameters: tuple[str, ...]
 
     def measured_in(self, window: WindowStatistics) -> bool:
-        """Whether a window has all states that it needs."""
+        """Whether a window has all states that the equation needs."""
         names = {name for pair in (*self.inputs, self.target) for name in pair}
         return names <= {*window.states, *(() if window.synchronous is None else (_PHASE,))}
 
@@ -50,9 +50,9 @@ PAPER_EQUATIONS = (
 
 
 def full_correlation(window: WindowStatistics, reference: str, response: str) -> FloatArray:
-    """R_ij(τ) with the rotation-synchronous part (Eqs. 17-18), shape (n_lags,).
+    """R_ij(τ) including the synchronous part (Eqs. 17-18), shape (n_lags,).
 
-    The window holds the stochastic rest; x_n = Re{q e^{jθ}} adds ½ Re{q̄_i q_j e^{jΩτ}}.
+    The window holds the stochastic part; the synchronous part x_n = Re{q e^{jθ}} adds ½ Re{q̄_i q_j e^{jΩτ}}.
     """
     i, j = window.states.index(reference), window.states.index(response)
     rest = window.correlation[:, i, j]
@@ -64,7 +64,7 @@ def full_correlation(window: WindowStatistics, reference: str, response: str) ->
 
 
 def phase_correlation(window: WindowStatistics, reference: str, unbalance_phase_rad: float) -> FloatArray:
-    """R_in(τ) = E{x_i(t) n(t+τ)} with n = cos Ωt counted from the heavy spot (Eqs. 6, 23), shape (n_lags,).
+    """R_in(τ) = E{x_i(t) n(t+τ)} with n = cos Ωt relative to the heavy spot (Eqs. 6, 23), shape (n_lags,).
 
     Raises
     ------
@@ -115,14 +115,14 @@ class PaperNetwork:
 def train_paper_network(
     equation: PaperEquation, windows: Sequence[WindowStatistics], machine: Machine, seed: int
 ) -> PaperNetwork:
-    """Fit one of the paper's networks to windows of the healthy machine, from initial weights drawn with a seed.
+    """Fit one of the paper's networks to windows of the healthy machine, with random initial weights from a seed.
 
-    Correlations stand in their own units: no window is normalised. All inputs are divided by their rms over the
-    training rows, and the target by its own, which only helps the search.
+    Correlations keep their units: no window is normalised. All inputs and the target are divided by their rms over the
+    training rows, which only helps the search.
 
-    Raises EstimationError if there is no window, or the fit does not come out finite.
+    Raises EstimationError if there is no window, or the fit is not finite.
     """
-    import torch  # noqa: PLC0415  # for whoever trains: it takes seconds
+    import torch  # noqa: PLC0415  # takes seconds, only needed for training
 
     if not windows:
         raise EstimationError(f"{machine.name}: no training window for equation {equation.number}, expected at least 1")
@@ -162,7 +162,7 @@ def train_paper_network(
 
 @dataclass(frozen=True, slots=True)
 class PaperDiagnostician:
-    """Says which equations have become inconsistent: those whose MSD exceeds the limit that healthy windows set."""
+    """Names the inconsistent equations, whose MSD exceeds a limit set by healthy windows."""
 
     networks: Sequence[PaperNetwork]
     limits: Mapping[str, float]
@@ -171,7 +171,7 @@ class PaperDiagnostician:
     def calibrated(
         cls, networks: Sequence[PaperNetwork], healthy: Sequence[WindowStatistics], false_alarm_rate: float
     ) -> "PaperDiagnostician":
-        """With limits at a rate of false alarms per window over all equations together.
+        """Set the limits for a false-alarm rate per window, over all equations together.
 
         Raises EstimationError if there are too few windows for the declared rate.
         """

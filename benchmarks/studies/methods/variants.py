@@ -1,4 +1,4 @@
-"""Variants of the relation networks' equations, as data: what each row of the ablation switches on or off."""
+"""Variants of the relation networks' equations for the ablation study: the ingredients that each one has."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from models.signals.block import FloatArray
 
 
 class Measure(StrEnum):
-    """What is made of the residual."""
+    """Measure computed from the residual."""
 
     MSD = "mean squared deviation"
     PROJECTION = "projection on the signatures"
@@ -24,7 +24,7 @@ class Measure(StrEnum):
 
 @unique
 class Reader(StrEnum):
-    """Who reads the window; the last three are diagnosticians, by their names."""
+    """Method that reads the window; the last three are diagnosticians, by name."""
 
     PAPER = "paper"
     NETWORK = "trained network"
@@ -39,18 +39,18 @@ _ALL, _BEARING = ("28", "29", "31"), ("28", "31")
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One row of the table: the equations it exists for, and which ingredients it has."""
+    """One row of the table: the equations for which it exists, and its ingredients."""
 
     group: str
     label: str
     equations: tuple[str, ...]
-    has: frozenset[str]  # of `_INGREDIENTS`
+    has: frozenset[str]  # names from `_INGREDIENTS`
     measure: Measure = Measure.OWN_ERROR
     reader: Reader = Reader.NETWORK
 
     @property
     def network_key(self) -> "Variant":
-        """The same for all variants that share a trained network."""
+        """Key that is the same for all variants that share a trained network."""
         return replace(self, group="", label="", equations=(), measure=Measure.MSD)
 
 
@@ -107,28 +107,28 @@ VARIANTS: tuple[Variant, ...] = (*_one_after_the_other(), *_without(), *_in_its_
 
 
 class _LevelRows(EquationRows):
-    """Rows that are not divided by their own target."""
+    """Rows that are not normalised by the rms of their own target."""
 
     __slots__ = ()
 
     @property
     def norm(self) -> float:
-        """The rows come in units of the training windows' target."""
+        """1, because the rows are already in units of the training windows' target."""
         return 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class VariantEquation(Equation):
-    """Equation 28 or 31 with the first few of its references y1, y2, z1, z2.
+    """Equation 28 or 31 with the first `references` of its references y1, y2, z1, z2.
 
-    A `unit` takes the place of every window's own norm in target, inputs and signatures.
+    If `unit` is given, it replaces every window's own norm in target, inputs and signatures.
     """
 
     references: int = 4
     unit: float | None = None
 
     def rows(self, view: StatisticsView, machine: Machine) -> EquationRows:
-        """Rows of one view, one per lag and reference kept."""
+        """Rows of one view, one for each lag and reference used."""
         rows = Equation.rows(self, view, machine)
         kept = np.arange(rows.target.shape[-1]).reshape(-1, 4)[:, : self.references].ravel()
         parts = (rows.inputs[..., kept, :], rows.target[..., kept], rows.signatures[..., kept, :])
@@ -150,7 +150,7 @@ class _FixedSpeedEquation(SynchronousEquation):
 
 @dataclass(frozen=True, slots=True)
 class LinearRelation(Network):
-    """A linear map in the network's place; `W2` and `b2` alone are used."""
+    """A linear map that replaces the network; only `W2` and `b2` are used."""
 
     def __call__(self, inputs: FloatArray) -> FloatArray:
         """Output for each row of inputs, shape (…, n_rows)."""
@@ -160,7 +160,7 @@ class LinearRelation(Network):
 def linear_fit(
     equation: Equation | SynchronousEquation, windows: Sequence[WindowStatistics], machine: Machine
 ) -> Network:
-    """Least squares on the rows that a network would be trained on."""
+    """Least-squares fit to the rows on which a network would be trained."""
     rows = [equation.rows(window_view(window, machine), machine) for window in windows]
     inputs = np.concatenate([row.inputs / row.norm for row in rows])
     target = np.concatenate([row.target / row.norm for row in rows])
@@ -176,7 +176,7 @@ def _first(function: Callable[..., tuple[float, ...]], count: int, rotor: object
 
 
 def variant_equation(variant: Variant, number: str) -> Equation | SynchronousEquation:
-    """The variant's equation, still without a unit."""
+    """The variant's equation, without `unit`."""
     equation = equation_by_number(number)
     if isinstance(equation, SynchronousEquation):
         kind = SynchronousEquation if "powers" in variant.has else _FixedSpeedEquation
@@ -193,7 +193,7 @@ def variant_equation(variant: Variant, number: str) -> Equation | SynchronousEqu
 
 
 def as_seen(variant: Variant, window: WindowStatistics) -> WindowStatistics:
-    """The window with the rotation-synchronous part put back where the variant does not remove it (Eqs. 17-18)."""
+    """The window with the synchronous part added back if the variant does not remove it (Eqs. 17-18)."""
     if "synchronous" in variant.has or window.synchronous is None:
         return window
     q = window.synchronous

@@ -1,1 +1,1 @@
-"""What a study is: a plan of windows, its records, figures, charts and the page made of them."""
+"""Framework of the studies: plan of windows, records, figures, charts and pages."""

@@ -1,4 +1,4 @@
-"""What the diagnosticians say of one window, as columns of a record, and whether that is right."""
+"""Results of the diagnosticians in one window as columns of a record, and their correctness."""
 
 import hashlib
 import json
@@ -22,7 +22,7 @@ from models.machine import Machine, load_machine
 from models.physics.rotor import PARAMETERS
 from simulator.training.draws import Layout
 
-RATES = (0.01, 0.001)  # declared false alarms per window at which an opinion is judged, strict last
+RATES = (0.01, 0.001)  # declared false-alarm rates per window at which results are evaluated, the strict one last
 TITLES = {
     "likelihood": "likelihood",
     "network": "amortised networks",
@@ -35,19 +35,19 @@ LAYOUTS = {None: "either", Layout.ONE_SOURCE: ONE, Layout.INDEPENDENT: SEVERAL}
 
 @dataclass(frozen=True, slots=True)
 class Trained:
-    """A machine, and the networks that were trained for it, if there are some."""
+    """A machine, and the networks trained for it, if any."""
 
     machine: Machine
     bundle: Bundle | None
 
     @classmethod
     def named(cls, name: str) -> "Trained":
-        """A shipped machine, or one of a file, with the networks of its name."""
+        """Load a machine by shipped name or file, with the networks of its name."""
         machine = load_machine(name)
         return cls(machine, load_bundle(machine.name, machine))
 
     def diagnosticians(self) -> tuple[Diagnostician, ...]:
-        """The equations' networks and the amortised networks where there are some, and the likelihood, all cold."""
+        """The relation and amortised networks, if any, and the likelihood, all without state from earlier windows."""
         likelihood = LikelihoodFit(self.machine)
         if self.bundle is None:
             return (likelihood,)
@@ -65,18 +65,18 @@ def physics_hash(machine: Machine) -> str:
 
 
 def made_with(machines: Iterable[Trained]) -> dict[str, str]:
-    """What all records of a study of these machines must share."""
+    """Digests of machines and bundles that all records of a study must share."""
     return {
         one.machine.name: f"{physics_hash(one.machine)} {one.bundle.identity if one.bundle else ''}" for one in machines
     }
 
 
 def opinion(one: Diagnostician, window: WindowStatistics, rates: tuple[float, ...] = RATES) -> dict[str, Value]:
-    """Columns of a record: a refused window is a result, and counted.
+    """Columns of a record with a diagnostician's results; a refused window is a result too.
 
-    Of every parameter that is read its relative change and, with ``error`` behind its name, the standard error;
-    ``named`` the parameters said to have changed, with spaces between them, ``largest`` the largest change among them,
-    and ``outside``, at the first of `rates`, with ``strict`` before them at the second one.
+    For every parameter read, the relative change, and in ``<name> error`` the standard error; ``named``, the parameters
+    named as changed, separated by spaces; ``largest``, the largest change among them; and ``outside``. These three are
+    at the first of `rates`; those with the prefix ``strict`` at the second.
     """
     started = process_time()
     try:
@@ -107,16 +107,16 @@ def truth(faults: Mapping[str, float]) -> dict[str, Value]:
 
 
 def named_in(record: Record, column: str = "named") -> set[str]:
-    """What is named in a record; nothing in a refused window."""
+    """Parameters named in a record; empty for a refused window."""
     return set(str(record.get(column) or "").split())
 
 
 def judged(records: Iterable[Record]) -> Iterator[Record]:
-    """Records with what is right and wrong in them, at the first declared rate.
+    """Records with columns on their correctness, at the first declared rate.
 
-    ``any``: something is named; ``exact``: the changed ones and no others; ``wrong``: one that did not change;
-    ``claimed``: something is named without "outside the model" beside it, but for the shaft alone; ``noticed``: outside
-    the model, or a suspect is named.
+    ``any``: a parameter is named; ``exact``: exactly the changed ones are named; ``wrong``: an unchanged one is named;
+    ``claimed``: a parameter other than EI is named, without "outside the model"; ``noticed``: outside the model, or a
+    suspect is named.
     """
     for record in records:
         named, true = named_in(record), {name for name in PARAMETERS if record.get(f"{name} true")}
@@ -133,7 +133,7 @@ def judged(records: Iterable[Record]) -> Iterator[Record]:
 
 
 def readings(records: Iterable[Record]) -> Iterator[Record]:
-    """One row for every parameter of every window, refused ones too: deviation, in errors and in bounds, covered."""
+    """One row for every parameter of every window, refused or not, with its deviation from the truth and coverage."""
     for record in records:
         for name in PARAMETERS:
             change, error, true = (record.get(f"{name}{column}") for column in ("", " error", " true"))
@@ -164,10 +164,10 @@ READING_COLUMNS: dict[str, r.Of[r.Figure]] = {
     "covered": r.share("covered"),
     "named": r.share("is named"),
 }
-"""Of `readings`."""
+"""Columns of tables of `readings`."""
 
 
 def false_alarms(by: str, healthy: Sequence[Record], groups: Sequence[str]) -> Iterator[Goal]:
-    """The declared rates on healthy windows, from what `judged` makes of them."""
+    """Goals that false-alarm rates of healthy windows, from `judged`, match the declared ones."""
     for column, declared in zip(("any", "strict any"), RATES, strict=True):
         yield r.holding(f"{by}: false alarms of healthy windows", r.each(healthy, groups, r.share(column)), declared)

@@ -1,4 +1,4 @@
-"""Pages of the documents, written from the records of a study, with all figures as CSV beside them."""
+"""Writes the documentation page of a study from its records, and all figures as CSV files."""
 
 import textwrap
 import tomllib
@@ -16,7 +16,7 @@ _TEXTS = tomllib.loads((_HERE / "texts.toml").read_text(encoding="utf-8"))
 
 
 def write_page(study: Study, options: Options, records: Sequence[Record], docs: Path) -> list[Path]:
-    """Write a page, its charts into ``figures/`` and its tables into ``results/`` beside it; returns what was written.
+    """Write a page, and its charts to ``figures/`` and tables to ``results/`` beside it; returns the files written.
 
     Raises OSError if something cannot be written.
     """

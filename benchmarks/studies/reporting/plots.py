@@ -12,7 +12,7 @@ from PIL import Image
 from benchmarks.studies.reporting.results import Chart, Estimate
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""After Okabe and Ito: told apart with any colour vision."""
+"""Okabe and Ito's palette, distinguishable with any colour vision."""
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 _STYLE = {
     "font.size": 9.0,
@@ -54,7 +54,7 @@ def draw(chart: Chart, folder: Path) -> Path:
         figure.legend(handles=handles, loc="outside upper center", ncols=min(6, len(handles)))
         path = folder / f"{chart.name}.png"
         figure.savefig(path, dpi=130, bbox_inches="tight", metadata={"Software": None})
-    with Image.open(path) as image:  # few colours, few bytes
+    with Image.open(path) as image:  # fewer colours for a smaller file
         small = image.convert("RGB").quantize(48, dither=Image.Dither.NONE)
     small.save(path, optimize=True)
     return path

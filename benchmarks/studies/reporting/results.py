@@ -1,7 +1,7 @@
-"""From records to figures: groups, rates and spreads with their 95 % intervals, and goals judged by them.
+"""Computes figures from records: groups, rates and spreads with 95 % intervals, and goals judged by them.
 
-Spread is a robust standard deviation, 1.4826 times the median distance from the median. Intervals of rates are
-Clopper-Pearson, those of everything else come from resampling the windows.
+The spread is a robust standard deviation, 1.4826 times the median absolute deviation from the median. Intervals of
+rates are Clopper-Pearson intervals; all others are bootstrap intervals over windows.
 """
 
 import csv
@@ -17,15 +17,15 @@ import scipy.stats
 from models.diagnosis.readings import Z95
 from models.errors import EstimationError
 
-Value = str | float | bool | None  # of a record: what JSON has, none of it nested
+Value = str | float | bool | None  # value in a record: any JSON value that is not nested
 Record = Mapping[str, Value]
 FloatArray = npt.NDArray[np.float64]
 _T = TypeVar("_T")
-Of = Callable[[Sequence[Record]], _T]  # a figure of some records
+Of = Callable[[Sequence[Record]], _T]  # function from records to a figure
 
 _RESAMPLINGS = 400
 _RESAMPLING_SEED = 20261
-_FEWEST = 4  # a spread of fewer windows says nothing
+_FEWEST = 4  # least number of windows for a spread
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Estimate:
     low: float
     high: float
     n: int  # windows
-    count: int | None = None  # of a rate: windows in which it holds
+    count: int | None = None  # for a rate, the number of windows in which it holds
 
     def __str__(self) -> str:
         if self.count is None:
@@ -45,7 +45,7 @@ class Estimate:
 
 
 def rate(flags: Iterable[object]) -> Estimate | None:
-    """Share of independent windows in which something holds, with its Clopper-Pearson interval; None without any."""
+    """Fraction of true flags, with its Clopper-Pearson interval for independent windows; None without windows."""
     held = [bool(flag) for flag in flags]
     return _share(sum(held), len(held), 0.025) if held else None
 
@@ -57,7 +57,7 @@ def _share(count: int, n: int, tail: float) -> Estimate:
 
 
 def resampled(statistic: Callable[[FloatArray], FloatArray], values: FloatArray) -> Estimate:
-    """Resample the windows; the statistic works on the last axis. Seed fixed: the same windows, the same limits."""
+    """A statistic over the last axis with its bootstrap interval; the seed is fixed, so results are reproducible."""
     rng = np.random.default_rng(_RESAMPLING_SEED)
     drawn = statistic(values[rng.integers(len(values), size=(_RESAMPLINGS, len(values)))])
     low, high = np.quantile(drawn, (0.025, 0.975)).tolist()
@@ -70,20 +70,21 @@ def rms(values: FloatArray) -> FloatArray:
 
 
 def robust(values: FloatArray) -> FloatArray:
-    """1.4826 times the median distance from the median, over the last axis."""
+    """1.4826 times the median absolute deviation from the median, over the last axis."""
     middle = np.median(values, axis=-1, keepdims=True)
     return np.asarray(1.4826 * np.median(np.abs(values - middle), axis=-1), dtype=np.float64)
 
 
 def floats(values: Iterable[Value]) -> FloatArray:
-    """The numbers among them."""
+    """All values that are numbers or booleans."""
     return np.array([value for value in values if value is not None and not isinstance(value, str)], dtype=np.float64)
 
 
 def limit_of(healthy: FloatArray, false_alarm_rate: float) -> float:
-    """Limit that a further healthy window exceeds with the declared probability at most, whatever the distribution.
+    """Limit that a further healthy window exceeds with at most the declared probability, for any distribution.
 
-    The ⌈(n+1)(1-α)⌉-th smallest of n healthy scores that nothing was learned from; refused with fewer than 1/α - 1.
+    It is the ⌈(n+1)(1-α)⌉-th smallest of n healthy scores not used for learning. Raises EstimationError with fewer than
+    1/α - 1 scores.
     """
     rank = int(np.ceil((healthy.size + 1) * (1 - false_alarm_rate) - 1e-9))
     if rank > healthy.size:
@@ -95,20 +96,20 @@ def limit_of(healthy: FloatArray, false_alarm_rate: float) -> float:
 
 
 def limits_of(healthy: Sequence[Mapping[str, float]], false_alarm_rate: float) -> dict[str, float]:
-    """Limits of several test values, of which a further healthy window exceeds any with the declared probability.
+    """Limits of several test values, any of which a further healthy window exceeds with the declared probability.
 
-    Each counts in units of its own 90 % quantile, so that none decides the limits of another. An upper quantile, not a
-    median: operating conditions make some values many times larger than the rest.
+    Each value is scaled by its own 90 % quantile, so that none dominates the limits of the others. An upper quantile is
+    used instead of the median because operating conditions make some values many times larger than the rest.
     """
     names = sorted({name for one in healthy for name in one})
     scale = {name: float(np.quantile([one[name] for one in healthy if name in one], 0.9)) for name in names}
     largest = [max((value / scale[name] for name, value in one.items()), default=0.0) for one in healthy]
-    limit = limit_of(np.array(largest), false_alarm_rate) * (1 + 1e-12)  # whoever sets it is not above it by rounding
+    limit = limit_of(np.array(largest), false_alarm_rate) * (1 + 1e-12)  # not exceeded by the window that sets it
     return {name: limit * one for name, one in scale.items()}
 
 
 def grouped(records: Iterable[Record], *by: str) -> dict[tuple[Value, ...], list[Record]]:
-    """Records by the values of some columns, in the order in which they come first."""
+    """Records grouped by the values of some columns, in order of first occurrence."""
     groups: dict[tuple[Value, ...], list[Record]] = {}
     for record in records:
         groups.setdefault(tuple(record[name] for name in by), []).append(record)
@@ -116,23 +117,23 @@ def grouped(records: Iterable[Record], *by: str) -> dict[tuple[Value, ...], list
 
 
 def where(records: Iterable[Record], **wanted: Value | tuple[Value, ...]) -> list[Record]:
-    """Records with these values; of several in parentheses with any of them."""
+    """Records with the given values; for a tuple, with any of its values."""
     one_of = {name: value if isinstance(value, tuple) else (value,) for name, value in wanted.items()}
     return [record for record in records if all(record.get(name) in values for name, values in one_of.items())]
 
 
 def among(figure: Of[_T], **wanted: Value | tuple[Value, ...]) -> Of[_T]:
-    """A figure of the records with these values alone."""
+    """A figure computed only from the records with the given values."""
     return lambda rows: figure(where(rows, **wanted))
 
 
 def share(column: str) -> Of[Estimate | None]:
-    """Rate of the records that have the column in which it holds."""
+    """Rate at which a column is true, among records that have it."""
     return lambda rows: rate(row[column] for row in rows if row.get(column) is not None)
 
 
 def statistic(column: str, make: Callable[[FloatArray], float | FloatArray]) -> Of[float | None]:
-    """What is made of the numbers in a column; None without any."""
+    """A statistic of the numbers in a column; None without numbers."""
 
     def of(rows: Sequence[Record]) -> float | None:
         found = floats(row.get(column) for row in rows)
@@ -147,7 +148,7 @@ def middle(column: str) -> Of[float | None]:
 
 
 def estimated(column: str, make: Callable[[FloatArray], FloatArray], fewest: int) -> Of[Estimate | None]:
-    """The same with its interval, and None of fewer."""
+    """A statistic of a column with its interval; None with fewer than `fewest` numbers."""
 
     def of(rows: Sequence[Record]) -> Estimate | None:
         found = floats(row.get(column) for row in rows)
@@ -162,7 +163,7 @@ def scatter(column: str) -> Of[Estimate | None]:
 
 
 def each(records: Iterable[Record], by: Sequence[str], figure: Of[Estimate | None]) -> dict[str, Estimate | None]:
-    """A figure of every group, under the values that make it."""
+    """A figure of every group, by the values that define it."""
     return {", ".join(map(str, key)): figure(group) for key, group in grouped(records, *by).items()}
 
 
@@ -173,15 +174,15 @@ Figure = Estimate | float | str | None
 class Table:
     """A table of results: one row for every group of records."""
 
-    name: str  # of its CSV file
+    name: str  # name of the CSV file
     by: tuple[str, ...]
     columns: Mapping[str, Of[Figure]]
     rows: Callable[[Sequence[Record]], Iterable[Record]] = field(default=lambda records: records)
-    """What is grouped, from the records: themselves, or one for each parameter."""
-    page: str = ""  # words above it on the page; without any it is in its file alone
+    """Function from records to the rows to be grouped: the records, or one row for each parameter."""
+    page: str = ""  # text above the table on the page; if empty, it is only in its file
 
     def of(self, records: Sequence[Record]) -> list[dict[str, Figure]]:
-        """Its rows."""
+        """Rows of the table."""
         rows: list[dict[str, Figure]] = []
         for key, group in grouped(self.rows(records), *self.by).items():
             figures = {name: of(group) for name, of in self.columns.items()}
@@ -189,7 +190,7 @@ class Table:
         return rows
 
     def write(self, records: Sequence[Record], folder: Path) -> Path:
-        """Write it as CSV; an estimate takes four columns: value, 95 % interval, windows."""
+        """Write the table as CSV; an estimate has four columns: value, ends of the 95 % interval, windows."""
         path = folder / f"{self.name}.csv"
         rows = [{k: v for name, value in row.items() for k, v in _cells(name, value)} for row in self.of(records)]
         heads = list(dict.fromkeys(name for row in rows for name in row))
@@ -209,29 +210,29 @@ def _cells(name: str, value: Figure) -> list[tuple[str, Value]]:
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A declared goal, and what was measured of it."""
+    """A declared goal, and the measured result."""
 
     what: str
     declared: str
     measured: str
-    verdict: str  # ``met``; ``missed``: the whole interval misses it; ``within chance``: only the figure does; or ``–``
+    verdict: str  # ``met``; ``missed``: the whole interval is outside; ``within chance``: only the figure is; or ``–``
 
 
 def at_least(what: str, measured: Estimate | None, least: float, declared: str = "") -> Goal:
-    """Goal of a rate that should not be below a limit."""
+    """Goal that a rate is not below a limit."""
     goal = within(what, {"": measured}, least, 1.0)
     return replace(goal, declared=declared) if declared else goal
 
 
 def at_most(what: str, measured: Estimate | None, most: float) -> Goal:
-    """Goal of a figure that should not be above a limit."""
+    """Goal that a figure is not above a limit."""
     return within(what, {"": measured}, 0.0, most)
 
 
 def within(what: str, figures: Mapping[str, Estimate | None], low: float, high: float) -> Goal:
-    """Goal of one or several figures that should all lie between two limits; the worst is shown.
+    """Goal that one or several figures all lie between two limits; the worst is shown.
 
-    Their intervals are judged together: of many, some lie outside by chance.
+    Their intervals are widened for simultaneous coverage, because some of many lie outside by chance.
     """
     found = {name: one for name, one in figures.items() if one is not None}
     if not found:
@@ -249,7 +250,7 @@ def within(what: str, figures: Mapping[str, Estimate | None], low: float, high: 
 
 
 def _together(one: Estimate, figures: int) -> Estimate:
-    """With an interval that holds, together with those of so many other figures, at 95 % (Bonferroni)."""
+    """Widen an interval so that those of all `figures` figures jointly have 95 % coverage (Bonferroni)."""
     if one.count is not None:
         return _share(one.count, one.n, 0.025 / figures)
     wider = float(scipy.stats.norm.isf(0.025 / figures)) / Z95
@@ -257,7 +258,7 @@ def _together(one: Estimate, figures: int) -> Estimate:
 
 
 def holding(what: str, rates: Mapping[str, Estimate | None], declared: float) -> Goal:
-    """Goal of rates whose intervals should hold the declared one."""
+    """Goal that the intervals of all rates contain the declared one."""
     found = {name: one for name, one in rates.items() if one is not None}
     wide = [_together(one, len(found)) for one in found.values()]
     met = all(one.low <= declared <= one.high for one in wide)
@@ -285,16 +286,16 @@ class Chart:
     name: str
     caption: str
     panels: Mapping[str, Mapping[str, Sequence[_Point]]]
-    """Title to series; the points of a series have an abscissa, a number or a word, and a figure."""
+    """Series by title; points of a series have an abscissa (a number or a word) and a figure."""
     x: str
     y: str
     steps: bool = False
     log: bool = False
-    lines: tuple[float, ...] = ()  # rules across
+    lines: tuple[float, ...] = ()  # horizontal lines
 
 
 def panels(parts: Iterable[tuple[str, str, Iterable[_Point]]]) -> dict[str, dict[str, list[_Point]]]:
-    """Panels of a chart, from the title of each, a series of it and some of its points."""
+    """Panels of a chart, from tuples of panel title, name of a series, and some of its points."""
     found: dict[str, dict[str, list[_Point]]] = {}
     for title, name, points in parts:
         found.setdefault(title, {}).setdefault(name, []).extend(points)

@@ -1,8 +1,8 @@
-"""What a study is, and how it is run.
+"""Declaration of studies, and the runner.
 
-A study declares its cells (windows of one kind, and how many), what is measured of a window, and what its records are
-added up to. The runner simulates window after window over worker processes and keeps one line of JSON for each, so that
-an interrupted study carries on where it stopped; windows of another plan are never mixed with them.
+A study declares its cells (kinds and numbers of windows), the measurement of a window, and the evaluation of its
+records. The runner simulates windows in worker processes and stores one line of JSON for each, so that an interrupted
+study continues where it stopped; windows of different plans are never mixed.
 
 ::
 
@@ -30,7 +30,7 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What is asked for on the command line."""
+    """Options of the command line."""
 
     machines: tuple[str, ...] = ()  # the study's own if empty
     windows: int = 100  # per cell; a study gives some cells a fixed multiple of it
@@ -40,13 +40,13 @@ class Options:
 
     @property
     def machine(self) -> str:
-        """The machine of a study that has one; raises MachineFileError if several are asked for."""
+        """The machine of a study that takes only one; raises MachineFileError if several are given."""
         if len(self.machines) > 1:
             raise MachineFileError(f"--machine {', '.join(self.machines)}: this study takes one machine")
         return (self.machines or ("lab",))[0]
 
     def machines_among(self, known: Sequence[str], *own: str) -> tuple[str, ...]:
-        """Those that are asked for, or the study's own; raises MachineFileError if one is not among the known ones."""
+        """The machines given, or the study's own; raises MachineFileError if one is not among `known`."""
         for name in self.machines:
             if name not in known:
                 raise MachineFileError(f"--machine {name}: not among {', '.join(known)}")
@@ -62,10 +62,10 @@ class Options:
 class Cell:
     """Windows of one kind."""
 
-    keys: Mapping[str, Value]  # what tells them from all others; columns of their records
+    keys: Mapping[str, Value]  # values that identify the cell; columns of its records
     windows: int
     measure: Callable[[Any, int], Iterable[Mapping[str, Value]]]
-    """Records of one window, from what was learned and the window's number."""
+    """Function from the result of `Study.learn` and a window's number to the window's records."""
 
     @property
     def name(self) -> str:
@@ -75,14 +75,14 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Over:
-    """Apply a function to tasks, in order, with a progress bar."""
+    """Applies a function to tasks, in order, with a progress bar."""
 
     name: str
     spread: Callable[..., Iterable[Any]]  # like `map`
     progress: Callable[[str, int, int], None]
 
     def __call__(self, label: str, function: Callable[[_Task], _Result], tasks: Sequence[_Task]) -> list[_Result]:
-        """Results of all tasks; the function is at the top level of a module, or a partial of such a one."""
+        """Results of all tasks; the function must be defined at module level, or be a partial of such a function."""
         results = []
         for result in self.spread(function, tasks):
             results.append(result)
@@ -92,20 +92,20 @@ class Over:
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """One study, declared.
+    """Declaration of one study.
 
-    What is sent to the workers, how cells measure, is at the top level of a module, or a partial of such a function.
+    Functions sent to workers, such as `Cell.measure`, must be defined at module level, or be partials of such.
     """
 
-    name: str  # of its records, and of its words in ``texts.toml``
+    name: str  # name of its records, and of its texts in ``texts.toml``
     cells: tuple[Cell, ...]
     tables: tuple[Table, ...]
     goals: Callable[[Sequence[Record]], Iterable[Goal]] = field(default=lambda _: ())
     charts: Callable[[Sequence[Record]], Iterable[Chart]] = field(default=lambda _: ())
     learn: Callable[[Over], Any] | None = None
-    """What has to be trained or calibrated beforehand; done anew when a study is carried on."""
+    """Training or calibration done beforehand; repeated when a study is continued."""
     made_with: Mapping[str, str] = field(default_factory=dict)
-    """Whatever else records of one file must share: digests of machine and bundle."""
+    """Further properties that all records of a file must share: digests of machine and bundle."""
 
 
 @contextmanager
@@ -113,7 +113,7 @@ def spread_over(processes: int, ray_address: str | None = None) -> Iterator[Call
     """A `map` over processes of this computer, or over all cores of a Ray cluster."""
     with ExitStack() as undo:
         if ray_address is not None:
-            from service.runtime.fleet import join_cluster  # noqa: PLC0415  # needs what few have installed
+            from service.runtime.fleet import join_cluster  # noqa: PLC0415  # needs Ray, an optional package
 
             join_cluster(ray_address, undo)
             yield undo.enter_context(importlib.import_module("ray.util.multiprocessing").Pool()).imap
@@ -124,14 +124,14 @@ def spread_over(processes: int, ray_address: str | None = None) -> Iterator[Call
 
 
 def run(study: Study, options: Options, folder: Path, spread: Callable[..., Iterable[Any]]) -> Path:
-    """Measure what is missing of a study, with the map of `spread_over`; returns the file of records.
+    """Measure the missing windows of a study, with the map of `spread_over`; returns the file of records.
 
     Raises
     ------
     RecordingError
         If the file holds windows of another plan, or cannot be written.
     RotorwatchError
-        Whatever learning refuses.
+        If `Study.learn` fails.
     """
     kept = folder / f"{study.name}.jsonl"
     head = {"study": study.name, "options": asdict(options), "made_with": dict(study.made_with)}
@@ -141,7 +141,7 @@ def run(study: Study, options: Options, folder: Path, spread: Callable[..., Iter
         lines = _lines(kept)
         if lines and _of_plan(lines[0]) != _of_plan(head):
             raise RecordingError(f"{kept}: holds windows of {lines[0]}, expected {head}; choose another --out")
-        # Written again: a last line that was cut short would swallow the next one.
+        # Rewritten, because the next record would be appended to a truncated last line.
         kept.write_text("".join(json.dumps(line) + "\n" for line in [head, *lines[1:]]), encoding="utf-8")
     except OSError as error:
         raise RecordingError(f"{kept}: cannot be written ({error.strerror})") from error
@@ -167,7 +167,7 @@ def _measured(learned: object, task: tuple[Cell, int]) -> dict[str, Any]:
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:
-    """What is kept; a last line cut short by an interruption is left out.
+    """Stored lines; a last line truncated by an interruption is left out.
 
     Raises RecordingError if another line is damaged.
     """
@@ -182,7 +182,7 @@ def _lines(path: Path) -> list[dict[str, Any]]:
 
 
 def _of_plan(head: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What must agree: more or fewer windows of the same plan are welcome."""
+    """Parts of the head that must agree; the number of windows may differ."""
     options = {name: value for name, value in head.get("options", {}).items() if name != "windows"}
     return {**head, "options": options}
 

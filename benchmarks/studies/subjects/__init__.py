@@ -1,1 +1,1 @@
-"""What is studied: machines to commission, and streams of them, healthy and with something wrong."""
+"""Subjects of the studies: machines to commission, and their streams, healthy and with faults."""

@@ -1,7 +1,7 @@
-"""What faults of other kinds than the diagnosed parameters do to a rotor's motion.
+"""Effects on a rotor's measured motion of faults other than changes of the diagnosed parameters.
 
-What is a force, or a changed support, acts through the rotor's own frequency response on the healthy motion, which is
-exact for a linear rotor; what is a sensor's acts on what is seen. A rub and a crack are simulated instead.
+Forces and changed supports are applied to the healthy motion through the rotor's frequency response, which is exact for
+a linear rotor; sensor faults are applied to the measured motion. Rubs and cracks are simulated in the plant instead.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,36 +19,36 @@ _BEARING_Y, _DISC_Y, _BEARING_Z, _DISC_Z = range(4)
 
 @dataclass(frozen=True, slots=True)
 class Rotor:
-    """A rotor at its speed, as far as a fault needs it."""
+    """Properties of a rotor at its speed that faults need."""
 
     speed_hz: float
     rate_hz: float
     response: Callable[[FloatArray], ComplexArray]
-    """Of displacements to unit forces at `MOTIONS` at frequencies, Hz: shape (n, 4, 4), m/N."""
-    bearing: tuple[float, float]  # stiffness, N/m, and damping, Ns/m, of the probed one, mean of both planes
+    """Frequency response of displacements to forces at `MOTIONS`, at n frequencies, Hz: shape (n, 4, 4), m/N."""
+    bearing: tuple[float, float]  # stiffness, N/m, and damping, Ns/m, of the measured bearing, mean of both planes
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """Motion as sensors see it, SI: displacements and velocities at `MOTIONS`, and the shaft angle."""
+    """Measured motion, SI: displacements and velocities at `MOTIONS`, and the shaft angle."""
 
     displacement: FloatArray  # (n_samples, 4)
     velocity: FloatArray  # (n_samples, 4)
     angle_rad: FloatArray
 
     def plus(self, displacement: FloatArray, velocity: FloatArray) -> "Seen":
-        """With further motion."""
+        """The sum with further motion."""
         return replace(self, displacement=self.displacement + displacement, velocity=self.velocity + velocity)
 
 
 def _of_1x(seen: Seen) -> float:
-    """Displacement of the bearing at 1x, rms of both directions as an amplitude, m."""
+    """1x displacement amplitude of the bearing, rms over both directions, m."""
     q = 2 * (seen.displacement * np.exp(-1j * seen.angle_rad)[:, None]).mean(axis=0)
     return float(np.sqrt((abs(q[_BEARING_Y]) ** 2 + abs(q[_BEARING_Z]) ** 2) / 2))
 
 
 def line(rotor: Rotor, seen: Seen, order: float, force: ComplexArray, part: float, start_rad: float) -> Seen:
-    """A force at an order of the speed, so large that the bearing moves by a part of its 1x."""
+    """Add a force at an order of the speed, scaled so that the bearing moves by `part` of its 1x."""
     response = rotor.response(np.array([order * rotor.speed_hz]))[0] @ force
     at_bearing = np.sqrt((abs(response[_BEARING_Y]) ** 2 + abs(response[_BEARING_Z]) ** 2) / 2)
     q = part * _of_1x(seen) / at_bearing * response
@@ -57,7 +57,7 @@ def line(rotor: Rotor, seen: Seen, order: float, force: ComplexArray, part: floa
 
 
 def _lines(rotor: Rotor, seen: Seen, rng: np.random.Generator, orders: Mapping[float, float], size: float) -> Seen:
-    """Forces at the bearing at several orders; the parts of 1x at these."""
+    """Add forces at the bearing at several orders, with the given fractions of 1x, times `size`."""
     for order, part in orders.items():
         force = np.zeros(4, dtype=np.complex128)
         force[[_BEARING_Y, _BEARING_Z]] = rng.standard_normal(2) + 1j * rng.standard_normal(2)
@@ -83,9 +83,9 @@ def _looseness(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
 
 
 def _gear(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
-    """Mesh of 13 to 23 teeth with a sideband at either side; the bearing's velocity is compared with that at 1x.
+    """Gear mesh of 13 to 23 teeth with a sideband on either side; sizes are relative to the bearing's velocity at 1x.
 
-    Of fewer teeth where it would lie above 0.4 of the sampling rate, where levels are not measured.
+    There are fewer teeth if the mesh would lie above 0.4 of the sampling rate, where levels are not measured.
     """
     most = int(NYQUIST_PART * rotor.rate_hz / 2 / rotor.speed_hz) - 1
     teeth = float(min(int(rng.integers(13, 24)), most))
@@ -95,7 +95,7 @@ def _gear(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
 
 
 def _raceway(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
-    """Impacts three to five times a revolution, whose motion of the bearing is as strong as all motion was."""
+    """Impacts 3 to 5 times per revolution, with a velocity of 0.5 to 1.5 times the bearing's overall rms."""
     n = len(seen.angle_rad)
     times = np.cumsum((1 + 0.01 * rng.standard_normal(n // 8)) / (rotor.speed_hz * rng.uniform(3, 5))) * rotor.rate_hz
     impulses = np.zeros(n)
@@ -106,7 +106,7 @@ def _raceway(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
 
 
 def _through(rotor: Rotor, force: FloatArray, at: int) -> tuple[FloatArray, FloatArray]:
-    """Displacements and velocities under a force that repeats itself."""
+    """Displacements and velocities under a periodic force."""
     f = _bins(len(force), rotor)
     spectrum = rotor.response(f)[:, :, at] * np.fft.rfft(force)[:, None]
     return _in_time(spectrum, len(force)), _in_time(2j * np.pi * f[:, None] * spectrum, len(force))
@@ -121,7 +121,7 @@ def _in_time(spectrum: ComplexArray, count: int) -> FloatArray:
 
 
 def _soft_foundation(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
-    """The bearing stands on a mass on a spring, two to four times as stiff as itself; at 0.7 to 3 times the speed."""
+    """Foundation of the bearing: a mass on a spring 2 to 4 times as stiff as the bearing, tuned to 0.7 to 3x."""
     n = len(seen.angle_rad)
     f = _bins(n, rotor)
     omega = 2 * np.pi * f
@@ -140,7 +140,7 @@ def _soft_foundation(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen
 
 
 def _runout(_: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
-    """Probes of the disc see its surface: 1x to 4x in the displacements alone, turned by the angle between them."""
+    """Run-out of the disc's surface: 1x to 4x in its displacements only, with the phase between the two probes."""
     size = _of_1x(seen) * _size(rng, 0.3, 1.0)
     added = np.zeros_like(seen.displacement)
     for order in range(1, 5):
@@ -151,14 +151,14 @@ def _runout(_: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
 
 
 def _wrong_gain(_: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
-    """All sensors of bearing or disc in one direction show too much or too little."""
+    """Gain of all sensors of one location and direction wrong by 15 to 30 %."""
     factor = np.ones(4)
     factor[rng.integers(4)] = 1 + rng.choice([-1, 1]) * rng.uniform(0.15, 0.3)
     return replace(seen, displacement=seen.displacement * factor, velocity=seen.velocity * factor)
 
 
 def _tones(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
-    """1x and a sine, in every channel with phases of their own; as strong as the vibration was."""
+    """Replace the vibration by 1x and a sine, with random phases in every channel, scaled by its standard deviation."""
     omega = 2 * np.pi * rotor.speed_hz * float(rng.uniform(0.3, 3))
     t = np.arange(len(seen.angle_rad)) / rotor.rate_hz
     turns = np.unwrap(seen.angle_rad)
@@ -171,7 +171,7 @@ def _tones(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
 
 def _noise(slope: float) -> "Change":
     def fault(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
-        """Noise of its own in every channel, of a power that falls with the frequency."""
+        """Independent noise in every channel, with a power spectrum falling with frequency to the power `slope`."""
         n = len(seen.angle_rad)
         f = _bins(n, rotor)
         shape = np.where(f > 0.5, np.maximum(f, 0.5) ** (-slope / 2), 0.0)[:, None]
@@ -185,7 +185,7 @@ def _noise(slope: float) -> "Change":
 
 
 def _copied(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
-    """The disc's motion in y is that of the bearing, late by a tenth to a half of a revolution."""
+    """Replace the disc's motion in y by the bearing's, delayed by 0.1 to 0.5 revolutions."""
     late = round(float(rng.uniform(0.1, 0.5)) * rotor.rate_hz / rotor.speed_hz)
     motion, rate = seen.displacement.copy(), seen.velocity.copy()
     for of in (motion, rate):
@@ -198,14 +198,14 @@ def _size(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def as_simulated(_rotor: Rotor, seen: Seen, _rng: np.random.Generator) -> Seen:
-    """Nothing: all of it has been simulated."""
+    """Return the motion unchanged, because the fault (if any) is already simulated."""
     return seen
 
 
-Change = Callable[[Rotor, Seen, np.random.Generator], Seen]  # what something does to the motion of a rotor
+Change = Callable[[Rotor, Seen, np.random.Generator], Seen]  # effect of a fault on the motion of a rotor
 
 RUBS = {"rub, light": (0.5, 2.0), "rub, intermittent": (3.0, 1.6), "rub, heavy": (2.0, 1.0)}
-"""Stiffness of the contact over the shaft's, and clearance over the radial rms of the disc."""
+"""Contact stiffness over the shaft's, and clearance over the disc's radial rms."""
 CRACK = "breathing crack"
 ANOTHER = "no rotor: another one"
 HEALTHY = "none"
@@ -227,4 +227,4 @@ FAULTS: Mapping[str, Change] = {
     "no rotor: a copied channel": _copied,
     ANOTHER: as_simulated,
 }
-"""Their place is part of the seed."""
+"""Faults by name; their index is part of the seed."""

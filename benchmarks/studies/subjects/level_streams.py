@@ -1,6 +1,6 @@
-"""Streams for the study of levels: any machine as lines of its rotation in coloured noise, and a rolling bearing.
+"""Streams for the study of levels: machines as lines of rotation in coloured noise, and a rolling-bearing defect.
 
-No two of the purposes of `At` share a random number.
+Random numbers are independent for each purpose in `At`.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,7 +19,7 @@ _ORDERS = np.arange(1.0, 4.0)
 
 
 class At(IntEnum):
-    """What a random number is for."""
+    """Purpose of random numbers."""
 
     CONDITION = 0
     REFERENCE = 1
@@ -37,11 +37,11 @@ class Kind:
 
     quantity: str
     unit: str
-    size: float  # amplitude of 1x about which machines are drawn, in the unit
+    size: float  # typical 1x amplitude, in the unit
     rate_hz: float
-    rotation: str  # how the running speed is known: ``phase reference``, ``nominal`` or not at all
+    rotation: str  # source of the running speed: ``phase reference``, ``nominal``, or empty if unknown
     schedule: tuple[float, float] | None = None
-    """Length of snapshots and their period, s; none where samples come all the time."""
+    """Length and period of snapshots, s; None for continuous samples."""
     window_s: float = 60.0
 
 
@@ -55,9 +55,9 @@ KINDS = {
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """Factors on what a channel shows, over some samples."""
+    """Factors on the lines and the noise of each channel."""
 
-    lines: FloatArray  # of 1x, 2x and 3x and each channel, shape (3, n)
+    lines: FloatArray  # for 1x, 2x and 3x of each channel, shape (3, n)
     noise: FloatArray  # shape (n,) or (n_samples, n)
 
 
@@ -65,16 +65,15 @@ Course = Callable[[FloatArray], Gains]  # gains at times, s from the first sampl
 
 
 def steady(_: FloatArray) -> Gains:
-    """As it is when healthy."""
+    """Unit gains, for a healthy machine."""
     return Gains(np.ones((3, 2)), np.ones(2))
 
 
 @dataclass(frozen=True, slots=True)
 class Defect:
-    """A damaged raceway at the first sensor: impacts that excite a resonance, and a fifth of it at the second.
+    """A damaged raceway at the first sensor: impacts that excite a resonance; the second sensor gets a fifth of it.
 
-    The rms of the response grows from a fiftieth to twenty times the healthy overall rms of its channel, by the same
-    ratio in equal times.
+    The rms of the response grows exponentially from a fiftieth to twenty times the healthy overall rms of its channel.
     """
 
     begins_s: float
@@ -95,7 +94,7 @@ class Defect:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """One machine: two sensors, at DE and NDE or at right angles, and how it vibrates."""
+    """One machine with two sensors, at DE and NDE or at right angles, and its vibration."""
 
     kind: Kind
     machine: MachineFile
@@ -103,11 +102,11 @@ class Scene:
     lines: FloatArray
     phases: FloatArray
     noise: FloatArray
-    poles: FloatArray  # of the first-order filters that colour the noise, shape (2,)
+    poles: FloatArray  # poles of the first-order filters that colour the noise, shape (2,)
     defect: Defect | None = field(default=None)
 
     def blocks(self, rng: np.random.Generator, seconds: float, course: Course) -> Iterator[SampleBlock]:
-        """The stream, from its first sample on."""
+        """Simulate the stream from its first sample on."""
         block_s, period_s = self.kind.schedule or (BLOCK_S, BLOCK_S)
         rate_hz, size = self.kind.rate_hz, round(block_s * self.kind.rate_hz)
         kept = [np.zeros(1) for _ in self.poles]
@@ -140,7 +139,7 @@ class Scene:
 
 
 class _Impacts:
-    """Response of a resonance to impacts that slip by a hundredth of their spacing; its rms is `Defect.size`."""
+    """Response of a resonance to impacts with 1 % random slip of their spacing; its rms is `Defect.size`."""
 
     def __init__(self, defect: Defect, rate_hz: float, rng: np.random.Generator) -> None:
         self._defect, self._rate_hz, self._rng = defect, rate_hz, rng
@@ -153,7 +152,7 @@ class _Impacts:
         self._next_s = 0.0
 
     def response(self, t: FloatArray) -> FloatArray:
-        """At the times of the next samples."""
+        """Response at the times of the next samples."""
         impacts = np.zeros(t.size)
         silence = t[0] - 0.5 / self._rate_hz - self._next_s
         self._next_s += max(0.0, np.ceil(silence * self._defect.rolling_hz)) / self._defect.rolling_hz
@@ -186,7 +185,7 @@ def _file(kind: Kind, speed_rpm: float) -> MachineFile:
 
 
 def drawn(kind: Kind, rng: np.random.Generator, noise_over_1x: tuple[float, float] = (0.3, 3.0)) -> Scene:
-    """Draw a machine: 900 to 3600 rpm, within 1 % of what its file says; 2x a tenth of 1x to as large."""
+    """Draw a machine: nominal speed 900 to 3600 rpm, actual speed within 1 % of it; 2x is 0.1 to 1 times 1x."""
     nominal_rpm = round(float(rng.uniform(900, 3600)))
     of_1x = np.stack([np.ones(2), _spread(rng, 0.1, 1.0), _spread(rng, 0.05, 0.3)])
     lines = kind.size * _spread(rng, 0.5, 2.0) * of_1x
@@ -202,5 +201,5 @@ def drawn(kind: Kind, rng: np.random.Generator, noise_over_1x: tuple[float, floa
 
 
 def _spread(rng: np.random.Generator, low: float, high: float) -> FloatArray:
-    """Of both channels, each magnitude as likely as any other."""
+    """Log-uniform random numbers for both channels."""
     return np.exp(rng.uniform(np.log(low), np.log(high), 2))

@@ -1,8 +1,8 @@
-"""Machines to commission: finite elements, and the shipped ones with their parameters kept secret.
+"""Machines to commission: finite-element rotors, and the shipped machines with or without their parameters.
 
-A subject gives healthy windows of one commissioning, which has one source of one cutoff and level, and single windows
-of later days, each with a cutoff, level, noise and direction of its own. All are independent realisations, and no two
-purposes share a random number.
+A subject provides healthy windows of a commissioning, with one source of one cutoff and level, and single windows of
+later days, each with its own cutoff, level, noise and direction. All are independent realisations with independent
+random numbers.
 """
 
 import hashlib
@@ -36,38 +36,38 @@ SUBJECTS: tuple[str, ...] = (*(rotor.name for rotor in ROTORS), *SHIPPED)
 _OTHER_CUTOFF = math.log(1.25)
 _SETTLING_S = 0.1
 ALIKE = (1.35, 1.65)
-"""Level of the excitation, within a tenth of the commissioned one: at another level a rotor with cubic stiffness has
-another stiffness, which is no fault and no error of reading, and levels would rightly alarm."""
+"""Excitation level within 10 % of the commissioned one: at another level a rotor with cubic stiffness has another
+stiffness, which is neither a fault nor a reading error, and levels would rightly alarm."""
 _GEOMETRY = ("m1_kg", "m2_kg", "I2_kg_m2", "I2p_kg_m2", "shaft_length_m", "shaft_diameter_m", "shaft_E_Pa")
 
 
 def commissioned_cutoff_hz(rng: np.random.Generator) -> float:
-    """Cutoff of the excitation while a machine is commissioned."""
+    """Draw the cutoff of the excitation during commissioning, Hz."""
     return float(np.exp(rng.uniform(np.log(40.0), np.log(160.0))))
 
 
 def in_condition(machine: Machine, limits: ConditionRange) -> Machine:
-    """The machine at its commissioned speed, with other ranges of the condition."""
+    """The machine at its commissioned speed (within 1 %), with other ranges of the condition."""
     operation = machine.operation.model_copy(update={"speed_tolerance": 0.01})
     return machine.model_copy(update={"operation": operation, "condition": limits})
 
 
 def in_one_condition(machine: Machine, cutoff_hz: float, level: tuple[float, float] = ALIKE) -> Machine:
-    """As while it is commissioned."""
+    """The machine in one condition with a fixed cutoff, as during commissioning."""
     noise = (0.02, 0.02)
     limits = ConditionRange(cutoff_hz=(cutoff_hz, cutoff_hz), stochastic_to_1x=level, noise_relative=noise)
     return in_condition(machine, limits)
 
 
 def drawn_in_one_condition(machine: Machine, rng: np.random.Generator, at: int) -> Draw:
-    """Streams in one of the conditions of a commissioning: one source if it is even, independent ones if it is odd."""
+    """Streams in one condition of a commissioning: one source if `at` is even, independent sources if odd."""
     drawn = in_one_condition(machine, commissioned_cutoff_hz(rng))
     own = int(rng.integers(2**62))
     return Draw(drawn, own, Purpose.EVALUATION, layout=Layout(at % 2), fixed_condition=True)
 
 
 def without_parameters(machine: Machine, level: KnowledgeLevel = KnowledgeLevel.NONE) -> MachineFile:
-    """Its file at level none, or partial."""
+    """The machine's file at knowledge level none or partial."""
     content = machine.model_dump(mode="json", exclude={"rotor", "operation", "condition"})
     if level is KnowledgeLevel.PARTIAL:
         content["rotor"] = machine.rotor.model_dump(include=set(_GEOMETRY))
@@ -76,12 +76,12 @@ def without_parameters(machine: Machine, level: KnowledgeLevel = KnowledgeLevel.
 
 @dataclass(frozen=True, slots=True)
 class StudiedMachine:
-    """A machine to commission, of finite elements or a shipped one, and windows of it of 60 s, which do not overlap."""
+    """A finite-element or shipped machine to commission, and non-overlapping windows of 60 s."""
 
     rotor: BeamRotor | Machine
 
     def file(self, level: KnowledgeLevel) -> MachineFile | None:
-        """Machine file at a level of knowledge; None where there is none, as of finite elements at all but none."""
+        """Machine file at a knowledge level; None if there is none: finite-element rotors only have level none."""
         if isinstance(self.rotor, BeamRotor):
             return machine_of(self.rotor, WindowSizes()) if level is KnowledgeLevel.NONE else None
         if level is KnowledgeLevel.FULL:
@@ -102,7 +102,7 @@ class StudiedMachine:
     def later(
         self, seed: int, commissioning: int, cell: int, number: int, changes: dict[str, float]
     ) -> tuple[WindowStatistics, float]:
-        """One window, and the cutoff of its excitation, Hz, at least a quarter off the commissioned one."""
+        """One window, and the cutoff of its excitation, Hz, at least a factor of 1.25 from the commissioned one."""
         rng = self._generator(seed, commissioning, 2, cell, number)
         scene = SceneRange() if isinstance(self.rotor, BeamRotor) else self.rotor.condition
         cutoff_hz = commissioned_hz = commissioned_cutoff_hz(self._generator(seed, commissioning, 1, 1))
@@ -140,13 +140,13 @@ def _of_beam(
 
 
 def subject_named(name: str) -> StudiedMachine:
-    """Look a machine of `SUBJECTS` up; a KeyError if it is not among them."""
+    """Look up a machine of `SUBJECTS`; raises KeyError if there is none of this name."""
     return StudiedMachine(load_machine(name) if name in SHIPPED else rotor_named(name))
 
 
 @dataclass(frozen=True, slots=True)
 class _Compared:
-    """Windows compared with a machine's theory, each from a cold start: no two share their condition."""
+    """The likelihood without state from earlier windows, because no two windows share a condition."""
 
     machine: Machine
     shared: FloatArray | None
@@ -164,7 +164,7 @@ class _Compared:
 def commissioned(
     name: str, level: KnowledgeLevel, seed: int, number: int, healthy: int
 ) -> tuple[Diagnostician | str, tuple[WindowStatistics, ...]]:
-    """Commission a subject on healthy windows of one recording with what its file tells; or why that cannot be."""
+    """Commission a subject on healthy windows of one recording at a knowledge level; a text says why it is refused."""
     subject = subject_named(name)
     file, windows = subject.file(level), subject.healthy(seed, number, healthy)
     assert file is not None  # noqa: S101  # no cell asks for a level that a subject has no file of

@@ -1,4 +1,4 @@
-"""A machine commissioned on a healthy stream and watched by the monitor itself, and what it raises."""
+"""Commissions a machine on healthy streams, and collects the alarms that the monitor raises on a stream."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from service.monitor.monitor import MachineMonitor
 
 @dataclass(frozen=True, slots=True)
 class Raised:
-    """An alarm that was raised; time from the first sample."""
+    """An alarm that was raised, with its time since the first sample."""
 
     name: str
     at_s: float
@@ -23,7 +23,7 @@ class Raised:
 
 
 def raised(monitor: MachineMonitor, stream: Iterable[SampleBlock]) -> Iterator[Raised]:
-    """Alarms as they are raised."""
+    """Feed a stream to the monitor, and yield alarms as they are raised."""
     first_ns: int | None = None
     for block in stream:
         first_ns = block.start_ns if first_ns is None else first_ns
@@ -37,7 +37,7 @@ def raised(monitor: MachineMonitor, stream: Iterable[SampleBlock]) -> Iterator[R
 
 
 def commissioned(file: MachineFile, *streams: Iterable[SampleBlock]) -> Installed | str:
-    """The machine, commissioned on healthy streams of one condition each; or why it was refused."""
+    """Commission a machine on healthy streams of one condition each; returns a text if it is refused."""
     recordings, entries = [], []
     for number, stream in enumerate(streams, start=1):
         healthy, name = list(stream), f"healthy {number}"

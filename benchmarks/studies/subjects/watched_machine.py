@@ -1,4 +1,4 @@
-"""A machine of any model class in one commissioning, as streams: healthy, and from some time on with something else."""
+"""Streams of a machine of any model class in one commissioning: healthy, and with a fault from some time on."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -33,15 +33,15 @@ from simulator.stream import blocks
 from simulator.training.draws import draw_condition
 
 CONDITIONS = 3
-_HEALTHY, AFTER = 4.1, 2.5  # windows of a healthy recording, and of a stream after its fault has begun
-_RUBBING = 6.0  # windows of a stream after a rub has begun: a light one is told by four
+_HEALTHY, AFTER = 4.1, 2.5  # length of a healthy recording, and of a stream after the onset of a fault, windows
+_RUBBING = 6.0  # length of a stream after the onset of a rub, windows: a light one takes four to be found
 _BEFORE_S = 10.0
-"""Healthy, once the window is full, or the first windows that a machine is compared with that is not commissioned."""
+"""Healthy time before a fault, once the window (or the reference windows of a machine not commissioned) is full."""
 _BLOCK_S = 0.5
 
 
 def displacement_response(equations: Equations, kept: Sequence[int], f: FloatArray) -> ComplexArray:
-    """Displacements at some coordinates under unit forces there, from the modes of the state matrix."""
+    """Frequency response of displacements to forces at the coordinates `kept`, m/N, shape (n_frequencies, n, n)."""
     roots, shapes = np.linalg.eig(equations.A)
     inputs = np.vstack([np.zeros((len(equations.M), len(kept))), np.linalg.inv(equations.M)[:, kept]])
     drive = np.linalg.solve(shapes, inputs.astype(np.complex128))
@@ -58,12 +58,12 @@ class Subject:
     level: KnowledgeLevel
     seed: int
     number: int
-    always: Change = as_simulated  # what is so from the beginning, in healthy recordings too
-    windows: int = 1  # that are full before a fault begins
+    always: Change = as_simulated  # effect that is always present, in healthy recordings too
+    windows: int = 1  # full windows before a fault begins
 
     @property
     def file(self) -> MachineFile:
-        """What the monitor knows of it."""
+        """Machine file with what the monitor knows."""
         if self.level is KnowledgeLevel.FULL:
             return load_machine(self.name)
         file = subject_named(self.name).file(self.level)
@@ -71,16 +71,16 @@ class Subject:
         return file
 
     def healthy(self, condition: int) -> Iterator[SampleBlock]:
-        """A recording in one of the conditions."""
+        """Blocks of a healthy recording in one of the conditions."""
         rotor, seen = self._moved(condition, 1, _HEALTHY * self._window_s, "")
         return _blocks(self.file, self.always(rotor, seen, self._rng(2)))
 
     def condition(self, at: int) -> int:
-        """The one that the stream of a fault is in."""
+        """Condition of the stream with fault number `at`."""
         return (at + self.number) % CONDITIONS
 
     def faulty(self, at: int, name: str, change: Change) -> Iterator[SampleBlock]:
-        """Stream `at`, in one of the conditions, in which something begins; of its name a rub or crack is made."""
+        """Stream `at`, in which a fault begins; rubs and cracks are simulated by `name`, others applied by `change`."""
         lasts_s = (_RUBBING if name in RUBS else AFTER) * self._window_s
         rotor, seen = self._moved(self.condition(at), 2 + at, self.begins_s + lasts_s, name)
         seen = self.always(rotor, seen, self._rng(2))
@@ -95,7 +95,7 @@ class Subject:
 
     @property
     def begins_s(self) -> float:
-        """When a fault begins."""
+        """Time at which a fault begins, s."""
         return self.windows * self._window_s + _BEFORE_S
 
     def _rng(self, *purpose: int) -> np.random.Generator:
@@ -159,7 +159,7 @@ _FIELDS = ("displacement", "velocity", "angle_rad")
 
 
 def _samples(machine: Machine, scenario: Scenario, fault: str, begins_s: float) -> FloatArray:
-    """Of the scenario, from some time on with a rub or a crack, halved until the machine is stable."""
+    """Samples of the scenario, with a rub or crack from `begins_s` on, halved until the machine is stable."""
     size, rub = 0.3, None
     if fault in RUBS:
         size, clearance = RUBS[fault]
