@@ -1,10 +1,10 @@
-"""How an archive of recordings is evaluated faster on two Ray workers than on one.
+"""Measures the speed-up of evaluating an archive of recordings on two Ray workers instead of one.
 
-Run: ``python benchmarks/archive.py [--minutes 20] [--machines 4]`` (minutes). So many rotor kits (9 channels, 2 kHz)
-are recorded for so long each, and the archive is evaluated as ``rotorwatch replay --offline --ray`` does it, by a
-cluster of this computer with one core and with two, in turns, twice. Beside the duration stands the processor time of
-all workers: on a computer whose cores others use as well, durations say little, and how much more processor two workers
-take for the same, because they disturb each other, says by how much they can be faster at most.
+Run: ``python benchmarks/archive.py [--minutes 20] [--machines 4]`` (minutes). Rotor kits (9 channels, 2 kHz) are
+recorded for the given time each, and the archive is evaluated as by ``rotorwatch replay --offline --ray``, on a cluster
+of this computer with one core and with two, in turns, twice. The processor time of all workers is printed too: on a
+computer with other load, durations are unreliable, but the extra processor time of two workers, which disturb each
+other, limits the possible speed-up.
 """
 
 import os
@@ -35,7 +35,7 @@ EVER_NS = 2**63 - 1
 
 
 def archive(folder: Path, machines: int, minutes: float) -> list[MachineTask]:
-    """Record the machines; what is to be evaluated of them."""
+    """Record the machines, and return the tasks of evaluating them."""
     scenario, _ = load_scenario("healthy")
     tasks = []
     for number in range(machines):
@@ -49,7 +49,7 @@ def archive(folder: Path, machines: int, minutes: float) -> list[MachineTask]:
 
 
 def descendants_s() -> dict[int, float]:
-    """Processor time of every program that this one has started, and of those that they have, by its number."""
+    """Processor time, s, of all descendants of this process, by process id."""
     found: dict[int, tuple[int, float]] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -65,7 +65,7 @@ def descendants_s() -> dict[int, float]:
 
 @contextmanager
 def watched() -> Iterator[dict[int, float]]:
-    """Processor time of all descendants as it was last seen: workers end as soon as there is nothing left to do."""
+    """Track the processor time of all descendants while the block runs, because workers end when they are idle."""
     seen, over = descendants_s(), threading.Event()
 
     def watch() -> None:
@@ -82,7 +82,7 @@ def watched() -> Iterator[dict[int, float]]:
 
 
 def evaluated(tasks: Sequence[MachineTask], workers: int) -> tuple[float, float, float]:
-    """Seconds, and processor time of the cluster, for all tasks; and how long their data are."""
+    """Evaluate all tasks; return duration, processor time of the cluster, and length of the data, all in s."""
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": workers, "include_dashboard": False})
     try:
         with watched() as seen:

@@ -1,14 +1,13 @@
-"""How many machines one monitor carries: end to end, from the last sample of a hop to its report on the topic.
+"""Measures how many machines one monitor can watch, end to end: from the last sample of a hop to the published report.
 
-Run: ``python benchmarks/capacity.py --machines 10 20 40`` (some minutes for each). A monitor with its history in a file
-and networks on watches so many rotor kits (9 channels, 2 kHz, windows of 60 s, hops of 5 s), or machines of another
-kind: ``--channels 13 --rate 4000 --hop 10 --no-networks``, or ``--levels`` of any number of channels. This process,
-which shares the computer with it, sends streams simulated beforehand at pace 1, the machines' hops spread evenly over
-time. Cores and memory are the monitor's own; *yardstick* is the processor time of the Fourier transforms that a hop's
-cross-spectra need at the very least, measured here before. ``--stall 10`` stops the monitor, or with
-``--of-shard`` one of its processes, for as long in the middle of it, and tells when reports are in time again, what is
-lost, and which hops were not evaluated. ``costs.py`` measures kinds of machines with it, for
-``rotorwatch size``.
+Run: ``python benchmarks/capacity.py --machines 10 20 40`` (some minutes for each). A monitor with a history file and
+trained networks watches the given numbers of rotor kits (9 channels, 2 kHz, windows of 60 s, hops of 5 s), or machines
+of another kind: ``--channels 13 --rate 4000 --hop 10 --no-networks``, or ``--levels`` with any number of channels. This
+process, on the same computer, sends previously simulated streams at pace 1, with the machines' hops spread evenly over
+time. Cores and memory are those of the monitor alone; *yardstick* is the processor time of the Fourier transforms that
+a hop's cross-spectra need at least, measured beforehand. ``--stall 10`` stops the monitor (with ``--of-shard`` one of
+its processes) for 10 s, and prints when reports are in time again, what is lost, and which hops were not evaluated.
+``costs.py`` uses this module to measure kinds of machines for ``rotorwatch size``.
 """
 
 import os
@@ -42,13 +41,13 @@ from models.signals.link import LinkSettings
 from models.signals.wire import encode_block
 
 BLOCK_S = 0.1
-KINDS = 4  # streams with a seed of their own; machines share them, each with its own times
+KINDS = 4  # different streams, by seed; machines share them, each with its own times
 IN_TIME_S = 1.0
 CACHED = 1200
 
 
 def yardstick_s(machine: MachineFile) -> float:
-    """Processor time of the Fourier transforms of a hop, the least of many."""
+    """Processor time of the Fourier transforms of a hop, minimum of 200 runs."""
     plan = plan_for(machine)
     piece = np.random.default_rng(1).standard_normal((plan.hop + plan.segment, len(machine.sensors)))
     times = []
@@ -62,12 +61,12 @@ def yardstick_s(machine: MachineFile) -> float:
 
 @dataclass(slots=True)
 class Process:
-    """What the system says of a process and those that it has started: processor, memory, what went to the disk."""
+    """Resources used by a process and its children, from ``/proc``: processor, memory, bytes written."""
 
     pid: int
 
     def all(self) -> list[Path]:
-        """Where the system tells of each."""
+        """Folders in ``/proc`` of the process and its children."""
         stats = ((one.parent, one.read_text(encoding="utf-8")) for one in Path("/proc").glob("[0-9]*/stat"))
         started = [place for place, text in stats if int(text.rsplit(")", 1)[1].split()[1]) == self.pid]
         return [Path(f"/proc/{self.pid}"), *started]
@@ -78,37 +77,37 @@ class Process:
         return sum(int(one[11]) + int(one[12]) for one in stats) / os.sysconf("SC_CLK_TCK")
 
     def memory_mb(self) -> float:
-        """Resident memory, what processes share counted in each, MB."""
+        """Resident memory, MB; memory shared between processes counts in each."""
         return sum(int((one / "statm").read_text(encoding="ascii").split()[1]) for one in self.all()) * 4096 / 1e6
 
     def written_mb(self) -> float:
-        """What has gone to the disk, MB."""
+        """Data written to the disk, MB."""
         texts = [(one / "io").read_text(encoding="ascii").splitlines() for one in self.all()]
         return sum(int(dict(line.split(": ") for line in lines)["write_bytes"]) for lines in texts) / 1e6
 
     def signal(self, number: int) -> None:
-        """Send a signal to all of them."""
+        """Send a signal to the process and its children."""
         for one in self.all():
             os.kill(int(one.name), number)
 
 
 @dataclass(slots=True)
 class Plant:
-    """Machines that send, each its own hops later than the one before, and when their reports came."""
+    """Machines that send, with hops staggered in time, and the arrival times of their reports."""
 
     machines: Sequence[MachineFile]
     session: zenoh.Session
     streams: list[list[SampleBlock]]
     start_ns: int = field(default_factory=time.time_ns)
-    sent_s: dict[tuple[str, int], float] = field(default_factory=dict)  # of every block, by its number
-    heard: list[tuple[float, float]] = field(default_factory=list)  # when, and how late
-    windows: dict[str, list[tuple[float, int]]] = field(default_factory=lambda: defaultdict(list))  # when, and end
-    skipped: list[bool] = field(default_factory=list)  # whether each report is of a window that was not evaluated
+    sent_s: dict[tuple[str, int], float] = field(default_factory=dict)  # by machine and number of the block
+    heard: list[tuple[float, float]] = field(default_factory=list)  # arrival and delay of each report, s
+    windows: dict[str, list[tuple[float, int]]] = field(default_factory=lambda: defaultdict(list))  # arrival, end
+    skipped: list[bool] = field(default_factory=list)  # whether each report is on a window that was not evaluated
     told_bytes: int = 0
     behind_s: float = 0.0
 
     def hear(self, sample: zenoh.Sample) -> None:
-        """Take a report."""
+        """Record the arrival of a report."""
         now_s, payload = time.monotonic(), sample.payload.to_bytes()
         report = json.loads(payload)
         self.told_bytes += len(payload)
@@ -118,10 +117,10 @@ class Plant:
         self.windows[report["machine"]].append((now_s, report["end_ns"] - self.start_ns))
 
     def send(self, ended: threading.Event) -> None:
-        """Send everything, at the pace of the data, until the end."""
+        """Send all streams in real time, to their end or until `ended` is set."""
         count, per_hop = len(self.machines), round(self.machines[0].window.hop_s / BLOCK_S)
         hashes = [machine.descriptor.schema_hash for machine in self.machines]
-        # As a real publisher: a monitor that begins again gets what it missed.
+        # Like a real publisher, with a cache from which a restarted monitor gets what it missed.
         outlets = [
             zenoh.ext.declare_advanced_publisher(
                 self.session,
@@ -153,7 +152,7 @@ class Plant:
 def monitored(
     folder: Path, machines: Sequence[MachineFile], bundle: dict[str, str]
 ) -> Iterator[tuple[Process, str, str]]:
-    """A monitor of these machines, whose files are in the folder: its process, its endpoint and its address."""
+    """Run a monitor of machines whose files are in the folder; yields its process, Zenoh endpoint and URL."""
     environment, endpoint = on_loopback(folder)
     entries = [{"file": str(folder / f"{machine.name}.toml"), **bundle} for machine in machines]
     environment["ROTORWATCH_MACHINES"] = json.dumps(entries)
@@ -165,7 +164,7 @@ def monitored(
 
 
 def session_with(endpoint: str) -> zenoh.Session:
-    """A session of a client."""
+    """Open a Zenoh session as a client."""
     config = zenoh.Config()
     for path, value in LinkSettings(mode="client", connect=(endpoint,)).zenoh_items().items():
         config.insert_json5(path, value)
@@ -176,7 +175,7 @@ def session_with(endpoint: str) -> zenoh.Session:
 def sending(
     endpoint: str, machines: Sequence[MachineFile], streams: list[list[SampleBlock]]
 ) -> Iterator[tuple[Plant, threading.Thread]]:
-    """A plant that sends and hears reports, and the thread that does until the streams end or the block is left."""
+    """A plant that sends and receives reports, and its sending thread, which ends with the streams or the block."""
     with session_with(endpoint) as session:
         plant, ended = Plant(machines, session, streams), threading.Event()
         subscriber = session.declare_subscriber("rotorwatch/*/*/report", plant.hear)
@@ -191,7 +190,7 @@ def sending(
 
 
 def lost(url: str, machines: Sequence[MachineFile]) -> tuple[int, float, dict[str, list[str]]]:
-    """Blocks refused, dropped or missing of all machines; seconds of data missing; where which alarms were raised."""
+    """Number of blocks refused, dropped or missing; missing data, s; and machines by the alarms that they raised."""
     count, missing_s, raised = 0, 0.0, defaultdict[str, list[str]](list)
     with httpx.Client(base_url=url, trust_env=False, timeout=60.0, verify=False) as http:  # noqa: S501  # no HTTPS
         for machine in machines:
@@ -206,7 +205,7 @@ def lost(url: str, machines: Sequence[MachineFile]) -> tuple[int, float, dict[st
 
 
 def held_bytes(file: Path) -> tuple[int, int, int]:
-    """How many reports a history holds, and the pages of the file that reports and readings take with their indexes."""
+    """Number of reports in a history, and bytes of its file used by reports and by readings, indexes included."""
     with closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True, timeout=60.0)) as database:
         pages = "SELECT cast(total(pgsize) AS INTEGER) FROM dbstat WHERE name GLOB ?"
         of_reports, of_windows = (
@@ -217,21 +216,21 @@ def held_bytes(file: Path) -> tuple[int, int, int]:
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """What a plant of one kind took; of one hop of one machine where nothing else is said."""
+    """Resources used by a plant of one kind; per hop and machine unless stated otherwise."""
 
-    cores: float  # of all
+    cores: float  # whole plant
     processor_ms: float
     yardstick_ms: float
-    idle_mb: float  # memory of all, before data
-    memory_mb: float  # of all
+    idle_mb: float  # memory of the whole plant before data arrive
+    memory_mb: float  # whole plant
     written_kb: float
-    reports_kb: float  # of the history's file, with indexes
+    reports_kb: float  # in the history's file, with indexes
     readings_kb: float
-    told_kb: float  # report on the topic
+    told_kb: float  # published report
 
 
 def measure(kind: MachineKind, count: int, seed: int, length_s: float, stall_s: float, *, of_shard: bool) -> Figures:
-    """Watch so many machines for a while after their windows have filled, print what it took, and return it."""
+    """Watch `count` machines for `length_s` after their windows have filled; print and return the resources used."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         folder = Path(name)
         machines = [kind.machine(folder, f"kit{number}") for number in range(count)]
@@ -291,8 +290,8 @@ def measure(kind: MachineKind, count: int, seed: int, length_s: float, stall_s: 
 
 
 def _stalled(process: Process, plant: Plant, stall_s: float, most_s: float, *, of_shard: bool) -> float:
-    """Stop the monitor for a while; seconds from then on until the last report that came late."""
-    # One of the others keeps no machines, but looks after what processes share, and is small.
+    """Stop the monitor for `stall_s`, and return the seconds from its continuation to the last late report."""
+    # The largest child process: one that monitors no machines, but manages shared resources, is small.
     largest = sorted(process.all()[1:], key=lambda one: int((one / "statm").read_text(encoding="ascii").split()[1]))[
         -1:
     ]
@@ -309,7 +308,7 @@ def _stalled(process: Process, plant: Plant, stall_s: float, most_s: float, *, o
 
 
 def _untold(plant: Plant) -> int:
-    """Hops between the first and the latest report of a machine that no report is about."""
+    """Number of hops without a report between the first and the latest report of each machine."""
     hop_ns = round(plant.machines[0].window.hop_s * 1e9)
     ends = ({end_ns for _, end_ns in found} for found in plant.windows.values())
     return sum((max(found) - min(found)) // hop_ns + 1 - len(found) for found in ends)

@@ -1,9 +1,9 @@
-"""What a machine of several kinds takes, end to end: the figures that ``rotorwatch size`` reckons with.
+"""Measures the resources that machines of several kinds need, end to end, for ``rotorwatch size``.
 
-Run: ``python benchmarks/costs.py`` (half an hour; ``--cases 1 4`` measures the first and the fourth kind alone and
-keeps the others). One kind after the other is watched by a monitor of one process, as ``capacity.py`` does it, and what
-it took is written to ``service/runtime/costs.toml``. Processor time counts, not duration, but on a busy computer it is
-longer, too: let nothing else run.
+Run: ``python benchmarks/costs.py`` (half an hour; ``--cases 1 4`` measures only the first and the fourth kind and keeps
+the others). One kind after the other is watched by a monitor of one process, as in ``capacity.py``, and the costs are
+written to ``service/runtime/costs.toml``. Processor time is measured, not duration, but it grows on a busy computer
+too: run nothing else.
 """
 
 import os
@@ -44,7 +44,7 @@ _HEADING = """# What machines of several kinds take, for `rotorwatch size`; writ
 
 
 def computer() -> str:
-    """Name of the processor, and how many there are."""
+    """Number of cores and name of the processor."""
     lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     name = next(
         (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown processor"
@@ -61,7 +61,7 @@ def process_mb() -> float:
 
 
 def case(kind: MachineKind, figures: Figures, machines: int, base_mb: float) -> dict[str, Any]:
-    """Figures as `service.runtime.sizing.Case` has them."""
+    """Costs of a kind as fields of `service.runtime.sizing.Case`."""
     return kind.fields | {
         "processor_ms": round(figures.processor_ms, 1),
         "memory_mb": round((figures.memory_mb - base_mb) / machines, 2),
@@ -73,7 +73,7 @@ def case(kind: MachineKind, figures: Figures, machines: int, base_mb: float) -> 
 
 
 def written(heading: dict[str, Any], recording: dict[str, Any], cases: list[dict[str, Any]]) -> str:
-    """All of it as TOML, whose numbers, texts and lists are those of JSON."""
+    """The cost file as TOML; its numbers, strings and lists are written like JSON."""
 
     def table(fields: dict[str, Any]) -> list[str]:
         return [f"{name} = {json.dumps(value)}" for name, value in fields.items()]

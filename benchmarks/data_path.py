@@ -1,7 +1,7 @@
-"""What one machine costs: the data path's stages over the same samples, as ratios measured side by side in one run.
+"""Measures the processing time of the data path's stages for one machine, as ratios to a yardstick in the same run.
 
-Run: ``python -m benchmarks.data_path``. The yardstick is the Fourier transform that the cross-spectra need at the very
-least (one real FFT per segment and channel); absolute times depend on the computer, ratios much less.
+Run: ``python -m benchmarks.data_path``. The yardstick is the Fourier transform that the cross-spectra need at least
+(one real FFT per segment and channel); absolute times depend on the computer, ratios much less.
 """
 
 import os
@@ -38,7 +38,7 @@ DATA_S = 180.0
 
 
 def median_s(work: Callable[[], object], count: int, repetitions: int = REPETITIONS) -> float:
-    """Median time of one of `count` items of work, over the repetitions."""
+    """Median over repetitions of the time per item, if `work` handles `count` items."""
     times = []
     for _ in range(repetitions):
         begin = time.perf_counter()
@@ -64,11 +64,11 @@ def main() -> None:
             measures.append(loud)
     piece = samples[: plan.preamble + plan.hop]
     level = piece[:, : len(plan.states)].mean(axis=0)
-    rows = np.ascontiguousarray(piece.T)  # as the moments have them
+    rows = np.ascontiguousarray(piece.T)  # as in the moments
     seen, angle, measured = waveform_of(rows[:-1, -plan.hop :].T), rows[-1, -plan.hop :], plan.levels
     assert measured is not None  # noqa: S101  # planned above
     taper = np.hanning(plan.segment + 1)[:-1] / np.sqrt(3 / 8 * plan.segment * plan.rate_hz)
-    spectrum = np.fft.rfft(seen[1] * taper)  # as the moments have it: a hop is a segment here
+    spectrum = np.fft.rfft(seen[1] * taper)  # as in the moments: here a hop equals a segment
     channels = [machine.sensors[column] for column in plan.columns]
     judge = LevelJudge(measured, channels, machine.levels)
     healthy = learn_levels("commissioned", [channel.name for channel in channels], measures)
@@ -89,7 +89,7 @@ def main() -> None:
         return median_s(lambda: [work() for _ in range(100)], 100)
 
     def whole_s(installed: Installed) -> float:
-        """Time for a hop once the window is full."""
+        """Time per hop once the window is full."""
         monitor = MachineMonitor(installed)
         for block in stream[: len(stream) // 2]:
             monitor.step(block)

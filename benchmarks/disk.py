@@ -1,12 +1,12 @@
-"""What a monitor writes to the disk for each hop and machine, in steady state, SQLite's log and checkpoints included.
+"""Measures the bytes written to disk per hop and machine in steady state, including SQLite's log and checkpoints.
 
-Run: ``python benchmarks/disk.py [--machines 20] [--hops 60] [--seed 1] [--days 30]``. Simulated rotor kits, each with a
-seed of its own, go through real workers into one SQLite history as fast as they can, so the hops of one machine follow
-each other faster than in real time; how many there are of each is counted. Machines complete their hops one after the
-other, as machines that know nothing of each other do; ``--together`` lets them do it at the same time, so that they
-share transactions. What is counted is ``write_bytes`` of this process in ``/proc/self/io``: what goes to the device,
-from when the windows are full until the last of it has moved from the write-ahead log into the file. Buckets of
-``--days`` are there before, because their rows would otherwise lie all on one page.
+Run: ``python benchmarks/disk.py [--machines 20] [--hops 60] [--seed 1] [--days 30]``. Simulated rotor kits with
+different seeds go through real workers into one SQLite history as fast as possible, i.e. faster than in real time; the
+hops are counted. Machines complete their hops one after the other, like independent machines; with ``--together`` they
+do so at the same time and share transactions. The measured quantity is ``write_bytes`` of this process in
+``/proc/self/io``, i.e. bytes written to the device, from the first full windows until everything has been moved from
+the write-ahead log to the file. The history is prefilled with buckets of ``--days`` days, because in an empty one all
+rows of new buckets would lie on one page.
 """
 
 import os
@@ -45,14 +45,14 @@ BUCKET_NS = 600 * 10**9
 
 
 def stream(seed: int, length_s: float, start_ns: int) -> Iterator[SampleBlock]:
-    """A healthy rotor kit."""
+    """Blocks of a simulated healthy rotor kit."""
     scenario, machine = load_scenario("healthy")
     for block, _ in blocks(scenario.overridden(seed=seed, duration_s=length_s), machine, BLOCK_S, start_ns):
         yield block
 
 
 def age(file: Path, before_ns: int, days: float) -> int:
-    """Give every machine the buckets of so many days; return how many."""
+    """Fill the history with buckets of `days` days for every machine; return their number."""
     count = round(days * 86_400 * 10**9 / BUCKET_NS)
     end_ns = before_ns // BUCKET_NS * BUCKET_NS
     rng = np.random.default_rng(1)
@@ -77,7 +77,7 @@ def age(file: Path, before_ns: int, days: float) -> int:
 
 
 def feed(workers: list[MachineWorker], streams: list[Iterator[SampleBlock]], hops: int, *, together: bool) -> None:
-    """Give every machine the data of so many hops, and wait until what comes of them is committed."""
+    """Feed every machine the data of `hops` hops, and wait until the results are committed."""
     per_hop = round(workers[0].machine.window.hop_s / BLOCK_S)
     for _ in range(hops):
         for worker, source in zip(workers, streams, strict=True):
@@ -99,7 +99,7 @@ def settled(workers: list[MachineWorker]) -> None:
 
 
 def measure(machines: int, hops: int, seed: int, days: float, *, together: bool) -> None:
-    """Run so many machines over so many hops, and print what was written."""
+    """Run `machines` machines over `hops` hops, and print the bytes written."""
     _, machine = load_scenario("healthy")
     warm = machine.window.hops + 3
     start_ns = time.time_ns()

@@ -1,7 +1,7 @@
 """What the event stream of a plant costs: bytes, and the processor without HTTP around it.
 
 Run: ``python benchmarks/event_stream.py HEALTH`` (a minute) with the answer of ``GET …/health`` in a file. 500 machines
-say such a health every 5 s, 25 of them after each other four times a second, to so many listeners.
+publish such a health every 5 s, in batches of 25 four times per second, to various numbers of listeners.
 """
 
 import argparse
@@ -19,7 +19,7 @@ MACHINES, TICK, TICK_S, SECONDS = 500, 25, 0.25, 8.0
 
 
 def speaking(feed: EventFeed, healths: list[Health], ended: threading.Event) -> None:
-    """Let machines say how they are, as the service does."""
+    """Publish the health of machines as the service does, until `ended` is set."""
     at = 0
     while not ended.wait(TICK_S):
         for health in healths[at : at + TICK]:
@@ -29,7 +29,7 @@ def speaking(feed: EventFeed, healths: list[Health], ended: threading.Event) -> 
 
 
 async def measured(healths: list[Health], listeners: int, whole: Any) -> tuple[float, float]:
-    """Share of a core, and bytes per second of one stream."""
+    """Processor load as a fraction of a core, and bytes per second of one stream."""
     feed, ended, heard = EventFeed(), threading.Event(), 0
     places = {f"{one.site}/{one.machine}": one for one in healths}
     logs: Any = dict.fromkeys(places, SimpleNamespace(last_sequence=lambda: -1))
@@ -45,7 +45,7 @@ async def measured(healths: list[Health], listeners: int, whole: Any) -> tuple[f
     thread = threading.Thread(target=speaking, args=(feed, healths, ended))
     thread.start()
     tasks = [asyncio.create_task(listen()) for _ in range(listeners)]
-    await asyncio.sleep(MACHINES / TICK * TICK_S + 3.0)  # whatever is said first is said apart
+    await asyncio.sleep(MACHINES / TICK * TICK_S + 3.0)  # skips the initial messages
     before_s, begin_s, before = time.process_time(), time.monotonic(), heard
     await asyncio.sleep(SECONDS)
     length_s = time.monotonic() - begin_s

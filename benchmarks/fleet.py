@@ -1,11 +1,11 @@
-"""A fleet whose computers are killed: how long until every machine is evaluated again, and what becomes of the alarms.
+"""Kills computers of a fleet, and measures how long it takes until every machine is evaluated again; compares alarms.
 
 Run: ``python benchmarks/fleet.py --database postgresql://USER@HOST/NAME`` (some 20 minutes; the database is emptied).
-Three computers of a Ray cluster, all of them this one, monitor rotor kits (9 channels, 2 kHz, windows of 60 s) that
-this process sends at pace 1, as in ``capacity.py``. In every fourth a bearing loses a third of its stiffness. Once all
-windows are full, one computer after the other is killed (``SIGKILL``), and another one comes. Measured: from each kill
-until every machine has a report of data that are later than the kill. Then the same streams without kills, and the
-alarm logs of both are compared: sequence, kind, alarm, and time of the data.
+Three nodes of a Ray cluster, all on this computer, monitor rotor kits (9 channels, 2 kHz, windows of 60 s) that this
+process sends at pace 1, as in ``capacity.py``. In every fourth machine a bearing loses a third of its stiffness. Once
+all windows are full, one node after the other is killed (``SIGKILL``) and replaced. The measured time is that from each
+kill until every machine has a report on data later than the kill. Then the same streams are run without kills, and the
+alarm logs of both runs are compared: sequence, kind, alarm, and data time.
 """
 
 import os
@@ -51,7 +51,7 @@ def emptied(database: str) -> None:
 
 
 def fleet_files(folder: Path, machines: Sequence[MachineFile], database: str, link: str, inner: str) -> Path:
-    """Settings for machines whose files are in the folder; returns their file."""
+    """Write the settings of a fleet for machines whose files are in the folder, and return their path."""
     lines = [f'[link]\nmode = "client"\nconnect = ["{link}"]', f'[fleet]\nlisten = "{inner}"']
     lines += [f'[history]\nurl = "{database}"']
     lines += [f'[[machines]]\nfile = "{machine.name}.toml"\nbundle = "lab"' for machine in machines]
@@ -61,7 +61,7 @@ def fleet_files(folder: Path, machines: Sequence[MachineFile], database: str, li
 
 @contextmanager
 def routing(folder: Path, link: str) -> Iterator[None]:
-    """A Zenoh router in a process of its own: in one with publishers, these and it wait for the same threads."""
+    """Run a Zenoh router in its own process: in one process, publishers and router would wait for the same threads."""
     command, environment = ["service", "router", "--listen", link], dict(os.environ)
     router = started(command, folder / "router", folder / "router_log", environment)
     try:
@@ -77,7 +77,7 @@ def routing(folder: Path, link: str) -> Iterator[None]:
 
 @contextmanager
 def cluster_of() -> Iterator[Any]:
-    """A Ray cluster of these computers, beside one without cores."""
+    """A Ray cluster of `COMPUTERS` nodes and a head node without cores."""
     head = {"num_cpus": 0, "include_dashboard": False, "_system_config": json.loads(HEALTH_CHECKS)}
     cluster = Cluster(initialize_head=True, head_node_args=head)
     try:
@@ -89,7 +89,7 @@ def cluster_of() -> Iterator[Any]:
 
 
 def logs_of(url: str, plant: Plant, until_ms: int) -> dict[str, list[tuple[int, str, str, int]]]:
-    """Alarm log of every machine before the end of the data; times are those of the data, ms since the start."""
+    """Alarm log of every machine up to the end of the data; times are data times, ms since the start."""
     found = {}
     with httpx.Client(base_url=url, trust_env=False, timeout=60.0) as http:
         for machine in plant.machines:
@@ -104,7 +104,7 @@ def logs_of(url: str, plant: Plant, until_ms: int) -> dict[str, list[tuple[int, 
 
 
 def again_s(plant: Plant, killed_s: float) -> float | None:
-    """From a kill until every machine has a report of data that are later; None while one has not."""
+    """Seconds from a kill until every machine has a report on later data; None while one has none."""
     later_ns = time.time_ns() - round((time.monotonic() - killed_s) * 1e9) - plant.start_ns
     firsts = [
         min((at for at, end_ns in plant.windows[one.name] if end_ns > later_ns and at > killed_s), default=None)
@@ -115,7 +115,7 @@ def again_s(plant: Plant, killed_s: float) -> float | None:
 
 
 def killed(plant: Plant, cluster: Any, number: int) -> None:
-    """Kill a computer, add another one, and print when all machines are evaluated again."""
+    """Kill a node, add a new one, and print when all machines are evaluated again."""
     killed_s = time.monotonic()
     cluster.remove_node(sorted(cluster.worker_nodes, key=lambda node: node.node_id)[0], allow_graceful=False)
     cluster.add_node(num_cpus=CORES)
@@ -129,7 +129,7 @@ def killed(plant: Plant, cluster: Any, number: int) -> None:
 def run(
     count: int, kills: int, length_s: float, seed: int, database: str
 ) -> dict[str, list[tuple[int, str, str, int]]]:
-    """Monitor so many machines, killing so many computers; returns the alarm logs."""
+    """Monitor `count` machines while killing `kills` nodes, and return the alarm logs."""
     emptied(database)
     base = load_machine("lab")
     scenario, _ = load_scenario("healthy")
@@ -174,7 +174,7 @@ def main() -> None:
     parser.add_argument("--database", required=True, help="PostgreSQL; what it holds is dropped")
     asked = parser.parse_args()
     logs = {}
-    length_s = WARM_S + (2 * asked.kills + 2) * BETWEEN_S  # a busy computer takes longer than that between two kills
+    length_s = WARM_S + (2 * asked.kills + 2) * BETWEEN_S  # twice, for a busy computer
     for kills in (asked.kills, 0):
         print(f"{asked.machines} machines, {kills} kills, seed {asked.seed}", flush=True)
         logs[kills] = run(asked.machines, kills, length_s, asked.seed, asked.database)

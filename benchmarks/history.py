@@ -1,11 +1,10 @@
-"""A monitor with a history of a million reports: how long until it has started, and until it answers from it.
+"""Measures start-up and response times of a monitor with a history of a million reports.
 
-Run: ``python benchmarks/history.py [--reports 1000000] [--machines 20] [--file FILE]``. The history is made by the
-store's own writer, in the file if it is not there yet (some minutes, 2 GB): reports of one simulated rotor kit every
-5 s up to now, the same hundred again and again with times of their own, their readings with some noise, and a thousand
-alarm events of each machine. Then a monitor is started with it and, to compare, with none; and each question of the
-page and of programs is asked several times, of a machine in the middle. Times are those of whoever waits; *processor*
-is the monitor's alone.
+Run: ``python benchmarks/history.py [--reports 1000000] [--machines 20] [--file FILE]``. If the file does not exist, the
+store's own writer fills it (some minutes, 2 GB): reports every 5 s up to now, repeating a hundred reports of one
+simulated rotor kit with new times and some noise on the readings, and a thousand alarm events for each machine. Then a
+monitor is started with it and, for comparison, with an empty history, and each request of the page and of programs is
+made several times for a machine in the middle. Times are those of the client; *processor* is that of the monitor.
 """
 
 import os
@@ -50,7 +49,7 @@ GOAL_START_S, GOAL_ANSWER_S = 5.0, 0.3
 
 
 def windows_of(folder: Path) -> list[Report]:
-    """Reports of a rotor kit."""
+    """`DIFFERENT` reports of a simulated rotor kit."""
     kind = MachineKind()
     monitor = MachineMonitor(install(kind.machine(folder, "lab"), "lab"))
     length_s = 60.0 + 5.0 * DIFFERENT
@@ -77,7 +76,7 @@ def event(sequence: int, time_ns: int) -> StoredEvent:
 
 
 def fill(file: Path, machines: Sequence[MachineFile], reports: int, folder: Path) -> None:
-    """Make the history."""
+    """Fill the history with reports, readings and alarm events."""
     windows, rng = windows_of(folder), np.random.default_rng(1)
     texts = [pack("demo/lab", Step((stored_report(one),)), 0)[0].text for one in windows]
     columns = [stored_report(one) for one in windows]
@@ -114,7 +113,7 @@ def fill(file: Path, machines: Sequence[MachineFile], reports: int, folder: Path
                 )
                 for number, end_ns in zip(many, ends_ns, strict=True)
             ]
-            # Its text stands in `packed`, compressed.
+            # The texts of the reports are in `packed`, compressed.
             writer.submit(claim, step, packed, ends_ns[-1])
         print(f"  {machine.name}: {each} reports", flush=True)
     writer.stop()
@@ -123,7 +122,7 @@ def fill(file: Path, machines: Sequence[MachineFile], reports: int, folder: Path
 
 @contextmanager
 def monitored(folder: Path, file: Path, machines: Sequence[MachineFile]) -> Iterator[tuple[Process, str, float, float]]:
-    """A monitor with this history: its process, its address, and seconds and processor time until it answered."""
+    """Run a monitor with this history; yields its process, URL, and seconds and processor time until it answered."""
     environment, _ = on_loopback(folder)
     entries = [{"file": str(folder / f"{machine.name}.toml"), "bundle": "lab"} for machine in machines]
     environment |= {"ROTORWATCH_MACHINES": json.dumps(entries), "ROTORWATCH_HISTORY__URL": f"sqlite:///{file}"}
@@ -134,7 +133,7 @@ def monitored(folder: Path, file: Path, machines: Sequence[MachineFile]) -> Iter
 
 
 def questions(machine: MachineFile, machines: Sequence[MachineFile]) -> dict[str, str]:
-    """What is asked, by what it is."""
+    """Paths of all requests, by description."""
     place = f"/api/v1/machines/{machine.site}/{machine.name}"
     of = "&".join(f"of={one.site}/{one.name}/parameter/k_by" for one in machines)
     end_ns = time.time_ns()
@@ -185,7 +184,7 @@ def main() -> None:
 
 
 def ask(process: Process, url: str, machines: Sequence[MachineFile]) -> None:
-    """Ask everything, and print how long it took."""
+    """Make all requests, and print their response times."""
     with httpx.Client(base_url=url, trust_env=False, timeout=60.0) as http:
         for what, path in questions(machines[len(machines) // 2], machines).items():
             times, before_s = [], process.cpu_s()

@@ -2,12 +2,11 @@
 
 Run: ``python benchmarks/http_campaign.py`` (about twenty minutes), ``--small`` for half a minute. For each number of
 files that the monitor may open (256 and 1024), a monitor is started on loopback, a simulated rotor kit sends to it at
-pace 1, and callers of one kind after the other attack its API from the same address: what they are and how many stands
-in the table that is printed. Whatever is ended, they open again, until their time is over; then they hold what they
-have.
+pace 1, and one kind of callers after the other attacks its API from the same address; kinds and numbers are in the
+printed table. Callers replace connections that are ended until their time is over, and then hold the open ones.
 
-Meanwhile somebody asks for ``/healthz``, over a new connection each time. Exit code 1 if a question was not answered, a
-block was lost, the monitor came near its last file, wrote more than 100 kB of log, or did not recover.
+Meanwhile ``/healthz`` is requested, over a new connection each time. Exit code 1 if a request was not answered, a block
+was lost, the monitor came near its limit of files, wrote more than 100 kB of log, or did not recover.
 """
 
 import argparse
@@ -66,7 +65,7 @@ class Callers:
     held: list[socket.socket] = field(default_factory=list)
 
     def fill(self) -> None:
-        """Open what is missing, a hundred at most."""
+        """Open missing connections, a hundred at most."""
         for _ in range(min(100, self.count - len(self.held))):
             one = socket.socket()
             if not self.attack.reads:
@@ -84,7 +83,7 @@ class Callers:
             self.held.append(one)
 
     def look(self, *, trickle: bool) -> None:
-        """Send a byte each, if it is time, and find out who was ended or told something."""
+        """Send a byte on each connection if `trickle`, and remove connections that were ended."""
         poll = select.poll()
         held = {one.fileno(): one for one in self.held}
         for number in held:
@@ -102,7 +101,7 @@ class Callers:
         self.held = [one for one in self.held if one not in over]
 
     def close(self) -> None:
-        """Leave."""
+        """Close all connections."""
         while self.held:
             self.held.pop().close()
 
@@ -118,11 +117,11 @@ class Callers:
             return False
         except OSError:
             return True
-        return True  # who does not read is only woken by the end
+        return True  # without reading, poll only reports the end of a connection
 
 
 def campaign(one: Monitor, attack: Attack, count: int, duration_s: float, limit: int, recovery_s: float) -> list[str]:
-    """Attack, print a line, and return what should not be."""
+    """Attack, print a line of the table, and return the faults found."""
     place = httpx.URL(one.url)
     callers = Callers((place.host, place.port or 0), attack, count)
     before, log_before = one.files(), one.log.stat().st_size
@@ -141,7 +140,7 @@ def campaign(one: Monitor, attack: Attack, count: int, duration_s: float, limit:
         time.sleep(0.02)
     end_s = time.monotonic()
     opened = callers.opened
-    if attack.name == "event streams":  # who is answered may stay, so these have to leave
+    if attack.name == "event streams":  # the monitor may keep answered callers, so these must close
         callers.close()
     while one.files() > before + 5 and time.monotonic() < end_s + recovery_s:
         time.sleep(0.05)
@@ -154,7 +153,7 @@ def campaign(one: Monitor, attack: Attack, count: int, duration_s: float, limit:
     log = one.log.stat().st_size - log_before
     answers = {status: sum(status == found for found, _ in asked) for status, _ in sorted(asked)}
     answered = ", ".join(f"{number} x {status or 'nothing'}" for status, number in answers.items())
-    # Where all are being answered, the monitor says so until it knows better.
+    # While all connections are being answered, 503 is right, until the monitor finds that the clients read nothing.
     unanswered = len(asked) - answers.get(200, 0) - (0 if attack.reads else answers.get(503, 0))
     slowest_s = max(wait_s for _, wait_s in asked)
     told = ", ".join(f"{number} x {status}" for status, number in sorted(callers.statuses.items()))

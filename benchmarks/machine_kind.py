@@ -1,4 +1,4 @@
-"""Machines of several kinds for benchmarks of the whole service: their files, their bundles, and what they send."""
+"""Machines of several kinds for benchmarks of the whole service: files, bundles, and simulated streams."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -28,11 +28,11 @@ location = "place {number}"
 direction = "y"
 unit = "m/s2"
 """
-_KIT = 9  # channels of the rotor kit, the shaft angle among them; four of tilt are known besides
+_KIT = 9  # channels of the rotor kit including the shaft angle; four tilt channels can be added
 
 
 def rotor_kit(rate_hz: float = 2000.0, hop_s: float = 5.0, *, tilt: bool = False) -> str:
-    """Text of the shipped rotor kit's machine file, at another rate or hop, and with four tilt channels as well."""
+    """Text of the shipped rotor kit's machine file with the given rate and hop, and optionally four tilt channels."""
     shipped = Path(models.__file__).parent / "machines" / "lab.toml"
     text = shipped.read_text(encoding="utf-8")
     text = text.replace("rate_hz = 2000.0", f"rate_hz = {rate_hz}").replace("hop_s = 5.0", f"hop_s = {hop_s}")
@@ -45,17 +45,17 @@ def rotor_kit(rate_hz: float = 2000.0, hop_s: float = 5.0, *, tilt: bool = False
 
 @dataclass(frozen=True, slots=True)
 class MachineKind:
-    """How many channels of a machine come how fast, and what is made of them."""
+    """A kind of machine: number of channels, rate, and how it is evaluated."""
 
     channels: int = _KIT
     rate_hz: float = 2000.0
     hop_s: float = 5.0
-    diagnosed: bool = True  # a rotor kit, whose parameters are known; otherwise levels alone are watched
-    networks: bool = True  # the shipped ones: of the rotor kit, at 2 kHz, with hops of 5 s
+    diagnosed: bool = True  # a rotor kit with known parameters; otherwise only levels are watched
+    networks: bool = True  # the shipped networks, which are for the rotor kit at 2 kHz with hops of 5 s
 
     @property
     def fields(self) -> dict[str, Any]:
-        """All of it by name."""
+        """All fields by name."""
         return asdict(self)
 
     @property
@@ -73,13 +73,13 @@ class MachineKind:
         return heading + "".join(_WATCHED.format(number=number) for number in range(self.channels))
 
     def machine(self, folder: Path, name: str) -> MachineFile:
-        """A machine of this kind, with its file in the folder."""
+        """Write the file of a machine of this kind to the folder, and load it."""
         file = folder / f"{name}.toml"
         file.write_text(self.text().replace('name = "lab"', f'name = "{name}"', 1), encoding="utf-8")
         return load_machine_file(str(file))
 
     def stream(self, folder: Path, seed: int, length_s: float, block_s: float) -> list[SampleBlock]:
-        """What one machine sends, from time 0 on: a simulated rotor kit, or noise where levels alone are watched."""
+        """Blocks of one machine from time 0 on: a simulated rotor kit, or noise if only levels are watched."""
         if self.diagnosed:
             scenario, _ = load_scenario("healthy")
             given, machine = scenario.overridden(seed=seed, duration_s=length_s), self.machine(folder, "lab")

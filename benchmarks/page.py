@@ -3,15 +3,15 @@
 Run: ``python benchmarks/page.py`` (about eight minutes, with a Chromium, or what ``ROTORWATCH_CHROMIUM`` names),
 ``--small`` for three.
 
-Plant: for each number of machines, all in one run, a server tells the page of each machine's health in batches. *Batch*
-is the processor time of the browser's main thread, over the number of batches: reading, elements, style, layout and
-painting. *Longest* is its longest task. Then the view is scrolled from top to bottom while batches come (*frames*:
-median, 95 % and longest); *questions* are those for lines, before that and while it is scrolled.
+Plant: for each number of machines, all in one run, a server sends the page the health of machines in batches. *Batch*
+is the processor time of the browser's main thread per batch: parsing, elements, style, layout and painting. *Longest*
+is its longest task. Then the view is scrolled from top to bottom while batches arrive (*frames*: median, 95 % and
+longest); *questions* are the requests for spark lines before and during scrolling.
 
-Monitor: what a page that shows the machine asks for again and again is found out with the browser, which is closed
-then. For each number of browsers that ask for that and hold an event stream each, the monitor's processor time, what
-each stream brings, and how much later than at the earliest a window's report arrives at somebody who follows the event
-stream (median and largest). Nothing is drawn meanwhile, so nothing but the monitor gets slower.
+Monitor: the requests that a page repeats while it shows the machine are recorded with the browser, which is then
+closed. For each number of simulated browsers that repeat these requests and hold an event stream each, the monitor's
+processor time, the data rate of each stream, and the delay of reports at a follower of the event stream are measured,
+relative to the earliest (median and largest). Nothing is drawn meanwhile, so only the monitor can get slower.
 """
 
 import argparse
@@ -58,7 +58,7 @@ SCROLL = """async () => {
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """The browser that there is."""
+    """Launch the installed Chromium, or the one named in ``ROTORWATCH_CHROMIUM``."""
     path = os.environ.get("ROTORWATCH_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)))
     flags = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
     with sync_playwright() as playwright, playwright.chromium.launch(executable_path=path, args=flags) as found:
@@ -72,7 +72,7 @@ def busy_s(session: CDPSession) -> float:
 
 
 def plant(browser: Browser, machines: int, seconds: float) -> None:
-    """One line about a plant."""
+    """Measure the page with a plant, and print a line."""
     with told(Plant(machines, max(1, machines // 25), 0.2)) as served, browser.new_context() as context:
         page = context.new_page()
         begin_s = time.monotonic()
@@ -82,7 +82,7 @@ def plant(browser: Browser, machines: int, seconds: float) -> None:
         page.wait_for_timeout(3000)
         page.evaluate(WATCH)
         session = context.new_cdp_session(page)
-        session.send("Performance.enable", {"timeDomain": "threadTicks"})  # what else the computer does, left out
+        session.send("Performance.enable", {"timeDomain": "threadTicks"})  # excludes other load of the computer
         before_s, batches = busy_s(session), served.told
         page.wait_for_timeout(1000 * seconds)
         batch_ms = 1000 * (busy_s(session) - before_s) / (served.told - batches)
@@ -100,7 +100,7 @@ def plant(browser: Browser, machines: int, seconds: float) -> None:
 
 
 def arrivals(one: Monitor, ended: threading.Event, found: list[tuple[int, float]]) -> None:
-    """End of each window, and when its report arrived."""
+    """Append the end of each window, ns, and the arrival time of its report, s, to `found`."""
     seen = -1
     with httpx.stream("GET", f"{one.url}/api/v1/events", timeout=60, trust_env=False) as answer:
         for line in answer.iter_lines():
@@ -114,7 +114,7 @@ def arrivals(one: Monitor, ended: threading.Event, found: list[tuple[int, float]
 
 
 def asked_again(browser: Browser, one: Monitor) -> list[str]:
-    """What a page that shows the machine asks for every 15 s."""
+    """Paths that a page requests every 15 s while it shows the machine."""
     asked: list[str] = []
     with browser.new_context() as context:
         page = context.new_page()
@@ -128,7 +128,7 @@ def asked_again(browser: Browser, one: Monitor) -> list[str]:
 
 
 def asking(one: Monitor, paths: list[str], phase_s: float, ended: threading.Event) -> None:
-    """Ask as a page does."""
+    """Repeat a page's requests every 15 s, until `ended` is set."""
     connection = http.client.HTTPConnection(one.url.removeprefix("http://"), timeout=60)
     wait_s = phase_s
     while not ended.wait(wait_s):
@@ -136,12 +136,12 @@ def asking(one: Monitor, paths: list[str], phase_s: float, ended: threading.Even
         for path in paths:
             connection.request("GET", path)
             connection.getresponse().read()
-        connection.close()  # the monitor would, before it is asked again
+        connection.close()  # the monitor would close it before the next request
         wait_s = EVERY_S - (time.monotonic() - begin_s)
 
 
 def hearing(one: Monitor, ended: threading.Event, heard: list[int]) -> None:
-    """Listen as a page does; what comes is counted."""
+    """Follow the event stream as a page does, and append the number of bytes of each line to `heard`."""
     connection = http.client.HTTPConnection(one.url.removeprefix("http://"), timeout=60)
     connection.request("GET", STREAM)
     answer = connection.getresponse()
@@ -151,7 +151,7 @@ def hearing(one: Monitor, ended: threading.Event, heard: list[int]) -> None:
 
 
 def pages(one: Monitor, paths: list[str], count: int, seconds: float) -> tuple[float, float, list[float]]:
-    """Share of a core, bytes per second of a stream, and lateness of reports with so many pages of as many browsers."""
+    """Fraction of a core, bytes per second of a stream, and delays of reports, s, with `count` pages."""
     arrived: list[tuple[int, float]] = []
     heard: list[int] = []
     ended = threading.Event()
@@ -161,7 +161,7 @@ def pages(one: Monitor, paths: list[str], count: int, seconds: float) -> tuple[f
     threads += [threading.Thread(target=asking, args=(one, paths, phase_s, ended)) for phase_s in phases]
     for each in (listener, *threads):
         each.start()
-    time.sleep(EVERY_S)  # whatever is asked first is not asked again
+    time.sleep(EVERY_S)  # skips the initial requests, which are not repeated
     process = Process(one.process.pid)
     before_s, before, begin_s = process.cpu_s(), sum(heard), time.monotonic()
     arrived.clear()
@@ -198,7 +198,7 @@ def main() -> None:
                 "\n| pages | % of a core | of which a page | kB/s of a stream | reports | later than the earliest, s |"
             )
             print("|---|---|---|---|---|---|")
-            # Without pages before and after: what else the computer does changes.
+            # Without pages both first and last, because other load of the computer changes.
             counts = (0, 1) if small else (0, 1, 20, 0)
             measured = [(count, *pages(one, paths, count, 15.0 if small else 60.0)) for count in counts]
             earliest_s = min(late for _, _, _, lates in measured for late in lates)

@@ -1,4 +1,4 @@
-"""A monitor of any number of machines that only tells what a page asks of it: for measuring a browser alone."""
+"""A mock monitor of any number of machines that only answers the page's requests, for measuring the browser alone."""
 
 import asyncio
 import copy
@@ -26,7 +26,7 @@ DAY_NS = 86_400_000_000_000
 
 @dataclass(slots=True)
 class Plant:
-    """Machines that report one after the other, some at a time."""
+    """Machines that report in turns, a batch at a time."""
 
     machines: int
     batch: int
@@ -36,7 +36,7 @@ class Plant:
     asked: list[int] = field(default_factory=list)
 
     def health(self, number: int) -> str:
-        """What a machine says now; one in twenty is in alert."""
+        """Event with a machine's health; one machine in twenty is in alert."""
         told: dict[str, Any] = copy.deepcopy(dict(example(Health)))
         told |= {"site": f"site-{number // SITE:02d}", "machine": f"machine-{number:03d}"}
         for part in told["report"]["parameters"]:
@@ -46,7 +46,7 @@ class Plant:
         return f"event: overview\ndata: {overview(Health.model_validate(told)).model_dump_json()}\n\n"
 
     async def events(self) -> AsyncIterator[str]:
-        """All of them one after the other, as the service does, and then a batch again and again."""
+        """Send the health of all machines, as the service does at the start, and then a batch every `every_s`."""
         yield "event: start\ndata: {}\n\n"
         for number in range(self.machines):
             yield self.health(number)
@@ -57,7 +57,7 @@ class Plant:
             yield "".join(self.health(next(turn)) for _ in range(self.batch))
 
     def app(self) -> FastAPI:
-        """What the page asks of it."""
+        """Application with the routes that the page needs."""
         app = FastAPI()
         add_page_routes(app)
 
@@ -70,7 +70,7 @@ class Plant:
             return StreamingResponse(self.events(), media_type="text/event-stream")
 
         @app.get("/api/v1/trends")
-        def trends(of: list[str] = Query()) -> dict[str, Any]:  # noqa: B008  # how FastAPI is told
+        def trends(of: list[str] = Query()) -> dict[str, Any]:  # noqa: B008  # FastAPI's way to declare it
             self.asked.append(len(of))
             now_ns, step = time.time_ns(), DAY_NS // 48
             starts = [now_ns - (48 - at) * step for at in range(48)]
@@ -81,7 +81,7 @@ class Plant:
 
 @contextmanager
 def told(plant: Plant) -> Iterator[Plant]:
-    """The plant while it is served on loopback."""
+    """Serve the plant on loopback while the block runs."""
     server = uvicorn.Server(uvicorn.Config(plant.app(), host="127.0.0.1", port=0, log_level="error", lifespan="off"))
     thread = threading.Thread(target=server.run)
     thread.start()

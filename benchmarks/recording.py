@@ -1,6 +1,6 @@
-"""What recording costs: writing, recovering and reading messages of 12 channels at 4 kHz, against copying the bytes.
+"""Measures the time of writing, recovering and reading recordings of 12 channels at 4 kHz, relative to a plain write.
 
-Run: ``python benchmarks/recording.py [DIRECTORY]``. The yardstick is a plain write of the same bytes to the same place
+Run: ``python benchmarks/recording.py [DIRECTORY]``. The yardstick is a plain write of the same bytes to the same folder
 with one fsync at the end; absolute times depend on the computer and its disk, ratios less. At the end a hundred such
 machines are recorded in real time, each with its own file and its own fsync every second.
 """
@@ -36,7 +36,7 @@ MACHINES, LIVE_S = 100, 10.0
 
 
 def messages(key: str) -> list[RecordedMessage]:
-    """Five minutes of a vibration of 30 Hz with noise, as a converter of 16 bit would see it."""
+    """Five minutes of a 30 Hz vibration with noise, quantised as by a 16-bit converter."""
     rng = np.random.default_rng(1)
     time_s = np.arange(BLOCK) / RATE_HZ
     found = []
@@ -62,7 +62,7 @@ def median_s(work: Callable[[], object], clean: Callable[[], object]) -> float:
 
 
 def live(machine: Machine, content: list[RecordedMessage], out: Path) -> tuple[float, int, float]:
-    """Record many machines in real time: share of one core, messages not on the disk at the end, MB/s."""
+    """Record many machines in real time; return the fraction of a core, messages not synced at the end, and MB/s."""
     settings = RecordingSettings(directory=str(out))
     recorders = [
         MachineRecorder(machine.model_copy(update={"name": f"m{n}"}), settings, lambda _: ()) for n in range(MACHINES)

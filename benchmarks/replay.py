@@ -1,8 +1,8 @@
-"""How fast a recording of a large machine is replayed offline, and in how much memory.
+"""Measures speed and memory of replaying a recording of a large machine offline.
 
-Run: ``python benchmarks/replay.py [MINUTES]`` (60 without). A rotor kit with twelve channels and a shaft angle at 4 kHz
-is simulated into a recording of that length and one of a sixth of it; each is replayed offline by the command, one
-after the other, in one thread. What matters is the ratio to real time and that memory does not grow with the length.
+Run: ``python benchmarks/replay.py [MINUTES]`` (60 by default). A rotor kit with twelve channels and a shaft angle at
+4 kHz is simulated into recordings of that length and of a sixth of it; each is replayed offline by the command, one
+after the other, in one thread. The results are the ratio to real time, and whether memory grows with the length.
 """
 
 import os
@@ -36,7 +36,7 @@ def main() -> None:
             record(machine, blocks(scenario.overridden(seed=1, duration_s=60 * length), machine), path)
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
             command = ["-m", "service", "replay", str(path), "--offline", "--machine", str(file)]
-            # A process of its own each: the largest of all children so far is what the system remembers.
+            # Each in its own process; the system only reports the largest peak memory of all child processes so far.
             subprocess.run(
                 [sys.executable, *command, "--out", str(path.with_suffix(".jsonl"))],
                 check=True,

@@ -1,4 +1,4 @@
-"""A monitor in a process of its own on loopback, and a simulated rotor kit that sends to it at pace 1."""
+"""Runs a monitor in its own process on loopback, with a simulated rotor kit that sends to it at pace 1."""
 
 import json
 import os
@@ -31,23 +31,23 @@ class Monitor:
     published: Path
 
     def files(self) -> int:
-        """Files that it has open."""
+        """Number of files that the monitor has open."""
         return len(os.listdir(f"/proc/{self.process.pid}/fd"))
 
     def get(self, path: str) -> httpx.Response:
         """Answer to a request."""
-        # Unverified, since it is no HTTPS: reading certificates takes longer than the monitor does to answer.
-        return httpx.get(f"{self.url}{path}", trust_env=False, timeout=ANSWER_S, verify=False)  # noqa: S501  # no certificate is there to be read: it is HTTP
+        # Without verification, because it is not HTTPS: loading certificates takes longer than the answer.
+        return httpx.get(f"{self.url}{path}", trust_env=False, timeout=ANSWER_S, verify=False)  # noqa: S501  # plain HTTP
 
     def asked(self) -> tuple[int, float]:
-        """Status of ``/healthz``, 0 if there is no answer, and seconds until then."""
+        """Status of ``/healthz``, 0 without an answer, and the response time, s."""
         begin_s, status = time.monotonic(), 0
         with suppress(httpx.HTTPError):
             status = self.get("/healthz").status_code
         return status, time.monotonic() - begin_s
 
     def blocks(self) -> tuple[int, int]:
-        """Blocks accepted, and those refused, dropped or missing."""
+        """Number of blocks accepted, and of those refused, dropped or missing."""
         quality = self.get(f"/api/v1/machines/{PLACE}/health").json()["quality"]
         lost = sum(quality["refused_blocks"].values()) + quality["queue_dropped_blocks"] + quality["gaps"]
         return quality["accepted_blocks"], lost
@@ -57,7 +57,7 @@ class Monitor:
 def serving(
     folder: Path, environment: dict[str, str], *arguments: str
 ) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """The service (``run`` without arguments) until the block is left, its output in the folder; and its address."""
+    """Run the service (``run`` by default) until the block is left, output in the folder; yields process and URL."""
     out, log = folder / "out", folder / "log"
     process = started(["service", *(arguments or ("run",))], out, log, environment)
     try:
@@ -69,7 +69,7 @@ def serving(
 
 @contextmanager
 def monitor(folder: Path, files: int, settings: dict[str, str], *publish: str) -> Iterator[Monitor]:
-    """A monitor that may open so many files, with environment variables, and a machine that sends with options."""
+    """Run a monitor that may open `files` files, with environment `settings`, and a machine with `publish` options."""
     environment, endpoint = on_loopback(folder)
     send = ["simulator.rotorsim", "publish", "--connect", endpoint, "--wait-for-subscriber", "120", *publish]
     out, log, published = folder / "out", folder / "log", folder / "published"
@@ -89,7 +89,7 @@ def monitor(folder: Path, files: int, settings: dict[str, str], *publish: str) -
 
 
 def on_loopback(folder: Path) -> tuple[dict[str, str], str]:
-    """Environment of a monitor that whoever is on this computer may ask, with its history in a file; its endpoint."""
+    """Environment of a monitor that is open to local callers, with a history file; and its Zenoh endpoint."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
     return {
@@ -103,7 +103,7 @@ def on_loopback(folder: Path) -> tuple[dict[str, str], str]:
 
 
 def started(arguments: list[str], out: Path, err: Path, environment: dict[str, str]) -> subprocess.Popen[bytes]:
-    """``python -m ARGUMENTS``, with its output in files."""
+    """Start ``python -m ARGUMENTS`` with its output in files."""
     with out.open("wb") as output, err.open("wb") as errors:
         return subprocess.Popen(
             [sys.executable, "-m", *arguments], stdout=output, stderr=errors, env=environment, stdin=subprocess.DEVNULL
@@ -111,7 +111,7 @@ def started(arguments: list[str], out: Path, err: Path, environment: dict[str, s
 
 
 def url_of(process: subprocess.Popen[bytes], out: Path, log: Path) -> str:
-    """Where a monitor that was started says it answers."""
+    """URL that a started monitor prints."""
     while process.poll() is None:
         if (told := re.search(r"HTTP API (http\S+)\s", out.read_text(encoding="utf-8"))) is not None:
             return told[1]

@@ -1,7 +1,7 @@
 """Pictures of the page for the documents: a real monitor, three simulated rotors, one of which loses bearing stiffness.
 
-Run: ``python benchmarks/screenshots.py [FOLDER]`` (two minutes, with a Chromium, or what ``ROTORWATCH_CHROMIUM`` names;
-FOLDER is ``docs/figures`` if left out).
+Run: ``python benchmarks/screenshots.py [FOLDER]`` (two minutes, with a Chromium, or the one in ``ROTORWATCH_CHROMIUM``;
+FOLDER is ``docs/figures`` by default).
 """
 
 import argparse
@@ -17,7 +17,7 @@ from PIL import Image
 from playwright.sync_api import Page
 from running_monitor import PLACE, Monitor, monitor, serving, started
 
-#: Path of each view, what is there when it is complete, and how high a picture of it is.
+#: Path of each view, selector of an element that is present when it is complete, and height of its picture, px.
 VIEWS = {
     "plant": ("", "machine-tile.alert spark-line polyline", 460),
     "machine": (f"machines/{PLACE}", "spectrum-plot canvas", 935),
@@ -30,11 +30,11 @@ VIEWS = {
 FAULT = "k_by=-0.25@140"
 WIDTH, MOST_BYTES, PACE = 1280, 150_000, "6"
 WAIT_MS = 240_000
-SCRUBBER = 130  # height of what stays above the window of a replay, px
+SCRUBBER = 130  # height of the fixed parts above the window of a replay, px
 
 
 def picture(page: Page, at: Path, height: int, top: str = "body") -> None:
-    """What is seen from an element on, in as many colours as fit into the size."""
+    """Save a picture from the element `top` on, with as many colours as `MOST_BYTES` allows."""
     page.set_viewport_size({"width": WIDTH, "height": height})
     page.wait_for_timeout(1500)
     above = 0 if top == "body" else SCRUBBER
@@ -48,7 +48,7 @@ def picture(page: Page, at: Path, height: int, top: str = "body") -> None:
 
 
 def look(one: Monitor, folder: Path) -> None:
-    """Look at every view once the fault is found."""
+    """Save a picture of every view once the fault is found."""
     with chromium() as browser:
         page = browser.new_page(viewport={"width": WIDTH, "height": 900}, color_scheme="light")
         page.set_default_timeout(WAIT_MS)
@@ -58,7 +58,7 @@ def look(one: Monitor, folder: Path) -> None:
         for name, (path, there, height) in VIEWS.items():
             page.goto(f"{one.url}/#/{path}")
             if name == "plant":
-                page.reload()  # lines as they are by now
+                page.reload()  # updates the spark lines
             page.locator(there).first.wait_for()
             if name == "replay":
                 page.get_by_role("button", name=re.compile("Choose ten minutes before and after .*k_by")).click()
@@ -76,7 +76,7 @@ def look(one: Monitor, folder: Path) -> None:
 
 
 def sign_in(temporary: Path, folder: Path) -> None:
-    """The view of a monitor that wants a token."""
+    """Save a picture of the sign-in view of a monitor that requires a token."""
     settings = {
         "ROTORWATCH_MACHINES": json.dumps([{"file": "lab"}]),
         "ROTORWATCH_LINK": json.dumps({"listen": ["tcp/127.0.0.1:0"]}),

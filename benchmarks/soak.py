@@ -1,12 +1,12 @@
 """A day of a machine's life through the real service, with all that goes wrong, against the same day offline.
 
-Run: ``python benchmarks/soak.py --hours 24 --seed 1`` (hours of data). A simulated rotor kit changes its parameters now
-and then; probes get stuck; blocks are lost, repeated and swapped; the monitor is killed (SIGKILL) in the middle of its
-work and started again; followers of the alarm log come, are killed and come back. The same blocks go, in order and
-undisturbed, through the data path in one process of their own. In the end the log in the database, the log that the
-followers wrote down and the offline log must be the same, event by event. Exit code 1 if they are not.
+Run: ``python benchmarks/soak.py --hours 24 --seed 1`` (hours of data). A simulated rotor kit changes its parameters at
+times; probes get stuck; blocks are lost, repeated and swapped; the monitor is killed (SIGKILL) at work and restarted;
+followers of the alarm log join, are killed and return. The same blocks go, in order and undisturbed, through the data
+path in a separate process. At the end the log in the database, the log written by the followers and the offline log
+must agree event by event; if they do not, the exit code is 1.
 
-In the last third the monitor is left alone, to see whether its memory stays where it is.
+In the last third the monitor is not killed, to see whether its memory stays constant.
 """
 
 import argparse
@@ -49,21 +49,21 @@ from simulator.stream import blocks
 _PLACE = "demo/lab"
 _BLOCK_S = 0.5
 _START_NS = 1_767_225_600_000_000_000
-_AHEAD = 80  # blocks that may be on their way; a publisher keeps 1200
+_AHEAD = 80  # most blocks in flight; a publisher caches 1200
 _PATIENCE_S = 30.0
 _FAULTS = {"k_by": (-0.35, -0.2, 0.4), "k_bz": (-0.35, 0.4), "c_by": (-0.5, 0.8), "c_bz": (-0.5, 0.8), "e": (0.5, 1.0)}
 _PAGE = 1000
 
 
 def machine_file(folder: Path) -> Path:
-    """The shipped rotor kit, for which a minute without data is no lost stream: the day is played much faster."""
+    """The shipped rotor kit, with a minute until the stream counts as lost, because the day is played much faster."""
     path = folder / "lab.toml"
     path.write_text(f"{rotor_kit()}\n[ingest]\nno_data_after_s = 60.0\n", encoding="utf-8")
     return path
 
 
 def story(seed: int, hours: float) -> Scenario:
-    """Faults that come and go: one parameter at a time, for five to twenty minutes, every half an hour or so."""
+    """Scenario of temporary faults: one parameter at a time, for 5 to 20 minutes, every half an hour or so."""
     rng = np.random.default_rng([seed, 1])
     events, at_s = [], 400.0
     while at_s < hours * 3600 - 300:
@@ -78,7 +78,7 @@ def story(seed: int, hours: float) -> Scenario:
 
 
 def lived(machine: Machine, seed: int, hours: float) -> Iterator[SampleBlock]:
-    """Blocks that leave the machine, in order: some are lost for good, and now and then a probe is stuck."""
+    """Blocks that leave the machine, in order: some are lost for good, and at times a probe is stuck."""
     rng = np.random.default_rng([seed, 2])
     lost = stuck = 0
     for block, _ in blocks(story(seed, hours), machine, _BLOCK_S, _START_NS):
@@ -97,7 +97,7 @@ def lived(machine: Machine, seed: int, hours: float) -> Iterator[SampleBlock]:
 
 
 def offline(file: Path, seed: int, hours: float) -> None:
-    """Print the log of alarms, one line an event, and the ends of all windows."""
+    """Print the offline alarm log, one event per line, and the ends of all windows."""
     machine = load_machine(file)
     monitor = MachineMonitor(install(machine, None))
     for block in lived(machine, seed, hours):
@@ -111,7 +111,7 @@ def offline(file: Path, seed: int, hours: float) -> None:
 
 
 def follow(endpoint: str, path: Path) -> None:
-    """Write the alarm log into a file, going on after its last whole line, until killed."""
+    """Append the alarm log to a file, continuing after its last complete line, until killed."""
     kept = path.read_bytes() if path.exists() else b""
     whole = kept[: kept.rfind(b"\n") + 1]
     last = AlarmCloudEvent.model_validate_json(whole.splitlines()[-1]).data.sequence if whole else -1
@@ -127,14 +127,14 @@ def follow(endpoint: str, path: Path) -> None:
         while True:
             try:
                 link = Link(LinkSettings(mode="client", connect=(endpoint,)))
-            except LinkError:  # it joined while the monitor was away
+            except LinkError:  # the monitor is down at present
                 continue
             follow_alarms(link.session, [_PLACE], {_PLACE: last}, keep)
 
 
 @dataclass
 class Plant:
-    """The monitor, whoever follows it, and what is seen of them."""
+    """The monitor, its follower, and what is observed of them."""
 
     folder: Path
     environment: dict[str, str]
@@ -150,13 +150,13 @@ class Plant:
     memory_mb: list[tuple[float, float]] = field(default_factory=list)
 
     def start(self) -> None:
-        """Start the monitor and wait until it listens; what it says goes into files of this start."""
+        """Start the monitor, with output in files of this start, and wait until it listens."""
         out, log = (self.folder / f"{name}-{self.kills}" for name in ("out", "log"))
         self.process = started(["service", "run"], out, log, self.environment)
         self.url = url_of(self.process, out, log)
 
     def kill(self) -> None:
-        """Kill -9, and up again; wait until the publisher's cache arrives."""
+        """Kill the monitor (SIGKILL) and restart it; wait until the publisher's cache arrives."""
         assert self.process is not None  # noqa: S101  # for the type checker
         self.process.kill()
         self.process.wait()
@@ -167,10 +167,10 @@ class Plant:
             if health["quality"]["accepted_blocks"] or health["quality"]["refused_blocks"] or health["filled"]:
                 break
             time.sleep(0.05)
-        self.reports += 1  # what was on its way has been lost or has arrived
+        self.reports += 1  # blocks in flight have been lost or have arrived
 
     def toggle_follower(self) -> None:
-        """Kill the follower if there is one, otherwise let one join."""
+        """Kill the follower if there is one, otherwise start one."""
         if self.follower is None:
             self.follower = subprocess.Popen(
                 [sys.executable, __file__, "--follow", self.endpoint, "--into", str(self.folder / "followed.jsonl")]
@@ -182,13 +182,13 @@ class Plant:
             self.follower_kills += 1
 
     def weigh(self, data_h: float) -> None:
-        """Note the monitor's memory."""
+        """Record the monitor's memory."""
         assert self.process is not None  # noqa: S101  # for the type checker
         self.memory_mb.append((data_h, Process(self.process.pid).memory_mb()))
 
 
 def disturbed(plant: Plant, machine: Machine, seed: int, hours: float) -> Iterator[tuple[SampleBlock, tuple[()]]]:
-    """The same blocks as they arrive: repeated, swapped; the monitor is killed in between."""
+    """The same blocks with repetitions and swaps; the monitor is killed in between."""
     rng, newest, sent, since = plant.rng, 0.0, 0, 0
     stream = lived(machine, seed, hours)
     recent: list[SampleBlock] = []
@@ -196,9 +196,9 @@ def disturbed(plant: Plant, machine: Machine, seed: int, hours: float) -> Iterat
     for first in stream:
         pair = [first]
         if rng.random() < 0.01:
-            pair = [*islice(stream, int(rng.integers(1, 6))), first]  # overtaken by some
+            pair = [*islice(stream, int(rng.integers(1, 6))), first]  # overtaken by 1 to 5 blocks
         for block in pair:
-            # Where the computer was too busy for the session to hold, it is the next block by which a loss is noticed.
+            # After a session lost on a busy computer, only the next block reveals the loss: do not wait for ever.
             patience_s = time.monotonic() + _PATIENCE_S
             while plant.reports == since and sent >= _AHEAD and time.monotonic() < patience_s:
                 time.sleep(0.002)
@@ -230,7 +230,7 @@ def counting(plant: Plant, session: zenoh.Session, machine: Machine) -> "zenoh.S
 
 
 def live(plant: Plant, machine: Machine, seed: int, hours: float) -> None:
-    """Play the day."""
+    """Run the service over the day of data."""
     plant.start()
     with session_with(plant.endpoint) as session:
         subscriber = counting(plant, session, machine)
@@ -242,13 +242,13 @@ def live(plant: Plant, machine: Machine, seed: int, hours: float) -> None:
 
 
 def differences(expected: list[list[object]], events: list[AlarmCloudEvent]) -> list[str]:
-    """Where the log is not the offline one."""
+    """Differences between the live and the offline log, at most 20."""
     found = [f"sequence {at} is {one.data.sequence}" for at, one in enumerate(events) if one.data.sequence != at]
     last_ns = max((int(str(one[2])) for one in expected), default=0)
     logged: list[list[object]] = [
         [d.kind, d.name, d.time_ns, d.occurrence, d.severity, d.state, d.relative_change]
         for d in (one.data for one in events)
-        if d.name != STREAM_LOST or d.time_ns <= last_ns  # the silence after the end is part of no recording
+        if d.name != STREAM_LOST or d.time_ns <= last_ns  # the silence after the end is not in the offline log
     ]
     for number in range(max(len(expected), len(logged))):
         one = expected[number] if number < len(expected) else None
@@ -259,7 +259,7 @@ def differences(expected: list[list[object]], events: list[AlarmCloudEvent]) -> 
 
 
 def main() -> None:
-    """Play the day, compare, say what was seen."""
+    """Run the soak test, or one of its helper processes."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--hours", type=float, default=24.0)
     parser.add_argument("--seed", type=int, default=1)
@@ -285,7 +285,7 @@ def main() -> None:
 
 
 def soak(folder: Path, seed: int, hours: float, kills_wanted: float) -> int:
-    """Run both and compare."""
+    """Run live and offline, compare the logs, and print the result; return the exit code."""
     file, begin_s = machine_file(folder), time.monotonic()
     machine = load_machine(file)
     arguments = ["--offline", str(file), "--hours", str(hours), "--seed", str(seed)]
@@ -340,7 +340,7 @@ def soak(folder: Path, seed: int, hours: float, kills_wanted: float) -> int:
 
 
 def _tell_memory(plant: Plant, hours: float) -> None:
-    """Print the monitor's memory over the time in which it was left alone, and its slope."""
+    """Print the monitor's memory in the time without kills, and its slope."""
     calm = [(at, mb) for at, mb in plant.memory_mb if at > hours * 0.7]
     print(
         "memory of the monitor, MB, over the last third: " + "  ".join(f"{at:.1f} h {mb:.0f}" for at, mb in calm[::4])
@@ -367,7 +367,7 @@ def _windows(history: MachineStore) -> list[int]:
 
 
 def _last_window(plant: Plant, end_ns: int) -> None:
-    """Wait until the monitor has evaluated the last window; what it has not, the comparison shows."""
+    """Wait up to 60 s until the monitor has evaluated the last window; the comparison shows if it has not."""
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
         health = _health(plant.url)
@@ -377,7 +377,7 @@ def _last_window(plant: Plant, end_ns: int) -> None:
 
 
 def _followed_to_the_end(plant: Plant, expected: int) -> list[str]:
-    """Let the follower go on until it has everything, and return what it wrote down."""
+    """Wait up to 60 s until the follower has all expected events, and return the lines that it wrote."""
     path = plant.folder / "followed.jsonl"
     if plant.follower is None:
         plant.toggle_follower()

@@ -1,9 +1,9 @@
 """Ten thousand bad messages a second, of one kind after the other, and what they cost the blocks of a machine.
 
 Run: ``python benchmarks/wire_flood.py`` (about five minutes). A monitor is started on loopback, and a simulated rotor
-kit sends to it at pace 1, while another program on the same computer sends to the same keys as fast as it is told,
-without dropping anything itself. What it sends and what became of the rotor kit's blocks is printed as a table. Exit
-code 1 if one was lost.
+kit sends to it at pace 1, while another program on the same computer sends to the same keys at the given rate, without
+dropping anything itself. The messages sent and the fate of the rotor kit's blocks are printed as a table. Exit code 1
+if a good block was lost.
 """
 
 import argparse
@@ -35,7 +35,7 @@ _STEP_S = 0.01
 def _block(
     number: int, run: int, samples: float | None = None, n_samples: int = 200, rate_hz: float = 2000.0
 ) -> SampleBlock:
-    """One of any time but the present one; noise if `samples` is None."""
+    """A block with any time but the present one; noise, whose last value is `samples` if given."""
     rng = np.random.default_rng(number)
     sequence = int(rng.integers(100_000))
     values = rng.standard_normal((n_samples, len(_LAB.sensors))).astype(np.float32)
@@ -78,7 +78,7 @@ def _made(kind: str, number: int) -> Message:
 
 
 def send(endpoint: str, kind: str, rate: float, seconds: float) -> None:
-    """Send as told, and print how many messages a second it were."""
+    """Send messages of one kind at `rate` per second, and print the rate reached."""
     made = [_made(kind, number) for number in range(_MADE)]
     sender = Sender(endpoint, tokens=0)
     time.sleep(1.0)
@@ -94,7 +94,7 @@ def send(endpoint: str, kind: str, rate: float, seconds: float) -> None:
 
 
 def flood(one: Monitor, kind: str, rate: float, seconds: float) -> list[str]:
-    """Let one kind come, print a row, and return what should not be."""
+    """Send one kind of messages, print a row of the table, and return the faults found."""
     path = f"/api/v1/machines/{PLACE}/health"
     before = one.get(path).json()["quality"]
     command = [sys.executable, __file__, "--send", kind, "--rate", str(rate), "--seconds", str(seconds)]

@@ -1,19 +1,19 @@
 """A million messages that no machine sends, against a monitor that is at work.
 
 Run: ``python benchmarks/wire_fuzz.py`` (about half an hour), ``--small`` for some seconds.
-Many bad messages a second of one kind after the other are sent by ``wire_flood.py``.
+``wire_flood.py`` sends many bad messages of one kind per second instead.
 
-A monitor is started on loopback. A simulated rotor kit sends to it at pace 1, while `wire_grammar` makes blocks,
-descriptors, records, liveliness tokens and queries that are wrong in one way or another. Two further machines are there
-for what a publisher might have sent: one gets a stream with samples out of all proportion, the other one blocks that
-contradict each other. Meanwhile health and readiness are asked for. The result is printed as a table and written as
-JSON. Exit code 1, with the seed and the messages, if
+A monitor is started on loopback. A simulated rotor kit sends to it at pace 1, while `wire_grammar` generates blocks,
+descriptors, records, liveliness tokens and queries that are invalid in some way. Two further machines receive what a
+faulty publisher might send: one a stream with absurdly large samples, the other blocks that contradict each other.
+Meanwhile health and readiness are requested. The result is printed as a table and written as JSON. Exit code 1, with
+the seed and the messages, if
 
-- the monitor ended, wrote an error or more than 2 kB a second into its log, or was not ready for another reason than
-  that the third machine's blocks make no window;
-- the rotor kit lost a block or a window, or anything but the conflict, which is there, was said of it;
-- the monitor's memory grew by more than 50 MB, or what it says of a machine is longer than 100 kB;
-- it does not stop with exit code 0.
+- the monitor ended, logged an error or more than 2 kB per second, or was not ready for another reason than that the
+  third machine's blocks fill no window;
+- the rotor kit lost a block or a window, or had an alarm other than the expected data conflict;
+- the monitor's memory grew by more than 50 MB, or the health of a machine is longer than 100 kB;
+- the monitor does not stop with exit code 0.
 """
 
 import argparse
@@ -45,13 +45,13 @@ _AT_ONCE = 500
 _GROWTH_MB, _HEALTH_BYTES, _LOG_BYTES_PER_S = 50.0, 100_000, 2_000.0
 _ERRORS = re.compile(r"Traceback|\[(error|critical)|panicked|Exception|something was lost", re.IGNORECASE)
 _ON_THE_WAY = 10
-"""Blocks of the last second, which a publisher that is stopped may take with it; there are no gaps before them."""
-_WARM_MINUTES = 4  # until windows are full and evaluated, caches too
+"""Blocks of the last second, which may be lost when the publisher is stopped; there must be no gaps before them."""
+_WARM_MINUTES = 4  # until windows are full and evaluated, and caches filled
 
 
 @dataclass(slots=True)
 class Outcome:
-    """What became of a run."""
+    """Result of a run."""
 
     seed: int
     messages: int = 0
@@ -72,7 +72,7 @@ class Outcome:
 
 
 class Sender:
-    """Does on the network what messages say; the latest tokens stay."""
+    """Sends generated messages on the network; keeps the latest liveliness tokens declared."""
 
     def __init__(self, endpoint: str, tokens: int = 8) -> None:
         self._link = Link(LinkSettings(connect=(endpoint,)))
@@ -82,7 +82,7 @@ class Sender:
         self.answers = self.unsendable = 0
 
     def send(self, one: Message) -> None:
-        """Send one, waiting only where the network is full."""
+        """Send a message, waiting only while the network is congested."""
         wait = zenoh.CongestionControl.BLOCK
         try:
             if one.act == "put":
@@ -98,19 +98,19 @@ class Sender:
             else:
                 selector = f"{one.key}?{one.encoding}" if one.encoding else one.key
                 self.session.get(selector, self._answered, payload=one.payload, timeout=1.0, congestion_control=wait)
-        except (zenoh.ZError, ValueError, UnicodeError):  # not to be sent by this library, at least
+        except (zenoh.ZError, ValueError, UnicodeError):  # the library refuses to send it
             self.unsendable += 1
 
     def _answered(self, _: zenoh.Reply) -> None:
         self.answers += 1
 
     def close(self) -> None:
-        """Leave."""
+        """Close the session."""
         self._link.close()
 
 
 class Watch:
-    """Looks at the monitor, and says what should not be."""
+    """Checks the monitor for faults."""
 
     def __init__(self, one: Monitor, outcome: Outcome) -> None:
         self._monitor, self._outcome = one, outcome
@@ -118,7 +118,7 @@ class Watch:
         self._begin_s = time.monotonic()
 
     def look(self) -> list[str]:
-        """Look once more."""
+        """Check the monitor, and return the faults found since the last check."""
         one, outcome = self._monitor, self._outcome
         if one.process.poll() is not None:
             return [f"the monitor ended with {one.process.returncode}"]
@@ -143,7 +143,7 @@ class Watch:
         return faults
 
     def _weigh(self) -> None:
-        """Note the monitor's own memory once a minute, and how much more it is than at the end of the warm-up."""
+        """Record the monitor's private memory once a minute, and its growth since the warm-up."""
         now_s = time.monotonic() - self._begin_s
         if now_s < 60.0 * len(self._outcome.memory_mb):
             return
@@ -158,7 +158,7 @@ class Watch:
         return why.startswith(f"{_THIRD}: ") and "no window was evaluated" in why
 
     def finish(self) -> list[str]:
-        """Wait until all is evaluated, end the publisher and the monitor, and look at what they say."""
+        """Stop the publisher, wait until everything is evaluated, stop the monitor, and return the faults found."""
         one, outcome = self._monitor, self._outcome
         one.publisher.send_signal(signal.SIGINT)
         one.publisher.wait(60)
@@ -179,7 +179,7 @@ class Watch:
                 "refused": found["refused_blocks"],
                 "dropped": found["queue_dropped_blocks"],
             }
-        expected = outcome.accepted // 50 - 1  # windows: a block is 0.1 s, a hop 5 s, but not from the first block on
+        expected = outcome.accepted // 50 - 1  # windows: a block is 0.1 s, a hop 5 s; the first hop may start later
         alarms = {alarm["name"] for alarm in health["alarms"]} - {"data-conflict"}
         faults = {
             f"{outcome.accepted} of {outcome.published} blocks accepted": not 0
@@ -199,7 +199,7 @@ class Watch:
 
 
 def metric(one: Monitor, name: str, place: str) -> float:
-    """One of the monitor's metrics of a machine."""
+    """Value of one of the monitor's metrics for a machine."""
     site, _, machine = place.partition("/")
     found = re.search(
         rf'^rotorwatch_{name}{{machine="{machine}",site="{site}"}} (\S+)$', one.get("/metrics").text, re.MULTILINE
@@ -210,7 +210,7 @@ def metric(one: Monitor, name: str, place: str) -> float:
 def messages(
     outcome: Outcome, grammar: Grammar, first: int, count: int, sender: Sender, watch: Watch, folder: Path
 ) -> None:
-    """Send them, some hundred at a time, and look in between; stop at the first fault."""
+    """Send the messages, `_AT_ONCE` at a time, checking the monitor in between; stop at the first fault."""
     kinds: Counter[str] = Counter()
     begin_s = time.monotonic()
     with Progress(console=Console(stderr=True)) as progress:
@@ -234,12 +234,12 @@ def messages(
 
 
 def shown(one: Message) -> dict[str, Any]:
-    """A message as JSON."""
+    """A message as a JSON object, bytes as Base64."""
     return {key: base64.b64encode(x).decode() if isinstance(x, bytes) else x for key, x in asdict(one).items()}
 
 
 def table(outcome: Outcome) -> str:
-    """The result for people."""
+    """The result as a Markdown table."""
     rows = {
         "messages": f"{outcome.messages} in {outcome.elapsed_s:.0f} s (seed {outcome.seed})",
         "of kinds": ", ".join(f"{count} {kind}" for kind, count in outcome.kinds.items()),

@@ -1,14 +1,14 @@
-"""Messages for a monitor, made from valid ones by rules: the same number and seed give the same message.
+"""Generates messages for a monitor from valid ones by rules; the same number and seed give the same message.
 
 ::
 
     message -> block | descriptor | record | token | query | deletion | odd key
-    block   -> raw | Arrow, of which fields, samples, metadata, types or bytes are not as they should be
+    block   -> raw | Arrow, with invalid fields, samples, metadata, types or bytes
 
-Three machines are there. The first one has a publisher of its own, so blocks that it might have sent do not go there:
-two publishers on one key are a conflict, which the monitor states. They go to the third one. The second one gets a
-stream that is in order, but of which the samples are out of all proportion now and then, so that such windows
-are evaluated, too. Everything that cannot be a block goes to any of them.
+There are three machines. The first has its own publisher, so blocks that the monitor might accept are not sent to it:
+two publishers on one key would be a conflict, which the monitor reports. They are sent to the third. The second gets a
+consistent stream with absurdly large or small samples at times, so that such windows are evaluated too. Messages that
+cannot be a block are sent to any machine.
 """
 
 import json
@@ -31,12 +31,12 @@ from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health
 
-GOOD_RUN = 7  # of the first machine's own publisher
+GOOD_RUN = 7  # run number of the first machine's own publisher
 
 _START_NS = 1_767_225_600_000_000_000
 _STRETCH = 2000
 _BLOCK_S = 0.5
-_EVERY = 20  # each so many-th message is the next block of the second machine
+_EVERY = 20  # every 20th message is the next block of the second machine
 
 _BOUNDS = (7, 8, 15, 16, 31, 32, 53, 63, 64)
 WHOLE = [0, 1, -1, *(sign * 2**bits + off for bits in _BOUNDS for sign in (1, -1) for off in (-1, 0, 1)), 10**30]
@@ -62,7 +62,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """What is to be done on the network, on the key: publish, delete, declare a liveliness token, or ask."""
+    """An action on a Zenoh key: publish, delete, declare a liveliness token, or query."""
 
     number: int
     kind: str  # the rule that made it
@@ -70,11 +70,11 @@ class Message:
     key: str
     payload: bytes = b""
     attachment: bytes = b""
-    encoding: str = ""  # of a question its parameters
+    encoding: str = ""  # the parameters, if it is a query
 
 
 class Grammar:
-    """Makes messages for three machines, all with the channels and the rate of the first."""
+    """Generates messages for three machines, all with the channels and the rate of the first."""
 
     def __init__(self, seed: int, first: Machine, second: Machine, third: Machine) -> None:
         self._seed = seed
@@ -98,7 +98,7 @@ class Grammar:
         ]
 
     def message(self, number: int) -> Message:
-        """Make the message of a number."""
+        """Generate the message with a given number."""
         dice = _Dice(np.random.default_rng([self._seed, number]))
         if number % _EVERY == 0:
             return self._next_block(dice, number)
@@ -114,7 +114,7 @@ class Grammar:
         return samples
 
     def _next_block(self, dice: "_Dice", number: int) -> Message:
-        """A block that continues the second machine's stream; its numbers are finite, and that is all."""
+        """A block that continues the second machine's stream, with finite but possibly absurd samples."""
         sequence = number // _EVERY
         n_samples = round(_BLOCK_S * self._second.rate_hz)
         samples = self._samples(dice, n_samples)
@@ -146,7 +146,7 @@ class Grammar:
         return fields, samples
 
     def _spoil(self, dice: "_Dice", fields: dict[str, Any], samples: np.ndarray) -> np.ndarray:
-        """Change fields and samples."""
+        """Change some fields in place, and return the samples, possibly changed."""
         for _ in range(dice.one([0, 1, 1, 2, 3])):
             field = dice.one(_FIELDS)
             fields[field] = dice.one(REAL) if field == "rate_hz" else dice.one([*WHOLE, fields[field] + 1, 1000])
@@ -202,7 +202,7 @@ class Grammar:
     def _block(
         self, dice: "_Dice", number: int, kind: str, payload: bytes, attachment: bytes, encoding: str
     ) -> Message:
-        """To the third machine what might be a block, to any what cannot be one."""
+        """A message to the third machine if it might be accepted as a block, else to any machine."""
         streams = [machine.keys.stream for machine in self._machines]
         key = streams[-1]
         if not self._might_be_used(payload, attachment, encoding):
@@ -216,7 +216,7 @@ class Grammar:
             return False
         return self._gate.form(block) is None
 
-    # What travels beside them
+    # Other messages
 
     def _machine(self, dice: "_Dice") -> Machine:
         return dice.one(self._machines)
@@ -227,7 +227,7 @@ class Grammar:
         return Message(number, "descriptor", "put", key, payload, encoding="application/json")
 
     def _record(self, dice: "_Dice", number: int) -> Message:
-        """Something that only a monitor, or the simulator, publishes."""
+        """A record that only a monitor or the simulator should publish."""
         keys = self._machine(dice).keys
         key = dice.one([keys.alarm_event, keys.alarm_event, keys.alarm_state, keys.health, keys.report, keys.truth])
         record = self._alarms.get(key.rpartition("/")[2], self._health)
@@ -241,7 +241,7 @@ class Grammar:
 
     @staticmethod
     def _advanced(dice: "_Dice", key: str) -> str:
-        """A key on which Zenoh's own publishers announce themselves and their latest number."""
+        """A key on which Zenoh's advanced publishers announce themselves and their latest sequence number."""
         zid = dice.one(["0", "*", "zz", "f" * 32, "f" * 33, dice.some(dice.one([1, 8, 16])).hex().lstrip("0") or "1"])
         eid = dice.one(["0", "1", "uhlc", "4294967295", "4294967296", "-1", "x", str(dice.below(100))])
         return f"{key}/@adv/{dice.one(['pub', 'sub'])}/{zid}/{eid}/{dice.one(['_', 'x/y'])}"
@@ -261,7 +261,7 @@ class Grammar:
         return Message(number, "deletion", "delete", dice.one(some), attachment=dice.some(dice.one([0, 32])))
 
     def _odd_key(self, dice: "_Dice", number: int) -> Message:
-        """No blocks: a number that a publisher is said to have reached, or anything where nobody expects it."""
+        """A forged sequence number of a publisher (heartbeat), or random bytes on an unexpected key."""
         keys = self._machine(dice).keys
         if dice.chance(0.5):
             payload = dice.one([b"", b"\xff" * 9, struct.pack("<I", dice.one(WHOLE) % 2**32), dice.some(4)])
@@ -274,7 +274,7 @@ class Grammar:
 
 
 class _Dice:
-    """Draws."""
+    """Random choices."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -292,7 +292,7 @@ class _Dice:
         return self._rng.bytes(count)
 
     def damaged(self, whole: bytes) -> bytes:
-        """Bytes that are cut, lengthened, repeated or changed; those at the beginning more often."""
+        """Cut, lengthen, repeat or change bytes, more often near the beginning."""
         at = self.below(min(len(whole), 700) if self.chance(0.7) else len(whole)) if whole else 0
         how = self.below(6)
         if how == 0:
@@ -312,7 +312,7 @@ class _Dice:
         return bytes(changed)
 
     def spoilt_json(self, value: Any) -> bytes:
-        """JSON with a few things replaced, left out, or as no JSON should be."""
+        """JSON with some values replaced or removed, sometimes malformed or in another encoding."""
         value = json.loads(json.dumps(value))
         for _ in range(self.one([0, 1, 1, 2, 4])):
             value = self._replaced(value)
@@ -325,7 +325,7 @@ class _Dice:
         return text.encode(encoding, "surrogatepass")
 
     def _replaced(self, value: Any) -> Any:
-        """A tree in which one thing, somewhere, is another one."""
+        """A copy of a tree with one node replaced, removed or renamed."""
         inside = list(value) if isinstance(value, dict) else list(range(len(value))) if isinstance(value, list) else []
         if inside and self.chance(0.8):
             at = self.one(inside)
@@ -345,7 +345,7 @@ class _Dice:
 
 
 def arrow_stream(dice: _Dice, samples: np.ndarray, metadata: list[tuple[str, str]]) -> bytes:
-    """An Arrow stream: in half of all cases with one fixed-size list, as it should be."""
+    """An Arrow stream; in half of all cases valid, with one column of fixed-size lists."""
     flat, width = pa.array(np.ascontiguousarray(samples).reshape(-1)), samples.shape[1]
     empty = pa.nulls(len(samples), pa.list_(flat.type, 0))
     column: Any = pa.FixedSizeListArray.from_arrays(flat, width) if width else empty
