@@ -6,7 +6,7 @@ import { UNSEEN } from "./monitor/states.js";
 import "./plant/plant-view.js";
 import "./sign-in.js";
 
-/** Views by the first part of the address after `#/`; what is not needed for the plant is loaded when it is asked for. @type {Record<string, [string, () => Promise<unknown>]>} */
+/** Views by the first part of the address after `#/`; those other than the plant are loaded on demand. @type {Record<string, [string, () => Promise<unknown>]>} */
 const VIEWS = {
   machines: ["machine-view", () => import("./machine/machine-view.js")],
   alarms: ["alarms-view", () => import("./alarms/alarms-view.js")],
@@ -16,7 +16,7 @@ const VIEWS = {
   administration: ["administration-view", () => import("./administration/administration-view.js")],
 };
 
-/** The page: what is always there, and the view that the address names. */
+/** The page: its permanent parts, and the view named in the address. */
 class RotorwatchPage extends HTMLElement {
   #banner = html("p", { class: "banner", role: "alert", hidden: true });
   #alarms = html("a", { href: "#/alarms" }, "Alarms");
@@ -52,7 +52,7 @@ class RotorwatchPage extends HTMLElement {
     if (!this.#main.firstChild) this.#main.append(html("p", { class: "note" }, "Loading …"));
     try {
       await load();
-      if (location.hash !== asked) return; // gone on meanwhile
+      if (location.hash !== asked) return; // the user has navigated on meanwhile
     } catch {
       this.#main.replaceChildren(html("p", {}, monitor.unloaded));
       return;
@@ -68,7 +68,7 @@ class RotorwatchPage extends HTMLElement {
     if (moved) this.#main.focus();
   }
 
-  /** Whoever looks has changed: what was shown was for another one's eyes. */
+  /** The caller has changed: remove what was shown to the previous one. */
   #caller() {
     this.#who.textContent = monitor.caller?.name ?? "";
     this.#leave.hidden = !monitor.caller || monitor.caller.name === "anonymous";
@@ -93,7 +93,7 @@ class RotorwatchPage extends HTMLElement {
     this.#go(false);
   }
 
-  /** How many alarms stand, in the title and beside the link. */
+  /** Show the number of standing alarms in the title and beside the link. */
   #count() {
     const all = standing();
     const unseen = all.filter(({ alarm }) => UNSEEN.has(alarm.state)).length;

@@ -8,7 +8,7 @@ import "./settings-list.js";
 import "./token-list.js";
 import "./webhook-list.js";
 
-/** The service itself, for whoever may configure it: who may use it, who did, and whether it keeps up. */
+/** The service itself, for callers with the scope configure: tokens, audit log, load, settings. */
 class AdministrationView extends LiveElement {
   connectedCallback() {
     super.connectedCallback();

@@ -7,14 +7,14 @@ const [PAGE, REFRESH_S] = [50, 15];
 
 /** @typedef {import("../monitor/records.d.ts").AuditRecord} AuditRecord */
 
-/** What came of a request, in words. @param {AuditRecord} one */
+/** Outcome of a request, in words. @param {AuditRecord} one */
 function outcome(one) {
   if (one.status === 0) return "outcome not known";
   const word = one.status < 300 ? "done" : [401, 403, 429].includes(one.status) ? "refused" : "failed";
   return `${word} (${one.status})`;
 }
 
-/** Who asked for what and what came of it, newest first; a deed and its announcement are one line. */
+/** The audit log, newest first; the start of an action and its outcome are shown as one line. */
 class AuditLog extends LiveElement {
   /** @type {AuditRecord[]} */
   #entries = [];
@@ -35,7 +35,7 @@ class AuditLog extends LiveElement {
     const found = await monitor.ask(`${API}/audit?limit=${PAGE}`);
     const known = this.#entries[0]?.number ?? -1;
     const newer = found.entries.filter((/** @type {AuditRecord} */ one) => one.number > known);
-    if (newer.length === PAGE || known < 0) [this.#entries, this.#before] = [newer, found.next_before]; // others may be in between
+    if (newer.length === PAGE || known < 0) [this.#entries, this.#before] = [newer, found.next_before]; // there may be further entries in between
     else this.#entries.unshift(...newer);
     if (newer.length || known < 0) this.#show();
     this.#message.textContent = "";

@@ -7,7 +7,7 @@ const REFRESH_S = 60;
 
 /** @typedef {import("../monitor/records.d.ts").HistoryStatus} HistoryStatus */
 
-/** How large the history is, how far back it goes, and for how long things are kept. */
+/** Size, time span and retention of the history. */
 class HistoryStatusTable extends LiveElement {
   connectedCallback() {
     super.connectedCallback();

@@ -8,9 +8,9 @@ const REFRESH_S = 10;
 
 /** @typedef {import("../monitor/records.d.ts").Readiness} Readiness */
 
-/** Whether the service can do its work, and how each machine's monitor keeps up. */
+/** Readiness of the service, and the load of each machine's monitor. */
 class ServiceLoad extends LiveElement {
-  /** Machines of which nothing had been heard when they were shown. @type {Set<string>} */
+  /** Machines whose health had not arrived when they were shown. @type {Set<string>} */
   #unheard = new Set();
 
   connectedCallback() {
@@ -24,7 +24,7 @@ class ServiceLoad extends LiveElement {
       this.#show(await monitor.ask("/readyz"));
     } catch (error) {
       if (!(error instanceof Refused) || !error.body.machines) throw error;
-      this.#show(error.body); // not ready, and says why
+      this.#show(error.body); // not ready; the body states the reasons
     }
   }
 

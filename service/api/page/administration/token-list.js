@@ -9,7 +9,7 @@ const SCOPES = /** @type {[string, string][]} */ ([["read", "look"], ["operate",
 
 /** @typedef {import("../monitor/records.d.ts").TokenEntry} TokenEntry */
 
-/** Who may use the service: tokens, a form for a new one, and the end of each. */
+/** Tokens of the service, with a form to create one, and a button to revoke each. */
 class TokenTable extends LiveElement {
   #open = html("p", { hidden: true }, "The API is open on this computer: anyone who can log in here may do everything, without a token. Tokens can already be created for later.");
   #message = html("p", { class: "message", role: "status" });
@@ -88,7 +88,7 @@ class TokenTable extends LiveElement {
     }
   }
 
-  /** The text of a new token, until whoever made it says it is safe. @param {TokenEntry} token @param {string} text */
+  /** Show the text of a new token until its creator confirms that it is stored safely. @param {TokenEntry} token @param {string} text */
   #show(token, text) {
     const shown = /** @type {HTMLInputElement} */ (html("input", { readonly: true, value: text, "aria-label": "New token", class: "number", spellcheck: "false" }));
     const hide = () => {

@@ -7,7 +7,7 @@ const REFRESH_S = 15;
 
 /** @typedef {import("../monitor/records.d.ts").WebhookStatus} WebhookStatus */
 
-/** Programs that are told of alarms, when they last took an event, and what went wrong last. */
+/** Webhooks, with the last event that each accepted, and its last error. */
 class WebhookTable extends LiveElement {
   connectedCallback() {
     super.connectedCallback();

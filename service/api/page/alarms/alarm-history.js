@@ -10,7 +10,7 @@ const PAGE = 50;
 
 /** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
 
-/** What happened to the alarms of a machine, newest first. */
+/** Alarm events of a machine, newest first. */
 class AlarmHistory extends MachineElement {
   /** @type {AlarmEvent[]} */
   #events = [];

@@ -9,7 +9,7 @@ import "../elements/state-mark.js";
 /** @typedef {import("../monitor/records.d.ts").Alarm} Alarm */
 /** @typedef {{place: string, alarm: Alarm}} Placed */
 
-/** Why it is silenced, or how large the change is, or what the note says. @param {Alarm} alarm */
+/** Reason why an alarm is silenced, else the size of its change, else its note. @param {Alarm} alarm */
 function known(alarm) {
   const { shelf, interval_95: range, relative_change: change } = alarm;
   if (shelf) return `shelved by ${shelf.by} until ${clock(shelf.until_ns)}${shelf.one_shot ? " or until it clears" : ""}: ${shelf.reason}`;
@@ -22,10 +22,10 @@ function known(alarm) {
 /** @param {Placed} one */
 const keyOf = ({ place, alarm }) => `${place} ${alarm.name}`;
 
-/** When its condition began. @param {Alarm} alarm */
+/** Start of the alarm's condition. @param {Alarm} alarm */
 const came = (alarm) => alarm.raised_ns ?? alarm.since_ns;
 
-/** What can be done to an alarm as it is: the order, the button, and the scope that takes. @param {Alarm} alarm @returns {[string, string, string, boolean][]} */
+/** Actions that an alarm's state allows: order, label of the button, and required scope. @param {Alarm} alarm @returns {[string, string, string, boolean][]} */
 function operations(alarm) {
   const silenced = ["shelved", "out-of-service"].includes(alarm.state);
   /** @type {[string, string, string, boolean][]} */
@@ -40,7 +40,7 @@ function operations(alarm) {
   return all.filter(([, , scope, possible]) => possible && monitor.may(scope));
 }
 
-/** Alarms that are not normal, with what can be done to them: of all machines, of one `place="site/machine"`, or one `alarm="k_by"` of that. */
+/** Alarms that are not normal, with buttons for actions: of all machines, of one `place="site/machine"`, or one `alarm="k_by"` of it. */
 class AlarmList extends HTMLElement {
   #gone = new AbortController();
   #said = "";
@@ -48,7 +48,7 @@ class AlarmList extends HTMLElement {
   #rows = html("div");
   #order = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Order", change: () => this.#show() }, html("option", { value: "" }, "most urgent first"), html("option", { value: "first-out" }, "first out: in order of occurrence")));
   #together = html("div", { class: "tools" });
-  /** @type {Set<string>} alarms that something is to be done to together */
+  /** @type {Set<string>} alarms selected for a common action */
   #chosen = new Set();
 
   connectedCallback() {
@@ -75,7 +75,7 @@ class AlarmList extends HTMLElement {
       .sort((one, other) => (this.#order.value ? came(one.alarm) - came(other.alarm) : byUrgency(one.alarm, other.alarm)));
   }
 
-  /** Only if something has changed: whoever is about to press a button shall not miss it. */
+  /** Redraw only if something has changed, so that buttons do not move under the pointer. */
   #show() {
     const all = this.#alarms();
     const said = JSON.stringify([all.map(({ place, alarm }) => [place, { ...alarm, evidence: null }]), monitor.caller?.scopes, this.#order.value, [...this.#chosen]]);
@@ -87,7 +87,7 @@ class AlarmList extends HTMLElement {
     renew(this.#rows, rows.length ? table(heads, rows, this.hasAttribute("alarm") ? "Now" : "Alarms that are not normal") : html("p", { class: "note" }, this.hasAttribute("alarm") ? "The alarm is normal now." : "No alarm is raised or waiting to be acknowledged."));
   }
 
-  /** What can be done to those that are chosen. @param {Placed[]} all */
+  /** Actions on the selected alarms. @param {Placed[]} all */
   #offer(all) {
     const chosen = all.filter((one) => this.#chosen.has(keyOf(one)));
     const orders = new Map(chosen.flatMap(({ alarm }) => operations(alarm).map(([kind, text]) => [kind, text])));
@@ -129,7 +129,7 @@ class AlarmList extends HTMLElement {
     };
   }
 
-  /** One after the other, each only if it still is as it is shown. @param {Placed[]} all @param {string} kind */
+  /** Apply an action to alarms one after the other, each only if it has not changed since it was shown. @param {Placed[]} all @param {string} kind */
   async #operate(all, kind) {
     const order = await ordered(kind, all.map(({ place, alarm }) => `${place}: ${alarm.text}`).join("; "));
     if (!order) return;

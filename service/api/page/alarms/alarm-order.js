@@ -4,10 +4,10 @@ const TITLES = /** @type {Record<string, string>} */ ({ shelve: "Shelve", "remov
 const HOURS = [1, 4, 8];
 
 /**
- * What is to be said with an order; asks for a reason where one is needed.
+ * Body of an order; asks the operator for a reason if the order requires one.
  * @param {string} kind
  * @param {string} about
- * @returns {Promise<Record<string, unknown> | null>} null if the operator has thought better of it
+ * @returns {Promise<Record<string, unknown> | null>} null if the operator cancels
  */
 export function ordered(kind, about) {
   if (!(kind in TITLES)) return Promise.resolve({});

@@ -7,7 +7,7 @@ import "../elements/state-mark.js";
 
 const SHOWN = 5;
 
-/** Every standing alarm of every machine. */
+/** All standing alarms of all machines. */
 export function standing() {
   return [...monitor.machines]
     .flatMap(([place, { health }]) => health.alarms.filter(stands).map((alarm) => ({ place, alarm })))

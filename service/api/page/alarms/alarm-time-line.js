@@ -7,7 +7,7 @@ const [BEGINS, ENDS] = [new Set(["raised", "escalated"]), new Set(["cleared", "r
 /** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
 /** @typedef {{from: number, to: number, severity: string, text: string}} Spell */
 
-/** When an alarm was raised and when it cleared, out of its events, oldest first. @param {AlarmEvent[]} events @param {number} end @returns {Spell[]} */
+/** Times during which an alarm was raised, from its events, oldest first. @param {AlarmEvent[]} events @param {number} end @returns {Spell[]} */
 function spells(events, end) {
   /** @type {Spell[]} */
   const found = [];
@@ -23,7 +23,7 @@ function spells(events, end) {
   return found;
 }
 
-/** How long each alarm stood, one below the other on a line of time. @param {AlarmEvent[]} events newest first @param {number} now @returns {HTMLElement | null} */
+/** Time line with one row per alarm, which shows when it was raised. @param {AlarmEvent[]} events newest first @param {number} now @returns {HTMLElement | null} */
 export function timeLine(events, now) {
   if (!events.length) return null;
   const [first, end] = [events[events.length - 1].time_ns, Math.max(now, events[0].time_ns)];

@@ -24,12 +24,12 @@ class AlarmsView extends HTMLElement {
     this.#gone.abort();
   }
 
-  /** Every machine that has been heard of, the one with the most urgent alarm chosen first. */
+  /** Offer all known machines; initially, the one with the most urgent alarm is selected. */
   #offer() {
     this.#rights.textContent = !monitor.connected || monitor.may("operate") ? "" : "You have read access only: acknowledging and shelving need the scope operate.";
     const places = [...monitor.machines.keys()].sort();
     if ([...this.#choice.options].map((one) => one.value).join() === places.join()) return;
-    const chosen = this.#chosen || standing()[0]?.place; // machines are heard of one after the other
+    const chosen = this.#chosen || standing()[0]?.place; // machines become known one after the other
     this.#choice.replaceChildren(...places.map((place) => html("option", { value: place, selected: place === chosen }, place)));
     if (this.#history.firstElementChild?.getAttribute("place") !== this.#choice.value) this.#show();
   }

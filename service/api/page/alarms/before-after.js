@@ -14,7 +14,7 @@ const HEIGHT = 270;
 const AFTER = { label: "after", colour: "estimated", width: 2 };
 const BEFORE = { label: "before", colour: "nominal", dash: [6, 4], width: 1.5 };
 
-/** How far two correlation functions are apart, in standard errors (rms over the lags); null where that cannot be said. @param {Pair | undefined} was @param {Pair} now */
+/** Difference of two correlation functions in standard errors (rms over the lags); null if it cannot be computed. @param {Pair | undefined} was @param {Pair} now */
 function apart(was, now) {
   if (!was || was.measured.length !== now.measured.length) return null;
   const squares = now.measured.flatMap((value, at) => {
@@ -32,7 +32,7 @@ class BeforeAfter extends HTMLElement {
   #pair = choiceOf("Pair of the correlation function", () => this.#correlation());
   #said = html("small", { class: "number" });
   #correlations = /** @type {any} */ (html("line-chart", { role: "img" }));
-  /** What is chosen, on paper. */
+  /** The selected pair as text, for print. */
   #printed = [html("span", { class: "printed" }), html("span", { class: "printed" })];
   /** @type {Picture | null} */
   #before = null;
@@ -48,7 +48,7 @@ class BeforeAfter extends HTMLElement {
     offered(this.#channel, channels);
     offered(this.#pair, pairs.map((one, at) => [String(at), pairName(one)]));
     const distances = pairs.map((one) => apart(this.#was(one), one) ?? -1);
-    this.#pair.value = String(Math.max(0, distances.indexOf(Math.max(...distances)))); // the one that has changed most
+    this.#pair.value = String(Math.max(0, distances.indexOf(Math.max(...distances)))); // the pair that has changed most
     const missing = [!orbits.length && after.orbits.reason, !channels.length && after.spectra.reason, after.correlations ? after.correlations.reason : "Correlation functions were not kept with this alarm, which is from an earlier version."];
     lay(
       this,
@@ -71,7 +71,7 @@ class BeforeAfter extends HTMLElement {
     this.#correlation();
   }
 
-  /** The same pair of before. @param {Pair} pair */
+  /** The same pair in the window before. @param {Pair} pair */
   #was(pair) {
     return this.#before?.correlations?.pairs.find((one) => one.first === pair.first && one.second === pair.second);
   }

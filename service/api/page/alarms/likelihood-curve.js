@@ -3,9 +3,9 @@ import "../elements/line-chart.js";
 
 /** @typedef {import("../monitor/records.d.ts").Parameter} Parameter */
 
-const [REACH, POINTS] = [4.5, 60]; // standard errors to either side, points there
+const [REACH, POINTS] = [4.5, 60]; // range on either side in standard errors, number of points
 
-/** How likely each value of a parameter is by one reading, 1 at the likeliest: a normal curve, which is what an interval states. @param {Parameter | undefined} read @param {number[]} at */
+/** Likelihood of values of a parameter given one reading, 1 at the maximum: a normal curve, as assumed by the interval. @param {Parameter | undefined} read @param {number[]} at */
 function likelihood(read, at) {
   return at.map((value) => {
     if (!read) return null;

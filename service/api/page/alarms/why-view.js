@@ -15,17 +15,17 @@ import "../elements/state-mark.js";
 
 const MEASURES = /** @type {(keyof ChannelLevels)[]} */ (["overall", "velocity", "x1", "x2", "crest", "kurtosis"]);
 
-/** What a report reads of a parameter: since a change within its window, or over all of it. @param {Report} report @param {string} name @returns {Parameter | undefined} */
+/** Reading of a parameter in a report: since a change within its window, or over the whole window. @param {Report} report @param {string} name @returns {Parameter | undefined} */
 function reading(report, name) {
   const since = report.verdict?.settled ? undefined : report.verdict?.current.find((one) => one.name === name);
   const found = since ?? report.parameters.find((one) => one.name === name);
   return found && found.relative_change !== null && found.standard_error !== null ? found : undefined;
 }
 
-/** A probability without pretending more than it can say. @param {number} value */
+/** Format a probability without false precision. @param {number} value */
 const probability = (value) => (value > 0.999 ? "> 99.9 %" : value < 0.001 ? "< 0.1 %" : `${(100 * value).toFixed(1)} %`);
 
-/** What one alarm rests on: `place` is site/machine/alarm, and which occurrence of it if not the latest. */
+/** The evidence of one alarm: `place` is site/machine/alarm, and the occurrence if not the latest. */
 class WhyView extends HTMLElement {
   connectedCallback() {
     const [site, machine, name, occurrence] = (this.getAttribute("place") ?? "").split("/");
@@ -91,7 +91,7 @@ class WhyView extends HTMLElement {
     return made;
   }
 
-  /** What else was considered, and how much less it explains. @param {Report} report */
+  /** Alternative sets of changed parameters, and how much less they explain the data. @param {Report} report */
   #weighed(report) {
     const weighed = report.verdict?.alternatives ?? [];
     if (!weighed.length) return [];

@@ -1,4 +1,4 @@
-/** A machine of which nothing is known but its sensors: where they are, and what they measure. */
+/** Picture of a machine of which only the sensors are known: their locations and quantities. */
 
 import { quantity } from "../monitor/figures.js";
 import { svg } from "../elements/markup.js";
@@ -11,7 +11,7 @@ import { MARKS } from "./rotor-parts.js";
 
 const [WIDTH, LINE, SHAFT] = [360, 19, 22];
 
-/** The level of a channel that has a limit, else its overall level. @param {Sensor} sensor @param {Health} health */
+/** The level of a channel that has a limit, else the overall level. @param {Sensor} sensor @param {Health} health */
 function level(sensor, health) {
   const found = health.report?.levels.find((one) => one.channel === sensor.name);
   if (!found) return "no level yet";

@@ -5,7 +5,7 @@ import { parameterReadings } from "../machine/parameter-readings.js";
 import { plainPicture } from "./plain-picture.js";
 import { rotorPicture } from "./rotor-picture.js";
 
-/** The machine as its file describes it, with what is read of each part at that part; only what is abnormal has a colour. */
+/** Drawing of the machine from its file, with the readings of each part beside it; only abnormal parts are coloured. */
 class RotorDrawing extends MachineElement {
   needsFile = true;
   #why = "";

@@ -1,4 +1,4 @@
-/** Parts of the drawing of a rotor, each where it physically is: y to the right, z up. */
+/** Parts of the drawing of a rotor, at their physical positions: y to the right, z up. */
 
 import { percent, within, Z95 } from "../monitor/figures.js";
 import { svg } from "../elements/markup.js";
@@ -24,7 +24,7 @@ function lines(lines, x, y, anchor) {
   return lines.map(({ text, kind }, at) => svg("text", { x, y: y + at * LINE, "text-anchor": anchor, class: kind }, text));
 }
 
-/** What is read of a parameter, and in brackets the smallest loss and gain that would be seen. @param {Reading | undefined} reading @param {string} name */
+/** Reading of a parameter, and in brackets the minimum detectable loss and gain. @param {Reading | undefined} reading @param {string} name */
 function said(reading, name) {
   if (!reading) return [{ text: name, kind: "name" }];
   const { severity, read, why, seen, parameter } = reading;
@@ -35,7 +35,7 @@ function said(reading, name) {
 }
 
 /**
- * A parameter: its part of the machine and what is read of it, in the colour of its alarm.
+ * A parameter: its part of the machine and its reading, in the colour of its alarm.
  * @param {Reading | undefined} reading
  * @param {string} name
  * @param {{x: number, y: number, anchor: string}} at
@@ -59,19 +59,19 @@ export function damper(x, y, length, turned = 0) {
   return svg("path", { d: `M0 0H${from}M${to} -7H${from}V7H${to}M${middle} -5V5M${middle} 0H${length}`, transform: `translate(${x} ${y}) rotate(${turned})` });
 }
 
-/** An arrow out of a middle. @param {number} x @param {number} y @param {number} length @param {number} angle_deg from y towards z @param {string} kind */
+/** An arrow from a centre. @param {number} x @param {number} y @param {number} length @param {number} angle_deg from y towards z @param {string} kind */
 export function arrow(x, y, length, angle_deg, kind) {
   return svg("path", { d: `M0 0H${length}M${length - 7} -4 L${length} 0 L${length - 7} 4`, transform: `translate(${x} ${y}) rotate(${-angle_deg})`, class: kind });
 }
 
-/** Which way the shaft turns, round a middle. @param {number} x @param {number} y @param {number} radius @param {number} direction */
+/** An arc around a centre in the sense of rotation. @param {number} x @param {number} y @param {number} radius @param {number} direction */
 export function rotation(x, y, radius, direction) {
   const end = radius * Math.SQRT1_2;
   return svg("path", { d: `M${end} ${-end} A${radius} ${radius} 0 0 0 ${-end} ${-end}M${-end + 8} ${-end - 4} L${-end} ${-end} L${-end + 2} ${-end - 9}`, transform: `translate(${x} ${y}) scale(${direction} 1)`, class: "thin" });
 }
 
 /**
- * Sensors round a place, those that look the same way together, each by its name.
+ * Sensors around a location, grouped by direction, each with its name.
  * @param {Sensor[]} sensors
  * @param {Health} health
  * @param {{x: number, y: number, radius?: number}} at

@@ -13,7 +13,7 @@ const BEARING = { x: 196, y: 214 };
 const DISC = { x: 250, y: 444 };
 const ARROW = 30;
 
-/** Length of a dimension as it is written on drawings. @param {number} metres */
+/** A length as written on drawings. @param {number} metres */
 const millimetres = (metres) => quantity(1000 * metres, "mm");
 
 /** @param {number} angle */
@@ -64,7 +64,7 @@ function bearing(file, health, readings) {
   ];
 }
 
-/** Unbalance and sensors at the disc, as the mark of the shaft passes its sensor. @param {MachineFile} file @param {Health} health @param {Map<string, Reading>} readings */
+/** Unbalance and sensors at the disc, at the moment of the phase reference's pulse. @param {MachineFile} file @param {Health} health @param {Map<string, Reading>} readings */
 function disc(file, health, readings) {
   const { x, y } = DISC;
   const reading = readings.get("e");

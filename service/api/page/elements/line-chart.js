@@ -2,17 +2,17 @@ import { html } from "./markup.js";
 import { clock, local, shownIn, ticks } from "../monitor/figures.js";
 
 /** @typedef {{label: string, values: (number | null)[], colour?: string, dash?: number[], hidden?: boolean, width?: number, dots?: boolean}} Line */
-/** What a line at a place is called, above it or `below`. @typedef {{at: number, axis: "x" | "y", colour: string, text?: string, dash?: number[], below?: boolean}} Mark */
-/** A stretch of values, such as a zone of a standard; `edge` where it begins with a line. @typedef {{from: number, to: number, text: string, colour?: string, edge?: boolean}} Zone */
+/** A marked position with its label, above the line or `below`. @typedef {{at: number, axis: "x" | "y", colour: string, text?: string, dash?: number[], below?: boolean}} Mark */
+/** A range of values, such as a zone of a standard; `edge` if it begins with a line. @typedef {{from: number, to: number, text: string, colour?: string, edge?: boolean}} Zone */
 /** @typedef {{x: number[], lines: Line[], band?: [number, number], marks: Mark[], time: boolean, log?: boolean, include?: number[], unit: string, cut?: [number, number, number], xUnit?: string, shaded?: {from: number, to: number, text?: string}[], zones?: Zone[], height: number}} Drawing */
 
-/** Pixels between ticks of time: of minutes, and of seconds, whose labels are longer. */
+/** Least pixels between ticks of time: for minutes, and for seconds, whose labels are longer. */
 const SPACE = [56, 84];
 
 /** @type {Promise<any> | undefined} */
 let library;
 
-/** The library of charts, fetched by the first view that draws one. @returns {Promise<any>} */
+/** The chart library, loaded by the first view that draws a chart. @returns {Promise<any>} */
 function charts() {
   library ??= new Promise((resolve, reject) => {
     const at = (/** @type {string} */ name) => new URL(`../${name}`, import.meta.url).href;
@@ -23,7 +23,7 @@ function charts() {
   return library;
 }
 
-/** Of places for ticks only those on the axis. @param {any} plot @param {number[]} at */
+/** Tick positions, with those outside the axis replaced by null. @param {any} plot @param {number[]} at */
 const within = (plot, at) => at.map((each) => (each >= plot.scales.x.min && each <= plot.scales.x.max ? each : null));
 
 /** Lines over time or frequency, with bands, limits and marks; colours are names of properties of the style sheet. */
@@ -32,10 +32,10 @@ class LineChart extends HTMLElement {
   #plot = null;
   /** @type {Drawing | null} */
   #drawing = null;
-  /** @type {Drawing | null} as it was asked for, before its units became those that are shown */
+  /** @type {Drawing | null} as given, before conversion to the units shown */
   #given = null;
   #shape = "";
-  /** Where zones are named. @type {{from: number, to: number, at: number}[]} */
+  /** Positions of the names of zones. @type {{from: number, to: number, at: number}[]} */
   #names = [];
   #sized = new ResizeObserver(() => this.#plot?.setSize(this.#size()));
   #dark = matchMedia("(prefers-color-scheme: dark)");
@@ -44,7 +44,7 @@ class LineChart extends HTMLElement {
     if (this.#given) this.draw(this.#given);
   };
 
-  #print = () => this.#plot?.setSize(this.#size(true)); // what is laid out for paper comes too late to draw
+  #print = () => this.#plot?.setSize(this.#size(true)); // the resize observer would be too late for print
   #printed = () => this.#plot?.setSize(this.#size(false));
 
   connectedCallback() {
@@ -88,7 +88,7 @@ class LineChart extends HTMLElement {
     this.#plot = new uPlot(this.#options(uPlot, drawing), data, this);
   }
 
-  /** That of the page; on paper that which the style sheet says. */
+  /** Size of the chart on the page or, for print, from the style sheet. */
   #size(paper = matchMedia("print").matches) {
     const [width, height] = paper ? getComputedStyle(this).getPropertyValue("--on-paper").split(" ").filter(Boolean).map(Number) : [];
     return width && height ? { width, height } : { width: Math.max(this.clientWidth, 200), height: this.#drawing?.height ?? 160 };
@@ -124,7 +124,7 @@ class LineChart extends HTMLElement {
     };
   }
 
-  /** All that is drawn, and the limits that shall be seen beside it. @param {number} low @param {number} high */
+  /** Range of the vertical axis: all values, and the limits that must be visible. @param {number} low @param {number} high */
   #range(low, high) {
     const seen = [...(this.#drawing?.include ?? []), low, high].filter((each) => Number.isFinite(each));
     const [bottom, top] = [Math.min(...seen), Math.max(...seen)];
@@ -132,7 +132,7 @@ class LineChart extends HTMLElement {
     return [bottom === 0 ? 0 : bottom - rim, top + rim];
   }
 
-  /** Without a pointer the legend tells the newest of a trend, and no value of anything else. @param {any} plot */
+  /** Without a pointer the legend shows the newest values of a trend, and no values in other charts. @param {any} plot */
   #rest(plot) {
     const away = plot.cursor.left < 0;
     const still = away && !this.#drawing?.time;
@@ -178,7 +178,7 @@ class LineChart extends HTMLElement {
     ctx.restore();
   }
 
-  /** Lines of limits and moments, and then what they are called: a name stays readable on the line of another one. @param {any} plot */
+  /** Draw lines of limits and moments first and their labels last, so that labels stay readable on other lines. @param {any} plot */
   #mark(plot) {
     const { ctx, bbox } = plot;
     const [gap, right] = [3 * devicePixelRatio, bbox.left + bbox.width];
@@ -203,7 +203,7 @@ class LineChart extends HTMLElement {
     ctx.strokeStyle = this.#colour("surface");
     const taken = [...this.#names];
     const free = (/** @type {number[]} */ [x, y], /** @type {number} */ wide) => x >= bbox.left && x + wide <= right && taken.every(({ from, to, at }) => x > to || x + wide < from || Math.abs(y - at) >= 4 * gap);
-    // Limits first: their names stand at the left, beside each other where the limits are close.
+    // Limits first: their labels are at the left, side by side if the limits are close.
     for (const { text, place, upright, colour, below } of marks.sort((one, other) => Number(one.upright) - Number(other.upright))) {
       if (!text) continue;
       const wide = ctx.measureText(text).width;
@@ -211,7 +211,7 @@ class LineChart extends HTMLElement {
       const from = upright ? [place + gap, place - gap - wide] : [bbox.left + gap, ...taken.map(({ to }) => to + 3 * gap)];
       const places = rows.flatMap((y) => from.map((x) => [x, y]));
       const found = places.find((each) => free(each, wide)) ?? (upright ? places[0] : null);
-      if (!found) continue; // what is said of a limit stands beside the chart, too
+      if (!found) continue; // limits are also described beside the chart
       const [x, y] = found;
       taken.push({ from: x, to: x + wide, at: y });
       ctx.fillStyle = this.#colour(colour);

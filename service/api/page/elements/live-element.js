@@ -1,18 +1,18 @@
 import { monitor } from "../monitor/monitor.js";
 
-/** An element that listens to the monitor and asks it again and again while it is on the page. */
+/** An element that listens to the monitor and requests data periodically while it is on the page. */
 export class LiveElement extends HTMLElement {
   #gone = new AbortController();
   #loading = false;
   #again = false;
   #unseen = false;
-  /** Whether what was asked for last has been answered. */
+  /** Whether the last request was answered. */
   answered = false;
 
   connectedCallback() {
     this.#gone = new AbortController();
     this.#unseen = false;
-    // Not while nobody looks, but as soon as somebody does.
+    // A load skipped while the page was hidden is done as soon as it is visible.
     document.addEventListener("visibilitychange", () => this.#unseen && !document.hidden && this.load(), { signal: this.#gone.signal });
   }
 
@@ -25,19 +25,19 @@ export class LiveElement extends HTMLElement {
     monitor.addEventListener(kind, hear, { signal: this.#gone.signal });
   }
 
-  /** Do something again and again while the element is on the page. @param {number} every_s @param {() => void} act */
+  /** Call a function periodically while the element is on the page. @param {number} every_s @param {() => void} act */
   repeat(every_s, act) {
     const timer = setInterval(act, 1000 * every_s);
     this.#gone.signal.addEventListener("abort", () => clearInterval(timer));
   }
 
-  /** Load now, and again and again while the element is on the page. @param {number} every_s */
+  /** Load now, and then periodically while the element is on the page. @param {number} every_s */
   keepLoading(every_s) {
     this.repeat(every_s, () => this.load());
     this.load();
   }
 
-  /** Ask for what is shown: never twice at once, nor while nobody looks. What is wanted meanwhile is asked for afterwards. */
+  /** Request the data shown: one request at a time, none while the page is hidden; a load wanted meanwhile is done afterwards. */
   async load() {
     this.#unseen = document.hidden;
     this.#again = this.#loading;
@@ -55,9 +55,9 @@ export class LiveElement extends HTMLElement {
     }
   }
 
-  /** Ask the monitor, and lay out what it answers. */
+  /** Request data from the monitor, and show the answer. */
   async ask() {}
 
-  /** Say why there is nothing new to be shown. @param {string} _why */
+  /** Show why there are no new data. @param {string} _why */
   refused(_why) {}
 }

@@ -4,18 +4,18 @@ import { monitor, pathOf } from "../monitor/monitor.js";
 import { LiveElement } from "./live-element.js";
 
 /**
- * An element about the machine that its attribute `place` names; `show` is called whenever that is heard of. With an attribute `recorded`, what it asks for is
- * of a recorded window instead of what is live: arguments of the API such as `replay=ID&until_ns=TIME`.
+ * An element about the machine named in its attribute `place`; `show` is called whenever the machine's health arrives. With an attribute `recorded`, it requests
+ * a recorded window instead of live data: arguments of the API such as `replay=ID&until_ns=TIME`.
  */
 export class MachineElement extends LiveElement {
   static observedAttributes = ["recorded"];
   /** @type {import("../monitor/records.d.ts").Health | undefined} */
   #instead;
-  /** Whether `show` needs all that is known of the latest window. */
+  /** Whether `show` needs the complete health, with the whole report of the latest window. */
   needsWhole = true;
-  /** Whether `show` needs the machine file, which is then asked for. */
+  /** Whether `show` needs the machine file, which is then requested. */
   needsFile = false;
-  /** The machine file; null before it is there. @type {import("../machine/machine-file.js").MachineFile | null} */
+  /** The machine file; null until it is loaded. @type {import("../machine/machine-file.js").MachineFile | null} */
   file = null;
 
   connectedCallback() {
@@ -31,7 +31,7 @@ export class MachineElement extends LiveElement {
     this.show();
   }
 
-  /** The machine file as it is in use. */
+  /** Load the machine file in use. */
   machineFile() {
     return machineFile(this.place, this.health?.machine_hash);
   }
@@ -40,7 +40,7 @@ export class MachineElement extends LiveElement {
     if (this.isConnected) this.load();
   }
 
-  /** What is recorded does not change, and is asked for until it is there. @param {number} every_s */
+  /** Load periodically; recorded data do not change, and are only requested until they have arrived. @param {number} every_s */
   keepLoading(every_s) {
     this.repeat(every_s, () => (this.recorded && this.answered) || this.load());
     this.load();
@@ -50,12 +50,12 @@ export class MachineElement extends LiveElement {
     return this.getAttribute("recorded") ?? "";
   }
 
-  /** What the API has of the machine, live or recorded. @param {string} route @param {string} [wanted] */
+  /** Request a route of the machine from the API, live or recorded. @param {string} route @param {string} [wanted] */
   askFor(route, wanted = "") {
     return monitor.ask(`${pathOf(this.place)}/${route}?${[wanted, this.recorded].filter(Boolean).join("&")}`);
   }
 
-  /** Says of a recorded window that it is one, and which. @param {{start_ns: number | null, end_ns: number | null}} found */
+  /** Heading that identifies a recorded window. @param {{start_ns: number | null, end_ns: number | null}} found */
   windowText({ start_ns, end_ns }) {
     if (!this.recorded) return "";
     return start_ns === null || end_ns === null ? "Replay" : `Replay, window ${stretch(start_ns, end_ns)}`;
@@ -66,18 +66,18 @@ export class MachineElement extends LiveElement {
     return this.getAttribute("place") ?? "";
   }
 
-  /** Show this and nothing that is live: a window of a replay. @param {import("../monitor/records.d.ts").Health} health */
+  /** Show this health, of a window of a replay, instead of live data. @param {import("../monitor/records.d.ts").Health} health */
   feed(health) {
     this.#instead = health;
     this.show();
   }
 
-  /** What was heard last, or what is shown instead; undefined before the first. */
+  /** The latest health, or the one shown instead; undefined before the first. */
   get health() {
     const heard = this.recorded ? undefined : monitor.machines.get(this.place);
     return this.#instead ?? (heard && (heard.whole || !this.needsWhole) ? heard.health : undefined);
   }
 
-  /** Lay out what is known. */
+  /** Show the health. */
   show() {}
 }

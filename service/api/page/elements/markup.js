@@ -1,11 +1,11 @@
-/** Elements made by hand: text is always text, so nothing that a machine is called can become markup. */
+/** Creates elements without parsing HTML: text stays text, so the name of a machine can never become markup. */
 
 /** @typedef {Node | string | number | null | undefined | false} Child */
 /** @typedef {Record<string, string | number | boolean | null | undefined | ((event: any) => void)>} Attributes */
 
 const SVG = "http://www.w3.org/2000/svg";
 
-/** What hears the events of an element, by their names. @type {WeakMap<Element, Record<string, (event: any) => void>>} */
+/** Event listeners of each element, by event name. @type {WeakMap<Element, Record<string, (event: any) => void>>} */
 const heard = new WeakMap();
 
 /** @param {Element} made @param {string} name @param {(event: any) => void} hear */
@@ -26,18 +26,18 @@ function filled(made, attributes, children) {
     else if (value === true) made.setAttribute(name, "");
     else if (value !== false && value !== null && value !== undefined) made.setAttribute(name, String(value));
   }
-  made.append(...nodes(children)); // an element that has filled itself keeps what it has
+  made.append(...nodes(children)); // an element that fills itself keeps its content
   return made;
 }
 
-/** What there is, as nodes and text, numbers with the minus sign that people write. @param {Child[]} children */
+/** Children as nodes and text without empty ones, numbers with a true minus sign. @param {Child[]} children */
 function nodes(children) {
   const there = children.filter((child) => child !== null && child !== undefined && child !== false && child !== "");
   return there.map((child) => (child instanceof Node ? child : new Text(String(child).replace(/(^|[^\w-])-(?=\d)/g, "$1−"))));
 }
 
 /**
- * Put children in the place of those that were there; what is empty is left out.
+ * Replace all children; empty ones are left out.
  * @param {Element} parent
  * @param {...Child} children
  */
@@ -46,8 +46,8 @@ export function lay(parent, ...children) {
 }
 
 /**
- * Put children in the place of those that were there, but only what differs: an element that is there already keeps the focus, what is selected of its text, and stays open.
- * For what is made anew each time; what changes places, and what must not become something else, has the attribute `data-key`.
+ * Replace children, but change only what differs: an existing element keeps the focus and its text selection, and stays open.
+ * For content that is created anew each time; elements that may move, or must not be turned into others, have the attribute `data-key`.
  * @param {Element} parent
  * @param {...Child} children
  */
@@ -72,7 +72,7 @@ function match(parent, wanted) {
   while (parent.childNodes.length > wanted.length) parent.lastChild?.remove();
 }
 
-/** Make a node like another one. @param {Node} old @param {Node} one */
+/** Change a node to be like another one. @param {Node} old @param {Node} one */
 function liken(old, one) {
   if (!(old instanceof Element) || !(one instanceof Element)) {
     if (old.nodeValue !== one.nodeValue) old.nodeValue = one.nodeValue;
@@ -82,11 +82,11 @@ function liken(old, one) {
   for (const { name, value } of one.attributes) if (old.getAttribute(name) !== value && name !== "open") old.setAttribute(name, value);
   if (old instanceof HTMLInputElement && one instanceof HTMLInputElement) old.checked = one.checked;
   for (const [name, hear] of Object.entries(heard.get(one) ?? {})) listen(old, name, hear);
-  if (!old.localName.includes("-")) match(old, [...one.childNodes]); // those fill themselves
+  if (!old.localName.includes("-")) match(old, [...one.childNodes]); // custom elements fill themselves
 }
 
 /**
- * Let a parent have a child for each key, in this order; one that stays is the same element, and keeps the focus.
+ * Give a parent one child for each key, in this order; a child that stays is the same element, and keeps the focus.
  * @param {Element} parent
  * @param {string[]} keys
  * @param {Map<string, HTMLElement>} made children by key
@@ -106,7 +106,7 @@ export function arrange(parent, keys, made, make) {
 }
 
 /**
- * An element of the page; attributes that are functions are listeners.
+ * Create an element of the page; attributes that are functions are listeners.
  * @param {string} tag
  * @param {Attributes} [attributes]
  * @param {...Child} children
@@ -117,7 +117,7 @@ export function html(tag, attributes = {}, ...children) {
 }
 
 /**
- * An element of a drawing.
+ * Create an SVG element.
  * @param {string} tag
  * @param {Attributes} [attributes]
  * @param {...Child} children
@@ -128,7 +128,7 @@ export function svg(tag, attributes = {}, ...children) {
 }
 
 /**
- * A table that a phone shows as cards: each cell carries the name of its column. A row with a key stays the same element where the table is renewed.
+ * A table that a phone shows as cards: each cell has the name of its column. A row with a key stays the same element when the table is updated.
  * @param {string[]} heads
  * @param {{cells: Child[], attributes?: Attributes, key?: string | number}[]} rows
  * @param {string} caption

@@ -7,7 +7,7 @@ const [WIDTH, HEIGHT] = [120, 28];
 const REFRESH_S = 300;
 const [TOGETHER, SOON_MS, PACE_MS] = [64, 50, 1000];
 
-/** Elements that can be seen and wait for their line; asked for together, once a second. @type {Set<SparkLine>} */
+/** Visible elements that wait for their line; their data are requested together, once a second. @type {Set<SparkLine>} */
 const waiting = new Set();
 let asking = false;
 
@@ -39,8 +39,8 @@ const seen = new IntersectionObserver((entries) => {
 });
 
 /**
- * The last 24 h of one reading, without numbers: `<spark-line place quantity series range>`. What lies within `range`,
- * two numbers, is shown in any case: scatter far from a limit looks like scatter.
+ * The last 24 h of one reading, without numbers: `<spark-line place quantity series range>`. The vertical axis always
+ * includes `range`, two numbers, so that scatter far from a limit looks small.
  */
 class SparkLine extends MachineElement {
   #drawn = -Infinity;
@@ -59,12 +59,12 @@ class SparkLine extends MachineElement {
     waiting.delete(this);
   }
 
-  /** What the line is of. */
+  /** Name of the reading shown: site/machine/quantity/series. */
   get of() {
     return [this.place, this.getAttribute("quantity"), this.getAttribute("series")].join("/");
   }
 
-  /** Wait for a line while somebody sees where it is to be. @param {boolean} visible */
+  /** Wait for a line while the element is visible. @param {boolean} visible */
   seen(visible) {
     this.#visible = visible;
     waiting.delete(this);
@@ -73,7 +73,7 @@ class SparkLine extends MachineElement {
     askTogether();
   }
 
-  /** Whether its line is on its way: a tile that moves meanwhile is not asked for again. @param {boolean} now */
+  /** Note whether a request is under way, so that a tile that moves meanwhile makes no second one. @param {boolean} now */
   asked(now) {
     this.#asked = now;
   }
@@ -94,7 +94,7 @@ class SparkLine extends MachineElement {
       if (!at || start - starts[at - 1] > longest) parts.push([]);
       parts[parts.length - 1].push(`${x(start).toFixed(1)},${y(means[at]).toFixed(1)}`);
     });
-    const lines = parts.map((points) => svg("polyline", { points: (points[1] ? points : [points[0], points[0]]).join(" ") })); // a point alone is a dot
+    const lines = parts.map((points) => svg("polyline", { points: (points[1] ? points : [points[0], points[0]]).join(" ") })); // a single point is drawn as a dot
     this.replaceChildren(svg("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, preserveAspectRatio: "none", "aria-hidden": "true" }, ...lines));
   }
 }

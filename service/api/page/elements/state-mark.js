@@ -1,7 +1,7 @@
 import { html, svg } from "./markup.js";
 import { STATES } from "../monitor/states.js";
 
-/** Outlines for what is as it should be, filled shapes for what is not. @type {Record<string, string>} */
+/** Outlined shapes for normal states, filled shapes for abnormal ones. @type {Record<string, string>} */
 const SHAPES = {
   danger: "M8 0 16 8 8 16 0 8Z",
   alert: "M8 1 16 15 0 15Z",

@@ -3,7 +3,7 @@ import { html } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import { monitor } from "../monitor/monitor.js";
 
-/** What came in, and what is to be known about it. */
+/** Data received from the machine, and their quality. */
 class DataQuality extends MachineElement {
   connectedCallback() {
     super.connectedCallback();

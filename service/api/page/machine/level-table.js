@@ -12,7 +12,7 @@ function leveled(one, measure) {
   return value === null ? null : value * shownIn(levelUnit(one, measure))[0];
 }
 
-/** Vibration levels of each channel, their limits beside them, and what is beyond them. */
+/** Vibration levels of each channel with their limits; levels beyond a limit are marked. */
 class LevelTable extends MachineElement {
   show() {
     const report = this.health?.report;

@@ -5,7 +5,7 @@ import { ReadingTrend } from "./reading-trend.js";
 /** @typedef {import("../monitor/records.d.ts").LevelBound} LevelBound */
 /** @typedef {import("../elements/line-chart.js").Zone} Zone */
 
-/** Zones of a standard, from the bottom to the top. @param {[number, number, number]} edges @returns {Zone[]} */
+/** Zones of a standard, in ascending order. @param {[number, number, number]} edges @returns {Zone[]} */
 const zonesOf = ([first, second, third]) => [
   { from: 0, to: first, text: "zone A" },
   { from: first, to: second, text: "zone B", edge: true },
@@ -15,7 +15,7 @@ const zonesOf = ([first, second, third]) => [
 
 /** @param {LevelBound} bound @returns {import("./reading-trend.js").Limit[]} */
 function limitsOf({ source, zones, alert, danger, fall }) {
-  const from = zones ? "" : `, ${source}`; // zones say their own names
+  const from = zones ? "" : `, ${source}`; // zones have their own names
   return [
     ...(alert === null ? [] : [{ at: alert, kind: /** @type {"alert"} */ ("alert"), text: `alert${from}` }]),
     ...(danger === null ? [] : [{ at: danger, kind: /** @type {"danger"} */ ("danger"), text: `danger${from}` }]),
@@ -23,14 +23,14 @@ function limitsOf({ source, zones, alert, danger, fall }) {
   ];
 }
 
-/** The leading level of every channel over time, with the zones and limits by which the newest is judged. */
+/** The most important level of every channel over time, with the zones and limits that apply to the newest. */
 export class LevelTrend extends ReadingTrend {
   quantity = "level";
   title = "Levels over time";
   note = " Zones and limits are those of the newest window.";
 
   async trended() {
-    // Whatever changed, every level may show it.
+    // Any change may affect every level.
     const changed = (this.health?.report?.verdict?.changed ?? []).map((one) => ({ ...one, text: `${one.name} changed` }));
     return (this.health?.report?.levels ?? []).map((one) => {
       const usual = one.velocity === null ? "overall" : "velocity";

@@ -1,7 +1,7 @@
 import { html } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 
-/** Values with their places in the file, `window.length_s` for instance; what is not given is left out. @param {unknown} value @param {string} name @returns {[string, string][]} */
+/** Values with their paths in the file, for instance `window.length_s`; missing values are left out. @param {unknown} value @param {string} name @returns {[string, string][]} */
 function facts(value, name) {
   if (value === null || value === "" || (Array.isArray(value) && !value.length)) return [];
   if (typeof value !== "object") return [[name, String(value)]];
@@ -12,7 +12,7 @@ function facts(value, name) {
   });
 }
 
-/** The machine file as it is in use, line by line. */
+/** The machine file in use, line by line. */
 class MachineFacts extends MachineElement {
   needsFile = true;
   /** @type {unknown} */

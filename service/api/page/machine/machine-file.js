@@ -1,7 +1,7 @@
 import { monitor, pathOf } from "../monitor/monitor.js";
 
 /**
- * The machine file as far as the page reads it: a document of its own, whose fields docs/machine-file.md explains.
+ * The parts of the machine file that the page uses; docs/machine-file.md explains its fields.
  *
  * @typedef {{name: string, quantity: string, location: string, direction: string, unit: string, angle_deg?: number | null}} Sensor
  * @typedef {{raise_above: number, danger_above: number}} Limits
@@ -12,9 +12,9 @@ import { monitor, pathOf } from "../monitor/monitor.js";
 const known = new Map();
 
 /**
- * The machine file as it is in use; asked for once, however many elements show something of it.
+ * The machine file in use; requested once for all elements.
  * @param {string} place
- * @param {string} [hash] of the machine file: another one is asked for again
+ * @param {string} [hash] of the machine file; a new hash causes a new request
  */
 export function machineFile(place, hash = "") {
   const key = `${place} ${hash}`;
@@ -27,10 +27,10 @@ export function machineFile(place, hash = "") {
 const RATES = /** @type {Record<string, string>} */ ({ displacement: "", velocity: "_dot", acceleration: "_ddot", tilt: "", tilt_rate: "_dot" });
 const TILTS = /** @type {Record<string, string>} */ ({ y: "psi", z: "phi" });
 
-/** Angle of a sensor's axis from y towards z; null where its direction does not say it. @param {Sensor} sensor */
+/** Angle of a sensor's axis from y towards z; null if its direction does not determine it. @param {Sensor} sensor */
 export const angleOf = (sensor) => sensor.angle_deg ?? { y: 0, z: 90 }[sensor.direction] ?? null;
 
-/** What a report calls that which a sensor measures. @param {Sensor} sensor */
+/** Name of the state that a sensor measures, as in reports. @param {Sensor} sensor */
 export function stateOf(sensor) {
   const { quantity, location, direction, name } = sensor;
   if (quantity === "shaft_angle") return "theta";
@@ -43,7 +43,7 @@ export function stateOf(sensor) {
   return plane ? `${plane}${number}${rate}` : `${location}@${angle}${rate}`;
 }
 
-/** Why a sensor is abnormal: at fault, or with a level alarm; empty if it is not. @param {Sensor} sensor @param {import("../monitor/records.d.ts").Health} health */
+/** Why a sensor is abnormal: a fault, or a level alarm; empty if it is normal. @param {Sensor} sensor @param {import("../monitor/records.d.ts").Health} health */
 export function sensorState(sensor, health) {
   if (health.report?.sensors.some((one) => one.states.includes(stateOf(sensor)))) return "data-health";
   return health.alarms.find((one) => one.raised && one.name === `level:${sensor.name}`)?.severity ?? "";

@@ -18,7 +18,7 @@ import "../elements/state-mark.js";
 const RANGES = /** @type {[string, string][]} */ ([["1", "last hour"], ["24", "last 24 h"], ["720", "last 30 days"], ["", "all data"]]);
 const RAW = ["health", "reports", "alarms", "alarms/events", "detectable", "configuration"];
 
-/** What is loaded only when it is opened: element and heading. */
+/** Folded parts that are loaded when opened: element and heading. */
 const FOLDED = [
   ["waveform-plot", "Waveform"],
   ["vector-plot", "1× over speed: Bode and polar"],
@@ -28,7 +28,7 @@ const FOLDED = [
   ["correlation-plot", "Correlations and residuals of the equations"],
 ];
 
-/** Everything that is known of one machine. */
+/** The view of one machine. */
 class MachineView extends MachineElement {
   #head = html("div", { class: "head" });
   #built = false;
@@ -61,7 +61,7 @@ class MachineView extends MachineElement {
     );
   }
 
-  /** What is said channel by channel where no equation can be evaluated. */
+  /** Shapes of the channels, for machines whose equations cannot be evaluated. */
   #shapes() {
     const shapes = this.health?.report?.shapes ?? [];
     if (!shapes.length) return null;
@@ -71,7 +71,7 @@ class MachineView extends MachineElement {
   #build() {
     this.#built = true;
     const place = this.place;
-    // Where parameters are read, levels tell less.
+    // If parameters are read, levels are less important.
     const trends = [html("parameter-trend", { place, hours: "24" }), html("plot-fold", { place, shows: "machine/level-trend", heading: "Levels over time", hours: "24", open: !this.health?.report?.parameters.length })];
     const range = html(
       "select",

@@ -5,18 +5,18 @@ import { parameterReadings } from "./parameter-readings.js";
 import { roundUp } from "../plots/plane.js";
 
 const [WIDTH, LEFT, ROW, TOP] = [360, 48, 46, 6];
-/** What is farther away is written at the edge: the others would be too close to be told apart. */
+/** Readings farther away are drawn at the edge, because the others would be too close to distinguish. */
 const FARTHEST = 0.6;
 const SHAPES = ["decides", "second", "third"];
 
-/** A mark of whoever reads: each has a shape of its own. @param {number} who @param {number} x @param {number} y */
+/** Marker of a diagnostician; each has its own shape. @param {number} who @param {number} x @param {number} y */
 function mark(who, x, y) {
   if (who === 0) return svg("circle", { class: SHAPES[0], cx: x, cy: y, r: 4 });
   if (who === 1) return svg("rect", { class: SHAPES[1], x: x - 3.5, y: y - 3.5, width: 7, height: 7 });
   return svg("path", { class: SHAPES[2], d: `M${x} ${y - 4.5} l4.5 8 h-9Z` });
 }
 
-/** What each diagnostician reads of each parameter, beside the limits and what would not be seen. */
+/** Readings of each parameter by each diagnostician, with the limits and the range that is not detectable. */
 class ParameterForest extends MachineElement {
   needsFile = true;
 

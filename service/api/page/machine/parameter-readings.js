@@ -2,7 +2,7 @@
 /** @typedef {{stated: Parameter, parameter: Parameter, read: boolean, why: string, seen: import("../monitor/records.d.ts").Detectable | undefined, severity: string}} Reading */
 
 /**
- * What is read of each parameter now: while the window straddles a change, of the machine since then.
+ * Current reading of each parameter; while the window straddles a change, that since the change.
  * @param {import("../monitor/records.d.ts").Health | undefined} health
  * @returns {Reading[]}
  */

@@ -7,7 +7,7 @@ import "../elements/state-mark.js";
 /** @typedef {import("../monitor/records.d.ts").Opinion} Opinion */
 /** @typedef {import("./parameter-readings.js").Reading} Reading */
 
-/** What another diagnostician reads of a parameter, and whether that agrees. @param {Opinion} opinion @param {string} name */
+/** Reading of a parameter by another diagnostician, and whether it agrees. @param {Opinion} opinion @param {string} name */
 function other(opinion, name) {
   const said = opinion.parameters.find((one) => one.name === name);
   if (!said || said.relative_change === null || said.standard_error === null) return html("span", { class: "number" }, "–");
@@ -21,7 +21,7 @@ function said({ read, why, parameter }) {
   return [html("b", { class: "number" }, percent(parameter.relative_change)), html("span", { class: "number" }, interval(parameter.interval_95))];
 }
 
-/** Who reads what of each parameter, and what would have been noticed. */
+/** Readings of each parameter by all diagnosticians, and the minimum detectable changes. */
 class ParameterTable extends MachineElement {
   show() {
     const report = this.health?.report;

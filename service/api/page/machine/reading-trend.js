@@ -9,13 +9,13 @@ const [POINTS, REFRESH_S, EVENTS] = [240, 15, 200];
 /** @typedef {import("../monitor/records.d.ts").ReadingBucket} Bucket */
 /** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
 /** @typedef {{at: number, kind: "alert" | "danger", text: string, below?: boolean}} Limit */
-/** What is shown over time; limits within `near` are always in the picture. @typedef {{name: string, alarm: string, title: string, unit: string, scale: number, limits: Limit[], near: number, zones?: import("../elements/line-chart.js").Zone[], said?: string[], zero: boolean, changed: {text: string, since_ns: number, between_ns?: [number, number] | null}[]}} Trended */
+/** A reading shown over time; limits within `near` are always visible. @typedef {{name: string, alarm: string, title: string, unit: string, scale: number, limits: Limit[], near: number, zones?: import("../elements/line-chart.js").Zone[], said?: string[], zero: boolean, changed: {text: string, since_ns: number, between_ns?: [number, number] | null}[]}} Trended */
 
 /** Readings of a machine over time, a chart each, with interval bands, limits and the times of alarms. */
 export class ReadingTrend extends MachineElement {
   quantity = "";
   title = "";
-  /** What is to be known of the limits. */
+  /** Remarks on the limits. */
   note = "";
   /** @type {number | null} */
   #oldest = null;
@@ -24,9 +24,9 @@ export class ReadingTrend extends MachineElement {
   #figures = html("div", { class: "charts" });
   #message = html("p", { class: "message" });
   #when = html("p", { class: "note" });
-  /** What was read last. @type {{shown: Trended[], buckets: Bucket[], events: AlarmEvent[]}} */
+  /** The data loaded last. @type {{shown: Trended[], buckets: Bucket[], events: AlarmEvent[]}} */
   #read = { shown: [], buckets: [], events: [] };
-  /** A moment that is marked. @type {number | null} */
+  /** A marked moment, ns. @type {number | null} */
   #moment = null;
 
   connectedCallback() {
@@ -37,7 +37,7 @@ export class ReadingTrend extends MachineElement {
   }
 
   /**
-   * How far back: the attribute `hours`, all without one. Not further than there are readings, or all would be in one bucket.
+   * Time span: the attribute `hours`, or everything without it; not longer than the readings, which would otherwise all fall into one bucket.
    * @param {Trended[]} shown
    */
   async #since(shown) {
@@ -50,7 +50,7 @@ export class ReadingTrend extends MachineElement {
     return Math.max(this.#oldest ?? 0, hours && end ? end - hours * 3600e9 : 0);
   }
 
-  /** What there is to be shown. @returns {Promise<Trended[]>} */
+  /** The readings to be shown. @returns {Promise<Trended[]>} */
   async trended() {
     return [];
   }
@@ -69,7 +69,7 @@ export class ReadingTrend extends MachineElement {
     this.#show();
   }
 
-  /** Readings and events out of the history. @param {Trended[]} shown @returns {Promise<{buckets: Bucket[], events: AlarmEvent[]}>} */
+  /** Readings and events from the history. @param {Trended[]} shown @returns {Promise<{buckets: Bucket[], events: AlarmEvent[]}>} */
   async readings(shown) {
     const since = String(await this.#since(shown));
     const asked = new URLSearchParams({ quantity: this.quantity, points: String(POINTS), since_ns: since });

@@ -2,34 +2,34 @@
 /** @typedef {(told: Told) => void} Listener */
 /** @typedef {"listen" | "look" | "leave" | "renew"} Order */
 
-/** Machines that everything may be asked of at once. */
+/** Most machines whose complete health is requested at once. */
 const MOST = 64;
-/** Machines that the start of a stream names: its id says of each how far it has been heard. @param {string} text */
+/** Machines named at the start of a stream, whose id holds the position in each machine's log. @param {string} text */
 export const named = (text) => new Set(text.split(",").map((entry) => entry.split("=")[0]));
-/** Characters of what has been heard that are sent along: it names every machine, and an address may not be any length. Health is told anew without, too. */
+/** Longest id that is sent on reconnection: it names every machine, and the length of a URL is limited. Without it, health is still sent anew. */
 const LONGEST = 4000;
 
-/** The monitor's stream of events for several listeners: who comes later is told first what was told last of each machine, and of the machine that a listener looks at everything. */
+/** The monitor's event stream, shared by several listeners: a new listener first gets the latest message of each machine, and the complete health of the machine that it looks at. */
 export class EventStream {
   /** @type {Map<Listener, string>} with the machine that each looks at */
   #listeners = new Map();
-  /** @type {Set<string>} machines that everything is told of */
+  /** @type {Set<string>} machines whose complete health is received */
   #inFull = new Set();
-  /** How far the stream has been heard. */
+  /** Id of the last event received. */
   #heard = "";
   /** @type {EventSource | null} */
   #source = null;
-  /** @type {Told | null} whether it is there */
+  /** @type {Told | null} latest state of the connection */
   #state = null;
   /** @type {Map<string, Told>} */
   #latest = new Map();
 
-  /** Be told of another sign-in. @param {Listener} listener */
+  /** Register a listener, which is told of a new sign-in. @param {Listener} listener */
   join(listener) {
     this.#listeners.set(listener, "");
   }
 
-  /** Be told what happens, from the beginning. @param {Listener} listener @param {string} place */
+  /** Send events to a listener, starting with the latest messages. @param {Listener} listener @param {string} place */
   listen(listener, place) {
     this.#listeners.set(listener, place);
     if (this.#source && this.#state) for (const told of [this.#state, ...this.#latest.values()]) listener(told);
@@ -37,9 +37,9 @@ export class EventStream {
     if (!this.#source) this.#begin();
   }
 
-  /** Be told everything of this machine. @param {Listener} listener @param {string} place */
+  /** Send a listener the complete health of a machine. @param {Listener} listener @param {string} place */
   look(listener, place) {
-    this.#listeners.delete(listener); // to the end: of very many places, the latest are told in full
+    this.#listeners.delete(listener); // moved to the end: if there are too many places, the latest are sent in full
     this.#listeners.set(listener, place);
     if (!this.#source || !place || this.#inFull.has(place)) return;
     this.#source.close();
@@ -52,7 +52,7 @@ export class EventStream {
     if (!this.#listeners.size) this.#end();
   }
 
-  /** Somebody else is signed in, or nobody: all but who says so begin again. @param {Listener} listener */
+  /** The signed-in caller has changed: all listeners except the one that reports it must start again. @param {Listener} listener */
   renew(listener) {
     this.#end();
     const told = /** @type {Told} */ ({ kind: "renewed", text: "", at: Date.now() });

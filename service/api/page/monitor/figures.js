@@ -1,4 +1,4 @@
-/** Numbers with units, and times, as people read them. */
+/** Formats numbers with units, and times. */
 
 const MINUS = "−";
 const KEPT = "rotorwatch.times";
@@ -8,7 +8,7 @@ export const Z95 = 1.96;
 const signed = (text) => text.replace("-", MINUS);
 
 /**
- * Three significant digits, without exponents where that can be read.
+ * Format a number to three significant digits, without exponent if that is readable.
  * @param {number | null | undefined} value
  */
 export function figure(value) {
@@ -30,7 +30,7 @@ export function percent(ratio, digits = 1) {
   return `${ratio > 0 ? "+" : ""}${signed(text)} %`;
 }
 
-/** A relative change with half its interval, which is never rounded to nothing. @param {number} ratio @param {number} error */
+/** A relative change with the half-width of its interval, which is never rounded to zero. @param {number} ratio @param {number} error */
 export function within(ratio, error) {
   const digits = error > 0 && error < 0.0005 ? 1 - Math.floor(Math.log10(100 * error)) : 1;
   return `${percent(ratio, digits)} ± ${(100 * error).toFixed(digits)} %`;
@@ -50,7 +50,7 @@ export const inches = () => localStorage.getItem("rotorwatch.units") === "inches
 /** @param {boolean} wanted */
 export const showInches = (wanted) => localStorage.setItem("rotorwatch.units", wanted ? "inches" : "metres");
 
-/** What a value in a unit is multiplied with, and which unit it then has. @param {string} unit @returns {[number, string]} */
+/** Factor from a unit to the unit shown, and that unit. @param {string} unit @returns {[number, string]} */
 export function shownIn(unit) {
   const [, length] = /(µm|mm)/.exec(unit) ?? [];
   if (!inches() || !length || unit.includes("/s²")) return [1, unit];
@@ -64,7 +64,7 @@ export function quantity(value, unit) {
   return `${figure(value === null || value === undefined ? value : factor * value)} ${shown}`.trim();
 }
 
-/** Whether times are local ones. */
+/** Whether times are shown as local times. */
 export const local = () => localStorage.getItem(KEPT) === "local";
 
 /** @param {boolean} wanted */
@@ -83,7 +83,7 @@ export function clock(ns) {
   return `${format({ dateStyle: "short", timeStyle: "medium" }).format(ns / 1e6)}${local() ? "" : " UTC"}`;
 }
 
-/** From when to when, the date once; of what is short, how long. @param {number} start_ns @param {number} end_ns */
+/** A time span, with the date once; for a short one, start and duration. @param {number} start_ns @param {number} end_ns */
 export function stretch(start_ns, end_ns) {
   if (end_ns - start_ns < 2e9) return `${clock(start_ns)}, ${figure((end_ns - start_ns) / 1e9)} s`;
   const [from, to] = [clock(start_ns), clock(end_ns)];
@@ -91,7 +91,7 @@ export function stretch(start_ns, end_ns) {
 }
 
 /**
- * Times along an axis: date or time of day, as fine as the axis is divided; nothing for null.
+ * Labels of times along an axis: date or time of day, as fine as the steps; empty for null.
  * @param {(number | null)[]} seconds
  * @param {number} step_s
  */
@@ -102,19 +102,19 @@ export function ticks(seconds, step_s) {
   return seconds.map((each, at) => (each === null ? "" : (step_s >= 86_400 ? "" : `${time.format(each * 1e3)}`) + (step_s >= 86_400 || at === first ? `\n${day.format(each * 1e3)}` : "")));
 }
 
-/** So many of the shortest step between readings without one are a gap. */
+/** A pause longer than this multiple of the shortest step between readings is a gap. */
 export const GAP = 2.5;
 
 /** Shortest step between times. @param {number[]} times */
 export const shortest = (times) => Math.min(...times.slice(1).map((each, at) => each - times[at]), Infinity);
 
-/** How large a file or a database is. @param {number} bytes */
+/** Format the size of a file or database. @param {number} bytes */
 export function size(bytes) {
   const [power, unit] = bytes < 1e6 ? [1e3, "kB"] : bytes < 1e9 ? [1e6, "MB"] : [1e9, "GB"];
   return `${figure(bytes / power)} ${unit}`;
 }
 
-/** How long, roughly. @param {number} seconds */
+/** Format a duration roughly. @param {number} seconds */
 export function lasting(seconds) {
   if (seconds < 100) return `${seconds.toFixed(0)} s`;
   if (seconds < 100 * 60) return `${(seconds / 60).toFixed(0)} min`;

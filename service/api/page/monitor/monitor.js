@@ -1,4 +1,4 @@
-/** What the page knows of the monitor: asked over HTTP, kept up to date by the stream of events. */
+/** The page's model of the monitor: loaded over HTTP, and kept up to date by the event stream. */
 
 import { EventStream, named } from "./event-stream.js";
 
@@ -9,7 +9,7 @@ export const API = "/api/v1";
 const AGAIN_MS = 5_000;
 const TOGETHER_MS = 100;
 
-/** An answer that says what was wrong. */
+/** A request was refused; the message is the problem's detail. */
 export class Refused extends Error {
   /** @param {number} status @param {string} detail @param {any} [body] */
   constructor(status, detail, body = {}) {
@@ -20,7 +20,7 @@ export class Refused extends Error {
 }
 
 /**
- * The stream of events that all pages of a browser share; of one's own where a browser knows nothing to share it with.
+ * The event stream shared by all pages of a browser (SharedWorker); an own stream if the browser does not support that.
  * @param {import("./event-stream.js").Listener} hear
  * @returns {(order: import("./event-stream.js").Order, place: string) => void}
  */
@@ -38,21 +38,21 @@ function sharedStream(hear) {
 export const pathOf = (place) => `${API}/machines/${place}`;
 
 /**
- * Tells `health:SITE/MACHINE`, `health` of any machine but at most ten times a second, `alarm`, `connection`, and `caller` where another one, or nobody, is signed in.
+ * Dispatches `health:SITE/MACHINE`; `health` for any machine, at most ten times a second; `alarm`; `connection`; and `caller` when the signed-in caller changes.
  */
 export class Monitor extends EventTarget {
-  /** What was heard last of each machine: of its latest window everything, or only the reading that matters most. @type {Map<string, {health: Health, heard: number, whole: boolean}>} */
+  /** Latest health of each machine, with the whole report of its latest window or only its most critical reading. @type {Map<string, {health: Health, heard: number, whole: boolean}>} */
   machines = new Map();
-  /** Those that are monitored; null before that is known. @type {Set<string> | null} */
+  /** Monitored machines; null until they are known. @type {Set<string> | null} */
   watched = null;
-  /** @type {{name: string, scopes: string[]} | null} who is signed in */
+  /** @type {{name: string, scopes: string[]} | null} the signed-in caller */
   caller = null;
-  /** Why somebody has to sign in; empty if nobody has to. */
+  /** Why a sign-in is required; empty if none is. */
   stranger = "";
   connected = false;
-  /** @type {number | null} since when nothing is heard */
+  /** @type {number | null} time since which the connection is lost */
   lostAt = null;
-  /** What is said where a view could not be loaded. */
+  /** Message if a view cannot be loaded. */
   get unloaded() {
     return this.connected ? "The monitor now serves a newer page: reload this one." : "There is no connection to the monitor, and this view has not been loaded yet: reload the page once the monitor can be reached.";
   }
@@ -66,7 +66,7 @@ export class Monitor extends EventTarget {
     addEventListener("pageshow", ({ persisted }) => persisted && this.listen());
   }
 
-  /** Begin to listen, now and whenever the stream has ended. */
+  /** Start listening, now and whenever the stream has ended. */
   async listen() {
     try {
       this.#known(await this.ask(`${API}/caller`), "");
@@ -79,7 +79,7 @@ export class Monitor extends EventTarget {
     this.#order("listen");
   }
 
-  /** Hear everything of one machine, or with an empty place of none. @param {string} place */
+  /** Receive the complete health of one machine; with an empty place, of none. @param {string} place */
   look(place) {
     this.#looked = place;
     this.#order("look");
@@ -147,7 +147,7 @@ export class Monitor extends EventTarget {
     return body;
   }
 
-  /** Ask for what may not be there: null then. @param {string} path @returns {Promise<any>} @throws {Refused} */
+  /** Request something that may not exist; null if it does not. @param {string} path @returns {Promise<any>} @throws {Refused} */
   async find(path) {
     return this.ask(path).catch((error) => {
       if (error instanceof Refused && error.status === 404) return null;
@@ -155,13 +155,13 @@ export class Monitor extends EventTarget {
     });
   }
 
-  /** Ask for something to be done. @param {string} path @param {unknown} [order] @returns {Promise<any>} */
+  /** Send an order. @param {string} path @param {unknown} [order] @returns {Promise<any>} */
   order(path, order = {}) {
     return this.ask(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(order) });
   }
 
   /**
-   * Do something to an alarm, if it still is as it was shown.
+   * Apply an action to an alarm, if it has not changed since it was shown.
    * @param {string} place
    * @param {Alarm} seen
    * @param {string} kind
@@ -175,7 +175,7 @@ export class Monitor extends EventTarget {
     });
   }
 
-  /** Seconds since the newest data of a machine, as far as is known; null if none ever came. @param {string} place */
+  /** Seconds since the newest known data of a machine; null if none ever arrived. @param {string} place */
   dataAge(place) {
     const known = this.machines.get(place);
     const age = known?.health.stream.data_age_s;
@@ -199,7 +199,7 @@ export class Monitor extends EventTarget {
     this.#tell("caller", stranger);
   }
 
-  /** @param {string} text names the machines; one that the monitor has no longer must not be shown as if it had */
+  /** @param {string} text names the machines; those no longer monitored are removed */
   #found(text) {
     this.connected = true;
     this.lostAt = null;

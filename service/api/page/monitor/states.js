@@ -1,4 +1,4 @@
-/** What states are called, how urgent they are, and what of a machine is worst. */
+/** Names and urgency of states, and the most critical reading of a machine. */
 import { figure, percent, printed, quantity, shownIn, within, Z95 } from "./figures.js";
 
 /** @typedef {import("./records.d.ts").Health} Health */
@@ -21,19 +21,19 @@ export const STATES = {
   healthy: "healthy",
 };
 
-/** What is abnormal: everything else is grey. */
+/** Abnormal states; all others are shown in grey. */
 export const ABNORMAL = new Set(["danger", "alert", "outside-model", "data-health", "not-evaluable"]);
 
 /** @param {string} state */
 export const urgency = (state) => Object.keys(STATES).indexOf(state);
 
-/** Of alarms that somebody has to look at. */
+/** States of alarms that require attention. */
 export const UNSEEN = new Set(["unacknowledged", "returned", "latched-unacknowledged"]);
 
-/** Whether an alarm says that something is wrong with the machine, not with its data or the monitor. @param {{name: string}} alarm */
+/** Whether an alarm is about the machine itself, not about its data or the monitor. @param {{name: string}} alarm */
 export const ofMachine = ({ name }) => !/^(stream|data|monitor)-/.test(name);
 
-/** Whether an alarm stands: operators are to see it. @param {Alarm} alarm */
+/** Whether an alarm is standing, i.e. must be shown to operators. @param {Alarm} alarm */
 export const stands = (alarm) => alarm.raised || UNSEEN.has(alarm.state) || alarm.state.startsWith("latched");
 
 /** Unacknowledged first, then danger, then the newest. @param {Alarm} one @param {Alarm} other */
@@ -43,7 +43,7 @@ export function byUrgency(one, other) {
   return rank(one) - rank(other) || (other.raised_ns ?? other.since_ns) - (one.raised_ns ?? one.since_ns);
 }
 
-/** What a measure of a channel is called. @type {Record<string, string>} */
+/** Names of a channel's measures. @type {Record<string, string>} */
 const MEASURES = { x_half: "½×", x1: "1×", x2: "2×", x3: "3×", not_x1: "not 1×", mean: "gap", s_max: "S_max", crest: "crest factor" };
 
 /** @param {string} measure */
@@ -104,16 +104,16 @@ function parameters(health) {
 }
 
 /**
- * What is worst at a machine: what an alarm is about, else what is nearest to its limit.
+ * The most critical reading of a machine: one that an alarm is about, else the one nearest to its limit.
  * @param {Health} health
  * @returns {Worst | null}
  */
 export function worst(health) {
-  // Missing data hides nothing of the machine: what an alarm says of it comes before what one says of the data.
+  // Alarms on the machine take precedence over alarms on its data.
   const rank = (/** @type {Alarm} */ one) => (ofMachine(one) ? 0 : 2) + (one.severity === "danger" ? 0 : 1);
   const alarm = health.alarms.filter((one) => one.raised).sort(byUrgency).sort((one, other) => rank(one) - rank(other))[0];
   const found = [...parameters(health), ...levels(health)].sort((one, other) => other.nearness - one.nearness);
-  if (!alarm) return health.state === "not-evaluable" ? null : (found[0] ?? null); // why it is not comes before a level of a machine that stands
+  if (!alarm) return health.state === "not-evaluable" ? null : (found[0] ?? null); // the reason is more important than a level of a machine that stands still
   const same = found.find((one) => one.series === alarm.name || `level:${one.series}`.startsWith(`${alarm.name}:`));
   const value = alarm.relative_change !== null && alarm.standard_error !== null ? within(alarm.relative_change, Z95 * alarm.standard_error) : "";
   return { title: alarm.text, value: same?.value ?? value, limit: same?.limit ?? "", quantity: same?.quantity ?? "", series: same?.series ?? "", range: same?.range ?? [] };

@@ -13,7 +13,7 @@ const seen = new IntersectionObserver(
   { rootMargin: "50%" },
 );
 
-/** One machine of the plant: its worst standing state, what is worst, and how old that is. */
+/** Tile of one machine: its worst standing state, the most critical reading, and the age of the data. */
 class MachineTile extends MachineElement {
   #states = html("div", { class: "states" });
   #worst = html("p", { class: "worst" });
@@ -35,7 +35,7 @@ class MachineTile extends MachineElement {
     seen.unobserve(this);
   }
 
-  /** What is far from being seen, of a plant of many machines, is brought up to date when it comes near. @param {boolean} near */
+  /** Tiles far outside the visible area are only updated when they come near, because a plant may have many. @param {boolean} near */
   seen(near) {
     this.#near = near;
     if (near && this.#late) this.show();

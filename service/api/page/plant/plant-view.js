@@ -10,20 +10,20 @@ const byName = new Intl.Collator(undefined, { numeric: true }).compare;
 /** @typedef {import("../monitor/records.d.ts").Health} Health */
 /** @typedef {import("./site-section.js").Machine} Machine */
 
-/** Minutes since the newest data: machines whose data come all the time stay where they are. @param {Machine} machine */
+/** Age of the newest data in whole minutes, so that machines with continuous data keep their places. @param {Machine} machine */
 const minutes = ({ place }) => Math.floor((monitor.dataAge(place) ?? Infinity) / 60);
 
-/** What comes first; names decide between equals. @type {Record<string, (one: Machine, other: Machine) => number>} */
+/** Orders of machines; equal ones are ordered by name. @type {Record<string, (one: Machine, other: Machine) => number>} */
 const ORDERS = {
   "most urgent first": (one, other) => urgency(one.health.state) - urgency(other.health.state),
   "by name": () => 0,
   "oldest data first": (one, other) => (minutes(one) === minutes(other) ? 0 : minutes(other) - minutes(one)),
 };
 
-/** Whether there is nothing to be told of a machine but that it has no data. @param {Health} health */
+/** Whether the only thing to report of a machine is that it has no data. @param {Health} health */
 const apart = (health) => (health.state === "no-data" || health.stream.data_age_s === null) && !health.alarms.some((one) => stands(one) && one.name !== "stream-lost");
 
-/** Every machine as a tile, by site; those without data and without an alarm apart. */
+/** Tiles of all machines, by site; machines without data and without an alarm are shown apart. */
 class PlantView extends HTMLElement {
   #gone = new AbortController();
   /** @type {Map<string, HTMLElement>} */
@@ -83,7 +83,7 @@ class PlantView extends HTMLElement {
     this.#none.textContent = all.length ? "No machine matches." : "Waiting for the machines …";
   }
 
-  /** How many are in each state; states that none is in are not offered. @param {Health[]} healths */
+  /** Number of machines in each state; states without machines are not offered. @param {Health[]} healths */
   #count(healths) {
     const chosen = this.#filter.value;
     const count = (/** @type {string} */ state) => healths.filter((one) => one.state === state || (state === "no-data" && one.stream.silent)).length;

@@ -10,7 +10,7 @@ const folded = () => JSON.parse(localStorage.getItem(KEPT) ?? "[]");
 
 /** @typedef {{place: string, health: import("../monitor/records.d.ts").Health}} Machine */
 
-/** Machines of one site under a heading that folds them away: `<site-section site="demo">`; what is folded still tells its worst state. */
+/** Machines of one site under a heading that can be folded: `<site-section site="demo">`; the worst state stays visible. */
 export class SiteSection extends HTMLElement {
   #summary = html("summary");
   #tiles = html("div", { class: "tiles" });
@@ -43,7 +43,7 @@ export class SiteSection extends HTMLElement {
     this.#place();
   }
 
-  /** What is folded away has no elements. */
+  /** Folded machines have no elements. */
   #place() {
     const places = this.#details.open ? this.#machines.map(({ place }) => place) : [];
     arrange(this.#tiles, places, this.#made, (place) => html("machine-tile", { place }));

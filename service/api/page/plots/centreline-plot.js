@@ -5,7 +5,7 @@ import { SamplePlot } from "./sample-plot.js";
 
 /** @typedef {import("../monitor/records.d.ts").CentrelineSeries} Centrelines */
 
-/** Where the shaft was on average, at each place with two displacements. @extends {SamplePlot<Centrelines>} */
+/** Average shaft centreline at each location with two displacements. @extends {SamplePlot<Centrelines>} */
 class CentrelinePlot extends SamplePlot {
   route = "centrelines";
   live = "windows of the history";

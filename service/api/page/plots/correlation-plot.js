@@ -13,7 +13,7 @@ const REFRESH_S = 15;
 /** @param {Pair} pair */
 export const pairName = ({ first, second }) => (first === second ? `${first} with itself` : `${first} and ${second}`);
 
-/** What was measured, with its 95 % interval, as lines of which the third and second make a band. @param {Pair} pair @param {import("../elements/line-chart.js").Line} line @returns {import("../elements/line-chart.js").Line[]} */
+/** Measured correlation function with its 95 % interval; the second and third line are the edges of a band. @param {Pair} pair @param {import("../elements/line-chart.js").Line} line @returns {import("../elements/line-chart.js").Line[]} */
 export function measuredLines(pair, line) {
   const errors = pair.standard_error.map((one) => Z95 * (one ?? 0));
   const edge = (/** @type {number} */ sign) => pair.measured.map((one, at) => (one === null ? null : one + sign * errors[at]));

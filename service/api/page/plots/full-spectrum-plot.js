@@ -6,7 +6,7 @@ const ORDERS = 5;
 
 /** @typedef {import("../monitor/records.d.ts").FullSpectrumSnapshot} FullSpectra */
 
-/** What goes round with the rotation, and what against it, at each place with two displacements. @extends {SamplePlot<FullSpectra>} */
+/** Full spectra, forward and reverse, at each location with two displacements. @extends {SamplePlot<FullSpectra>} */
 class FullSpectrumPlot extends SamplePlot {
   route = "full-spectra";
 
@@ -15,7 +15,7 @@ class FullSpectrumPlot extends SamplePlot {
     const known = found.speed_rad_s !== null;
     const turns = Math.abs(found.speed_rad_s ?? 0) / (2 * Math.PI);
     const last = found.frequencies_hz[found.frequencies_hz.length - 1] ?? 0;
-    const cut = turns && ORDERS * turns < last; // of a slow machine the orders would be too close to be told apart
+    const cut = turns && ORDERS * turns < last; // on a slow machine the orders would be too close to distinguish
     const shown = found.frequencies_hz.flatMap((line, at) => (cut && Math.abs(line) > ORDERS * turns ? [] : [at]));
     const orders = [-2, -1, 1, 2].filter((order) => turns && Math.abs(order) * turns < last);
     /** @type {import("../elements/line-chart.js").Mark[]} */

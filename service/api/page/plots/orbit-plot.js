@@ -9,7 +9,7 @@ const [REFRESH_S, REVOLUTIONS] = [15, 8];
 /** @typedef {import("../monitor/records.d.ts").PlaceOrbit} PlaceOrbit */
 /** @typedef {import("../monitor/records.d.ts").OrbitSnapshot} Orbits */
 
-/** Where the shaft was when its mark passed the sensor. @param {PlaceOrbit} orbit @param {number[]} pulses_s */
+/** Positions of the shaft at the pulses of the phase reference. @param {PlaceOrbit} orbit @param {number[]} pulses_s */
 function marked({ path }, pulses_s) {
   if (!path) return [];
   return pulses_s.flatMap((pulse) => {
@@ -21,7 +21,7 @@ function marked({ path }, pulses_s) {
   });
 }
 
-/** One place: samples, ellipses and marks. @param {PlaceOrbit} orbit @param {number[]} pulses_s @param {{measured: string, nominal: string}} [called] */
+/** Orbit at one location: samples, ellipses and marks. @param {PlaceOrbit} orbit @param {number[]} pulses_s @param {{measured: string, nominal: string}} [called] */
 export function orbitFigure(orbit, pulses_s, called = { measured: "1× measured", nominal: "as nominal" }) {
   const { path, ellipse, nominal, estimated, location, unit } = orbit;
   const reach = Math.max(...[ellipse, nominal, estimated].map((one) => one?.semi_major ?? 0), ...(path ? [...path.y, ...path.z].map(Math.abs) : []), 1e-12);

@@ -3,10 +3,10 @@
 import { svg } from "../elements/markup.js";
 
 export const SIZE = 220;
-/** Half of what is drawn of `SIZE`. */
+/** Half of the drawn part of `SIZE`. */
 export const REACH = 0.46 * SIZE;
 
-/** A length at or above another one with a single leading digit. @param {number} length */
+/** Round a length up to 1, 2, 5 or 10 times a power of ten. @param {number} length */
 export function roundUp(length) {
   const power = 10 ** Math.floor(Math.log10(length));
   return power * (/** @type {number} */ ([1, 2, 5, 10].find((each) => each * power >= length * (1 - 1e-9))));
@@ -14,7 +14,7 @@ export function roundUp(length) {
 
 /**
  * Children on a grid of four by four fields, their lengths in pixels.
- * @param {string} said what is shown, for those who do not see it
+ * @param {string} said description for screen readers
  * @param {string} field size of a field, with its unit
  * @param {...(Node | null | false)} children
  */

@@ -2,8 +2,8 @@ import { html } from "../elements/markup.js";
 import { monitor } from "../monitor/monitor.js";
 
 /**
- * Something that is not always needed, folded: `<plot-fold place shows="plots/waveform-plot" heading>`, with `open` not at first. It is loaded when it is
- * opened, and asks for nothing once it is closed again. `recorded` is handed on, also when it becomes another one.
+ * A folded element: `<plot-fold place shows="plots/waveform-plot" heading>`, initially unfolded with `open`. Its content is loaded when it is opened, and
+ * requests nothing once it is closed again. `recorded` is passed on, also when it changes.
  */
 class PlotFold extends HTMLElement {
   static observedAttributes = ["recorded"];
@@ -30,7 +30,7 @@ class PlotFold extends HTMLElement {
     if (recorded !== null) this.#inside.firstElementChild?.setAttribute("recorded", recorded);
   }
 
-  /** Show this and nothing that is live, see `MachineElement`. @param {import("../monitor/records.d.ts").Health} health */
+  /** Show this health instead of live data, see `MachineElement`. @param {import("../monitor/records.d.ts").Health} health */
   feed(health) {
     this.#fed = health;
     /** @type {any} */ (this.#inside.firstElementChild)?.feed?.(health);

@@ -9,14 +9,14 @@ const RECORDINGS = 40;
 /** @typedef {{source: string, reason: string}} Values */
 
 /**
- * A plot of what is live, of a recording of the machine or before the end of a recorded window: says in one line what is shown and from when. A recording
- * does not change, and is asked for once.
+ * A plot of live samples, of a recording of the machine, or of samples before the end of a recorded window; one line states what is shown and its time.
+ * Recorded data do not change, and are requested once.
  * @template {Values} T
  */
 export class SamplePlot extends MachineElement {
   /** Route of the API. */
   route = "";
-  /** What is shown where no recording is chosen. */
+  /** Name of the source if no recording is selected. */
   live = "newest samples";
   refreshS = 15;
   /** @type {Sensor[]} */
@@ -38,7 +38,7 @@ export class SamplePlot extends MachineElement {
   }
 
   /**
-   * Charts beside each other, each the same element as long as its name stays.
+   * Show charts side by side; a chart stays the same element as long as its name does.
    * @param {{name: string, more?: string, said: string, drawing: import("../elements/line-chart.js").Drawing}[]} charts
    */
   lines(charts) {
@@ -55,20 +55,20 @@ export class SamplePlot extends MachineElement {
     }
   }
 
-  /** What else may be chosen. @returns {HTMLElement[]} */
+  /** Further controls. @returns {HTMLElement[]} */
   choices() {
     return [];
   }
 
-  /** Offer channels or places, once it is known which there are. */
+  /** Offer channels or locations as soon as they are known. */
   offer() {}
 
-  /** What is asked for. @returns {[string, string][]} */
+  /** Arguments of the request. @returns {[string, string][]} */
   asked() {
     return [];
   }
 
-  /** Lay out what was found, and say in words what it is. @param {T} _found @returns {string} */
+  /** Show the data, and return a description of them. @param {T} _found @returns {string} */
   draw(_found) {
     return "";
   }
@@ -83,7 +83,7 @@ export class SamplePlot extends MachineElement {
     if (this.#source.value && asked === this.#shown) return;
     if (this.#source.value) this.#said.textContent = "The recording is being read …";
     const found = /** @type {T} */ (await this.askFor(this.route, asked));
-    if (asked !== this.#wanted()) return this.ask(); // something else was chosen meanwhile
+    if (asked !== this.#wanted()) return this.ask(); // the selection has changed meanwhile
     this.#shown = asked;
     const said = [this.recorded && "Replay", this.draw(found), found.reason].filter(Boolean).join("; ");
     this.#said.textContent = said.charAt(0).toUpperCase() + said.slice(1);
@@ -99,7 +99,7 @@ export class SamplePlot extends MachineElement {
     this.#said.textContent = why;
   }
 
-  /** The newest recordings; none where none are kept. */
+  /** The newest recordings; empty if none are kept. */
   async #offer() {
     const [site, machine] = this.place.split("/");
     try {
@@ -113,9 +113,9 @@ export class SamplePlot extends MachineElement {
   }
 }
 
-/** A choice among names, which asks anew. @param {string} label @param {() => void} changed */
+/** A selection of names; a change causes a new request. @param {string} label @param {() => void} changed */
 export const choiceOf = (label, changed) => /** @type {HTMLSelectElement} */ (html("select", { "aria-label": label, change: changed }));
 
-/** Offer names, with words where they differ. @param {HTMLSelectElement} choice @param {(string | [string, string])[]} names */
+/** Offer names, with other texts where given. @param {HTMLSelectElement} choice @param {(string | [string, string])[]} names */
 export const offered = (choice, names) =>
   choice.replaceChildren(...names.map((name) => html("option", { value: typeof name === "string" ? name : name[0] }, typeof name === "string" ? name : name[1])));

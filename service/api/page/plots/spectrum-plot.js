@@ -8,7 +8,7 @@ const [REFRESH_S, ORDERS] = [15, 5];
 /** @typedef {import("../monitor/records.d.ts").SpectrumSnapshot} Spectra */
 /** @typedef {import("../monitor/records.d.ts").WaterfallSnapshot} Waterfall */
 
-/** What spectra have around them: axes and the orders. @param {number[]} lines @param {number | null} turning Hz @param {string} unit */
+/** Common parts of spectra: axes and orders. @param {number[]} lines @param {number | null} turning Hz @param {string} unit */
 function frame(lines, turning, unit) {
   const orders = turning ? Array.from({ length: ORDERS }, (_, at) => at + 1).filter((order) => order * turning <= lines[lines.length - 1]) : [];
   return {
@@ -22,7 +22,7 @@ function frame(lines, turning, unit) {
   };
 }
 
-/** One channel's spectrum beside its theory, with the orders. @param {Spectra} found @param {import("../monitor/records.d.ts").ChannelDensity} shown @returns {import("../elements/line-chart.js").Drawing} */
+/** One channel's spectrum with theory and orders. @param {Spectra} found @param {import("../monitor/records.d.ts").ChannelDensity} shown @returns {import("../elements/line-chart.js").Drawing} */
 export function spectrumDrawing(found, shown) {
   /** @type {import("../elements/line-chart.js").Line[]} */
   const lines = [{ label: "measured", values: shown.measured }];
@@ -35,7 +35,7 @@ export function spectrumDrawing(found, shown) {
   };
 }
 
-/** Power spectral densities of a window beside theory, with the orders of the running speed. */
+/** Power spectral densities of a window with theory and the orders of running speed. */
 class SpectrumPlot extends MachineElement {
   #message = html("p", { class: "note" });
   #choice = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Channel", change: () => this.load() }));
@@ -50,7 +50,7 @@ class SpectrumPlot extends MachineElement {
   async ask() {
     const found = /** @type {Spectra} */ (await this.askFor("spectra"));
     const held = found.densities.map((one) => one.channel);
-    // Of channels of which only levels are watched no spectrum of the window is kept, but their newest samples are.
+    // For channels of which only levels are watched, there is no spectrum of the window, but there are newest samples.
     const there = this.recorded || found.filled < 1 ? [] : ((await this.machineFile())?.sensors ?? []);
     const others = there.filter((one) => one.quantity !== "shaft_angle" && !held.includes(one.name)).map((one) => one.name);
     const names = [...held, ...others];
@@ -60,7 +60,7 @@ class SpectrumPlot extends MachineElement {
     else this.#draw(found);
   }
 
-  /** Amplitudes in the newest samples. @param {Waterfall} found */
+  /** Amplitude spectrum of the newest samples. @param {Waterfall} found */
   #drawNewest({ channel, rows, frequencies_hz: lines, unit, start_ns, end_ns }) {
     this.#chart.hidden = this.#choice.hidden = !rows.length;
     if (!rows.length || !start_ns || !end_ns) return this.refused(`No samples of ${channel} are there.`);
@@ -82,7 +82,7 @@ class SpectrumPlot extends MachineElement {
     const shown = found.densities.find((one) => one.channel === this.#choice.value) ?? found.densities[0];
     this.#chart.hidden = this.#choice.hidden = !shown;
     const theory = found.theory;
-    // Whoever looks for 1× has to be told where it is.
+    // State where 1× is, because it is removed from these spectra.
     const once = shown && found.left_out_hz ? "1× is taken out (shaded: where some of it may be left); it is among the vibration levels" : "";
     this.#message.textContent = [...new Set([this.windowText(found), once, found.reason, theory.nominal_reason || theory.estimated_reason])].filter(Boolean).join("; ");
     if (!shown) return;

@@ -9,7 +9,7 @@ import "../elements/line-chart.js";
 
 const rpm = (/** @type {number | null} */ speed) => Math.abs((speed ?? 0) * 30) / Math.PI;
 
-/** Amplitude and phase at running speed, over speed (Bode) and in their plane (polar). @extends {SamplePlot<Vectors>} */
+/** Amplitude and phase of 1x over speed (Bode) and in the polar plane. @extends {SamplePlot<Vectors>} */
 class VectorPlot extends SamplePlot {
   route = "vectors";
   live = "windows of the history";
@@ -63,7 +63,7 @@ class VectorPlot extends SamplePlot {
     return steady ? `${which}; ${found.steady}, so amplitude and phase are shown over time` : which;
   }
 
-  /** Vectors as they are on the machine: 0° where the sensor is, the lag against the rotation. @param {Vectors} found */
+  /** Polar plot with angles as on the machine: 0° at the sensor, the lag counted against the rotation. @param {Vectors} found */
   #polar(found) {
     const [shown] = found.channels;
     const sensor = this.sensors.find((one) => one.name === shown.channel);

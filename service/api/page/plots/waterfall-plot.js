@@ -6,7 +6,7 @@ import { choiceOf, offered, SamplePlot } from "./sample-plot.js";
 
 const DECADES = 3;
 
-/** What a row is of: the time, or the speed. @param {Waterfall["rows"][number]} row @param {string} over */
+/** Label of a row: its time or speed. @param {Waterfall["rows"][number]} row @param {string} over */
 const named = (row, over) => (over === "speed" ? `${(Math.abs(row.speed_rad_s ?? 0) * 30 / Math.PI).toFixed(0)} rpm` : clock(row.start_ns).slice(11, 19));
 
 /** Spectra of one channel over time or speed, as shades on a logarithmic scale. @extends {SamplePlot<Waterfall>} */

@@ -4,7 +4,7 @@ import "../elements/line-chart.js";
 
 /** @typedef {import("../monitor/records.d.ts").WaveformSnapshot} Waveforms */
 
-/** The newest revolutions at one place, channel by channel, with the moments at which the keyphasor's mark passed. @extends {SamplePlot<Waveforms>} */
+/** The newest revolutions at one location, channel by channel, with the pulses of the phase reference. @extends {SamplePlot<Waveforms>} */
 class WaveformPlot extends SamplePlot {
   route = "waveforms";
   #where = choiceOf("Place", () => this.load());

@@ -5,14 +5,14 @@ import { differences } from "./replay-list.js";
 import "../elements/state-mark.js";
 
 const EVENTS = 1000;
-/** Events of one kind that are no farther apart than this are the same one, earlier or later: windows of a replay need not end when those that were live did. */
+/** Largest time between two events of one kind that count as the same: windows of a replay may end at other times than the live ones. */
 const SAME_NS = 120e9;
 
 /** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
 /** @typedef {import("../monitor/records.d.ts").ReplayJob} ReplayJob */
 
 /**
- * Events of both lists, in the order of time, those that are the same together.
+ * Events of both lists in order of time; matching events are paired.
  * @param {AlarmEvent[]} here @param {AlarmEvent[]} there
  * @returns {{here?: AlarmEvent, there?: AlarmEvent}[]}
  */
@@ -27,14 +27,14 @@ function paired(here, there) {
   return [...found, ...[...left].map((one) => ({ there: one }))].sort((one, other) => time(one) - time(other));
 }
 
-/** Where an event is. @param {AlarmEvent | undefined} here @param {AlarmEvent | undefined} there @param {string} other */
+/** Text on where an event occurred. @param {AlarmEvent | undefined} here @param {AlarmEvent | undefined} there @param {string} other */
 function where(here, there, other) {
   if (!here || !there) return html("strong", {}, here ? "this replay only" : `${other} only`);
   const later_s = (here.time_ns - there.time_ns) / 1e9;
   return Math.abs(later_s) < 0.5 ? "both" : `both, ${lasting(Math.abs(later_s))} ${later_s > 0 ? "later" : "earlier"} in this replay`;
 }
 
-/** Alarms as a replay would have raised them, beside those that were raised, or that another replay would have raised. */
+/** Alarms that a replay would have raised, compared with those raised live or by another replay. */
 class AlarmComparison extends HTMLElement {
   #beside = /** @type {HTMLSelectElement} */ (html("select", { change: () => this.#compare() }));
   #message = html("p", { class: "message", role: "status" });
@@ -78,7 +78,7 @@ class AlarmComparison extends HTMLElement {
 
   /** @param {string} beside @param {AlarmEvent[]} others */
   #lay(beside, others) {
-    const own = ["raised", "escalated", "cleared"]; // what operators do is no affair of a replay
+    const own = ["raised", "escalated", "cleared"]; // a replay has no actions of operators
     const [ours, theirs] = [this.#events, others].map((list) => list.filter((one) => own.includes(one.kind)));
     const other = beside === "live" ? "live" : "the other replay";
     const rows = paired(ours, theirs).map(({ here, there }) => {

@@ -17,11 +17,11 @@ const RAISED = new Set(["raised", "escalated"]);
 /** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
 /** @typedef {import("../monitor/records.d.ts").ReplayJob} ReplayJob */
 
-/** What an offline replay found: state, parameters and levels over time, alarms, and the report of any window. */
+/** Results of an offline replay: state, parameters and levels over time, alarms, and the report of any window. */
 class OfflineResult extends HTMLElement {
   /** @type {ReplayJob | null} */
   #job = null;
-  /** Every so many-th window. @type {Report[]} */
+  /** Every n-th window. @type {Report[]} */
   #reports = [];
   /** @type {AlarmEvent[]} */
   #events = [];
@@ -42,7 +42,7 @@ class OfflineResult extends HTMLElement {
     return `${API}/replays/${this.getAttribute("replay")}`;
   }
 
-  /** Whose recordings they are: `site/machine`. */
+  /** The recorded machine, `site/machine`. */
   get #machine() {
     return this.#job?.recordings[0].split("/").slice(0, 2).join("/") ?? "";
   }
@@ -92,7 +92,7 @@ class OfflineResult extends HTMLElement {
     );
     this.#strip.show(this.#reports, (/** @type {number} */ at) => this.#go(at * this.#every, true));
     this.#alarms.show(this.#job, this.#events, [first.start_ns, last.end_ns], (/** @type {number} */ ns) => this.#goTo(ns));
-    await this.#go(windows - 1, true); // what it came to
+    await this.#go(windows - 1, true); // the final result
   }
 
   #said() {
@@ -110,7 +110,7 @@ class OfflineResult extends HTMLElement {
     ].filter(Boolean).join("; ");
   }
 
-  /** A window as health tells what is live, with the alarms as they would have stood. @param {Report} report @returns {Health} */
+  /** A window in the form of a live health, with the alarms that would have been standing. @param {Report} report @returns {Health} */
   #health(report) {
     const [site, machine] = this.#machine.split("/");
     const latest = new Map(this.#events.filter((one) => one.time_ns <= report.end_ns && (RAISED.has(one.kind) || one.kind === "cleared")).map((one) => [one.name, one]));
@@ -124,7 +124,7 @@ class OfflineResult extends HTMLElement {
     if (set) this.#scrub.value = String(at);
     let report = at % this.#every === 0 ? this.#reports[at / this.#every] : undefined;
     if (!report) {
-      await new Promise((resolve) => setTimeout(resolve, WAIT_MS)); // a hand on the scrubber passes over many
+      await new Promise((resolve) => setTimeout(resolve, WAIT_MS)); // dragging the scrubber passes over many windows
       if (this.#wanted !== at) return;
       try {
         [report] = (await monitor.ask(`${this.#path}/reports?offset=${at}&limit=1`)).reports;
@@ -158,14 +158,14 @@ class OfflineResult extends HTMLElement {
     for (const one of [this.#strip, ...this.#trends]) one.mark(report.end_ns);
   }
 
-  /** Go to the first window that ends at a time or after it. @param {number} ns */
+  /** Go to the first window that ends at or after a time. @param {number} ns */
   #goTo(ns) {
     const found = this.#reports.findIndex((one) => one.end_ns >= ns);
     this.#go((found < 0 ? this.#reports.length - 1 : found) * this.#every, true);
     this.#scrub.focus();
   }
 
-  /** To the alarm event before or after. @param {number} direction */
+  /** Go to the previous or next alarm event. @param {number} direction */
   #next(direction) {
     const ends = this.#reports.map((one) => one.end_ns);
     const moments = [...new Set(this.#events.map((one) => ends.findIndex((end) => end >= one.time_ns)).filter((at) => at >= 0).map((at) => at * this.#every))].sort((one, other) => one - other);

@@ -8,7 +8,7 @@ const FOLLOW_MS = 15_000;
 
 /** @typedef {import("../monitor/records.d.ts").ReplayJob} ReplayJob */
 
-/** Pause, resume and seek of a replay that goes onto the network at a pace. */
+/** Controls of a paced replay on the network: pause, resume, seek. */
 class PacedControl extends HTMLElement {
   #said = html("p", { class: "number" });
   #pause = html("button", { type: "button", click: () => this.#order(this.#job?.state === "paused" ? "resume" : "pause") });
@@ -20,10 +20,10 @@ class PacedControl extends HTMLElement {
   #followed = -Infinity;
   /** @type {ReplayJob | null} */
   #job = null;
-  /** First and last data. @type {[number, number] | null} */
+  /** Time span of the data, ns. @type {[number, number] | null} */
   #span = null;
   #held = false;
-  /** Orders are given one after the other: of two at once, the first might be carried out last. */
+  /** Orders are sent one after the other, because two at once might be executed in the wrong order. */
   #orders = Promise.resolve();
   #waiting = 0;
 
@@ -49,7 +49,7 @@ class PacedControl extends HTMLElement {
     this.#stand();
   }
 
-  /** Put the slider where the replay is, unless somebody is moving it. */
+  /** Move the slider to the replay's position, unless the user is moving it. */
   #stand() {
     const progress = this.#job?.progress;
     if (this.#held || this.#waiting || !progress || !this.#span) return;
@@ -58,14 +58,14 @@ class PacedControl extends HTMLElement {
     this.#follow(this.#job?.state !== "running");
   }
 
-  /** Show the window that ends where it stands; while it goes on only now and then. @param {boolean} rests */
+  /** Show the window that ends at the slider; while the replay is running, only at intervals. @param {boolean} rests */
   #follow(rests) {
     if (!this.#span || (!rests && performance.now() - this.#followed < FOLLOW_MS)) return;
     this.#followed = performance.now();
     this.#plots?.stand(this.#at());
   }
 
-  /** From when to when the data are. @param {ReplayJob} job */
+  /** Time span of the replay's data. @param {ReplayJob} job */
   async #measure(job) {
     try {
       const all = await Promise.all(job.recordings.slice(0, 50).map((id) => monitor.ask(`${API}/recordings/${id}`)));
@@ -96,7 +96,7 @@ class PacedControl extends HTMLElement {
       .then(() => monitor.order(`${API}/replays/${this.#job?.id}/${kind}`, order))
       .then((job) => {
         this.#message.textContent = "";
-        const { state, progress } = this.#job ?? job; // an answer does not know yet where that is
+        const { state, progress } = this.#job ?? job; // the answer does not yet have the new position
         return state === "running" || state === "paused" ? this.show({ ...job, progress }) : undefined;
       })
       .catch((error) => {

@@ -10,7 +10,7 @@ const RANGES = /** @type {[string, string][]} */ ([["", "everything shown below"
 /** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
 /** @typedef {import("./recordings-view.js").Chosen} Chosen */
 
-/** Recordings on a line of time, the alarms of their machine above; an alarm chooses what was recorded around it. */
+/** Recordings on a time line, with the machine's alarms above; clicking an alarm selects the recordings around it. */
 class RecordingLine extends HTMLElement {
   #range = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Range of the time line", change: () => this.#draw() }, ...RANGES.map(([hours, text]) => html("option", { value: hours }, text))));
   #picture = html("div", { class: "time-line" });
@@ -63,7 +63,7 @@ class RecordingLine extends HTMLElement {
     this.#list(seen);
   }
 
-  /** The latest alarms, each of which chooses what is around it. @param {AlarmEvent[]} seen */
+  /** The latest alarms, as buttons that select the recordings around them. @param {AlarmEvent[]} seen */
   #list(seen) {
     const rows = seen.slice(0, SHOWN).map((one) => ({
       key: one.sequence,

@@ -10,7 +10,7 @@ const [LATEST, EVENTS, REFRESH_S] = [200, 200, 30];
 
 /** @typedef {import("../monitor/records.d.ts").RecordingEntry} RecordingEntry */
 /** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
-/** What is to be replayed: recordings by id, and a stretch of them if it is not all. @typedef {{ids: Set<string>, stretch: [number, number] | null}} Chosen */
+/** Selection for a replay: ids of recordings, and a stretch of time if not everything. @typedef {{ids: Set<string>, stretch: [number, number] | null}} Chosen */
 
 /** Recordings of one machine with its alarms, and replays of them. */
 class RecordingsView extends LiveElement {
@@ -38,7 +38,7 @@ class RecordingsView extends LiveElement {
     lay(this, html("div", { class: "tools" }, html("h1", {}, "Recordings"), this.#machine), this.#message, ...this.#parts, html("replay-list"));
     let heard = monitor.machines.size;
     this.follow("health", () => {
-      if (!this.#said || heard === monitor.machines.size) return; // nothing is claimed of recordings that were not asked for yet
+      if (!this.#said || heard === monitor.machines.size) return; // no statement before recordings have been requested
       heard = monitor.machines.size;
       this.#show();
     });
@@ -66,7 +66,7 @@ class RecordingsView extends LiveElement {
     const asked = new URLSearchParams({ site, machine, latest: String(LATEST), data_times: "true" });
     const recordings = /** @type {RecordingEntry[]} */ ((await monitor.ask(`${API}/recordings?${asked}`)).recordings);
     const from = Math.min(...recordings.map((one) => one.data_start_ns ?? Infinity));
-    // A machine that was recorded need not be monitored any more.
+    // A recorded machine may not be monitored any more.
     const alarms = Number.isFinite(from) ? ((await monitor.find(`${pathOf(place)}/alarms/events?kind=raised&limit=${EVENTS}&since_ns=${from}`))?.events ?? []) : [];
     if (place !== this.#machine.value) return;
     this.#recordings = recordings;
@@ -78,7 +78,7 @@ class RecordingsView extends LiveElement {
     this.#show();
   }
 
-  /** Where nothing is recorded, there is nothing to choose. @param {boolean} any */
+  /** Hide the selection if there are no recordings. @param {boolean} any */
   #offer(any) {
     for (const part of [this.#machine, ...this.#parts]) part.hidden = !any;
   }

@@ -7,13 +7,13 @@ const REFRESH_S = 10;
 
 /** @typedef {import("../monitor/records.d.ts").ReplayJob} ReplayJob */
 
-/** How a replay differs from what was live. @param {ReplayJob} job */
+/** Differences of a replay from live operation. @param {ReplayJob} job */
 export const differences = (job) => [job.machine && `${job.machine_file_sent ? "another machine file, " : "machine file "}${job.machine.split("/").pop()}`, ...(job.changes ?? [])].filter(Boolean).join("; ");
 
 /** @param {number} count @param {string} word */
 export const counted = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
 
-/** What came of a replay so far. @param {ReplayJob} job */
+/** Result of a replay so far. @param {ReplayJob} job */
 export function outcome(job) {
   if (job.error) return job.error;
   if (job.summary) return `${counted(job.summary.windows, "window")}, ${counted(job.summary.alarms, "alarm event")}; raised at the end: ${job.summary.raised.join(", ") || "none"}`;

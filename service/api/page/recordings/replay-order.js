@@ -9,7 +9,7 @@ const LARGEST = 100_000;
 /** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
 /** @typedef {import("./recordings-view.js").Chosen} Chosen */
 
-/** A form that starts a replay of what is chosen: as it was, or with another machine file, also one of this computer, or another limit. */
+/** A form that starts a replay of the selection: unchanged, or with another machine file (also a local one) or another limit. */
 class ReplayOrder extends HTMLElement {
   #what = html("p", { role: "status" });
   #message = html("p", { class: "message", role: "alert" });
@@ -67,13 +67,13 @@ class ReplayOrder extends HTMLElement {
 
   #changes() {
     const raise = this.#raise.value ? Number(this.#raise.value) / 100 : null;
-    // The way back stays where it is in proportion: 6 % for 10 %.
+    // The limit for clearing is scaled in proportion: 6 % for 10 %.
     const limits = raise === null ? [] : [`alarms.limits.raise_above = ${raise}`, `alarms.limits.clear_below = ${Number((0.6 * raise).toPrecision(6))}`];
     const delay = this.#delay.value ? [`alarms.on_delay_s = ${Number(this.#delay.value)}`] : [];
     return [...limits, ...delay, ...this.#lines.value.split("\n").map((one) => one.trim()).filter(Boolean)];
   }
 
-  /** Which machine file, if it is not that of the machine. @returns {Promise<Record<string, string>>} */
+  /** Arguments for another machine file than the machine's own. @returns {Promise<Record<string, string>>} */
   async #machineFile() {
     const [file] = this.#file.files ?? [];
     if (!file) return this.#machine.value ? { machine: this.#machine.value } : {};

@@ -5,12 +5,12 @@ import { ParameterTrend } from "../machine/parameter-trend.js";
 /** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
 /** @typedef {import("../monitor/records.d.ts").ReadingBucket} Bucket */
 /** @typedef {import("../machine/reading-trend.js").Trended} Trended */
-/** What a replay found. @typedef {{reports: Report[], events: AlarmEvent[], limits: Record<string, {raise_above: number, danger_above: number}>}} Found */
+/** Results of a replay. @typedef {{reports: Report[], events: AlarmEvent[], limits: Record<string, {raise_above: number, danger_above: number}>}} Found */
 
 /** @param {string} name @param {Report} report @param {number | null} value @param {number | null} error @returns {Bucket[]} */
 const reading = (name, report, value, error) => (value === null ? [] : [{ name, start_ns: report.end_ns, length_ns: 0, count: 1, minimum: value, mean: value, maximum: value, mean_standard_error: error }]);
 
-/** Changes of the parameters over the time of a replay, with the limits that held in it. */
+/** Changes of the parameters over the time of a replay, with its limits. */
 class ReplayParameters extends ParameterTrend {
   /** @type {Found} */
   found = { reports: [], events: [], limits: {} };

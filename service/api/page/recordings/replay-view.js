@@ -10,7 +10,7 @@ const ENDED = new Set(["finished", "stopped", "failed"]);
 
 /** @typedef {import("../monitor/records.d.ts").ReplayJob} ReplayJob */
 
-/** One replay, framed and under a banner, so that nobody takes it for what is live. */
+/** One replay, framed and under a banner, so that nobody takes it for live data. */
 class ReplayView extends LiveElement {
   #banner = html("p", { class: "replay-banner" });
   #head = html("div");
@@ -21,7 +21,7 @@ class ReplayView extends LiveElement {
   #body = html("div");
   /** @type {EventSource | null} */
   #stream = null;
-  /** The scrubber stays below the banner, whose lines are more on a phone. */
+  /** Keeps the scrubber below the banner, which has more lines on a phone. */
   #sized = new ResizeObserver(() => this.style.setProperty("--banner", `${this.#banner.offsetHeight}px`));
 
   get #path() {

@@ -36,7 +36,7 @@ class StateStrip extends HTMLElement {
     );
   }
 
-  /** Where the scrubber stands, ns. @param {number} moment */
+  /** Mark the position of the scrubber, ns. @param {number} moment */
   mark(moment) {
     for (const end of ["x1", "x2"]) this.#line.setAttribute(end, String(this.#x(moment)));
   }

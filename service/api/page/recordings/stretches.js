@@ -2,13 +2,13 @@
 /** @typedef {import("../monitor/records.d.ts").Report} Report */
 /** @typedef {{state: string, from: number, to: number, at: number}} Run */
 
-/** Ids of the recordings that can be replayed and hold data of a stretch. @param {RecordingEntry[]} recordings @param {number} from @param {number} to @returns {Set<string>} */
+/** Ids of the recordings that can be replayed and have data within a stretch of time. @param {RecordingEntry[]} recordings @param {number} from @param {number} to @returns {Set<string>} */
 export function within(recordings, from, to) {
   const there = recordings.filter((one) => one.complete && !one.problem && Number(one.data_start_ns) < to && Number(one.data_end_ns) > from);
   return new Set(there.map((one) => one.id));
 }
 
-/** States one after the other: each from the end of the window before, with the number of its first window. @param {Report[]} reports @returns {Run[]} */
+/** Runs of equal states in order of time: each from the end of the window before, with the index of its first window. @param {Report[]} reports @returns {Run[]} */
 export function runs(reports) {
   /** @type {Run[]} */
   const found = [];

@@ -10,7 +10,7 @@ const FOLDED = [
   ["correlation-plot", "Correlations and residuals of the equations"],
 ];
 
-/** The plots of a live machine, of a window of a replay, made of the samples it reads: `<window-plots place replay>`. */
+/** The plots of a live machine for a window of a replay, from the replay's samples: `<window-plots place replay>`. */
 class WindowPlots extends HTMLElement {
   #folds = /** @type {any[]} */ ([]);
   #timer = 0;
@@ -26,7 +26,7 @@ class WindowPlots extends HTMLElement {
   }
 
   /**
-   * Show the window that ends at a time, once nobody goes on to another one.
+   * Show the window that ends at a time, once the user stops moving on.
    * @param {number} end_ns
    * @param {import("../monitor/records.d.ts").Health} [health] as it was told then
    */
