@@ -1,6 +1,6 @@
 """What the page costs: a browser with a plant of many machines, and a monitor with many pages.
 
-Run: ``python benchmarks/page.py`` (about eight minutes, with a Chromium, or what ``ROTORWATCH_CHROMIUM`` names),
+Run: ``python benchmarks/page.py`` (about eight minutes, with a Chromium, or the one in ``ROTORWATCH_CHROMIUM``),
 ``--small`` for three.
 
 Plant: for each number of machines, all in one run, a server sends the page the health of machines in batches. *Batch*

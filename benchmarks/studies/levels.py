@@ -25,7 +25,7 @@ from service.monitor.monitor import MachineMonitor
 _FIRST_WINDOWS = 5  # windows of the reference of a machine that was not commissioned
 _DOUBLED = ("overall", "1x", "2x")  # their index is part of the seed
 _IN_NOISE = "2x, within the noise"
-_KNOWN_ERRORS = 10.0  # least 2x in the reference, in standard errors of one window; below, it is within the noise
+_KNOWN_ERRORS = 10.0  # least 2x in the reference, in standard errors of one window, i.e. known to 10 %; less is noise
 _BEARING, _IN_SNAPSHOTS = "accelerometers, 12.8 kHz", "accelerometers, 12.8 kHz, 0.1 s every 10 s"
 _BEARING_WINDOW_S = 20.0
 

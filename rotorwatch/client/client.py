@@ -112,7 +112,7 @@ class Client:
         return self._get(MachineDescription, place)
 
     def configuration(self, place: str) -> MachineConfiguration:
-        """The machine file as it is in use."""
+        """The machine file in use."""
         return self._get(MachineConfiguration, place, "configuration")
 
     def health(self, place: str) -> Health:
@@ -133,7 +133,7 @@ class Client:
         return self._get(AlarmStates, place, "alarms", state=wanted, name=names, all=everything)
 
     def alarm(self, place: str, name: str) -> Alarm:
-        """One alarm as it is now."""
+        """The current state of one alarm."""
         return self._get(Alarm, place, f"alarms/{name}")
 
     def acknowledge(self, place: str, seen: Alarm, reason: str = "") -> OperationDone:

@@ -1,4 +1,4 @@
-"""Alarms: what they are now, and what happened to them."""
+"""Alarms: current states, and events."""
 
 from enum import StrEnum
 from typing import Annotated, Literal

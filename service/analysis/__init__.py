@@ -1,1 +1,1 @@
-"""What windows and recordings show: orbits, spectra, correlations, trends, and what theory predicts of them."""
+"""Analysis of windows and recordings: orbits, spectra, correlation functions, trends, and predictions of theory."""

@@ -1,4 +1,4 @@
-"""The HTTP server in a thread of its own."""
+"""The HTTP server, which runs in its own thread."""
 
 import asyncio
 import errno

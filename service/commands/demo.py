@@ -352,7 +352,7 @@ def _program(name: str, module: str, *arguments: str, recordings: str = "") -> I
             stdout=output,
             stderr=subprocess.STDOUT,
             stdin=subprocess.PIPE,
-            # A session of its own: Ctrl-C reaches this program alone, which then stops the others in order.
+            # In a new session, so that Ctrl-C only reaches this program, which then stops the others in order.
             start_new_session=True,
             env=os.environ | _ENVIRONMENT | recording,
         )

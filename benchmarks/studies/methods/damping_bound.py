@@ -110,7 +110,7 @@ def damping_bound(
 ) -> DampingBound:
     """Information from statistics of `expected`, the later ones with the changes.
 
-    `durations_s`: of the healthy recording, and of what is read later.
+    `durations_s` are the lengths of the healthy recording and of the later data.
     """
     references = references_of(MOTION)
     before, after = (row_window(row, one, MOTION, references).beyond(SHORTEST_LAG_FROM_S) for one in (healthy, later))
