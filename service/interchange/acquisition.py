@@ -13,7 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from service.interchange.source import CHUNK_ROWS, Array, Reference, Source, SourceError, Timing, equally_long, readable
+from service.interchange.source import (
+    CHUNK_ROWS,
+    ONE_RATE,
+    Array,
+    Reference,
+    Source,
+    SourceError,
+    Timing,
+    equally_long,
+    readable,
+)
 from service.monitor.alarm_conversion import rfc3339
 
 _SAME_TIME_S = 1e-9
@@ -50,7 +60,7 @@ class TdmsSource(Source):
             if found is not None and timing != found:
                 raise SourceError(
                     f"{self.path}: channel {reference} has {_told(timing)}, channel {columns[0]} has {_told(found)}; "
-                    "expected the same (wf_increment, wf_start_time, wf_start_offset)"
+                    f"expected the same (wf_increment, wf_start_time, wf_start_offset): {ONE_RATE}"
                 )
             found = timing
         return found or Timing()

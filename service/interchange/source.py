@@ -135,6 +135,10 @@ class Source:
         return len(column), column.__getitem__
 
 
+ONE_RATE = "write the file with one rate, or leave one of them out of the mapping and of the machine file"
+"""What helps where the columns of a file do not belong together."""
+
+
 def _bare(name: str) -> str:
     """Name of a column without unit and blanks, case-folded, for comparison."""
     return re.sub(r"\s+|[\[(].*", "", name).casefold()
@@ -151,7 +155,8 @@ def equally_long(path: Path, columns: Sequence[Reference], lengths: Sequence[int
     for reference, length in zip(columns, lengths, strict=True):
         if length != lengths[0]:
             raise SourceError(
-                f"{path}: column {reference} has {length} rows, column {columns[0]} has {lengths[0]}; expected the same"
+                f"{path}: column {reference} has {length} rows, column {columns[0]} has {lengths[0]}; "
+                f"expected the same: {ONE_RATE}"
             )
     return lengths[0] if lengths else 0
 

@@ -15,6 +15,8 @@ from service.interchange.mapping import CsvFormat
 from service.interchange.source import CHUNK_ROWS, Array, Reference, Source, SourceError, readable
 
 _BYTES = 4 << 20
+_HEAD = 100  # rows after which a line with too few cells says nothing against how the others are read
+_NO_ROW = "; delete this line if it is no whole row"
 _NUMBER = r"[-+]?[\d.,]+([eE][-+]?\d+)?"
 _GROUPED = r"[-+]?\d{1,3}([.,' ]\d{3})+([.,]\d+)?"  # a number such as 1,899.62, with separators of thousands
 _ZONED = r"(Z|[T ].*[+-]\d\d(:?\d\d)?)$"
@@ -37,7 +39,10 @@ class _Table(Source):
         for reference in columns:
             self._column(reference)
             if reference.column in self._twice:
-                raise SourceError(f"{self.path}: there are several columns named {reference.column!r}")
+                raise SourceError(
+                    f"{self.path}: there are several columns named {reference.column!r}, expected a name of its own "
+                    "for each: change them in the file"
+                )
         return [reference.column for reference in columns]
 
 
@@ -62,8 +67,11 @@ class CsvSource(_Table):
         except SourceError as error:
             if not isinstance(error.__cause__, pa.ArrowInvalid | UnicodeError) or not path.stat().st_size:
                 raise
+            told = self._told(error)
+            if told.endswith(_NO_ROW):
+                raise SourceError(told) from error
             raise SourceError(
-                f"{self._told(error)}; taken as {form.encoding} with {form.delimiter!r} between cells and "
+                f"{told}; taken as {form.encoding} with {form.delimiter!r} between cells and "
                 f"{form.skip_lines} lines before the table: [csv] in the mapping says otherwise, with encoding, "
                 "delimiter, decimal, header and skip_lines"
             ) from error
@@ -139,9 +147,11 @@ class CsvSource(_Table):
         return _array(_utc(column, self._zone) if self._is_datetime(name) else column)
 
     def _told(self, error: Exception) -> str:
-        """Arrow's message, with rows counted from 1 without header lines."""
+        """Arrow's message, rows counted from 1 without header lines; for one after many good rows, with a remedy."""
         before = self._form.skip_lines + self._form.header + self._form.skip_lines_after_header
-        return re.sub(r"Row #(\d+)", lambda found: f"row {int(found[1]) - before}", str(error))
+        text = re.sub(r"Row #(\d+)", lambda found: f"row {int(found[1]) - before}", str(error))
+        short = re.search(r"row (\d+): Expected \d+ columns", text)
+        return text + _NO_ROW if short and int(short[1]) > _HEAD else text
 
     def _fault(self, wanted: list[str]) -> str:
         """Message on the first cell that is not a number or time; empty if none is found."""

@@ -14,6 +14,7 @@ from tests.interchange.material import (
     CHANNELS,
     GOOD,
     PULSES,
+    SAMPLED,
     START,
     TEXT,
     archive,
@@ -44,10 +45,18 @@ def test_channels_of_a_tdms_file_that_differ_in_time_are_told_in_words(tmp_path:
             writer.write_segment([nptdms.ChannelObject("g", name, column, {} if name == "a" else told)])
     says = (
         "run.tdms: channel a has no rate from no time on, "
-        "channel x has 2000 samples per second from 2026-01-31T12:00:00.000000Z on; expected the same"
+        "channel x has 2000 samples per second from 2026-01-31T12:00:00.000000Z on; expected the same "
+        "(wf_increment, wf_start_time, wf_start_offset): write the file with one rate, or leave one of them out of the "
+        "mapping and of the machine file"
     )
     with pytest.raises(MachineFileError, match=re.escape(says)):
         imported(tmp_path, tmp_path / "run.tdms", CHANNELS)
+
+
+def test_columns_of_different_lengths_are_told_with_what_helps(tmp_path: Path) -> None:
+    time, x, v, a = signals(1000)
+    with pytest.raises(MachineFileError, match=r"column v has 250 rows, column x has 1000; .* write the file with one"):
+        imported(tmp_path, archive(tmp_path, t=time, x=x, v=v[::4], a=a), SAMPLED + CHANNELS)
 
 
 def test_texts_for_missing_numbers_count_as_empty_cells(tmp_path: Path) -> None:

@@ -73,7 +73,11 @@ def test_days_of_matlab_and_of_a_spreadsheet_are_times(tmp_path: Path, start: st
             "row 1, column 't': found '0,0'", "or decimal commas with csv.decimal in the mapping",
         )),
         ([*GOOD[:500], "0.25,1.0", *GOOD[501:]], TEXT, HEADER, (
-            "run.csv: ", "row 501: Expected 4 columns, got 2",
+            "run.csv: ", "row 501: Expected 4 columns, got 2: 0.25,1.0; delete this line if it is no whole row",
+        )),
+        ([*GOOD, "End of data"], TEXT, HEADER, ("row 1001: Expected 4 columns, got 1: End of data; delete this line",)),
+        ([f"{row},0" for row in GOOD], TEXT, f"{HEADER},v", (
+            "run.csv: there are several columns named 'v', expected a name of its own for each: change them",
         )),
         ([row.replace(",", ";").replace(".", ",") for row in GOOD], TEXT, "t;x;v;a", (
             "run.csv: damaged, or no CSV file",
@@ -115,7 +119,8 @@ def test_days_of_matlab_and_of_a_spreadsheet_are_times(tmp_path: Path, start: st
     ],
     ids=[
         *("missing column", "zone", "unit in the name", "misspelt", "unmapped channel", "text", "two dots"),
-        *("no number", "thousands", "unit line", "names", "no names", "comma", "short row", "other signs"),
+        *("no number", "thousands", "unit line", "names", "no names", "comma", "short row"),
+        *("last line", "same name", "other signs"),
         *("time goes back", "no second time", "no time", "half the rate", "few decimals"),
         *("other rate", "rate contradicts times", "five decimals", "days first", "dates"),
         *("no row", "one row", "no start", "1900", "2300", "9999"),
