@@ -338,10 +338,28 @@ def _lines(out: Path | None, overwrite: bool) -> "Iterator[Callable[[str], objec
         return
     if out.exists() and not overwrite:
         raise MachineFileError(f"{out}: already exists; --overwrite replaces it")
+    with _named(out):
+        file = out.open("w", encoding="utf-8", newline="\n")
+
+    def write(line: str) -> None:
+        with _named(out, half=True):
+            file.write(line + "\n")
+
     try:
-        with out.open("w", encoding="utf-8", newline="\n") as file:
-            yield lambda line: file.write(line + "\n")
+        yield write
+    finally:
+        with _named(out, half=True):
+            file.close()
+
+
+@contextmanager
+def _named(out: Path, *, half: bool = False) -> Iterator[None]:
+    """Say of which file it is that it cannot be written, and only of that; none is left that is half written."""
+    try:
+        yield
     except OSError as error:
+        if half and out.is_file():
+            out.unlink()
         raise MachineFileError(f"{out}: cannot be written ({error.strerror or error})") from error
 
 

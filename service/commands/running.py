@@ -6,6 +6,7 @@ import math
 import os
 import re
 import resource
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -25,7 +26,7 @@ _FILES = 65_536
 _UNUSABLE = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.EROFS}
 """System errors for a file that the user has named and this program cannot use."""
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-"""System errors for a full disk; if the error has no file name, it concerns standard output."""
+"""System errors for a full disk; if the error has no file name, it may concern standard output."""
 _NO_THREAD = "can't start new thread"
 _MB = 1_000_000
 _ADDRESS_SPACE_MB = 2_000
@@ -134,6 +135,16 @@ def check_address_space() -> None:
         raise RotorwatchError(f"the monitor cannot start: {_too_small(limit)}")
 
 
+def _output_is_full() -> bool:
+    """Whether not even the end of a line can be written to the output."""
+    try:
+        sys.stdout.write("\n")
+        sys.stdout.flush()
+    except OSError:
+        return True
+    return False
+
+
 def _too_small(limit: int) -> str:
     return (
         f"the address space of the process is limited to {limit // _MB} MB (ulimit -v), expected at least "
@@ -158,7 +169,8 @@ def exit_codes() -> Iterator[None]:
         raise typer.Exit(exit_code(error)) from error
     except OSError as error:
         if error.errno in _FULL and error.filename is None:
-            typer.echo(f"the output cannot be written ({error.strerror})", err=True)
+            what = "the output" if _output_is_full() else "a file"
+            typer.echo(f"{what} cannot be written ({error.strerror})", err=True)
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # discards output that is still buffered
             raise typer.Exit(1) from error
         if error.errno not in _UNUSABLE or error.filename is None:

@@ -3,6 +3,8 @@
 import hashlib
 import json
 import signal
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import pytest
 from models.signals.recording import read_recording
 from service.commands.replay import link_of
 from simulator.scenario import parse_fault
-from tests.service.rig.live import LAB, endpoint, machine_file, program, scenario_blocks, until
+from tests.service.rig.live import LAB, ROOT, endpoint, machine_file, program, scenario_blocks, until
 from tests.service.rig.preloaded import rotorwatch
 from tests.service.rig.replaying import recording, write
 
@@ -41,6 +43,24 @@ def test_lines_go_to_a_file_or_to_the_terminal_and_are_the_same(faulty: Path, tm
     again = run(faulty, "--offline", "--out", out)
     assert (again.returncode, "already exists" in again.stderr) == (2, True)
     assert out.read_text(encoding="utf-8") == text
+
+
+def test_a_disk_that_is_full_leaves_no_half_file(faulty: Path, tmp_path: Path) -> None:
+    out = tmp_path / "reports.jsonl"
+    command = (sys.executable, "-m", "service", "replay", str(faulty), "--offline", "--out", str(out))
+    limited = ("sh", "-c", 'ulimit -f 16; exec "$@"', "sh", *command)
+    found = subprocess.run(limited, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert (found.returncode, found.stderr.splitlines()[-1:]) == (2, [f"{out}: cannot be written (File too large)"])
+    assert not out.exists()
+
+
+def test_a_full_disk_of_the_progress_is_not_told_of_the_file_of_the_lines(faulty: Path, tmp_path: Path) -> None:
+    out = tmp_path / "reports.jsonl"
+    command = (sys.executable, "-m", "service", "replay", str(faulty), "--offline", "--progress", "json")
+    with Path("/dev/full").open("w", encoding="utf-8") as full:
+        argv = [*command, "--out", str(out)]
+        found = subprocess.run(argv, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False)
+    assert (found.returncode, found.stderr) == (1, "the output cannot be written (No space left on device)\n")
 
 
 def test_interrupted_offline_replay_is_no_success_and_says_what_it_leaves(faulty: Path, tmp_path: Path) -> None:

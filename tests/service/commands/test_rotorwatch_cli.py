@@ -90,6 +90,13 @@ def test_an_output_that_has_no_room_is_told_in_a_line(command: tuple[str, ...]) 
     assert (found.returncode, found.stderr) == (1, "the output cannot be written (No space left on device)\n")
 
 
+def test_another_file_that_has_no_room_is_not_told_as_the_output(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit) as ended, exit_codes():
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert ended.value.exit_code == 1
+    assert capsys.readouterr().err == "a file cannot be written (No space left on device)\n"
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_run_says_where_it_is_needs_no_torch_and_stops_cleanly(tmp_path: Path, number: signal.Signals) -> None:
     address = endpoint()
