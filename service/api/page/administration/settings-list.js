@@ -14,7 +14,7 @@ class SettingTable extends LiveElement {
   async ask() {
     const { settings } = /** @type {SettingList} */ (await monitor.ask(`${API}/settings`));
     const rows = Object.entries(settings).flatMap(([part, fields]) => Object.entries(fields).map(([name, value]) => ({ cells: [`[${part}] ${name}`, html("span", {}, value === null ? "left out" : `${value}`)] })));
-    lay(this, html("h2", {}, "Settings"), table(["setting", "value"], rows, "Settings in use, but for machines, access, webhooks, history, fleet and Zenoh"));
+    lay(this, html("h2", {}, "Settings"), table(["setting", "value"], rows, "Settings in use, except machines, access, webhooks, history, fleet and Zenoh"));
   }
 
   /** @param {string} why */
