@@ -6,6 +6,7 @@ A field is overridden by an environment variable named after its place, with two
 """
 
 import os
+import re
 from pathlib import Path
 from typing import Literal, Self
 
@@ -15,7 +16,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 from models.errors import MachineFileError
 from models.machine import MachineFile, load_machine_file
 from models.mistakes import in_folder, mistakes, read_toml, unseen_mistakes
-from models.signals.link import LinkSettings, TlsSettings, endpoint_fault
+from models.signals.link import LinkSettings, TlsSettings, endpoint_fault, is_address
 from service.history.records import Retention, StoreError
 from service.settings.access import AccessSettings, check_access
 from service.settings.webhooks import WebhookSettings
@@ -31,6 +32,19 @@ class HttpSettings(BaseModel, extra="forbid", frozen=True):
     """Where the HTTP API is served, to how many at once, and how long it waits for them."""
 
     host: str = Field(default="127.0.0.1", min_length=1, description="address to listen on")
+
+    @field_validator("host")
+    @classmethod
+    def _one_host(cls, host: str) -> str:
+        # The last part of a name is never a number; one of numbers alone would be an address.
+        is_name = re.fullmatch(r"([\w-]+\.)*[\w-]*[^\W\d][\w-]*\.?", host)
+        if not is_name and not is_address(host):
+            raise ValueError(
+                f"{host!r} is neither an address nor a name of this computer, expected such as 0.0.0.0, ::1 or "
+                "localhost; the port is http.port"
+            )
+        return host
+
     port: int = Field(default=8080, ge=0, le=65535, description="TCP port; 0 takes a free one, which is printed")
     connections: int = Field(
         default=300,
