@@ -178,6 +178,8 @@ def _remove_networks(out: Path, machine: Machine) -> str:
     try:
         load_bundle(out, machine)
     except BundleError as error:
+        if isinstance(error.__cause__, OSError) and not isinstance(error.__cause__, FileNotFoundError):
+            raise  # they may be the machine's
         (out / MANIFEST).unlink()
         return str(error)
     return ""

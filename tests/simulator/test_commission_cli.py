@@ -100,6 +100,18 @@ def test_networks_that_cannot_be_used_do_not_stay_beside_a_new_commissioning(
     assert (install(LAB, folder / out).bundle is not None) is stays  # a monitor starts, whatever was there
 
 
+def test_networks_that_cannot_be_read_stay_and_nothing_is_written(folder: Path) -> None:
+    out = folder / "unreadable"
+    shutil.copytree(ROOT / "models" / "bundles" / "lab", out)
+    (out / "weights.safetensors").unlink()
+    (out / "weights.safetensors").mkdir()
+    found = run(folder, "--machine", "lab", "--healthy", "monday.mcap", "--out", out, "--no-networks")
+    assert found.exit_code == 2
+    assert "unreadable/weights.safetensors: cannot be read (Is a directory)" in " ".join(found.stderr.split())
+    assert (out / "manifest.json").exists()
+    assert not (out / "commissioned.json").exists()
+
+
 def test_an_unfit_recording_is_refused_with_what_to_record(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("simulator.commission.page.pictures_of", lambda *_: ())
     found = run(folder, "--machine", "machine.toml", "--healthy", "short.mcap", "--out", "never")

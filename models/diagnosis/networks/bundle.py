@@ -212,6 +212,8 @@ def load_bundle(name_or_path: str | Path, machine: Machine) -> Bundle:
         manifest = Manifest.model_validate_json((directory / MANIFEST).read_bytes())
         weights = (directory / "weights.safetensors").read_bytes()
     except OSError as error:
+        if directory.is_dir() and not isinstance(error, FileNotFoundError):
+            raise BundleError(f"{error.filename}: cannot be read ({error.strerror})") from error
         shipped = sorted(entry.name for entry in _SHIPPED.iterdir() if entry.is_dir())
         why = f"no {Path(error.filename).name} in it" if directory.is_dir() else "there is no such folder"
         raise BundleError(
