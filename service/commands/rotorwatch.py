@@ -1,5 +1,6 @@
 """The command ``rotorwatch``: monitoring, router, demo and check of settings; for others see `service.commands`."""
 
+import socket
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -309,7 +310,18 @@ def _checked(file: Path) -> str:
     Webhooks(settings.webhooks)
     if settings.access.tls is not None:
         tls_context(settings.access.tls)
-    return "; ".join((f"settings for {', '.join(names)}", *lapses(settings)))
+    told = (f"settings for {', '.join(names)}", *lapses(settings), _not_listening(settings.http.host))
+    return "; ".join(filter(None, told))
+
+
+def _not_listening(host: str) -> str:
+    """Say that an address is none of this computer, which is no mistake in settings of another one."""
+    try:
+        socket.create_server((host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
+    except OSError as error:
+        why = (error.strerror or str(error)).partition(" (while")[0]
+        return f"this computer cannot listen on http.host {host} ({why})"
+    return ""
 
 
 # Added last, so that the commands of this module come first in the list.

@@ -37,7 +37,7 @@ class HttpSettings(BaseModel, extra="forbid", frozen=True):
     @classmethod
     def _one_host(cls, host: str) -> str:
         # The last part of a name is never a number; one of numbers alone would be an address.
-        is_name = re.fullmatch(r"([\w-]+\.)*[\w-]*[^\W\d][\w-]*\.?", host)
+        is_name = re.fullmatch(r"([\w-]{1,63}\.)*(?!\d+\.?$)[\w-]{1,63}\.?", host, re.ASCII)
         if not is_name and not is_address(host):
             raise ValueError(
                 f"{host!r} is neither an address nor a name of this computer, expected such as 0.0.0.0, ::1 or "

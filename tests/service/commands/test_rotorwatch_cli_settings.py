@@ -91,6 +91,11 @@ def test_check_config_says_what_is_fine_and_what_is_not(tmp_path: Path) -> None:
     found = "ok, machine demo/lab, 9 channels at 2000 Hz; knowledge level full"
     assert f"{tmp_path / 'machine.toml'}: {found}" in fine.stdout
     assert "knowledge level none: [rotor] lacks I2p_kg_m2" in fine.stdout
+    elsewhere = tmp_path / "elsewhere.toml"
+    elsewhere.write_text('[http]\nhost = "192.0.2.1"\n', encoding="utf-8")  # of documentation: no computer's
+    there = run("check-config", str(elsewhere))
+    assert (there.returncode, there.stderr) == (0, "")
+    assert "demo/lab; this computer cannot listen on http.host 192.0.2.1 (Cannot assign requested" in there.stdout
     mixed = run("check-config", str(good), str(wrong_machine), str(wrong_bundle))
     assert mixed.returncode == 2
     assert f"{good}: ok" in mixed.stdout
