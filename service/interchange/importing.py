@@ -192,12 +192,21 @@ def summary_lines(done: Imported) -> list[str]:
         lines.append(
             f"rows left out for an empty cell, NaN, infinity or a number beyond the dtype{every}: {read.left_out}"
         )
+    never = []
     for name, times in written.missing.items():
         lost_s = sum(end_ns - from_ns for from_ns, end_ns in times) / 1e9
         stretches = f" in {len(times)} stretches" if len(times) > 1 else ""
         lines.append(
             f"missing, in whole blocks: {name}, {lasting(lost_s)}{stretches} from {rfc3339(times[0][0])} to "
             f"{rfc3339(times[-1][1])}"
+        )
+        if round(lost_s * machine.rate_hz) >= written.samples:
+            never.append(name)
+    if never:
+        lines.append(
+            f"note: no block without missing numbers: {', '.join(never)}; a column that has them in some rows only, "
+            "such as one of a lower rate, has to be filled up in the file, or left out of the mapping and of the "
+            "machine file"
         )
     if written.none_whole:
         lines.append(f"samples left out in blocks in which every channel lacks numbers: {written.none_whole}")

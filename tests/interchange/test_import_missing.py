@@ -142,6 +142,17 @@ def test_a_file_in_which_every_channel_lacks_numbers_in_every_block_is_refused_f
     assert "1000 rows, 1000 samples in blocks in which every channel lacks numbers, 0 gaps: no stretch" in told
 
 
+def test_a_column_of_a_lower_rate_is_told_not_to_be_usable(tmp_path: Path) -> None:
+    rows = [row.split(",") for row in good_rows()]
+    slow = [",".join([t, x, "" if number % 4 else v, a]) for number, (t, x, v, a) in enumerate(rows)]
+    dead = [",".join([t, x, "" if number < 700 else v, a]) for number, (t, x, v, a) in enumerate(rows)]
+    told = []
+    for one in (slow, dead):
+        done, _ = imported(tmp_path, table(tmp_path / "run.csv", one), TEXT.replace("[time]", MISSING))
+        told.append("note: no block without missing numbers: y1_dot;" in "\n".join(summary_lines(done)))
+    assert told == [True, False]
+
+
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 def test_a_channel_of_which_the_file_has_nothing_is_missing_throughout(tmp_path: Path, kind: str) -> None:
     rows = [",".join([t, x, "", a]) for t, x, _, a in (row.split(",") for row in good_rows())]
