@@ -20,6 +20,7 @@ from rotorwatch.records.windows import SensorFault
 
 MOST_ERRORS = 8.0  # standard errors that a jump or slip must exceed; jumps are tested at the most probable moment
 SEEN_ERRORS = 4.0  # the same if the angle itself jumps by as much at that moment
+_HALF_RAD = 0.2  # largest distance from 180° of a turn that counts as reversed signs
 LEAST_JUMP_RAD = 0.35  # a smaller jump does little harm and may come from the machine
 LEAST_SLIP_RAD = 0.2  # least slip from hop to hop; thermal bending turns vectors, too, but by less
 LEAST_JITTER = 0.05  # least power of the line left at 1x over that of the line removed: a jitter of 0.47 rad
@@ -40,7 +41,7 @@ _FEWEST_HOPS, _FEWEST_SIDE = 6, 3
 _CLOCK_HOPS = 8  # number of newest hops in which a clock is found that has only just begun to run at another rate
 LEAST_CLOCK_RAD = 0.1  # least turn from hop to hop of sensors on a clock of their own: 130 ppm at 24 Hz and 5 s
 _ALIKE = 0.25
-_STAY, _SURE = 3.0, 4.0
+_STAY, _SURE, _ALMOST = 3.0, 4.0, 0.8
 _LENGTH = 0.15  # largest relative change of the vectors' common length that counts as unchanged
 _LINE_BINS, _AROUND_BINS, _FEWEST_AROUND, _AROUND_HZ = 1, 12, 4, 6.0
 _LINE_STRENGTH = 15.0  # least factor by which the power of a line exceeds its surroundings, mean over the channels
@@ -247,33 +248,43 @@ def _clock(
 def _jump(window: WindowStatistics, vectors: ComplexArray, course: ComplexArray, name: str) -> SensorFault | None:
     """Finding if all vectors turned by one angle between two hops at constant length, and the shaft angle jumped.
 
-    If data are missing between the hops, a jump of the angle cannot be seen, and the vectors alone decide.
+    If data are missing between the hops, a jump of the angle cannot be seen, and the vectors alone decide. They also
+    decide if they turned by half a turn: then the signs of all sensors were reversed.
     """
-    n = len(course)
-    best, at = 0.0, 0
-    for k in range(_FEWEST_SIDE, n - _FEWEST_SIDE + 1):
-        change, error = _turn(course[:, None], k)
-        z = abs(float(change[0])) / float(error[0])
-        if z > best:
-            best, at = z, k
+    turns = [_turn(course[:, None], k) for k in range(1, len(course) - _FEWEST_SIDE + 1)]
+    z = np.array([abs(float(change[0])) / float(error[0]) for change, error in turns])
+    best = float(z.max())
     if best < SEEN_ERRORS:
         return None
-    change, error = _turn(course[:, None], at)
+    # The hop that straddles the jump has an angle in between or, for half a turn, only a shorter vector.
+    longer = np.array([_longer(course, k) for k in range(1, len(z) + 1)])
+    at = 1 + int(np.where(z > _ALMOST * best, longer, np.inf).argmin())
+    change, error = turns[at - 1]
     value = float(change[0])
     own = window.hop_jump_rad[max(1, at - 2) : at + 2]
     seen = np.abs(np.angle(np.exp(1j * (own + value)))) < max(_STAY * float(error[0]), _ALIKE * abs(value))
+    lengths = np.abs(np.delete(course, [at - 1, at]))
+    steady = lengths.std() < _LENGTH * lengths.mean()  # not where a bow grows through the unbalance to the other side
+    half = steady and best > MOST_ERRORS and np.pi - abs(value) < _HALF_RAD
     if seen.any():
         value = float(np.angle(np.exp(-1j * own[seen.argmax()])))
-    elif best < MOST_ERRORS or not np.isnan(own).any():
+    elif best < MOST_ERRORS or not (half or np.isnan(own).any()):
         return None
-    before, after = np.abs(course[: at - 1]), np.abs(course[at + 1 :])
-    longer = abs(float(after.mean() / before.mean()) - 1)
-    turns, errors = _turn(vectors, at)
-    together = np.abs(np.angle(np.exp(1j * (turns - value)))) < np.maximum(_STAY * errors, _ALIKE * abs(value))
+    own_turns, errors = _turn(vectors, at)
+    together = np.abs(np.angle(np.exp(1j * (own_turns - value)))) < np.maximum(_STAY * errors, _ALIKE * abs(value))
     clear = _STAY * errors < abs(value) / 2
     known = seen.any() or 2 * clear.sum() >= clear.size
-    if abs(value) < LEAST_JUMP_RAD or longer > _LENGTH or not np.all(together) or not known:
+    # The first hop may itself be astride half a turn: shorter, but not turned by another angle.
+    most = np.inf if half and at <= 2 else max(_LENGTH, _STAY * float(error[0]))
+    if abs(value) < LEAST_JUMP_RAD or longer[at - 1] > most or not np.all(together) or not known:
         return None
+    if half and not seen.any():
+        text = (
+            f"{name}: went on as before, but every channel's 1× vector turned by 180° (± "
+            f"{np.degrees(float(error[0])):.1f}°) within the window and kept its length: the signs of all sensors were "
+            "reversed, or the heavy spot is opposite all of a sudden"
+        )
+        return _theta(FaultKind.OFFSET, text, np.pi, best)
     text = (
         f"{name}: jumped by {np.degrees(-value):+.0f}° (± {np.degrees(float(error[0])):.1f}°) within the window: every "
         "channel's 1× vector turned by as much and kept its length, expected a machine to change each differently"
@@ -281,9 +292,15 @@ def _jump(window: WindowStatistics, vectors: ComplexArray, course: ComplexArray,
     return _theta(FaultKind.OFFSET, text, -value, best)
 
 
+def _longer(course: ComplexArray, k: int) -> float:
+    """Relative change of the common length at hop k, without the hops next to it."""
+    before, after = np.abs(course[: max(1, k - 1)]), np.abs(course[k + 1 :])
+    return abs(float(after.mean() / before.mean()) - 1)
+
+
 def _turn(vectors: ComplexArray, k: int) -> tuple[FloatArray, FloatArray]:
     """Angle by which each column turned at hop k, without the hops next to it, and its standard error."""
-    before, after = vectors[: k - 1], vectors[k + 1 :]
+    before, after = vectors[: max(1, k - 1)], vectors[k + 1 :]
     first, second = before.mean(axis=0), after.mean(axis=0)
     scatter = np.concatenate([np.angle(before * first.conj()), np.angle(after * second.conj())])
     freedom = max(1, len(scatter) - 2)

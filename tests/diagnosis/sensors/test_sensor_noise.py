@@ -237,6 +237,16 @@ def test_a_heavy_spot_that_turns_is_no_fault_of_the_angle() -> None:
     assert (finding.kind, finding.states) == ("offset", ("theta",))
 
 
+@pytest.mark.parametrize("part", [0.1, 0.5, 0.7])
+def test_signs_of_all_sensors_that_are_reversed_are_told_as_long_as_the_window_holds_both(part: float) -> None:
+    samples = recorded("lab", 921).copy()
+    samples[round(part * len(samples)) :, :-1] *= -1
+    (finding,) = [one for one in found_in(samples) if one.states == ("theta",)]
+    assert finding.kind == "offset"
+    assert finding.value == pytest.approx(np.pi)
+    assert "the signs of all sensors were reversed" in finding.text
+
+
 def test_a_small_jump_in_loud_vibration_is_found_where_the_angle_shows_it() -> None:
     samples, machine = recorded("lab", 922).copy(), load_machine("lab")
     shaking = np.fft.rfft(np.random.default_rng(923).standard_normal(samples[:, :-1].shape), axis=0)
