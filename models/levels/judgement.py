@@ -31,10 +31,12 @@ from models.levels.lines import new_line
 from models.levels.measures import LevelPlan, WindowLevels
 from models.levels.reference import LevelReference, OperatingState
 from models.levels.settings import LevelSettings
+from models.levels.wiring import rewired
 from models.levels.zones import ZONES, zone_of
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity, unit_in_text
 from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth, LevelLimits
+from rotorwatch.records.windows import SensorFault
 
 _ERRORS_OF_CONTACT = 5.0
 """Standard errors from which on a contact is reported: one-sided and Gaussian in theory, chance seldom makes five."""
@@ -196,6 +198,17 @@ class LevelJudge:
             f"a vibration at {channel.name} ({channel.location} {channel.direction}) that is {how}: kurtosis of its "
             f"random part {healthy + most:.2f}, {healthy:.2f} on the healthy machine"
         )
+
+    def rewired(self, levels: WindowLevels, reference: LevelReference) -> SensorFault | None:
+        """Places whose sensors have been exchanged or reversed since, at a speed at which the reference was learned."""
+        state, seen = reference.at(levels.speed_rad_s)
+        known = [state.levels.get(one.name, {}).get("x1") for one in self._channels]
+        healthy = np.array([complex(*one.vector) for one in known if one is not None and one.vector is not None])
+        if not seen or levels.vectors is None or levels.moments is None or len(healthy) < len(self._channels):
+            return None
+        if self._plan.runout is not None:  # hops show it
+            healthy += self._plan.runout if (levels.speed_rad_s or 0.0) >= 0 else self._plan.runout.conj()
+        return rewired(levels.moments[2][:, 0], healthy, self._channels)
 
     def _turned_up(self, levels: WindowLevels, state: OperatingState) -> tuple[FloatArray, FloatArray]:
         """Logarithm of each channel's 1x over that of the healthy machine, and its error; NaN where it is not known."""

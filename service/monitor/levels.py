@@ -27,6 +27,7 @@ from models.machine import Machine, MachineFile
 from models.signals.channels import state_name, with_channel_names
 from rotorwatch.records.alarms import Evidence
 from rotorwatch.records.levels import ChannelLevels
+from rotorwatch.records.windows import SensorFault
 from service.monitor.alarms.book import AlarmBook
 
 _DEPENDS_ON: Any = {
@@ -171,6 +172,13 @@ class LevelWatch:
         slowest, fastest = (operation.speed_rad_s * (1 + sign * operation.speed_tolerance) for sign in (-1, 1))
         modes = zip(*(each.tolist() for each in natural_frequencies(machine)), strict=True)
         return expected_levels(names, levels, (slowest, fastest), tuple(modes))
+
+    def rewired(self) -> tuple[SensorFault, ...]:
+        """Which places' sensors were exchanged or reversed, as the latest window shows; see `LevelJudge.rewired`."""
+        if self._found is None or self.reference is None:
+            return ()
+        found = self._judge.rewired(self._found, self.reference)
+        return () if found is None else (found,)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """State as named arrays: the first windows, and contact and lines in the latest ones."""

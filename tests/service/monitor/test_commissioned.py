@@ -71,6 +71,22 @@ def test_a_change_is_named_alone(name: str, change: float) -> None:
     assert low - 0.05 < change < high + 0.05
 
 
+@pytest.mark.parametrize(("alarm", "sign", "source"), [("data-gain", -1, "y1"), ("data-swapped", 1, "z1")])
+def test_all_sensors_of_a_place_reversed_or_exchanged_are_told_and_no_parameter(
+    alarm: str, sign: int, source: str
+) -> None:
+    """They agree with each other, and the machine is as it was."""
+    names, healthy = [sensor.name for sensor in MACHINE.sensors], stream(85.0, SEED + 3)
+    samples = samples_of(healthy)
+    wired = samples.copy()
+    for rate in ("", "_dot"):
+        own, other = names.index(f"y1{rate}"), names.index(f"{source}{rate}")
+        wired[:, [own, other]] = sign * samples[:, [other, own]]
+    windows, events = feed(MachineMonitor(installed()), with_samples(healthy, wired))
+    assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {alarm}
+    assert not any(window.parameters for window in full(windows))
+
+
 def test_a_change_within_the_window_is_named_and_is_not_outside_the_model() -> None:
     """Windows astride it fit neither the machine as it was nor as it is; their latest data fit."""
     begins_s = 63.0
