@@ -20,7 +20,7 @@ from rotorwatch.records.windows import SensorFault
 
 MOST_ERRORS = 8.0  # standard errors that a jump or slip must exceed; jumps are tested at the most probable moment
 SEEN_ERRORS = 4.0  # the same if the angle itself jumps by as much at that moment
-_HALF_RAD = 0.2  # largest distance from 180° of a turn that counts as reversed signs
+_HALF_RAD = 0.35  # largest distance from 180° of a turn that counts as reversed signs, with a straddling hop's error
 LEAST_JUMP_RAD = 0.35  # a smaller jump does little harm and may come from the machine
 LEAST_SLIP_RAD = 0.2  # least slip from hop to hop; thermal bending turns vectors, too, but by less
 LEAST_JITTER = 0.05  # least power of the line left at 1x over that of the line removed: a jitter of 0.47 rad
@@ -263,7 +263,7 @@ def _jump(window: WindowStatistics, vectors: ComplexArray, course: ComplexArray,
     value = float(change[0])
     own = window.hop_jump_rad[max(1, at - 2) : at + 2]
     seen = np.abs(np.angle(np.exp(1j * (own + value)))) < max(_STAY * float(error[0]), _ALIKE * abs(value))
-    lengths = np.abs(np.delete(course, [at - 1, at]))
+    lengths = np.abs(np.delete(course, [0, at - 1, at]))
     steady = lengths.std() < _LENGTH * lengths.mean()  # not where a bow grows through the unbalance to the other side
     half = steady and best > MOST_ERRORS and np.pi - abs(value) < _HALF_RAD
     if seen.any():
