@@ -61,8 +61,11 @@ def _mistakes(channels: Sequence[Channel]) -> Iterator[tuple[list[int], list[int
         places.setdefault(place_of(channel), []).append(column)
     for count in range(1, len(places)):
         for some in combinations(places.values(), count):
+            rest = [place for place in places.values() if place not in some]
             columns = [column for place in some for column in place]
-            yield columns, columns, -1
+            ways = [{channels[column].direction for place in part for column in place} for part in (some, rest)]
+            if ways[0] & ways[1]:  # a plane whose stiffness falls far enough turns by half a turn, too
+                yield columns, columns, -1
     for one, other in combinations(places.values(), 2):
         if [channels[column].quantity for column in one] == [channels[column].quantity for column in other]:
             yield one + other, other + one, 1

@@ -28,7 +28,7 @@ def hops(vectors: Vectors, seed: int, noise: float = 0.15) -> Vectors:
     return np.asarray(vectors + noise * np.abs(vectors) * (parts[0] + 1j * parts[1]) / np.sqrt(2))
 
 
-@pytest.mark.parametrize("columns", [[0, 1], [4, 5], [0, 1, 2, 3], [0, 1, 4, 5], [2, 3, 4, 5, 6, 7]])
+@pytest.mark.parametrize("columns", [[0, 1], [4, 5], [0, 1, 2, 3], [2, 3, 4, 5, 6, 7]])
 def test_reversed_places_are_told(columns: list[int]) -> None:
     now = HEALTHY.copy()
     now[columns] *= -1
@@ -61,6 +61,7 @@ def test_three_hops_are_enough_and_fewer_are_not() -> None:
         np.ones(8), -np.ones(8), 1.5 * np.ones(8), np.exp(0.8j) * np.ones(8),  # all alike, as of an unbalance
         [-1, 1, 1, 1, 1, 1, 1, 1],  # one sensor of a place: its other one tells
         [-0.5, -0.5, 1, 1, 1, 1, 1, 1], [-1, -1, 1, 1, 0.6, 0.6, 1, 1],  # a bearing
+        [-1, -1, 1, 1, -1, -1, 1, 1],  # a plane that runs above its critical speed instead of below
     ],
 )  # fmt: skip
 def test_what_a_machine_does_is_no_wiring(factor: npt.ArrayLike) -> None:
