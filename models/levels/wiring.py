@@ -1,7 +1,7 @@
-"""All sensors of a place exchanged with those of another, or reversed: they agree with each other all the same.
+"""Places whose sensors have all been reversed, or exchanged with those of another place, so that they agree as before.
 
-What turns with the shaft tells it. No machine gives each of two places the 1x vector that the other had, or turns some
-by half a turn, and leaves all the rest as they were.
+The 1x vectors reveal it. No change of the machine gives two places each other's healthy 1x vectors, or turns the
+vectors of some places by 180°, and leaves all others as they were.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,58 +15,62 @@ from models.signals.channels import Channel, state_name
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
-_NEWEST = (3, 6)  # hops, beside all of the window: so soon it is told
+_NEWEST = (3, 6)  # numbers of newest hops that are compared before the whole window
 _FEWEST_PLACES = 3
-_OFF = 0.15  # part of a healthy vector by which one may be off, beside `_SURE` standard errors
-_SURE, _CLEARLY = 3.0, 2.0  # one that moved must have moved by so many times as much
-_MOST_ERROR = 0.12  # part of a healthy vector
-_MEDIAN_STEP = 1.1774  # from one hop to the next, in standard deviations of either
+_OFF, _SURE = 0.15, 3.0  # tolerance: this part of the expected vector plus so many standard errors
+_CLEARLY = 2.0  # least distance from the healthy vector, in tolerances, of a channel that is called wrong
+_MOST_ERROR = 0.12  # largest standard error, as a part of the healthy vector
+_MEDIAN_STEP = 1.1774  # median length of a hop-to-hop step over the standard deviation of a hop's vector
 
 _ComplexArray = npt.NDArray[np.complex128]
 
 
 def rewired(vectors: _ComplexArray, healthy: _ComplexArray, channels: Sequence[Channel]) -> SensorFault | None:
-    """Which places show the healthy 1x vectors of each other, or reversed ones, while all others show their own.
+    """Find places that show each other's healthy 1x vectors, or reversed ones, while all others show their own.
 
     Parameters
     ----------
-    vectors, healthy : ndarray, shape (n_hops, n) and (n,)
-        Of the hops of a window, and of the healthy machine at the same speed.
+    vectors : ndarray, shape (n_hops, n)
+        1x vectors of the channels in the hops of a window.
+    healthy : ndarray, shape (n,)
+        1x vectors of the healthy machine at the same speed.
     """
-    if len(set(map(place_of, channels))) < _FEWEST_PLACES:
-        return None
-    sizes, scatter = np.abs(healthy), np.median(np.abs(np.diff(vectors, axis=0)), axis=0) / _MEDIAN_STEP
-    for hops in (*(few for few in _NEWEST if few < len(vectors)), len(vectors)):
-        error, now = scatter / np.sqrt(hops), vectors[-hops:].mean(axis=0)
-        if not np.all(error < _MOST_ERROR * sizes):
-            continue
-        found = []
-        for concerned, shown, sign in _mistakes(channels):
-            expected = healthy.copy()
-            expected[concerned] = sign * healthy[shown]
-            within = _OFF * np.abs(expected) + _SURE * error
-            off, moved = np.abs(now - expected) / within, np.abs(expected - healthy) / within
-            if off.max() < 1 and moved[concerned].min() > _CLEARLY:
-                found.append((float(off.max()), concerned, sign))
-        if found:
-            _, concerned, sign = min(found)
-            return _fault([channels[column] for column in concerned], swapped=sign > 0)
-    return None
-
-
-def _mistakes(channels: Sequence[Channel]) -> Iterator[tuple[list[int], list[int], int]]:
-    """Columns concerned, those whose vectors they show then, and with which sign."""
     places: dict[str, list[int]] = {}
     for column, channel in enumerate(channels):
         places.setdefault(place_of(channel), []).append(column)
-    for count in range(1, len(places)):
-        for some in combinations(places.values(), count):
-            rest = [place for place in places.values() if place not in some]
-            columns = [column for place in some for column in place]
-            ways = [{channels[column].direction for place in part for column in place} for part in (some, rest)]
-            if ways[0] & ways[1]:  # a plane whose stiffness falls far enough turns by half a turn, too
-                yield columns, columns, -1
-    for one, other in combinations(places.values(), 2):
+    if len(places) < _FEWEST_PLACES:
+        return None
+    scatter = np.median(np.abs(np.diff(vectors, axis=0)), axis=0) / _MEDIAN_STEP
+    for hops in (*(few for few in _NEWEST if few < len(vectors)), len(vectors)):
+        error, now = scatter / np.sqrt(hops), vectors[-hops:].mean(axis=0)
+        if not np.all(error < _MOST_ERROR * np.abs(healthy)):
+            continue
+        turned = np.abs(now + healthy) < _OFF * np.abs(healthy) + _SURE * error
+        found = []
+        for wrong, shown, sign in _mistakes(list(places.values()), turned, channels):
+            expected = healthy.copy()
+            expected[wrong] = sign * healthy[shown]
+            tolerance = _OFF * np.abs(expected) + _SURE * error
+            off, moved = np.abs(now - expected) / tolerance, np.abs(expected - healthy) / tolerance
+            if off.max() < 1 and moved[wrong].min() > _CLEARLY:
+                found.append((float(off.max()), wrong, sign))
+        if found:
+            _, wrong, sign = min(found)
+            return _fault([channels[column] for column in wrong], swapped=sign > 0)
+    return None
+
+
+def _mistakes(
+    places: list[list[int]], turned: npt.NDArray[np.bool_], channels: Sequence[Channel]
+) -> Iterator[tuple[list[int], list[int], int]]:
+    """Mistakes to test: columns that are wrong, the columns whose healthy vectors they show, and with which sign."""
+    of_place = [bool(turned[place].all()) for place in places]
+    wrong = [column for place, all_turned in zip(places, of_place, strict=True) for column in place if all_turned]
+    directions = {channels[column].direction for column in wrong}
+    # The stiffness of a plane may fall so far that all 1x vectors in it turn by 180°.
+    if any(one.direction in directions for column, one in enumerate(channels) if column not in wrong):
+        yield wrong, wrong, -1
+    for one, other in combinations(places, 2):
         if [channels[column].quantity for column in one] == [channels[column].quantity for column in other]:
             yield one + other, other + one, 1
 

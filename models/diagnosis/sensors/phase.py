@@ -282,7 +282,7 @@ def _jump(window: WindowStatistics, vectors: ComplexArray, course: ComplexArray,
         text = (
             f"{name}: went on as before, but every channel's 1× vector turned by 180° (± "
             f"{np.degrees(float(error[0])):.1f}°) within the window and kept its length: the signs of all sensors were "
-            "reversed, or the heavy spot is opposite all of a sudden"
+            "reversed, or the heavy spot has moved to the opposite side at once"
         )
         return _theta(FaultKind.OFFSET, text, np.pi, best)
     text = (
