@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from models.levels.contact import LatestContact, contact
 from models.levels.judgement import LevelJudge
@@ -11,11 +12,17 @@ from models.levels.kurtosis import HopReference
 from models.levels.measures import WindowLevels, level_plan
 from models.levels.reference import LevelReference, OperatingState
 from models.levels.settings import LevelSettings
+from models.physics.rotor import RotorParameters, system_A
 from models.signals.block import FloatArray
 from tests.levels.test_measures import channel
 
 N, SPEED_HZ, MODE_HZ = 10_000, 22.0, 31.0
 COUNT = 24  # realisations of each, five seconds at 2 kHz
+ROTOR = {
+    "m1_kg": 0.897, "m2_kg": 2.87, "I2_kg_m2": 0.0374, "I2p_kg_m2": 0.0591,
+    "shaft_length_m": 0.494, "shaft_diameter_m": 0.02558, "shaft_E_Pa": 2.07e11,
+    "k_by_N_per_m": 106_600.0, "k_bz_N_per_m": 109_200.0, "c_by_N_s_per_m": 20.4, "c_bz_N_s_per_m": 20.7, "e_m": 5e-5,
+}  # fmt: skip
 
 
 def told(
@@ -48,6 +55,29 @@ def told(
     return np.array([contact(pair, circle, SPEED_HZ * n * dt, rate_hz, skew, velocity) for pair in pairs])
 
 
+def of_a_rotor(seed: int, hops: int = 48) -> FloatArray:
+    """Hops of a healthy rotor at its bearing, sampled 117 times a turn, with noise of two per cent."""
+    rate_hz, speed_hz, n = 2560.0, 21.9, 12_800
+    rng, rotor = np.random.default_rng(seed), RotorParameters.model_validate(ROTOR)
+    forces = rng.standard_normal(((hops + 1) * n, 4)) * [0.6, 0.5, 0.9, 0.7]
+    pole = np.exp(2 * np.pi * 88.4 / rate_hz * np.exp(0.75j * np.pi))
+    forces = lfilter([1.0], [1.0, -2 * pole.real, abs(pole) ** 2], forces, axis=0)
+    values, modes = np.linalg.eig(system_A(rotor, 2 * np.pi * speed_hz))
+    inputs = np.linalg.inv(modes)[:, [6, 7, 9, 10]] / ([rotor.m1_kg, rotor.m2_kg] * 2)
+    pair = np.zeros((2, len(forces)))
+    for value, mode, into in zip(values, modes[[0, 3]].T, inputs, strict=True):
+        if value.imag > 0:
+            pair += 2 * np.outer(mode, lfilter([0.0, 1.0], [1.0, -np.exp(value / rate_hz)], forces @ into)).real
+    pair /= pair.std(axis=1, keepdims=True)
+    angle = 2 * np.pi * speed_hz / rate_hz * np.arange(len(forces))
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    pair += 0.5 * circle + 0.02 * rng.standard_normal(pair.shape)
+    parts = [slice(at * n, (at + 1) * n) for at in range(1, hops + 1)]
+    means = [pair[:, part].mean(axis=1, keepdims=True) for part in parts]
+    turns = speed_hz * n / rate_hz
+    return np.array([contact(pair[:, p] - m, circle[:, p], turns, rate_hz) for p, m in zip(parts, means, strict=True)])
+
+
 def z(found: FloatArray) -> FloatArray:
     return np.asarray(found.sum(axis=0) / np.sqrt(len(found)), dtype=np.float64)
 
@@ -67,6 +97,11 @@ def test_without_a_contact_it_is_standard_normal_or_less_of_velocities(velocity:
     assert np.all(z(found) < 4.5)
     assert velocity or np.all(z(found) > -4.5)
     assert np.all((found.std(axis=0) > 0.6) & (found.std(axis=0) < 1.5))
+
+
+def test_a_slow_rotor_sampled_many_times_a_turn_is_not_pushed_back() -> None:
+    found = np.concatenate([of_a_rotor(seed) for seed in range(2637002, 2637005)])
+    assert np.all(found.mean(axis=0) < 0.5)
 
 
 @pytest.mark.parametrize(
