@@ -178,8 +178,9 @@ _TABLES = (
             "oracle's error over bound, rms": r.estimated("oracle", r.rms, 1),
         },
         _dampings,
-        "Readings of damping in the first 30 s. *Not quite true*: what the relation leaves out of this rotor moves its "
-        "moments by more than chance does, and a bound for those to whom it is true means little.",
+        "Readings of damping in the first 30 s. *Not quite true*: effects of this rotor that the relation leaves out "
+        "move its moments by more than chance does, so the bound, which assumes that the relation is true, means "
+        "little.",
     ),
 )
 
