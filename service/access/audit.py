@@ -53,7 +53,7 @@ class Visit:
 
 
 class AuditTrail:
-    """Writes the audit log; of refused requests, at most `refusals_per_minute` of one address."""
+    """Writes the audit log; of refused requests, per minute at most `refusals_per_minute` of an address, 60 in all."""
 
     def __init__(
         self, log: AuditLog, refusals_per_minute: int, *, monotonic: Callable[[], float] = time.monotonic

@@ -354,7 +354,7 @@ def _lines(out: Path | None, overwrite: bool) -> "Iterator[Callable[[str], objec
 
 @contextmanager
 def _named(out: Path, *, half: bool = False) -> Iterator[None]:
-    """Say of which file it is that it cannot be written, and only of that; none is left that is half written."""
+    """Report a system error as one of writing `out`; if it came halfway (`half`), remove the incomplete file."""
     try:
         yield
     except OSError as error:

@@ -315,7 +315,7 @@ def _checked(file: Path) -> str:
 
 
 def _not_listening(host: str) -> str:
-    """Say that an address is none of this computer, which is no mistake in settings of another one."""
+    """Message if this computer cannot listen on a host, which settings of another computer may name; else empty."""
     try:
         socket.create_server((host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
     except OSError as error:

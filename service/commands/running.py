@@ -26,7 +26,7 @@ _FILES = 65_536
 _UNUSABLE = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.EROFS}
 """System errors for a file that the user has named and this program cannot use."""
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-"""System errors for a full disk; if the error has no file name, it may concern standard output."""
+"""System errors for a file without room; if the error has no file name, it may concern standard output."""
 _NO_THREAD = "can't start new thread"
 _MB = 1_000_000
 _ADDRESS_SPACE_MB = 2_000

@@ -167,7 +167,7 @@ def _first_times(source: Source, column: Reference, columns: list[Reference]) ->
 
 
 def _measured_rate(path: Path, column: Reference, times: FloatArray) -> tuple[float, float]:
-    """Rate of a time column without gaps, rounded to its first uncertain digit; and its relative error from jitter."""
+    """Rate of a time column, gaps left out, to its first uncertain digit; and its relative error from jitter."""
     steps = np.diff(times)
     check_order(path, column, times, 0)
     usual = float(np.median(steps))

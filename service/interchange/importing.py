@@ -31,7 +31,7 @@ from service.interchange.source import Reference, SourceError
 from service.monitor.alarm_conversion import rfc3339
 
 _NOTED = 0.01  # fraction of rows lost from which a note is given
-_MOST_ALONE = 0.1  # largest fraction of isolated rows, i.e. with a gap on either side
+_MOST_ALONE = 0.1  # largest fraction of isolated rows, i.e. with a gap on both sides
 _LISTED = 10
 _NAMED = 5
 _VARIED = 1.1  # ratio of highest to lowest speed from which both are stated

@@ -3,9 +3,9 @@
 Each window has context before and after the rows whose result is kept. The first and last rows of a stretch lack
 context; the result there is invalid and left out.
 
-A filter states the rows of which windows start at multiples (`multiple`), the rows of context before and after
-(`context`), and the columns that it changes (`columns`). It is called with times and samples of a window including
-context, and with the first row of the stretch, and returns times and samples of the rows between the contexts.
+A filter states the number of rows at multiples of which its windows start (`multiple`), the rows of context before and
+after (`context`), and the columns that it changes (`columns`). It is called with times and samples of a window, context
+included, and with the first row of the stretch, and returns times and samples of the rows between the contexts.
 
 Where a channel is missing, the filter input is interpolated linearly, and all output within reach is missing too.
 """

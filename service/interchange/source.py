@@ -136,7 +136,7 @@ class Source:
 
 
 ONE_RATE = "write the file with one rate, or leave one of them out of the mapping and of the machine file"
-"""What helps where the columns of a file do not belong together."""
+"""Advice in errors on a file whose columns differ in rate or length."""
 
 
 def _bare(name: str) -> str:

@@ -15,7 +15,7 @@ from service.interchange.mapping import CsvFormat
 from service.interchange.source import CHUNK_ROWS, Array, Reference, Source, SourceError, readable
 
 _BYTES = 4 << 20
-_HEAD = 100  # rows after which a line with too few cells says nothing against how the others are read
+_HEAD = 100  # rows after which a line with too few cells is no sign of a wrong [csv] table in the mapping
 _NO_ROW = "; delete this line if it is no whole row"
 _NUMBER = r"[-+]?[\d.,]+([eE][-+]?\d+)?"
 _GROUPED = r"[-+]?\d{1,3}([.,' ]\d{3})+([.,]\d+)?"  # a number such as 1,899.62, with separators of thousands

@@ -236,7 +236,7 @@ class LatestRotation:
     def lost(self, window: WindowStatistics, operation: Operation) -> str:
         """In how many hops the rotation was found, if not in all although its latest power would stand out; else empty.
 
-        Hops in which the shaft reached or left its speed are not counted: their line is much weaker than the others'.
+        A hop in which the shaft reached or left its speed counts as one without: its line is much weaker than others.
         """
         found = np.isfinite(window.hop_speed_rad_s) & window.settled
         if window.speed_source == "phase reference" or self.power <= STRONG * _noise(window) or found.all():

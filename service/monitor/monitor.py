@@ -113,7 +113,7 @@ class MachineMonitor:
             return (MonitorReport(self._count(Admission(Reason.MALFORMED, f"{self.machine.title}: {error}"))),)
         if (misshapen := self._gate.form(block, schema_hash)) is not None:  # before its run and number are used
             return (MonitorReport(self._count(misshapen)),)
-        if self._window.lacks or self._gate.had(block):  # sent again after a restart: neither new nor a mistake
+        if self._window.lacks or self._gate.had(block):  # `had`: sent again after a restart, neither new nor a mistake
             if self._gate.knows(block):
                 self._recall(block)
             else:  # a new block may have overtaken a known one
@@ -353,7 +353,7 @@ class MachineMonitor:
         )
 
     def _judged(self, block: SampleBlock, schema_hash: str | None, dropped: int) -> Admission:
-        """Judge a block by the gate and, as the gate does not know them, by the data before a restart."""
+        """Judge a block by the gate and, if it is the first one after a restart, by the time of the data before."""
         anew = not self._gate.courses
         verdict = self._gate.judge(block, schema_hash)
         if anew and verdict.accepted and self.end_ns is not None:

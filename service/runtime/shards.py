@@ -24,7 +24,7 @@ from service.stream.transport import LinkError
 from service.terminal.logs import logger
 
 OF_A_SHARD = 15
-"""Machines for which another process is worth its memory."""
+"""Number of machines for which a further process is worth its memory."""
 _START_S = 120.0
 _STOP_S = 60.0
 _LOOK_S = 0.25

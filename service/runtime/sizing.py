@@ -176,7 +176,7 @@ def sized(
     computers = min(machines, math.ceil((used + recorders) / (busy * cores)))
     in_fleet, on_one = math.ceil(machines / OF_A_SHARD), max(1, min(cores, machines // OF_A_SHARD))
     processes = in_fleet if computers > 1 else on_one  # as `fleet_count` and `shard_count` say
-    # More are needed if they do not suffice: no process uses more than one core or runs on two computers.
+    # More processes may be needed, because none uses more than one core or runs on two computers.
     processes = min(machines, max(processes, math.ceil(used / busy), computers if computers > 1 else 1))
     shards = processes if processes > 1 else 0
     reports_kb, readings_kb = costs.of(kind, "reports_kb"), costs.of(kind, "readings_kb")

@@ -1,6 +1,6 @@
 """Keeps the evidence of alarms: pictures of the machine before the change, when they were raised, and after it.
 
-An alarm can then be understood long after its window is gone. Nothing is decided by them.
+An alarm can then be understood long after its window is gone. The pictures decide nothing.
 """
 
 from models.alarm_names import alarm_kind

@@ -10,7 +10,7 @@ _LIMITS = {"after": (-1, 2**53), "limit": (1, MOST_EVENTS)}
 
 
 def read_log_query(parameters: str) -> tuple[int, int]:
-    """Read a query's parameters: events after which sequence number (-1 by default), and how many at most (100).
+    """Read a query's parameters: after which sequence number (default -1), and at most how many events (default 100).
 
     `parameters` is the text behind the question mark; names that begin with an underscore are Zenoh's own.
 

@@ -107,7 +107,7 @@ def full_spectrum_snapshot(data: Sampled) -> FullSpectrumSnapshot:
 
 
 def waterfall_snapshot(data: Sampled, channel: Channel, over: Literal["time", "speed"]) -> WaterfallSnapshot:
-    """Amplitude spectra of one channel over time or speed; groups of adjacent lines are reduced to their maximum.
+    """Amplitude spectra of one channel over time or speed; of many lines, groups of adjacent ones give their maximum.
 
     Raises
     ------

@@ -8,7 +8,7 @@ import "./settings-list.js";
 import "./token-list.js";
 import "./webhook-list.js";
 
-/** The service itself, for callers with the scope configure: tokens, audit log, load, settings. */
+/** The service itself, for callers with the scope configure: load, tokens, webhooks, history, settings, audit log. */
 class AdministrationView extends LiveElement {
   connectedCallback() {
     super.connectedCallback();
