@@ -29,9 +29,9 @@ class SimulatedSensor:
     The value passes the high-pass and the delay of the machine file. A delay that is a fault shifts it by the nearest
     whole number of samples; before the first sample the value is taken as constant.
 
-    ``noise_relative`` refers to `rms_SI`: the channel's own theoretical rms, one revolution for a shaft angle. The
-    signal is `late_s` late, 0 or more. `rng` belongs to this sensor alone, and one number per sample is drawn whatever
-    the settings are, so that a noise level can change without changing the noise.
+    ``noise_relative`` refers to `rms_SI`: the channel's own theoretical rms, one revolution for a shaft angle. `late_s`
+    is the delay in the machine file, counted so that no sensor is early. `rng` belongs to this sensor alone, and
+    one number per sample is drawn whatever the settings are, so that a noise level can change without the noise.
     """
 
     def __init__(

@@ -19,8 +19,8 @@ from models.physics.rotor import PARAMETERS
 from simulator.commands import bars
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition, windows, with_tilt
 
-# Calibration windows of either layout over training windows of a relation network: those with everything changed, for
-# each relation network; those for the amortised networks.
+# Calibration windows of each layout over the training windows of a relation network: with everything changed, for each
+# relation network; and healthy or changed, for the amortised networks.
 _CHANGED_SHARE, _AMORTISED_SHARE = 0.75, 4.0
 _AMORTISED_STREAM, _CHANGED_STREAM = 20, 30
 

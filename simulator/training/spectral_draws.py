@@ -64,9 +64,9 @@ class DrawnConditions:
 class SpectralDraws:
     """Draws windows of one machine in random conditions and with random parameters.
 
-    With `near`, parameters are drawn as near a centre as the first reading comes; most parameters of a centre are
-    nominal. The excitation is drawn more broadly than the diagnosis assumes: mostly one second-order low-pass for all
-    sources, as in the simulator, but also other slopes and a cutoff per source, and noise that differs between sensors.
+    With `near`, parameters are drawn around a centre, within the error of a first reading; most parameters of a centre
+    are nominal. The excitation is drawn more broadly than the diagnosis assumes: mostly one second-order low-pass for
+    all sources, as in the simulator, but also other slopes and a cutoff per source, and noise that differs by sensor.
     """
 
     def __init__(self, machine: Machine, near: bool = False) -> None:
