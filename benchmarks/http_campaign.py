@@ -83,7 +83,7 @@ class Callers:
             self.held.append(one)
 
     def look(self, *, trickle: bool) -> None:
-        """Send a byte on each connection if `trickle`, and remove connections that were ended."""
+        """Count the answers, send a byte on each connection if `trickle`, and remove connections that were ended."""
         poll = select.poll()
         held = {one.fileno(): one for one in self.held}
         for number in held:

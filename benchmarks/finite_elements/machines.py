@@ -1,4 +1,4 @@
-"""Rotors with parameters unknown to the monitor: machines of realistic size, all unlike its six-degree model."""
+"""Rotors of realistic size, unknown to the monitor and all unlike its model of six degrees of freedom."""
 
 import math
 from dataclasses import replace

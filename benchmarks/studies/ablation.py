@@ -236,7 +236,7 @@ def ablation(options: Options) -> Study:
     calibration = 9 if options.small else 199
     cells = []
     for layout in (None, Layout.INDEPENDENT):
-        few = not options.small and layout is not None  # the mixed layouts have the same number again
+        few = not options.small and layout is not None  # half as many as with both layouts mixed
         drawn = partial(Draw, trained.machine, options.seed, layout=layout)
         plan = [("calibration", "healthy", 99 if few else calibration, drawn(Purpose.CALIBRATION, _FIXED_STREAM))]
         windows = options.windows if layout is None else max(2, options.windows // 2)

@@ -66,7 +66,7 @@ class Drawing:
         poles, rms = scene.poles, scene.noise * to_si
 
         def density(cycles: FloatArray) -> FloatArray:
-            """Power of the noise relative to white noise of unit power, at frequencies in cycles per sample."""
+            """Noise power over that of unit white noise, at frequencies in cycles per sample; shape (.., n)."""
             response = np.abs(1 - poles * np.exp(-2j * np.pi * cycles[:, None])) ** -2
             return np.asarray(rms**2 * (1 - poles**2) * response, dtype=np.float64)
 

@@ -102,7 +102,7 @@ def _learn(
     runs = [({}, cutoffs[n % len(cutoffs)], _NOISE_LEVELS[0], (Purpose.CALIBRATION, n)) for n in range(count)]
     calibration = over("calibration windows", partial(simulate, machine, seed), runs)
     return {
-        # If test runs share the training realisations, the healthy deviations are those of the training runs.
+        # If test runs share the training realisations, the limit is the largest deviation among the training runs.
         "shared": PaperDiagnostician.calibrated(networks, training, 1 / (len(training) + 1)),
         "independent": PaperDiagnostician.calibrated(networks, calibration, options.rate),
     }
