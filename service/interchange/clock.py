@@ -65,7 +65,7 @@ class Clock:
 def clock_for(
     source: Source, columns: list[Reference], base: TimeBase, machine: MachineFile, start_ns: int | None = None
 ) -> Clock:
-    """Determine the rate and start of the rows, and check the rate against the machine; `start_ns` is used if known.
+    """Determine rate and start of the rows (`start_ns` if it is known), and check the rate against the machine.
 
     Raises
     ------
