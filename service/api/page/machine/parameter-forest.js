@@ -5,7 +5,7 @@ import { parameterReadings } from "./parameter-readings.js";
 import { roundUp } from "../plots/plane.js";
 
 const [WIDTH, LEFT, ROW, TOP] = [360, 48, 46, 6];
-/** Readings farther away are drawn at the edge, because the others would be too close to distinguish. */
+/** Readings farther away are written at the edge as numbers, because the others would be too close to distinguish. */
 const FARTHEST = 0.6;
 const SHAPES = ["decides", "second", "third"];
 

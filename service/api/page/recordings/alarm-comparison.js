@@ -5,7 +5,7 @@ import { differences } from "./replay-list.js";
 import "../elements/state-mark.js";
 
 const EVENTS = 1000;
-/** Largest time between two events of one kind that count as the same: windows of a replay may end at other times than the live ones. */
+/** Largest time between two events of one alarm and kind that count as the same: windows of a replay may end at other times than the live ones. */
 const SAME_NS = 120e9;
 
 /** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
