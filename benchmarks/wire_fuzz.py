@@ -191,7 +191,7 @@ class Watch:
             f"{quality['queue_dropped_blocks']} blocks dropped": quality["queue_dropped_blocks"] > 0,
             f"{quality['link_missed_blocks']} blocks missed on the way": quality["link_missed_blocks"] > 0,
             f"alarms: {', '.join(sorted(alarms))}": bool(alarms),
-            f"state {health['state']}: {health['reason']}": health["state"] not in {"healthy", "warming", "watch"},
+            f"state {health['state']}: {health['reason']}": health["state"] not in {"healthy", "warming", "watching"},
         }
         one.process.terminate()
         code = one.process.wait(120)
