@@ -31,7 +31,7 @@ _MUCH_REFUSED, _TOO_MUCH_REFUSED = 0.01, 0.2
 _STEADY_SPEED = 0.05
 _STEADY_LEVEL = 2.0  # ratio of the rms between the halves of a recording; chance alone reaches 1.3 in half a minute
 SAME_SPEED = 0.03  # relative difference within which speeds count as one
-# Largest part of the other plane's motion in a sensor (as when mounted two degrees off) that is not another machine's.
+# Cross-axis part of a sensor, as when mounted two degrees off, below which a window does not count against the theory.
 _LITTLE = 0.035
 _MOST_OUTSIDE = 0.8  # share of healthy windows outside a theory beyond which it is not the machine's
 _RATE = 1e-3  # probability that a healthy machine fails a comparison of its own windows
@@ -120,7 +120,7 @@ def check_sensors_of(
 def check_speed_given(machine: MachineFile, windows: Sequence[WindowStatistics]) -> Check | None:
     """Refusal if the shaft is so fast that other windows suit it and the file does not state the speed; else None."""
     speeds = [window.speed_rad_s / (2 * np.pi) for window in windows if np.isfinite(window.speed_rad_s)]
-    fastest_hz = max(map(abs, speeds), default=0.0)  # a falling angle is `check_steady`'s
+    fastest_hz = max(map(abs, speeds), default=0.0)  # `check_steady` refuses a falling angle
     modes_hz = () if machine.rotor is None else machine.rotor.modes_hz
     stated_hz, tolerance = 0.0, 0.0
     if machine.operation is not None:
@@ -162,7 +162,7 @@ def check_steady(
                 )
                 break
         powers = np.array([np.diag(w.as_mounted.correlation[0]) for w in windows[recording.name]])
-        powers = np.maximum(powers, 0.0)  # rounding may be below 0 in a channel that does not move
+        powers = np.maximum(powers, 0.0)  # rounding may make the power of a dead channel negative
         half = len(powers) // 2
         if half:
             ratio = np.sqrt(powers[half:].mean(axis=0) / np.maximum(powers[:half].mean(axis=0), np.finfo(float).tiny))
@@ -259,7 +259,7 @@ def check_sources(windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
 
 
 def _alike(recordings: Sequence[Sequence[WindowStatistics]]) -> bool:
-    """Whether recordings with one source each share it: they have one speed, and their mean spectra show one source."""
+    """Whether recordings with one source each share it: all at one speed, and their mean spectrum shows one source."""
     speeds = [window.speed_rad_s for own in recordings for window in own if np.isfinite(window.speed_rad_s)]
     if speeds and max(speeds) > (1 + SAME_SPEED) * min(speeds):
         return False
@@ -387,7 +387,7 @@ def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: 
 
 
 def _is_little(diagnosis: Diagnosis) -> bool:
-    """Whether the best explanation is a small cross-axis part or delay of a sensor, for which later windows allow.
+    """Whether the best explanation is a small cross-axis part or delay of a sensor, which `HealthyMisfit` takes off.
 
     The effect of a delay on the readings is checked before.
     """

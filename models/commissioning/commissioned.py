@@ -302,7 +302,7 @@ def load_commissioned(directory: Path, machine: MachineFile, *, same_description
     Raises
     ------
     BundleError
-        If it is missing, damaged, or of another machine; the message names the difference.
+        If it is missing, damaged, or does not fit the machine; the message says what is wrong.
     """
     path = directory / FILE
     try:
