@@ -19,8 +19,8 @@ from models.errors import EstimationError
 from models.signals.block import FloatArray
 
 _CHANCE = 4.0  # squared ratio of growth to its standard error up to which growth is taken for chance
-# Largest hidden growth assumed, for motions up to e times as strong or as weak; if smaller, the standard error of the
-# growth is used. Every stiffness carries half a per cent in any case (`rows.py`).
+# Largest hidden growth assumed where the power of the motion is e times as large or as small, or beyond; if smaller,
+# the standard error of the growth is used. Every stiffness carries half a per cent in any case (`rows.py`).
 _UNSEEN, _CARRIED = 0.02, 0.005
 
 

@@ -375,7 +375,7 @@ def disagreements(baseline: Baseline) -> tuple[str, ...]:
     """Sentences on conditions in which a parameter reads differently than in all others.
 
     Readings of one condition share the error of the relation, so the mean of their z is tested as a single one. If
-    there are such conditions, keep a baseline for each; otherwise `Relation.allowance` widens the errors of later
+    there are such conditions, keep a baseline for each. In any case `Relation.allowance` widens the errors of later
     windows.
     """
     found = []

@@ -189,7 +189,7 @@ class RowChange:
     widening: float  # scatter from hop to hop over that predicted from the spectra, at least 1, times the allowance
     chi2: float  # residual moments after the change, in units of all their errors
     degrees_of_freedom: int
-    # Whether no change at all fits as well, in a row whose terms partly cancel. If a sensor is reversed or late they do
+    # Whether the row fits without any change, too, and its terms partly cancel. If a sensor is reversed or late they do
     # not: the residual force is then so large that anything is within its scatter.
     unchanged: bool
 
@@ -401,13 +401,13 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
     Raises
     ------
     EstimationError
-        If the window does not determine them: no change at all fits, and so does nearly any change.
+        If the window does not determine them: it fits without any change, and with nearly any change.
     """
     usual_s = LAG_FROM_S * window.window.time_scale
     first = change_of(row, relation, window.beyond(max(usual_s, relation.lag_from_s)), stretched=False)
     lag_s = max(relation.lag_from_s, lag_beyond_memory(window, first.combination))
     believed = change = change_of(row, relation, window.beyond(lag_s))
-    # The misfit of an undetermined estimate can be anything, so the fit of no change at all is tested, too.
+    # The misfit of an undetermined estimate can be anything, so whether it fits without any change is tested, too.
     unchanged = change.unchanged
     if lag_s < usual_s:
         unchanged |= first.unchanged
