@@ -266,7 +266,7 @@ class Left(NamedTuple):
 class Diagnosis:
     """One diagnostician's diagnosis of one window."""
 
-    by: str  # diagnostician: ``likelihood``, ``network``, ``relation`` or ``paper``
+    by: str  # diagnostician: ``likelihood``, ``network``, ``relation`` or ``baseline``
     parameters: tuple[Parameter, ...] = ()  # the parameters that it covers, with a reading or a reason why not
     equations: tuple[Equation, ...] = ()  # the equations it evaluated; empty for the likelihood
     # (m, m): covariance of the m evaluable `parameters`' changes, in their order; None if the diagnostician only knows
@@ -329,7 +329,7 @@ class Diagnosis:
 
 
 class Diagnostician(Protocol):
-    """Reads in one window after the other which parameters changed, by how much, and with which standard errors."""
+    """Reads, window by window, which parameters changed, by how much, and with which standard errors."""
 
     @property
     def by(self) -> str:

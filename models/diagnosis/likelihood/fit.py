@@ -280,7 +280,7 @@ class LikelihoodFit:
     def _unbalance(
         self, window: WindowStatistics, model: SpectralModel, point: Expected, structural: FloatArray, speed: float
     ) -> Unbalance:
-        """Change of e; hop by hop where the speed varies or is found in the vibration, without an angle reference."""
+        """Change of e; hop by hop where the speed varies, or is found in the vibration, which gives no shaft angle."""
         known = (self._machine, model, point, structural)
         if window.relative_synchronous is not None:
             hop_s, found = window.duration_s / window.hop_speed_rad_s.size, np.isfinite(window.hop_speed_rad_s)

@@ -180,7 +180,7 @@ MOST_MISFIT, _BLIND = 4.0, 10.0
 def unexplained_at(
     model: SpectralModel, weights: Weights, reached: Whitened, states: ComplexArray, times: float = 1.0
 ) -> tuple[str, bool]:
-    """Why readings at this point mean nothing (empty if they do), and whether nothing in the model comes near.
+    """Why readings at this point mean nothing, else empty; and whether nothing in the model comes near the window.
 
     `states` are the estimated cross-spectra of the states, SI, shape (n_groups, n_states, n_states); the limits are
     multiplied by `times`.
@@ -220,7 +220,7 @@ def unexplained_at(
 
 
 def unseen(model: SpectralModel, weights: Weights, found: Maximum, misfit_z: float) -> str:
-    """Say which parameters of a nominal rotor such a window would show but hardly does; empty if at most half of them.
+    """Say which parameters this window hardly shows but one of the nominal rotor would; empty if at most half of those.
 
     Despite a misfit, readings mean something while the rotor is visible: they are those of the nearest rotor.
     """
