@@ -33,7 +33,7 @@ def sensor_findings(
     Without a reference only faults that no healthy sensor can show are found. A channel that is missing, stuck or
     clipped is not checked further. Channels are not compared with each other if the shaft angle jumps, slips, jitters
     or is missing from part of the window, because the synchronous part then remains in their spectra, or if the machine
-    stood; the angle need not turn then. Without any angle, no channel is found incoherent or noisy.
+    stood; the angle need not turn then. If the angle is missing throughout or stuck, none is found incoherent or noisy.
     """
     window, naming = window.as_mounted, Naming(channels)
     stood = np.full(len(window.waveforms), True) if standing else runs_down(window)

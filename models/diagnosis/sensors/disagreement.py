@@ -62,7 +62,7 @@ def gain_and_delay(
         least_delay = LEAST_DELAY_CHANGE_S if departure.known else LEAST_DELAY_S
         steady = departure.gain_z > MOST_ERRORS and abs(np.expm1(departure.log_gain)) > least_gain
         late = departure.delay_z > MOST_ERRORS and abs(departure.delay_s) > least_delay
-        if late:  # two delays in turn partly cancel in the mean, like a loss of gain
+        if late:  # a delay that changes weakens the mean cross-spectrum, like a loss of gain
             step_s, z = _largest_part(*delay_course(window, departure.reading, bands[departure.reading.pair]))
             steady &= not (z > MOST_ERRORS and abs(step_s) > least_delay)
         moving = departure.course_z > MOST_ERRORS and abs(departure.course_step) > LEAST_COURSE
@@ -279,7 +279,7 @@ def _once(findings: list[SensorFault]) -> list[SensorFault]:
 
 BROKEN = 0.9  # two sensors of one motion that share less than this do not see the same motion
 _SUSPECT = 0.985  # below this, channels may be swapped: two places of a stiff shaft move much alike
-_RESTORED = 0.97  # part that both pairs must share after the exchange, relative to the healthy one
+_RESTORED = 0.97  # least part that both pairs must share after the exchange, over the healthy part
 _CLEARLY = 5.0  # factor by which the exchange must reduce the part that the worse pair does not share
 # 1x amplitudes of exchanged channels: largest difference from each other's healthy ones over that from their own.
 _CROSSED = 0.25

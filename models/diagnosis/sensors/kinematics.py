@@ -26,7 +26,7 @@ _AS_GOOD = 0.98
 # The 1x vectors are rejected if they move gain or delay by more than so many standard errors: run-out falsifies them,
 # and so does cross-axis sensitivity, as the other plane's 1x comes a quarter turn later.
 _LINE_FITS = 5.0
-_RUNOUT = 0.03  # least change of the log gain for that, and largest standard error of the log gain without them
+_RUNOUT = 0.03  # least change of the log gain to reject them, and largest standard error without them
 _TOLD_APART = 2 * math.log(1e3)  # least fall of χ² with which a model of the phases is preferred: 1000 times likelier
 _MOST_ACROSS = 0.15  # largest cross-axis sensitivity that is corrected for: more has another cause
 _PLANES, _RATES = str.maketrans("yz", "zy"), {"": 0, "dot": 1, "ddot": 2}

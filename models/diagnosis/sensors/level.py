@@ -288,7 +288,7 @@ def gain_jump(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
         if z > MOST_ERRORS and abs(value) > LEAST_JUMP and alone and quiet and straight and along:
             state = window.states[column]
             why = "expected a change of the machine to show in more than one channel: its gain jumped"
-            if state.startswith(("y1", "z1", "bearing")):  # below resonance its stiffness hardly moves others
+            if state.startswith(("y1", "z1", "bearing")):  # others hardly show a bearing well below resonance
                 why = "so either its gain jumped or the stiffness of that bearing did"
             text = (
                 f"{naming.name(state)}: everything it measures changed by {value:+.0%} at once (± "

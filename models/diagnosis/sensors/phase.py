@@ -249,7 +249,7 @@ def _jump(window: WindowStatistics, vectors: ComplexArray, course: ComplexArray,
     """Finding if all vectors turned by one angle between two hops at constant length, and the shaft angle jumped.
 
     If data are missing between the hops, a jump of the angle cannot be seen, and the vectors alone decide. They also
-    decide if they turned by half a turn: then the signs of all sensors were reversed.
+    decide if they turned by half a turn, as when the signs of all sensors are reversed.
     """
     turns = [_turn(course[:, None], k) for k in range(1, len(course) - _FEWEST_SIDE + 1)]
     z = np.array([abs(float(change[0])) / float(error[0]) for change, error in turns])

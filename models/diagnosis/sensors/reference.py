@@ -2,8 +2,8 @@
 
 Two sensors of one motion differ by their noise alone, whatever moves the machine: |v - hjωx|². If a motion has only one
 sensor, the part of its power that the other channels do not explain contains its noise and some motion of the machine.
-The motion shows the machine's resonances, the noise is the floor below them. A line in one channel alone does not come
-from the machine.
+The motion shows the machine's resonances, the noise is the floor below them. A line in one channel alone may be mains
+hum (`noise.is_hum`).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
