@@ -39,7 +39,7 @@ _CHANCE = 1e-9
 _NEARLY_ALL, _OTHER_WAY, _TURNS = 0.8, 0.2, 1.5
 """Least part that turns one way, largest part of that which turns the other way, and least number of turns."""
 _LOUD, _SAME = 0.02, 0.02
-"""Part of a channel's random power above which a new line is reported, and relative distance of one and the same."""
+"""Part of a channel's random power above which a new line is reported, and relative tolerance for the same line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class Line:
     share: float  # of that channel's power without the part that turns with the shaft
     certain: bool  # whether noise cannot be as coherent
     beside: int = 0  # the multiple of the speed it is next to, within three bins of the spectra; 0 if next to none
-    likely: bool = False  # whether noise is as coherent so seldom that it is not so in two windows
+    likely: bool = False  # whether a second window with it makes it certain, as noise is seldom as coherent
 
     def known(self, speed_rad_s: float) -> KnownLine:
         """Its rounded frequency and order, for later comparison."""
@@ -158,7 +158,7 @@ class LatestLines:
         self._seen: list[tuple[int, KnownLine]] = []  # by the end of the window
 
     def take(self, lines: Sequence[Line], window: WindowStatistics) -> tuple[Line, ...]:
-        """Add a window and return its lines; likely ones become certain if a window that ended before had them."""
+        """Add a window and return its lines; a likely one is certain if a window that ended before this one had it."""
         length_ns = window.end_ns - window.start_ns
         # Later lines are from before the clock was set back. Where clocks run apart, a window begins a little early.
         self._seen = [one for one in self._seen if window.start_ns - length_ns <= one[0] < window.end_ns]

@@ -13,7 +13,7 @@ from models.diagnosis.window.moments import ComplexArray
 from models.signals.block import FloatArray
 
 _BLOCK = 16  # bins that are compared at once: many more than channels, and few enough to share one colour
-_CHANCE = 30.0  # variance of the levels times the values behind each, up to which a window is stationary; 3 is usual
+_CHANCE = 30.0  # variance of the levels, times the coefficients in each, below which a window is stationary; 3 is usual
 _ROUNDS = 2  # in the first, loud segments weigh too much in the mean that all segments are compared with
 
 

@@ -156,7 +156,7 @@ class WindowStatistics:
     def without_lines(self) -> "WindowStatistics":
         """The same window without `lines` in its correlations and spectra.
 
-        A line is as strong at all lags, and neither follows the motion at a bearing nor is forgotten by any force.
+        A line is equally strong at all lags: it has no relation to a bearing's motion, and outlasts any force's memory.
         """
         return self if all(line.power is None for line in self.lines) else self._cleared
 
