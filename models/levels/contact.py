@@ -22,12 +22,12 @@ from models.signals.block import FloatArray
 _LAGS = (0, 2, 4, 8, 16, 64, 128)
 """Samples back from which the next is predicted: the longest lags separate running speed from a line beside it."""
 _FAR_OUT = (0.02, 0.15)
-"""Fractions of samples that count as far out: the first shows a light contact best, the second one of every turn."""
+"""Fractions of samples that count as far out: the first shows a light contact best, the second one in every turn."""
 _BEFORE = 2
 """The second test counts the shaft as far out only if it was so this many samples earlier (one of the lags) as well. A
 stiff contact is over by then and the shaft returns later than predicted: the first test, without this, shows it."""
 _OFF = 8.0
-"""A sample whose remainder exceeds this many mean absolute ones is a spike: it counts as far out only if the shaft was
+"""A sample whose remainder exceeds its mean size this many times is a spike: it counts as far out only if the shaft was
 so before as well. No sample of a Gaussian vibration is that far off its prediction."""
 _LEAST = 1000
 """Fewest samples: of fewer, hardly any are far out."""
@@ -40,7 +40,7 @@ _NOTHING = 1e-6
 """Fraction of the largest deviation below which a value is rounding error."""
 _Hop = npt.NDArray[np.float32]  # written with every hop
 _PER_TURN, _LEAST_HZ = 48, 1000.0
-"""Samples per turn, and Hz: sampled faster than both, neighbours are averaged, as no force moves the shaft much
+"""Samples per turn, and Hz: sampled at twice both or more, neighbours are averaged, as no force moves the shaft much
 between them. Without averaging, a healthy rotor with 117 samples a turn and 2 % noise gave one standard error a hop."""
 
 

@@ -330,7 +330,7 @@ class WindowLevels:
 
     @property
     def unsteady(self) -> float:
-        """Range of the speed over the hops, relative to its mean; infinite if it is not known or zero in a hop."""
+        """Range of the hops' speeds, over their mean; infinite if one is unknown or the shaft stands in a hop."""
         speeds = self.speeds_rad_s
         if not self.speed_rad_s or speeds is None or not np.all(np.abs(speeds) > STANDS_RAD_S):
             return math.inf

@@ -62,7 +62,7 @@ class LevelReference(BaseModel, extra="forbid", frozen=True, strict=True):
 
     source: str  # where they are from, as operators will read it
     states: tuple[OperatingState, ...] = Field(min_length=1)
-    # Contrasts between the places, see `models.levels.gains`.
+    # Levels of the places for comparison with each other, see `models.levels.gains`.
     gains: GainReference | None = Field(default=None, exclude_if=lambda found: found is None)
     # Frequency, Hz, and order of each line; None if lines were not looked for.
     lines: tuple[tuple[_Level, _Level], ...] | None = Field(default=None, exclude_if=lambda found: found is None)

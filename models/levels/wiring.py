@@ -1,7 +1,7 @@
 """Places whose sensors have all been reversed, or exchanged with those of another place, so that they agree as before.
 
 The 1x vectors reveal it. No change of the machine gives two places each other's healthy 1x vectors, or turns the
-vectors of some places by 180°, and leaves all others as they were.
+vectors of some, not all, places of a plane by 180°, and leaves all others as they were.
 """
 
 from collections.abc import Iterator, Sequence
