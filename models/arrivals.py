@@ -104,7 +104,7 @@ class Arrivals:
             self._note(block)
             self._next += 1
             return (arrived,)
-        # Another run, or a count that began anew: the missing blocks of the old one will not come any more.
+        # Another run, or a count that began anew: the missing blocks of the old one are given up.
         gone_on = self.flush()
         known = 0 if block.run == self._run else self._known(block.run)
         self._run = block.run

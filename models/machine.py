@@ -336,7 +336,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
 
     @property
     def time_scale(self) -> float:
-        """How many times slower the machine moves than those that the usual window suits, see `time_scale`.
+        """How many times slower the machine moves than those that the usual window suits (`models.stream_settings`).
 
         It is 1 for a fast machine whose file gives lags for a slower one, because it is evaluated by those.
         """
@@ -402,7 +402,7 @@ def load_machine_file(name_or_path: str | Path, changes: str = "") -> MachineFil
     found = checked(MachineFile, changed(read_toml(path), changes), path)
     if found.rotor is None or found.rotor.unknown or found.operation is None or found.condition is None:
         return found
-    return Machine.model_validate(found.model_dump() | {"operation": found.operation})  # which knows its given fields
+    return Machine.model_validate(found.model_dump() | {"operation": found.operation})  # keeps which fields were given
 
 
 def _path(name_or_path: str | Path) -> Path:
