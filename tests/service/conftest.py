@@ -1,4 +1,4 @@
-"""What several modules of tests of the service ask for by the same name; a module may still say its own."""
+"""Fixtures shared by several test modules of the service; a module may override them."""
 
 import subprocess
 from collections.abc import Iterator
@@ -22,9 +22,9 @@ _ADAPTERS: dict[tuple[object, str], TypeAdapter[Any]] = {}
 
 
 def _adapter(kind: Any, **more: Any) -> TypeAdapter[Any]:
-    """Of an argument or an answer of the HTTP API.
+    """Cached adapter of an argument or a response of the HTTP API.
 
-    They are the same for every service that a test starts, and making them was two fifths of the computing of a start.
+    They are the same in every service that a test starts, and building them was two fifths of the CPU time of a start.
     """
     key = (kind.__origin__, f"{kind.__metadata__} {more}")
     if key not in _ADAPTERS:
@@ -37,7 +37,7 @@ fastapi._compat.v2.TypeAdapter = _adapter  # type: ignore[attr-defined, assignme
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator["Browser"]:
-    from tests.service.api.page.browsing import chromium  # noqa: PLC0415  # only who looks at pages waits for the library
+    from tests.service.api.page.browsing import chromium  # noqa: PLC0415  # only tests of the page wait for the library
 
     with chromium() as found:
         yield found

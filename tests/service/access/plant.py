@@ -1,4 +1,4 @@
-"""A plant on loopback: a router with users and grants, which hears everything it lets through."""
+"""A plant on loopback: a router with users and grants, which collects everything it lets through."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,7 +25,7 @@ USERS = ("lab", "pump", "monitor", "all", "one")
 
 
 def at_once(hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
-    """On the network's own thread: what comes over a link is heard before what follows on it is looked at."""
+    """Handle samples on the network's own thread: each before the next one on its link is looked at."""
     handler: zenoh.handlers.Callback[zenoh.Sample] = zenoh.handlers.Callback(hear, indirect=False)
     return handler
 
@@ -38,7 +38,7 @@ def kept(path: Path, text: str) -> Path:
 
 @dataclass(slots=True)
 class Plant:
-    """A program with rules that others connect to, and how they connect to it."""
+    """A session with access rules, and how clients connect to it."""
 
     session: zenoh.Session
     address: str
@@ -64,7 +64,7 @@ class Plant:
 
 @contextmanager
 def plant(folder: Path, mode: Literal["router", "peer"] = "router") -> Iterator[Plant]:
-    """Users with passwords and grants; what arrives is heard in order, and health and descriptor are answered."""
+    """Users with passwords and grants; samples that are let through are collected in order."""
     for user in USERS:
         kept(folder / f"{user}.password", f"word of {user}\n")
     passwords = kept(folder / "passwords", "".join(f"{user}:word of {user}\n" for user in USERS))

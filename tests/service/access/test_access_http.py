@@ -39,13 +39,13 @@ def test_a_wrong_expired_or_revoked_token_gets_the_same_answer(monitor: Guarded)
         without = client.get("/health")
         in_no_form = client.get("/health", headers={"authorization": f"Token {good}"})
     details = {problem(answer, 401) for answer in (refused, without, in_no_form)}
-    assert len(details) == 3  # nothing given, nothing that could be a token, and a token that is none of ours
+    assert len(details) == 3  # none, not a bearer token, and an unknown one
     assert "error" not in without.headers["www-authenticate"]
     with monitor.client(good) as client:
         assert client.get("/health").json()["name"] == "ops"
 
 
-def test_a_token_counts_only_in_its_header(monitor: Guarded) -> None:
+def test_a_token_is_accepted_only_in_its_header(monitor: Guarded) -> None:
     token = monitor.token(*Scope)
     header = f"Bearer {token}"
     with monitor.client() as client:
@@ -62,7 +62,7 @@ def test_a_token_counts_only_in_its_header(monitor: Guarded) -> None:
     assert all(token not in str(entry) for entry in monitor.entries())
 
 
-def test_browsers_give_the_token_as_password(monitor: Guarded) -> None:
+def test_browsers_can_send_the_token_as_a_password(monitor: Guarded) -> None:
     token = monitor.token(READ)
     with monitor.client() as client:
         for given in ({}, basic("rw_000000000000_" + 43 * "0")):
@@ -77,7 +77,7 @@ def test_browsers_give_the_token_as_password(monitor: Guarded) -> None:
             problem(client.get("/docs", headers={"authorization": wrong}), 401)
 
 
-def test_a_route_that_declares_nothing_or_was_added_too_late_is_refused_to_everybody(monitor: Guarded) -> None:
+def test_a_route_without_a_scope_or_added_too_late_is_refused_to_everybody(monitor: Guarded) -> None:
     @monitor.app.get("/late")
     def late() -> str:
         return "late"
@@ -91,7 +91,7 @@ def test_a_route_that_declares_nothing_or_was_added_too_late_is_refused_to_every
     assert not monitor.done
 
 
-def test_what_the_gate_does_not_stand_before_cannot_be_protected(monitor: Guarded) -> None:
+def test_an_app_with_a_route_that_bypasses_the_gate_is_not_protected(monitor: Guarded) -> None:
     def without_gate(app: FastAPI) -> None:
         @app.get("/x", dependencies=[monitor.guard.read])
         def route() -> str:
@@ -115,7 +115,7 @@ def test_what_the_gate_does_not_stand_before_cannot_be_protected(monitor: Guarde
             monitor.guard.protect(app)
 
 
-def test_without_the_middleware_nobody_gets_past_the_gate(monitor: Guarded) -> None:
+def test_without_the_middleware_the_gate_refuses_every_request(monitor: Guarded) -> None:
     app = application(monitor.guard, monitor.done)
     with served(app) as url, httpx.Client(base_url=url, trust_env=False, timeout=180.0) as client:
         headers = {"authorization": f"Bearer {monitor.token(*Scope)}"}
@@ -124,7 +124,7 @@ def test_without_the_middleware_nobody_gets_past_the_gate(monitor: Guarded) -> N
     assert not monitor.done
 
 
-def test_secrets_are_compared_in_constant_time_of_none_too(monitor: Guarded, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_tokens_are_compared_in_constant_time(monitor: Guarded, monkeypatch: pytest.MonkeyPatch) -> None:
     compared: list[tuple[int, int]] = []
     original = hmac.compare_digest
 
@@ -142,7 +142,7 @@ def test_secrets_are_compared_in_constant_time_of_none_too(monitor: Guarded, mon
         assert set(compared) == {(32, 32)}
 
 
-def test_answers_carry_safe_headers(monitor: Guarded) -> None:
+def test_responses_carry_security_headers(monitor: Guarded) -> None:
     with monitor.client(monitor.token(READ)) as client:
         for path in ("/docs", "/health", "/nowhere", "/healthz", "/openapi.json"):
             headers = client.get(path).headers
@@ -151,7 +151,7 @@ def test_answers_carry_safe_headers(monitor: Guarded) -> None:
             assert "server" not in headers
 
 
-def test_another_page_changes_nothing_even_with_a_token_and_a_form_cannot_be_sent(monitor: Guarded) -> None:
+def test_cross_site_requests_and_forms_change_nothing_even_with_a_token(monitor: Guarded) -> None:
     with monitor.client(monitor.token(*Scope)) as client:
         for headers in (
             {"origin": "http://evil.example"},
@@ -168,7 +168,7 @@ def test_another_page_changes_nothing_even_with_a_token_and_a_form_cannot_be_sen
     assert not monitor.done
 
 
-def test_our_own_page_may(tmp_path: Path) -> None:
+def test_requests_of_the_services_own_origins_are_accepted(tmp_path: Path) -> None:
     with guarded(tmp_path, AccessSettings(hosts=("plant.example", "[2001:db8::1]:8443"))) as monitor:
         ours: tuple[dict[str, str], ...] = (
             {"origin": monitor.url, "sec-fetch-site": "same-origin"},
@@ -182,7 +182,7 @@ def test_our_own_page_may(tmp_path: Path) -> None:
             problem(client.delete("/machine", headers={"origin": "https://plant.example:8443"}), 403)
 
 
-def test_open_on_loopback_everybody_is_anonymous_and_written_down(tmp_path: Path) -> None:
+def test_open_on_loopback_every_caller_is_anonymous_and_audited(tmp_path: Path) -> None:
     with guarded(tmp_path, AccessSettings(open_on_loopback=True, hosts=("Plant.example",))) as monitor:
         with monitor.client() as client:
             assert client.get("/health").json() == {"name": "anonymous", "address": "127.0.0.1"}
@@ -205,6 +205,6 @@ def test_open_on_loopback_everybody_is_anonymous_and_written_down(tmp_path: Path
 
 
 @pytest.mark.parametrize(("proxies", "address"), [((), "127.0.0.1"), (("127.0.0.1",), "10.1.2.3")])
-def test_a_named_proxy_alone_says_who_calls(tmp_path: Path, proxies: tuple[str, ...], address: str) -> None:
+def test_only_a_configured_proxy_names_the_caller(tmp_path: Path, proxies: tuple[str, ...], address: str) -> None:
     with guarded(tmp_path, AccessSettings(proxies=proxies)) as monitor, monitor.client(monitor.token(READ)) as client:
         assert client.get("/health", headers={"x-forwarded-for": "10.1.2.3"}).json()["address"] == address

@@ -1,4 +1,4 @@
-"""How much a caller may ask for, and what is written down of it: a real server, a real store."""
+"""Limits on a caller's requests, and what the audit log holds of them: a real server, a real store."""
 
 import asyncio
 import logging
@@ -52,8 +52,8 @@ def test_large_bodies_are_refused_while_they_are_read(tmp_path: Path) -> None:
         assert [entry.status for entry in monitor.entries() if entry.status][-2:] == [413, 413]
 
 
-def test_what_others_make_of_a_body_that_was_cut_off_is_not_sent(tmp_path: Path) -> None:
-    """Between a middleware of this kind and the route the refusal turns into a bad request."""
+def test_a_middleware_does_not_change_the_413_for_a_large_body(tmp_path: Path) -> None:
+    """Behind a middleware of this kind the route turns the refusal into a bad request."""
 
     async def passed_on(request: Request, call_next: RequestResponseEndpoint) -> Response:
         return await call_next(request)
@@ -72,7 +72,7 @@ def test_what_others_make_of_a_body_that_was_cut_off_is_not_sent(tmp_path: Path)
 
 
 def test_a_body_that_never_ends_is_cut_off(tmp_path: Path) -> None:
-    """Answered before the sender is through, however much it says it will send."""
+    """The refusal comes before the sender has finished, however much it announces."""
     with guarded(tmp_path, AccessSettings(limits=LimitSettings(body_bytes=1000))) as monitor:
         url, token = httpx.URL(monitor.url), monitor.token(OPERATE)
         for length in ("content-length: 99999999999999999999", "transfer-encoding: chunked"):
@@ -84,7 +84,7 @@ def test_a_body_that_never_ends_is_cut_off(tmp_path: Path) -> None:
                 assert raw.recv(100).startswith(b"HTTP/1.1 413")
 
 
-def test_so_many_requests_a_minute_of_a_caller(tmp_path: Path) -> None:
+def test_requests_per_minute_are_limited_for_each_caller(tmp_path: Path) -> None:
     with guarded(tmp_path, AccessSettings(limits=LimitSettings(requests_per_minute=5))) as monitor:
         one, other = monitor.client(monitor.token(READ)), monitor.client(monitor.token(READ))
         with one, other, monitor.client() as nobody:
@@ -99,7 +99,7 @@ def test_so_many_requests_a_minute_of_a_caller(tmp_path: Path) -> None:
             assert one.get("/health").status_code == 200
 
 
-def test_tokens_cannot_be_tried_out_and_are_looked_up_a_few_times_only(
+def test_guessing_tokens_is_limited_and_does_not_load_the_database(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with guarded(tmp_path, AccessSettings(limits=LimitSettings(failures_per_minute=3))) as monitor:
@@ -111,12 +111,12 @@ def test_tokens_cannot_be_tried_out_and_are_looked_up_a_few_times_only(
             assert stranger.get("/health").headers["retry-after"] == "60"
             monitor.clock.now_s += 60.0
             assert stranger.get("/health").status_code == 401
-        # Nor by taking another one each time.
+        # Nor with a different token each time.
         assert [_asked(monitor, f"{wrong[:-3]}{number:03}") for number in range(1, 5)] == [401] * 2 + [429] * 2
 
 
-def test_wrong_tokens_of_others_lock_nobody_out(tmp_path: Path) -> None:
-    """Behind a proxy that is not named in the settings, everybody has the same address."""
+def test_wrong_tokens_from_the_same_address_lock_no_valid_token_out(tmp_path: Path) -> None:
+    """Behind a proxy that the settings do not name, all callers have the same address."""
     with guarded(tmp_path, AccessSettings(limits=LimitSettings(failures_per_minute=3))) as monitor:
         in_use, fresh, old = monitor.token(READ), monitor.token(READ), monitor.token(READ)
         assert _asked(monitor, in_use) == 200
@@ -125,7 +125,7 @@ def test_wrong_tokens_of_others_lock_nobody_out(tmp_path: Path) -> None:
         assert [_asked(monitor, token) for token in (in_use, fresh, old)] == [200] * 3
 
 
-def test_probes_are_never_limited_away(tmp_path: Path) -> None:
+def test_health_and_readiness_probes_are_not_rate_limited(tmp_path: Path) -> None:
     limits = LimitSettings(requests_per_minute=3, failures_per_minute=3)
     with (
         guarded(tmp_path, AccessSettings(limits=limits)) as monitor,
@@ -146,14 +146,14 @@ def _asked(monitor: Guarded, token: str) -> int:
         return client.get("/health").status_code
 
 
-def test_so_many_streams(tmp_path: Path) -> None:
+def test_event_streams_are_limited_per_caller_and_in_total(tmp_path: Path) -> None:
     limits = LimitSettings(streams_per_caller=2, streams=3)
     with guarded(tmp_path, AccessSettings(limits=limits)) as monitor:
         seats = monitor.guard.seats
         one, other = monitor.client(monitor.token(READ)), monitor.client(monitor.token(READ))
         with one, other:
             with one.stream("GET", "/events") as first, one.stream("GET", "/events"):
-                # Piece by piece, not at the end, of which there is none.
+                # Piece by piece: the stream has no end.
                 pieces = first.iter_text()
                 assert "data: 0" in next(pieces)
                 refused = one.get("/events")
@@ -167,7 +167,7 @@ def test_so_many_streams(tmp_path: Path) -> None:
                 assert again.status_code == 200
 
 
-def test_what_is_done_is_written_down_before_and_after(monitor: Guarded) -> None:
+def test_actions_are_audited_before_and_after(monitor: Guarded) -> None:
     token = monitor.token(READ, OPERATE, name="control room")
     with monitor.client(token) as client:
         client.get("/health")
@@ -188,7 +188,7 @@ def test_what_is_done_is_written_down_before_and_after(monitor: Guarded) -> None
     assert monitor.done == ["shelve k_by control room"]
 
 
-def test_a_clock_that_is_set_back_counts_for_what_is_done_then(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_audit_times_follow_a_clock_that_is_set_back_by_days(monkeypatch: pytest.MonkeyPatch) -> None:
     day_ns = 86_400 * 10**9
     times = iter([5 * day_ns, 5 * day_ns, 5 * day_ns - 1, day_ns, day_ns])
     trail = AuditTrail(Store("sqlite:///:memory:", Retention()).audit, 5)
@@ -202,7 +202,7 @@ def audit_fails(folder: Path, when: str = "") -> None:
     executed(f"sqlite:///{folder / 'history.sqlite'}", f"CREATE TRIGGER full BEFORE INSERT ON audit_log {when} {then}")
 
 
-def test_nothing_is_done_that_cannot_be_written_down(monitor: Guarded, tmp_path: Path) -> None:
+def test_an_action_that_cannot_be_audited_is_not_done(monitor: Guarded, tmp_path: Path) -> None:
     token = monitor.token(*Scope)
     with monitor.client(token) as client:
         assert client.get("/health").status_code == 200
@@ -213,7 +213,7 @@ def test_nothing_is_done_that_cannot_be_written_down(monitor: Guarded, tmp_path:
     assert not monitor.done
 
 
-def test_an_outcome_that_cannot_be_written_is_in_the_log_at_least(monitor: Guarded, tmp_path: Path) -> None:
+def test_an_outcome_that_cannot_be_audited_is_logged(monitor: Guarded, tmp_path: Path) -> None:
     audit_fails(tmp_path, "WHEN NEW.status > 0")
     with monitor.client(monitor.token(*Scope)) as client, capture_logs() as lines:
         assert client.delete("/machine").status_code == 200
@@ -222,7 +222,7 @@ def test_an_outcome_that_cannot_be_written_is_in_the_log_at_least(monitor: Guard
     assert any("outcome is missing" in line["event"] and line["status"] == 200 for line in lines)
 
 
-def test_without_the_database_those_who_were_there_may_look_on(monitor: Guarded) -> None:
+def test_without_the_database_known_tokens_can_still_read_for_a_time(monitor: Guarded) -> None:
     known, fresh = monitor.token(*Scope), monitor.token(READ)
     with monitor.client(known) as client, monitor.client(fresh) as late:
         assert client.get("/health").status_code == 200
@@ -249,7 +249,7 @@ def test_refusals_do_not_flood_the_audit_log(tmp_path: Path) -> None:
             monitor.clock.now_s += 61.0
             client.get("/health")
             assert monitor.entries()[-1].reason.endswith("86 refused requests before this one are not in this log")
-        # What a token's owner does is written down all the same.
+        # Actions with a valid token are recorded all the same.
         with monitor.client(monitor.token(*Scope)) as client:
             assert client.delete("/machine").status_code == 200
         assert [entry.status for entry in monitor.entries()][-2:] == [0, 200]
@@ -284,7 +284,7 @@ def test_no_secret_is_written_anywhere(monitor: Guarded, tmp_path: Path, caplog:
     assert secrets[0].encode() not in stored
 
 
-def test_what_strangers_send_does_not_spoil_the_log(monitor: Guarded) -> None:
+def test_audited_paths_are_printable_and_bounded(monitor: Guarded) -> None:
     with monitor.client() as client:
         client.get("/%00%1b[31mred%0d%0aline%ff/" + "x" * 2000)
     (entry,) = monitor.entries()

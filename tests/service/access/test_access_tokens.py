@@ -1,4 +1,4 @@
-"""Tokens: made, taken apart, checked, hidden; rates and settings beside them; and the certificates of TLS."""
+"""Tokens: created, parsed, checked and masked; rate limits and settings of access; certificates for TLS."""
 
 import ssl
 from datetime import UTC, datetime, timedelta
@@ -34,13 +34,13 @@ def made(name: str = "ops", days: int | None = None) -> tuple[TokenRecord, str]:
     return new_token(name, [Scope.READ], now_ns=0, days=days)
 
 
-def test_tokens_differ_hold_256_bits_and_are_kept_as_a_hash() -> None:
+def test_tokens_are_unique_have_256_bits_and_are_stored_as_a_hash() -> None:
     tokens = [made()[1] for _ in range(200)]
     secrets = {token.rpartition("_")[2] for token in tokens}
     assert len(secrets) == len({token[:15] for token in tokens}) == 200
     assert {len(secret) for secret in secrets} == {43}
     assert 62**42 < 2**256 <= 62**43
-    # Every digit of the last place occurs, the first is small because 62**43 is more than 2**256.
+    # Every digit occurs in the last place; the first is small because 62**43 is more than 2**256.
     assert len({secret[-1] for secret in secrets}) > 50
     record, text = made()
     parsed = sure(parse_token(text))
@@ -51,13 +51,13 @@ def test_tokens_differ_hold_256_bits_and_are_kept_as_a_hash() -> None:
 
 
 @given(st.text())
-def test_any_text_is_no_token_and_breaks_nothing(text: str) -> None:
+def test_arbitrary_text_is_not_a_token(text: str) -> None:
     assert parse_token(text) is None
     assert not token_is_valid(made()[0], parse_token(text), 1)
 
 
 @given(place=st.integers(0, 58), other=st.sampled_from([*ALPHABET, "_", "-", " ", "\n", "é", "\0"]))
-def test_one_wrong_character_is_enough(place: int, other: str) -> None:
+def test_one_wrong_character_makes_a_token_invalid(place: int, other: str) -> None:
     record, text = made()
     assert len(text) == 59
     other = "!" if other == text[place] else other
@@ -67,25 +67,25 @@ def test_one_wrong_character_is_enough(place: int, other: str) -> None:
     assert not token_is_valid(None, parse_token(text), 1)
 
 
-def test_expiry_and_revocation() -> None:
+def test_expired_revoked_and_foreign_tokens_are_invalid() -> None:
     record, text = made(days=2)
     presented = parse_token(text)
     assert token_is_valid(record, presented, 2 * DAY_NS - 1)
     assert not token_is_valid(record, presented, 2 * DAY_NS)
     fields = {name: getattr(record, name) for name in TokenRecord.__dataclass_fields__}
     assert not token_is_valid(TokenRecord(**{**fields, "revoked_ns": 1}), presented, 1)
-    # The right secret under another token's name.
+    # The right secret under another token's identifier.
     assert not token_is_valid(TokenRecord(**{**fields, "token_id": "0" * 12}), presented, 1)
 
 
 @given(st.text(alphabet=" /?&=é\n"), st.text(alphabet=" /?&=é\n_"), st.integers(1, 43))
-def test_secrets_are_hidden_wherever_they_stand_and_if_they_are_cut_off(before: str, after: str, length: int) -> None:
+def test_secrets_are_masked_anywhere_in_a_text_even_if_truncated(before: str, after: str, length: int) -> None:
     text = made()[1]
     assert masked(f"{before}{text[: 16 + length]}{after}") == f"{before}{text[:16]}…{after}"
 
 
 @given(st.integers(1, 5), st.lists(st.tuples(st.sampled_from("ab"), st.floats(0.0, 40.0)), max_size=60))
-def test_never_more_than_so_many_in_any_minute(amount: int, hits: list[tuple[str, float]]) -> None:
+def test_the_limit_holds_in_any_minute(amount: int, hits: list[tuple[str, float]]) -> None:
     now_s = 0.0
     window = MovingWindow(amount, clock=lambda: now_s)
     admitted: dict[str, list[float]] = {"a": [], "b": []}
@@ -101,7 +101,7 @@ def test_never_more_than_so_many_in_any_minute(amount: int, hits: list[tuple[str
         assert (wait_s == 0.0) == (len(recent) < amount)
 
 
-def test_many_addresses_do_not_fill_the_memory() -> None:
+def test_the_number_of_tracked_addresses_is_bounded() -> None:
     window = MovingWindow(1, clock=lambda: 0.0, keys=100)
     for number in range(1000):
         window.hit(str(number))
@@ -120,11 +120,11 @@ def test_many_addresses_do_not_fill_the_memory() -> None:
         ("2001:db8:1:2::9", "2001:db8:1:2::/64"), ("fe80::1%eth0", "fe80::/64"), ("", ""), ("unix", "unix"),
     ],
 )  # fmt: skip
-def test_what_counts_as_one_address(address: str, network: str) -> None:
+def test_ipv6_addresses_count_by_their_64_bit_network(address: str, network: str) -> None:
     assert network_of(address) == network
 
 
-def test_open_to_all_only_on_loopback() -> None:
+def test_open_access_is_accepted_only_on_loopback() -> None:
     access = AccessSettings(open_on_loopback=True)
     for host in ("0.0.0.0", "::", "10.0.0.1", "monitor.plant", ""):  # noqa: S104  # refused
         with pytest.raises(MachineFileError, match=r"plant\.toml: access\.open_on_loopback is true, but http\.host"):
@@ -136,13 +136,13 @@ def test_open_to_all_only_on_loopback() -> None:
         check_access("plant.toml", AccessSettings(open_on_loopback=True, proxies=("10.0.0.1",)), "127.0.0.1")
 
 
-def test_settings_refuse_what_they_do_not_know() -> None:
+def test_invalid_access_settings_are_refused() -> None:
     for fields in ({"open": True}, {"proxies": ["proxy.plant"]}, {"limits": {"body_bytes": 1}}, {"tls": {"key": "k"}}):
         with pytest.raises(ValueError, match="validation error"):
             AccessSettings.model_validate(fields)
 
 
-def test_certificates_are_beside_the_settings_file() -> None:
+def test_certificate_paths_are_relative_to_the_settings_file() -> None:
     tls = HttpTlsSettings(certificate=Path("c.pem"), key=Path("/keys/k.pem"), client_ca=Path("ca.pem"))
     found = in_folder(AccessSettings(tls=tls), Path("/etc/rotorwatch")).tls
     assert found == HttpTlsSettings(
@@ -172,7 +172,7 @@ def trusting(authority: trustme.CA) -> ssl.SSLContext:
     return context
 
 
-def test_https_is_served_and_nothing_older_than_tls_1_2(tmp_path: Path, authority: trustme.CA) -> None:
+def test_https_is_served_with_tls_1_2_or_newer(tmp_path: Path, authority: trustme.CA) -> None:
     with guarded(tmp_path, AccessSettings(tls=files(tmp_path, authority))) as monitor:
         assert monitor.url.startswith("https://")
         token = monitor.token(Scope.READ)
@@ -185,7 +185,7 @@ def test_https_is_served_and_nothing_older_than_tls_1_2(tmp_path: Path, authorit
     assert tls_context(files(tmp_path, authority)).minimum_version == ssl.TLSVersion.TLSv1_2
 
 
-def test_a_client_without_a_certificate_is_refused_where_it_needs_one(tmp_path: Path, authority: trustme.CA) -> None:
+def test_a_client_without_a_required_certificate_is_refused(tmp_path: Path, authority: trustme.CA) -> None:
     with guarded(tmp_path, AccessSettings(tls=files(tmp_path, authority, client_ca=True))) as monitor:
         token = monitor.token(Scope.READ)
         known, stranger = trusting(authority), trusting(authority)
@@ -199,7 +199,7 @@ def test_a_client_without_a_certificate_is_refused_where_it_needs_one(tmp_path: 
         key.write_bytes(own.private_key_pem.bytes())
         status = ("status", "--url", monitor.url, "--token", token, "--ca", str(ca))
         found = CliRunner().invoke(app, [*status, "--certificate", str(file), str(key)])
-        assert "answers 404" in found.stderr  # of an application that has no machines
+        assert "answers 404" in found.stderr  # the application here has no machines
         found = CliRunner().invoke(app, status)
         assert (found.exit_code, "perhaps it requires a certificate" in found.stderr) == (4, True)
         for context in (stranger, trusting(authority)):
@@ -208,7 +208,7 @@ def test_a_client_without_a_certificate_is_refused_where_it_needs_one(tmp_path: 
 
 
 @pytest.mark.parametrize(("days", "said"), [(-1.0, ".pem expired on "), (20.0, "pem expires on "), (40.0, "")])
-def test_a_certificate_that_has_to_be_renewed_is_told(
+def test_a_certificate_that_has_expired_or_soon_will_is_reported(
     tmp_path: Path, authority: trustme.CA, monkeypatch: pytest.MonkeyPatch, days: float, said: str
 ) -> None:
     tls = files(tmp_path, authority)
@@ -217,7 +217,7 @@ def test_a_certificate_that_has_to_be_renewed_is_told(
     link = LinkSettings(listen=("tls/127.0.0.1:7447",), tls=TlsSettings(certificate=tls.certificate, key=tls.key))
     both = ServiceSettings(access=AccessSettings(tls=tls), link=link)
     assert [said in one for one in lapses(both)] == [True] * bool(said)
-    monkeypatch.delattr("ssl._ssl._test_decode_cert")  # a Python that cannot tell is no reason not to start
+    monkeypatch.delattr("ssl._ssl._test_decode_cert")  # without this function of Python there is no warning
     assert lapses(both) == []
 
 
@@ -228,7 +228,7 @@ def refused(tls: HttpTlsSettings) -> str:
 
 
 @pytest.mark.parametrize("name", ["certificate", "key", "client_ca"])
-def test_a_file_that_cannot_be_read_or_is_none_is_named(tmp_path: Path, authority: trustme.CA, name: str) -> None:
+def test_an_unreadable_or_invalid_tls_file_is_named(tmp_path: Path, authority: trustme.CA, name: str) -> None:
     tls = files(tmp_path, authority, client_ca=True)
     path: Path = getattr(tls, name)
     path.unlink()
@@ -242,7 +242,7 @@ def test_a_file_that_cannot_be_read_or_is_none_is_named(tmp_path: Path, authorit
         assert refused(tls).startswith(f"{path}: tls.{name} holds no ")
 
 
-def test_a_key_of_another_certificate_or_that_all_can_read_is_refused(tmp_path: Path, authority: trustme.CA) -> None:
+def test_a_key_of_another_certificate_or_readable_by_all_is_refused(tmp_path: Path, authority: trustme.CA) -> None:
     tls = files(tmp_path, authority)
     tls.key.write_bytes(authority.issue_cert("x", key_type=trustme.KeyType.ECDSA).private_key_pem.bytes())
     assert refused(tls) == f"{tls.key}: tls.key is not the key of tls.certificate {tls.certificate}"
@@ -253,7 +253,7 @@ def test_a_key_of_another_certificate_or_that_all_can_read_is_refused(tmp_path: 
     server_arguments(AccessSettings(tls=tls))
 
 
-def test_a_key_with_a_password_is_refused_without_asking_for_it(tmp_path: Path, authority: trustme.CA) -> None:
+def test_a_password_protected_key_is_refused(tmp_path: Path, authority: trustme.CA) -> None:
     from cryptography.hazmat.primitives import serialization  # noqa: PLC0415  # comes with trustme, used here alone
 
     tls = files(tmp_path, authority)

@@ -1,4 +1,4 @@
-"""Signing in with a browser: the token in a cookie, and what may not be done with it."""
+"""Signing in with a browser: the token in a cookie, and what is refused with it."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ def signed_in(monitor: Guarded, client: httpx.Client, token: str) -> httpx.Respo
     return client.post(SESSION, json={}, headers={"authorization": f"Bearer {token}", "origin": monitor.url})
 
 
-def test_who_signed_in_looks_and_operates_until_signing_out(monitor: Guarded) -> None:
+def test_a_session_reads_and_operates_until_signing_out(monitor: Guarded) -> None:
     token = monitor.token(READ, OPERATE)
     with monitor.client() as client:
         answer = signed_in(monitor, client, token)
@@ -36,7 +36,7 @@ def test_who_signed_in_looks_and_operates_until_signing_out(monitor: Guarded) ->
     assert logged == {("POST", "ops"), ("DELETE", "ops")}
 
 
-def test_the_cookie_alone_changes_nothing_and_no_page_from_elsewhere_can_use_it(monitor: Guarded) -> None:
+def test_the_cookie_changes_nothing_without_the_services_own_origin(monitor: Guarded) -> None:
     token = monitor.token(READ, OPERATE)
     with monitor.client() as client:
         signed_in(monitor, client, token)
@@ -44,12 +44,12 @@ def test_the_cookie_alone_changes_nothing_and_no_page_from_elsewhere_can_use_it(
         for headers in ({}, elsewhere, {"origin": "null"}, here | {"sec-fetch-site": "cross-site"}):
             assert problem(client.post("/alarms/k_by/shelve", json=BODY, headers=headers), 403)
             assert problem(client.delete(SESSION, headers=headers), 403)
-        assert client.get("/health", headers=elsewhere).status_code == 200  # other pages may ask, but cannot read it
+        assert client.get("/health", headers=elsewhere).status_code == 200  # they cannot read the response
         problem(client.post("/alarms/k_by/shelve", content=b"reason=known", headers=here), 415)
     assert not monitor.done
 
 
-def test_a_wrong_or_revoked_token_is_not_kept_and_one_that_was_kept_is_refused(monitor: Guarded) -> None:
+def test_a_wrong_token_sets_no_cookie_and_a_revoked_one_ends_the_session(monitor: Guarded) -> None:
     record, token = monitor.issue(READ)
     with monitor.client() as client:
         problem(signed_in(monitor, client, token[:-1]), 401)
@@ -58,19 +58,19 @@ def test_a_wrong_or_revoked_token_is_not_kept_and_one_that_was_kept_is_refused(m
         signed_in(monitor, client, token)
         monitor.store.tokens.revoke(record.token_id, 1)
         assert "no longer signed in" in problem(client.get("/health"), 401)
-        # A token that is given counts, whatever the browser has kept.
+        # A token in the header takes precedence over the cookie.
         other = monitor.token(READ, name="other")
         assert client.get("/health", headers={"authorization": f"Bearer {other}"}).json()["name"] == "other"
 
 
-def test_wrong_cookies_are_counted_as_attempts(tmp_path: Path) -> None:
+def test_wrong_cookies_count_as_failed_attempts(tmp_path: Path) -> None:
     settings = AccessSettings.model_validate({"limits": {"failures_per_minute": 2}})
     with guarded(tmp_path, settings) as monitor, monitor.client() as client:
         client.cookies.set(COOKIE, "rw_nothing")
         assert [client.get("/health").status_code for _ in range(4)] == [401, 401, 429, 429]
 
 
-def test_where_no_token_is_needed_none_is_kept(tmp_path: Path) -> None:
+def test_no_cookie_is_set_where_no_token_is_needed(tmp_path: Path) -> None:
     settings = AccessSettings.model_validate({"open_on_loopback": True})
     with guarded(tmp_path, settings) as monitor, monitor.client() as client:
         assert client.post(SESSION, json={}).json()["name"] == "anonymous"

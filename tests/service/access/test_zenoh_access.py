@@ -34,7 +34,7 @@ def router(tmp_path: Path) -> Iterator[Plant]:
 
 
 def knock(link: LinkSettings) -> None:
-    """Publish nothing at all: what is left is whether the program is let in."""
+    """Publish nothing: this tests only whether the program is let in."""
     publish(LAB, iter(()), PublishSettings(link=link, linger_s=0.0, pace=1.0))
 
 
@@ -42,7 +42,7 @@ def text_of(reply: zenoh.Reply) -> str:
     return sure(reply.ok).payload.to_string()
 
 
-def test_only_the_right_password_opens(router: Plant, tmp_path: Path) -> None:
+def test_only_the_right_user_and_password_are_let_in(router: Plant, tmp_path: Path) -> None:
     knock(router.link("lab"))
     kept(tmp_path / "wrong", "wrong-word")
     wrong = router.link("lab").model_copy(update={"password_file": tmp_path / "wrong"})
@@ -78,7 +78,7 @@ class Authority:
         )
 
 
-def test_only_a_certificate_of_the_authority_opens(tmp_path: Path) -> None:
+def test_only_a_certificate_of_the_authority_is_let_in(tmp_path: Path) -> None:
     ours, foreign = Authority(tmp_path, trustme.CA()), Authority(tmp_path, trustme.CA())
     address = endpoint().replace("tcp/", "tls/")
     served = ours.tls("router", "127.0.0.1")
@@ -132,22 +132,22 @@ def test_a_certificates_common_name_is_the_name_in_the_grants(tmp_path: Path) ->
         ("all", LAB.keys.report, "monitor"), ("one", PUMP.health, "monitor"),
     ],
 )  # fmt: skip
-def test_what_is_not_granted_is_dropped(router: Plant, who: str, key: str, owner: str) -> None:
+def test_messages_without_a_grant_are_dropped(router: Plant, who: str, key: str, owner: str) -> None:
     router.session.declare_queryable(LAB.keys.health, lambda query: query.reply(LAB.keys.health, "fine"))
     with router.client(who) as refused, router.client(owner) as granted:
         refused.put(key, "refused", congestion_control=zenoh.CongestionControl.BLOCK)
         own = {"lab": LAB.keys.stream, "monitor": LAB.keys.report}.get(who)
-        if own is not None:  # the same link goes on with what is allowed
+        if own is not None:  # the link still carries what is allowed
             refused.put(own, "own", congestion_control=zenoh.CongestionControl.BLOCK)
             router.until_heard(own, "own")
-        # A question behind it on the same link: when it is answered, the message was judged.
+        # A query behind it on the same link: once it is answered, the message has been handled.
         assert [text_of(reply) for reply in refused.get(LAB.keys.health, timeout=60.0)] == ["fine"]
         granted.put(key, "granted", congestion_control=zenoh.CongestionControl.BLOCK)
         router.until_heard(key, "granted")
     assert [text for heard, text in router.heard if heard == key] == ["granted"]
 
 
-def test_nobody_answers_for_a_monitor(router: Plant) -> None:
+def test_only_the_monitor_can_answer_queries_for_its_keys(router: Plant) -> None:
     key = LAB.keys.health
     with router.client("lab") as publisher, router.client("monitor") as monitor, router.client("all") as viewer:
         publisher.declare_queryable(key, lambda query: query.reply(key, "forged"))
@@ -160,7 +160,7 @@ def test_nobody_answers_for_a_monitor(router: Plant) -> None:
     assert answers == ["true"]
 
 
-def test_nobody_lives_in_anothers_name(router: Plant) -> None:
+def test_liveliness_tokens_are_accepted_only_from_their_owner(router: Plant) -> None:
     alive: list[str] = []
     router.session.liveliness().declare_subscriber(
         "rotorwatch/**", at_once(lambda sample: alive.append(str(sample.key_expr))), history=True
@@ -178,7 +178,7 @@ def test_nobody_lives_in_anothers_name(router: Plant) -> None:
             for session in (viewer, lab, monitor)
             for key in (*wanted[1:], wanted[0])
         ]
-        # A question behind the tokens on each link.
+        # A query behind the tokens on each link.
         router.session.declare_queryable(LAB.keys.health, lambda query: query.reply(LAB.keys.health, "fine"))
         for session in (viewer, lab, monitor):
             assert [text_of(reply) for reply in session.get(LAB.keys.health, timeout=60.0)] == ["fine"]
@@ -213,7 +213,7 @@ def test_a_viewer_reads_no_more_than_its_grant(router: Plant) -> None:
         token = monitor.liveliness().declare_token(PUMP.monitor_alive)
 
         def pass_round() -> bool:
-            """Again and again, until the last declaration has arrived."""
+            """Publish again, until the last declaration has arrived."""
             lab.put(LAB.keys.stream, "x", congestion_control=zenoh.CongestionControl.BLOCK)
             for key in (PUMP.health, PUMP.alarm_event, LAB.keys.report, LAB.keys.health):
                 monitor.put(key, "x", congestion_control=zenoh.CongestionControl.BLOCK)
@@ -235,7 +235,7 @@ def test_a_viewer_reads_no_more_than_its_grant(router: Plant) -> None:
 
 
 advanced = partial(advanced_publisher, kept=100, heartbeat_s=0.1)
-"""As the monitor and the simulator publish."""
+"""Publishers like those of the monitor and the simulator."""
 
 
 def collected(
@@ -254,8 +254,8 @@ def collected(
 
 
 @pytest.mark.parametrize("mode", ["router", "peer"])
-def test_late_joiners_get_what_was_before(tmp_path: Path, mode: Literal["router", "peer"]) -> None:
-    """Through a router as through a monitor that listens itself."""
+def test_late_joiners_get_cached_blocks_and_events(tmp_path: Path, mode: Literal["router", "peer"]) -> None:
+    """Both through a router and through a monitor that listens itself."""
     numbers = [str(number) for number in range(20)]
     with plant(tmp_path, mode) as found, found.client("lab") as lab, found.client("monitor") as monitor:
         stream, events = advanced(lab, LAB.keys.stream), advanced(monitor, LAB.keys.alarm_event)
@@ -272,7 +272,7 @@ def test_late_joiners_get_what_was_before(tmp_path: Path, mode: Literal["router"
             by_pattern, _ = collected(every, "rotorwatch/demo/*/alarm/event", history=True, recovery=True)
             until(lambda: len(by_name) >= 20 and len(by_pattern) >= 20, "events of before")
             assert "all events" in [text_of(reply) for reply in one.get(LAB.keys.alarm_event, timeout=60.0)]
-            # The stream's cache is not a viewer's to read.
+            # A viewer may not read the stream's cache.
             refused, _ = collected(one, LAB.keys.stream, history=True, recovery=True)
             assert [r for r in one.get(f"{LAB.keys.stream}/@adv/**", timeout=60.0) if r.ok] == []
             events.put("last")
@@ -282,7 +282,7 @@ def test_late_joiners_get_what_was_before(tmp_path: Path, mode: Literal["router"
         assert by_name == by_pattern == [*numbers, "last"]
 
 
-def test_a_granted_viewer_fetches_what_was_lost_on_the_way(router: Plant) -> None:
+def test_a_granted_viewer_recovers_lost_events(router: Plant) -> None:
     # The viewer's own session lets one event in a hundred seconds through: the others are lost, at its end of the link.
     lossy = (
         '[{"id": "lossy", "flows": ["ingress"], "messages": ["put"], '
@@ -297,7 +297,7 @@ def test_a_granted_viewer_fetches_what_was_lost_on_the_way(router: Plant) -> Non
         until_subscribed(monitor, LAB.keys.alarm_event)
         for number in numbers:
             events.put(number)
-        # Each subscriber has a thread of its own: what came by itself may be told last.
+        # Each subscriber has a thread of its own: the plain one may be last.
         until(lambda: len(texts) >= 10 and bool(plain), "events that were lost")
         assert texts == numbers
         assert plain == ["0"]
@@ -308,7 +308,7 @@ SHIPPED = ROOT / "deploy" / "zenoh"
 
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Made with the commands of the documentation."""
+    """Certificates made with the commands of the documentation."""
     if shutil.which("openssl") is None:  # a fresh machine has Python, git and make alone
         pytest.skip("openssl is not installed: the documented commands cannot be tried")
     page = (ROOT / "docs" / "zenoh-security.md").read_text(encoding="utf-8")
@@ -321,7 +321,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def started(recorder: Program, plan: ServiceSettings) -> Iterator[Runtime]:
-    """A monitor, once a recorder is there."""
+    """Start a monitor once the recorder is running."""
     recorder.wait_for("recording rotorwatch/demo/lab")
     with running(plan) as service:
         yield service
@@ -347,7 +347,7 @@ def test_the_shipped_examples_work_together(tmp_path: Path, level: str, request:
     plan = ServiceSettings(
         link=load_link(folder / "monitor.toml"), http=HttpSettings(port=0), machines=(MachineEntry(file="lab"),)
     )
-    load_link(SHIPPED / level / "router.toml").check_reach("shipped")  # as it is: on every network of the computer
+    load_link(SHIPPED / level / "router.toml").check_reach("shipped")  # unchanged: on every network of the computer
     gate = Link(load_link(folder / "router.toml"))
     try:
         with (
@@ -372,7 +372,7 @@ def test_the_shipped_examples_work_together(tmp_path: Path, level: str, request:
         gate.close()
 
 
-def test_rotorsim_says_what_it_cannot_use(tmp_path: Path) -> None:
+def test_rotorsim_reports_a_readable_password_file_and_a_refused_user(tmp_path: Path) -> None:
     address = endpoint()
     (tmp_path / "link.toml").write_text(
         f'[link]\nmode = "client"\nconnect = ["{address}"]\nuser = "lab"\npassword_file = "p"\n', encoding="utf-8"

@@ -1,4 +1,4 @@
-"""What the tests of snapshots share: windows of the rotor kit as a monitor holds them."""
+"""Shared by the tests of snapshots: windows of the rotor kit as a monitor holds them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -48,7 +48,7 @@ def window_of(machine: MachineFile, stream_: Sequence[SampleBlock], *, lagged: b
 
 @cache
 def latest(*faults: Event, lagged: bool = True) -> LatestData:
-    """What a monitor of the rotor kit holds after 70 s."""
+    """Latest data of a monitor of the rotor kit after 70 s."""
     stream_ = stream(SECONDS, SEED, *faults)
     window = window_of(LAB, stream_, lagged=lagged)
     return LatestData(window, 1.0, LikelihoodFit(LAB).diagnose(window).parameters, "", stream_[-20:])
@@ -63,7 +63,7 @@ def quiet() -> tuple[SampleBlock, ...]:
 
 
 def unbalance_um() -> npt.NDArray[np.complex128]:
-    """What it does by the equations of motion: y1, y2, psi, z1, z2, phi."""
+    """Response to the unbalance by the equations of motion: y1, y2, psi, z1, z2, phi."""
     W, rotor = LAB.operation.speed_rad_s, LAB.rotor
     H = H_matrix(rotor, W)
     dynamic = -(W**2) * M_matrix(rotor) + 1j * W * P_matrix(rotor, W) + Q_matrix(rotor)
@@ -79,7 +79,7 @@ def by_plane(snapshot: CorrelationSnapshot, plane: str) -> list[CorrelationPair]
 
 
 def synthetic(signals: dict[str, FloatArray]) -> list[SampleBlock]:
-    """Blocks of 0.1 s of the rotor kit with these samples, and nothing in other channels."""
+    """Blocks of 0.1 s of the rotor kit with these samples, and zeros in other channels."""
     n_samples = next(iter(signals.values())).size
     samples = np.zeros((n_samples, len(NAMES)))
     for name, values in signals.items():

@@ -1,4 +1,4 @@
-"""Pictures of what the history of a monitor holds: trend, run-ups and centrelines from its reports."""
+"""Plots from the history of a monitor: trend, run-ups and centrelines from its reports."""
 
 from pathlib import Path
 
@@ -43,7 +43,7 @@ def report(number: int) -> Report:
 
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of a monitor whose history has reports, one of them of another version of the program."""
+    """Settings of a monitor whose history has reports, one of them from another version of the program."""
     folder = tmp_path_factory.mktemp("past")
     (folder / "plant.toml").write_text('[history]\nurl = "sqlite:///history.sqlite"\n', encoding="utf-8")
     with opened(f"sqlite:///{folder / 'history.sqlite'}") as store:
@@ -56,7 +56,7 @@ def settings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "plant.toml"
 
 
-def test_vectors_and_gaps_of_the_history_are_those_of_the_reports(settings: Path) -> None:
+def test_vectors_and_centrelines_of_the_history_are_those_of_the_reports(settings: Path) -> None:
     data = Past.find(settings, None, (None, None))
     assert (data.name, len(data.reports)) == ("demo/lab", COUNT)
     number = np.arange(COUNT)
@@ -72,7 +72,7 @@ def test_vectors_and_gaps_of_the_history_are_those_of_the_reports(settings: Path
     assert past_trend(data, levels=True).levels[0].level.tolist() == [50.0] * COUNT
 
 
-def test_a_stretch_of_the_history_and_what_it_lacks(settings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_part_of_the_history_and_data_that_it_lacks(settings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     some = Past.find(settings, "demo/lab", ("20", "51"))
     assert [one.end_ns for one in some.reports] == [START_NS + (80 + 5 * one) * S for one in range(7)]
     with pytest.raises(RotorwatchError, match="no report of demo/lab has amplitude and phase of 3x of y1"):
@@ -89,7 +89,7 @@ def run(*arguments: str | Path) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize("kind", ["trend", "polar", "centreline"])
-def test_pictures_of_the_history(settings: Path, tmp_path: Path, kind: str) -> None:
+def test_plots_of_the_history_are_written(settings: Path, tmp_path: Path, kind: str) -> None:
     out = tmp_path / "picture.png"
     code, said = run(kind, "--history", settings, "--out", out, "--size", "6x4", "--dpi", "60")
     assert (code, said.strip()) == (0, str(out)), said
@@ -106,12 +106,12 @@ def test_pictures_of_the_history(settings: Path, tmp_path: Path, kind: str) -> N
         (("trend", "some.mcap", "--history"), "both recordings and --history are given, expected one of them"),
     ],
 )
-def test_what_a_history_lacks_is_said(settings: Path, tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
+def test_unusable_options_are_named(settings: Path, tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
     code, said = run(*arguments, settings, "--out", tmp_path / "picture.png")
     assert (code, message in said) == (2, True), said
 
 
-def test_without_recordings_it_asks_for_a_history_and_makes_none(tmp_path: Path) -> None:
+def test_without_recordings_a_history_is_asked_for_and_none_is_created(tmp_path: Path) -> None:
     code, said = run("orbit", "--out", tmp_path / "picture.png")
     assert (code, "no recordings are named: expected FILE..." in said) == (2, True)
     (tmp_path / "plant.toml").write_text('[history]\nurl = "sqlite:///none.sqlite"\n', encoding="utf-8")

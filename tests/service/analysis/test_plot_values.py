@@ -1,4 +1,4 @@
-"""Values of plots, of the newest samples, of recordings and of the history: against closed forms, and over HTTP."""
+"""Values of plots from the newest samples, recordings and the history, against closed forms and over HTTP."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -43,20 +43,20 @@ def data(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     return recorded(recording(tmp_path_factory.mktemp("run-up") / "made.mcap", BLOCKS))
 
 
-def test_a_waveform_is_the_newest_revolutions_with_their_pulses(data: Sampled) -> None:
+def test_a_waveform_is_of_the_newest_revolutions_with_their_pulses(data: Sampled) -> None:
     found = waveform_snapshot(data, CHANNELS, 6, None)
     assert (found.revolutions, len(found.pulses_s), found.reason) == (6, 7, "")
     assert found.start_ns is not None
     t = (found.start_ns - START_NS) / S + np.array(found.times_s)
     for one, expected in zip(found.waveforms, (np.cos(angle(t) - LAG), np.sin(angle(t) - LAG)), strict=True):
-        assert np.abs(numbers(one.values) - SHAFT_UM * expected).max() < 0.6  # its mean and the drift are taken away
+        assert np.abs(numbers(one.values) - SHAFT_UM * expected).max() < 0.6  # without its mean and drift
     at_pulses = angle((found.start_ns - START_NS) / S + np.array(found.pulses_s)) / (2 * np.pi)
     assert at_pulses == pytest.approx(np.round(at_pulses), abs=2e-3)
     assert found.waveforms[0].mean == pytest.approx(RUNOUT_UM, rel=1e-2)
     assert found.speed_rad_s == pytest.approx(2 * np.pi * TO_HZ, rel=0.02)
 
 
-def test_what_is_drawn_of_a_machine_that_measures_no_displacement() -> None:
+def test_without_displacements_velocities_are_the_default_channels() -> None:
     kinds = (Quantity.SHAFT_ANGLE, Quantity.VELOCITY)
     sensors = tuple(one for one in LAB.sensors if one.quantity in kinds)
     machine = LAB.model_copy(update={"sensors": sensors})
@@ -64,7 +64,7 @@ def test_what_is_drawn_of_a_machine_that_measures_no_displacement() -> None:
     assert {one.name for one in Held(LAB, BLOCKS).chosen(())} == {"y1", "y2", "z1", "z2"}
 
 
-def test_a_waveform_without_speed_is_the_newest_moment_and_says_so() -> None:
+def test_a_waveform_without_speed_is_of_the_newest_half_second_with_a_reason() -> None:
     plain = LAB.model_copy(update={"sensors": CHANNELS})
     columns = [LAB.sensors.index(one) for one in CHANNELS]
     blocks = [type(one)(one.start_ns, one.sequence, one.run, one.rate_hz, one.samples[:, columns]) for one in BLOCKS]
@@ -75,7 +75,7 @@ def test_a_waveform_without_speed_is_the_newest_moment_and_says_so() -> None:
     assert found.speed_rad_s is None
 
 
-def test_forward_and_reverse_circles_keep_their_sides(data: Sampled) -> None:
+def test_a_forward_orbit_is_on_the_forward_side_of_the_full_spectrum(data: Sampled) -> None:
     found = full_spectrum_snapshot(data)
     (bearing, _) = found.places
     assert (bearing.location, bearing.channels) == ("bearing", ("y1", "z1"))
@@ -115,7 +115,7 @@ def test_vectors_of_a_run_up_have_its_amplitude_and_lag(data: Sampled) -> None:
         assert numbers(one.amplitude) == pytest.approx(2 * SHAFT_UM, rel=0.02)
         assert numbers(one.phase_lag_deg) == pytest.approx(lag, abs=2)
     bare = vector_series(data, CHANNELS, 1, 5, 1000.0)
-    assert np.median(numbers(bare.channels[0].amplitude)) < 1  # the slow roll was all there was
+    assert np.median(numbers(bare.channels[0].amplitude)) < 1  # the slow-roll vector was all of it
 
 
 def test_the_centreline_moves_with_the_mean(data: Sampled) -> None:
@@ -139,7 +139,7 @@ def http(runtime: tuple[Runtime, Path]) -> Iterator[httpx.Client]:
         yield found
 
 
-def test_values_come_from_what_was_asked_for(runtime: tuple[Runtime, Path], http: httpx.Client) -> None:
+def test_values_come_from_the_requested_source(runtime: tuple[Runtime, Path], http: httpx.Client) -> None:
     (worker,) = runtime[0].machines()
     now = answered(http.get(f"{PLACE}/waveforms"), WaveformSnapshot)
     assert (now.source, now.revolutions) == ("newest samples", 8)
@@ -179,7 +179,7 @@ def test_values_come_from_what_was_asked_for(runtime: tuple[Runtime, Path], http
         assert read.model_dump()["reason"] == "", name
 
 
-def test_what_cannot_be_answered_is_refused_or_explained(http: httpx.Client) -> None:
+def test_impossible_requests_are_refused_or_explained(http: httpx.Client) -> None:
     listed = answered(http.get("/api/v1/recordings"), RecordingList).recordings
     (writing,) = (one.id.rsplit("/", 1)[1] for one in listed if not one.complete)
     assert "run-up.mcap.part" not in writing
@@ -192,7 +192,7 @@ def test_what_cannot_be_answered_is_refused_or_explained(http: httpx.Client) -> 
     assert "are kept of 1x and 2x" in explained.reason
 
 
-def test_recordings_are_read_for_one_at_a_time_and_few(http: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recordings_are_read_one_at_a_time_and_bounded(http: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
     path = f"{PLACE}/waterfalls?recording=run-up.mcap"
     with monkeypatch.context() as patched:
         patched.setattr(samples, "_MOST_BYTES", 1000)
@@ -203,7 +203,7 @@ def test_recordings_are_read_for_one_at_a_time_and_few(http: httpx.Client, monke
     assert answered(http.get(path), WaterfallSnapshot).rows
 
 
-def test_an_evaluation_without_samples_says_so() -> None:
+def test_a_full_spectrum_of_too_few_samples_is_refused() -> None:
     short = Held(LAB, BLOCKS[:2])
     with pytest.raises(RotorwatchError, match="needs 1 s without a gap"):
         full_spectrum_snapshot(short)

@@ -1,4 +1,4 @@
-"""What pictures of recordings show: orbits, spectra, correlations and trends, before anything is drawn."""
+"""What plots of recordings show: orbits, spectra, correlations and trends, mostly before drawing."""
 
 import json
 from dataclasses import replace
@@ -44,7 +44,7 @@ def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def lines(faulty: Path) -> list[dict[str, object]]:
-    """What an offline replay of it says, with the networks."""
+    """Output of an offline replay of it, with networks."""
     found: list[dict[str, object]] = []
     source = RecordingSource([faulty])
     OfflineReplay(source, LAB.keys, install(LAB, "lab"), lambda line: found.append(json.loads(line))).run()
@@ -75,11 +75,11 @@ def test_the_orbit_of_a_simulated_unbalance_is_the_ellipse_of_the_equations_of_m
         assert 2 * orbit.ellipse.semi_minor == pytest.approx(2 * radius.min(), rel=2e-3)
         assert np.ptp(orbit.y_um) == pytest.approx(2 * abs(y), rel=5e-3)
         assert orbit.ellipse.precession == "forward"
-        assert orbit.marks_um.shape == (9, 2)  # the pulse that begins and the one that ends, and between
+        assert orbit.marks_um.shape == (9, 2)  # pulses at the beginning, at the end, and in between
         assert orbit.marks_um == pytest.approx(np.tile([y.real, z.real], (9, 1)), abs=0.01 * abs(y))
 
 
-def test_orbits_need_so_many_revolutions_without_a_gap(tmp_path: Path) -> None:
+def test_orbits_need_the_requested_revolutions_without_a_gap(tmp_path: Path) -> None:
     signals = {"theta": lambda t: (2 * np.pi * 20.0 * t + 1) % (2 * np.pi), "y1": lambda t: t}
     data = made(tmp_path, signals, 4.0, without=[34])
     assert read_orbits(data, 9).revolutions == 9
@@ -89,7 +89,7 @@ def test_orbits_need_so_many_revolutions_without_a_gap(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("off_line", [0.0, 0.25, 0.5])
 @pytest.mark.parametrize(("name", "stated", "factor"), [("y2", "µm p-p", 2.0), ("y2_dot", "mm/s rms", 0.5**0.5)])
-def test_a_sine_reads_as_its_quantity_is_stated_within_the_scalloping_of_the_window(
+def test_a_sine_reads_its_amplitude_in_the_quantitys_unit_within_scalloping(
     tmp_path: Path, off_line: float, name: str, stated: str, factor: float
 ) -> None:
     """Displacement peak to peak, velocity rms."""
@@ -109,7 +109,7 @@ def test_a_sine_reads_as_its_quantity_is_stated_within_the_scalloping_of_the_win
     assert fall.values.max() == pytest.approx(factor * amplitude * scalloping, rel=1e-3)
 
 
-def test_metres_are_shown_as_engineers_read_them() -> None:
+def test_displacement_is_shown_peak_to_peak_and_velocity_rms() -> None:
     factors = {"y1": {"m": 2e6, "mm": 2e3, "mil": 2.0}, "y1_dot": {"m/s": 1e3 * 0.5**0.5, "in/s": 0.5**0.5}}
     said = []
     for name, units in factors.items():
@@ -121,8 +121,8 @@ def test_metres_are_shown_as_engineers_read_them() -> None:
     assert said == ["µm p-p", "µm p-p", "mil p-p", "mm/s rms", "in/s rms"]
 
 
-def test_frequencies_and_heights_that_are_shown(tmp_path: Path) -> None:
-    """Slow drift, and nothing above the second harmonic: neither makes the picture."""
+def test_axes_of_spectra_cover_the_harmonics_and_not_drift(tmp_path: Path) -> None:
+    """Slow drift, and nothing above the second harmonic: neither sets the limits of the axes."""
     signals = {
         "theta": lambda t: (2 * np.pi * 20.0 * t) % (2 * np.pi),
         "y1": lambda t: 3000 * np.sin(0.3 * t) + 10 * np.sin(2 * np.pi * 20.0 * t) + 4 * np.sin(2 * np.pi * 40.0 * t),
@@ -132,7 +132,7 @@ def test_frequencies_and_heights_that_are_shown(tmp_path: Path) -> None:
     fall = read_waterfall(stream, stream.channels(["y1"])[0], 4.0, 0.5, "amplitude")
     for log in (False, True):
         panel = paint_spectrum(found, "demo/lab", Look(), Lines(20.0, 0.5, "amplitude", log)).axes[0]
-        assert panel.get_xlim() == (1.0, 80.0)  # two lines, from which on the window lets no mean through, to 4×
+        assert panel.get_xlim() == (1.0, 80.0)  # from two lines, where the window passes no mean, to 4×
         assert panel.get_ylim()[1] > 20
     low, high = paint_spectrum(found, "demo/lab", Look(), Lines(20.0, 0.5, "amplitude", log=True)).axes[0].get_ylim()
     assert high / low < 10**5
@@ -144,8 +144,8 @@ def test_frequencies_and_heights_that_are_shown(tmp_path: Path) -> None:
     assert wide.get_xlim() == (1.0, 500.0)
 
 
-def test_every_line_of_a_wide_band_is_in_the_picture_of_a_waterfall(tmp_path: Path) -> None:
-    """There are eight lines to a pixel."""
+def test_every_line_of_a_wide_band_is_visible_in_a_waterfall(tmp_path: Path) -> None:
+    """There are eight lines per pixel."""
     tones_hz = np.arange(60.0, 760.0, 70.5)
     signals = {"y1": lambda t: np.sin(2 * np.pi * tones_hz[:, None] * t).sum(axis=0)}
     stream = made(tmp_path, signals, 12.0)
@@ -158,13 +158,13 @@ def test_every_line_of_a_wide_band_is_in_the_picture_of_a_waterfall(tmp_path: Pa
         lambda look: paint_waterfall(fall, "x", look, (), lines, over_speed=False, cascade=False),
     )
     pixels = imread(picture)
-    map_only = pixels[pixels.shape[0] // 2, : round(0.75 * pixels.shape[1]), :3]  # without the bar of colours
+    map_only = pixels[pixels.shape[0] // 2, : round(0.75 * pixels.shape[1]), :3]  # without the colour bar
     bright = (map_only[:, 0] > 0.8) & (map_only[:, 2] < 0.5)
     assert np.count_nonzero(np.diff(bright.astype(int)) == 1) == tones_hz.size
 
 
 def test_spectra_do_not_reach_across_gaps(tmp_path: Path) -> None:
-    """A step across the gap would be broadband; segments on either side do not see it."""
+    """A step across the gap would be broadband; segments on either side do not contain it."""
     stream = made(tmp_path, {"y1": lambda t: np.where(t > 4.05, 1000.0, 0.0)}, 10.0, without=[40])
     found = read_spectrum(stream, stream.channels(["y1"]), 10.0, 1.0, "amplitude")
     assert found.values.max() < 1e-9
@@ -186,7 +186,7 @@ def test_a_waterfall_follows_a_run_up_over_time_and_speed(tmp_path: Path) -> Non
     }
     stream = made(tmp_path, signals, 60.0, without=range(300, 330))
     found = read_waterfall(stream, stream.channels(["y1"])[0], 2.0, 0.5, "amplitude")
-    assert found.values.shape[0] == 15 + 13  # 3 s are missing, and what is left before the end is no segment
+    assert found.values.shape[0] == 15 + 13  # 3 s are missing, and the rest is too short for a segment
     strongest_hz = found.frequencies_hz[found.values.argmax(axis=1)]
     middle_s = ((found.start_ns + found.end_ns) / 2 - START_NS) / S
     assert strongest_hz == pytest.approx(10 + 0.5 * middle_s, abs=0.76)
@@ -200,7 +200,7 @@ def test_a_waterfall_follows_a_run_up_over_time_and_speed(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("nth", [-1, 3])
-def test_correlation_panels_have_figures_of_the_report(faulty: Path, lines: list[dict[str, object]], nth: int) -> None:
+def test_correlation_panels_agree_with_the_report(faulty: Path, lines: list[dict[str, object]], nth: int) -> None:
     report = [one for one in reports_of(lines) if one.equations][nth]
     window = latest_window(recorded(faulty, seconds=(0, (report.end_ns - START_NS) / S + 1)), LAB)
     panels = correlations_of(window, LAB, load_bundle("lab", LAB))
@@ -233,7 +233,7 @@ def test_curves_are_labelled_with_their_references(faulty: Path) -> None:
         assert np.corrcoef(curve.measured, estimated)[0, 1] == pytest.approx(1.0)
 
 
-def test_a_computed_trend_is_that_of_the_reports(computed: TrendSeries, lines: list[dict[str, object]]) -> None:
+def test_a_computed_trend_agrees_with_the_reports(computed: TrendSeries, lines: list[dict[str, object]]) -> None:
     found, reports = computed, reports_of(lines)
     assert found.end_ns.tolist() == [report.end_ns for report in reports]
     assert (found.states, found.limits) == (tuple(report.state for report in reports), LAB.alarms)
@@ -257,7 +257,7 @@ def test_a_computed_trend_is_that_of_the_reports(computed: TrendSeries, lines: l
     assert last.low[-1] < 0.5 < last.high[-1]
 
 
-def test_a_trend_of_a_publisher_started_again_earlier_shows_the_later_run(lines: list[dict[str, object]]) -> None:
+def test_a_trend_of_a_publisher_restarted_earlier_in_time_shows_the_later_run(lines: list[dict[str, object]]) -> None:
     reports = reports_of(lines)
     again = [one.model_copy(update={"end_ns": one.end_ns - 22 * S}) for one in reports]
     before = [one.end_ns for one in reports if one.end_ns < again[0].end_ns]
@@ -279,7 +279,7 @@ def test_a_trend_shows_levels_beyond_their_limits_beside_the_overall_one(lines: 
 def test_a_trend_of_recorded_reports_needs_no_samples(
     tmp_path: Path, computed: TrendSeries, lines: list[dict[str, object]]
 ) -> None:
-    """Recorded reports are shown as they are; a machine file asks for new ones, and needs the samples."""
+    """Recorded reports are shown unchanged; a machine file asks for new ones, which need samples."""
     messages = []
     for number, line in enumerate(lines):
         text = json.dumps(line["message"]).encode()
@@ -304,7 +304,7 @@ def test_a_trend_of_recorded_reports_needs_no_samples(
         source.machine("demo/fan", reports=True)
 
 
-def test_names_of_alarms_can_be_read_however_close_they_are(computed: TrendSeries) -> None:
+def test_names_of_alarms_in_a_trend_do_not_overlap(computed: TrendSeries) -> None:
     event, first_ns = AlarmEventData.model_validate(example(AlarmEventData)), int(computed.end_ns[0])
     named = [("k_by", 1), ("data-gap", 1), ("level:VE-1X", 2), ("level:VE-1Y", 2), ("model", 4), ("stream-lost", 38)]
     alarms = tuple(event.model_copy(update={"name": name, "time_ns": first_ns + at * S}) for name, at in named)
@@ -320,7 +320,7 @@ def test_names_of_alarms_can_be_read_however_close_they_are(computed: TrendSerie
     assert sum(len(axes.texts) for axes in figure.axes) == len(named)
 
 
-def test_a_trend_of_nothing_says_what_was_looked_for(faulty: Path) -> None:
+def test_a_trend_without_readings_is_refused_with_a_reason(faulty: Path) -> None:
     filling = read_trend(recorded(faulty, seconds=(0, 30)))
     assert (filling.parameters, len(filling.levels)) == ((), 8)
     bare = [Report.model_validate(example(Report) | {"levels": [], "parameters": [], "verdict": None, "reason": ""})]

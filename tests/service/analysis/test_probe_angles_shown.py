@@ -1,4 +1,4 @@
-"""What is shown of probes at an angle: channels as they are mounted, orbits turned to y and z."""
+"""Display of probes at an angle: channels as they are mounted, orbits turned to y and z."""
 
 import json
 from functools import cache
@@ -42,7 +42,7 @@ def samples(of: tuple[SampleBlock, ...]) -> np.ndarray:
     return np.concatenate([block.samples for block in of]).astype(float)
 
 
-def test_orbits_are_turned_and_say_so() -> None:
+def test_orbits_are_turned_to_y_and_z_and_labelled_so() -> None:
     plain = snapshots_of(LAB).orbits(held(mounted=False), 4)
     turned = snapshots_of(TURNED).orbits(held(mounted=True), 4)
     assert [orbit.location for orbit in turned.orbits] == ["bearing", "disc"]
@@ -60,7 +60,7 @@ def test_orbits_are_turned_and_say_so() -> None:
     assert (sure(turned.orbits[0].y).channel, sure(turned.orbits[0].z).channel) == ("y of y1 and z1", "z of y1 and z1")
 
 
-def test_spectra_and_correlations_are_those_of_the_probes_and_so_is_the_theory() -> None:
+def test_spectra_correlations_and_theory_are_those_of_the_probes() -> None:
     data = held(mounted=True)
     spectrum = snapshots_of(TURNED).spectra(data, ["y1", "z2", "y2_dot"], ["y1"], ["y1_dot"])
     mounted = sure(data.window).as_mounted
@@ -80,7 +80,7 @@ def test_spectra_and_correlations_are_those_of_the_probes_and_so_is_the_theory()
         assert sure(pair.nominal_z) < 4
 
 
-def test_theory_of_a_probe_is_that_of_the_planes_seen_at_its_angle() -> None:
+def test_the_spectrum_of_a_probe_is_that_of_the_planes_at_its_angle() -> None:
     plain, turned = (
         snapshots_of(machine).spectra(held(mounted=mounted), ["y1"], ["y1"], ["z1"])
         for machine, mounted in ((LAB, False), (TURNED, True))
@@ -92,7 +92,7 @@ def test_theory_of_a_probe_is_that_of_the_planes_seen_at_its_angle() -> None:
     assert numbers(turned.densities[0].measured) == pytest.approx(expected, rel=1e-2, abs=1e-3 * expected.max())
 
 
-def test_a_recorded_orbit_is_turned() -> None:
+def test_a_recorded_orbit_is_turned_to_y_and_z() -> None:
     t = np.arange(4000) / 2000
     theta = 2 * np.pi * 22 * t
     y, z = 40 * np.cos(theta), 20 * np.sin(theta)
@@ -105,7 +105,7 @@ def test_a_recorded_orbit_is_turned() -> None:
     assert orbit.names == ("y of z2 and y2", "z of z2 and y2")
 
 
-def test_the_angle_is_in_descriptors_told_to_clients_and_written_by_init(tmp_path: Path) -> None:
+def test_the_angle_is_in_descriptors_client_answers_and_files_by_init(tmp_path: Path) -> None:
     assert descriptor_mismatch(TURNED.descriptor.model_dump_json().encode(), TURNED) == ()
     fields = json.loads(TURNED.descriptor.model_dump_json())
     fields["channels"][0]["angle_deg"] = 50.0

@@ -1,4 +1,4 @@
-"""Windows of recordings: the same as a monitor held, and over HTTP, of recordings and of replays."""
+"""Windows of recordings: the same as in a monitor, and over HTTP, of recordings and of replays."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -51,7 +51,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, file: str) -> Path:
 
 
 def held_by_monitor(source: RecordingSource, installed: Installed) -> list[tuple[Report, WindowStatistics | None]]:
-    """Every report, and the window that it is of."""
+    """Every report with its window."""
     monitor = MachineMonitor(installed)
     held: list[tuple[Report, WindowStatistics | None]] = []
     for message in source.messages({source.machine("demo/lab").stream}):
@@ -60,7 +60,7 @@ def held_by_monitor(source: RecordingSource, installed: Installed) -> list[tuple
     return held
 
 
-def test_a_window_of_snapshots_is_that_of_the_monitor(tmp_path: Path) -> None:
+def test_a_recorded_window_of_snapshots_equals_the_monitors(tmp_path: Path) -> None:
     source = RecordingSource([recording(tmp_path / NAME, stream()[: 9 * 40], KIT)])
     installed = install(KIT, None)
     report, window = held_by_monitor(source, installed)[-1]
@@ -71,7 +71,7 @@ def test_a_window_of_snapshots_is_that_of_the_monitor(tmp_path: Path) -> None:
     assert found.window.spectrum == pytest.approx(window.spectrum, rel=1e-9, abs=1e-30)
 
 
-def test_a_window_of_a_recording_is_that_of_the_monitor(folder: Path, file: str) -> None:
+def test_a_recorded_window_equals_the_monitors(folder: Path, file: str) -> None:
     installed = install(load_machine(file), None)
     source = RecordingSource([folder / "demo" / "lab" / NAME])
     held = held_by_monitor(source, installed)
@@ -122,7 +122,7 @@ def finished(http: httpx.Client, job: ReplayJob) -> ReplayJob:
     return now()
 
 
-def test_windows_before_and_after_a_fault(http: httpx.Client) -> None:
+def test_windows_of_a_replay_before_and_after_a_fault_over_http(http: httpx.Client) -> None:
     job = finished(http, started(http, changes=["alarms.on_delay_s = 5"]))
     listed = answered(http.get(f"{REPLAYS}/{job.id}/reports", params={"limit": 1000}), ReplayReportList).reports
     healthy = next(one for one in listed if one.filled == 1 and one.parameters)
@@ -130,7 +130,7 @@ def test_windows_before_and_after_a_fault(http: httpx.Client) -> None:
     assert late.start_ns > START_NS + FAULT_S * S
     found = {}
     for report in (healthy, late):
-        # A number of JavaScript holds times to 256 ns.
+        # JavaScript numbers hold these times to 256 ns.
         asked: dict[str, str | int] = {"replay": job.id, "until_ns": int(float(report.end_ns))}
         orbits = answered(http.get(f"{PLACE}/orbits", params={**asked, "revolutions": 8}), OrbitSnapshot)
         spectra = answered(http.get(f"{PLACE}/spectra", params=asked), SpectrumSnapshot)
@@ -151,14 +151,14 @@ def test_windows_before_and_after_a_fault(http: httpx.Client) -> None:
     (first_orbits, first), (last_orbits, last) = found.values()
     for one, report in ((first_orbits, healthy), (last_orbits, late)):
         (x1,) = (each.x1 for each in report.levels if each.channel == "y1")
-        assert 2 * sure(one.orbits[0].y).amplitude == pytest.approx(x1, rel=0.05)  # that is of hops
+        assert 2 * sure(one.orbits[0].y).amplitude == pytest.approx(x1, rel=0.05)  # x1 is from hops
     assert np.abs(numbers(last.densities[0].measured) / numbers(first.densities[0].measured) - 1).max() > 0.5
     within: dict[str, str | int] = {"recording": NAME, "since_ns": healthy.start_ns, "until_ns": healthy.end_ns}
     rows = answered(http.get(f"{PLACE}/waterfalls", params=within), WaterfallSnapshot)
     assert healthy.start_ns <= sure(rows.start_ns) < sure(rows.end_ns) <= healthy.end_ns + S // 10
 
 
-def test_windows_of_recordings_alone_and_of_a_paced_replay(http: httpx.Client, runtime: Runtime) -> None:
+def test_windows_of_recordings_and_of_a_paced_replay_over_http(http: httpx.Client, runtime: Runtime) -> None:
     def spectra(until_ns: int) -> SpectrumSnapshot:
         asked: dict[str, str | int] = {"recording": NAME, "until_ns": until_ns}
         return answered(http.get(f"{PLACE}/spectra", params=asked), SpectrumSnapshot)
@@ -179,7 +179,7 @@ def test_windows_of_recordings_alone_and_of_a_paced_replay(http: httpx.Client, r
 
 
 @pytest.mark.parametrize("name", ["orbits", "spectra", "correlations", "waveforms", "full-spectra", "waterfalls"])
-def test_what_is_asked_wrongly_is_refused(http: httpx.Client, name: str) -> None:
+def test_invalid_arguments_are_refused(http: httpx.Client, name: str) -> None:
     assert "until_ns: needs" in problem(http.get(f"{PLACE}/{name}?until_ns=5"), 422).detail
     assert "no replay" in problem(http.get(f"{PLACE}/{name}?replay=0123456789ab"), 404).detail
     problem(http.get(f"{PLACE}/{name}?replay=..%2F1"), 422)

@@ -1,4 +1,4 @@
-"""Waveforms, full spectra, centrelines and run-ups against closed forms, before and after they are drawn."""
+"""Waveforms, full spectra, centrelines and run-ups against closed forms, as values and as drawn."""
 
 from collections.abc import Callable
 from functools import cache
@@ -36,7 +36,7 @@ def turning(hz: float, sense: int = 1) -> Callable[[FloatArray], FloatArray]:
 
 @pytest.mark.parametrize("sense", [1, -1])
 @pytest.mark.parametrize("orders", [False, True])
-def test_a_circle_with_the_rotation_is_one_line_and_an_ellipse_two(tmp_path: Path, sense: int, orders: bool) -> None:
+def test_a_circle_is_one_line_and_an_ellipse_two_in_full_spectra(tmp_path: Path, sense: int, orders: bool) -> None:
     """A circle of radius 20 µm; an ellipse with half axes of 30 and 10 µm, the sum and difference of two circles."""
     angle = 2 * np.pi * 20.0
     signals: Signals = {
@@ -57,7 +57,7 @@ def test_a_circle_with_the_rotation_is_one_line_and_an_ellipse_two(tmp_path: Pat
     assert found.useful == pytest.approx(4 * one)
 
 
-def test_names_of_orders_can_be_read_in_a_wide_band(tmp_path: Path) -> None:
+def test_labels_of_orders_do_not_overlap_in_a_wide_band(tmp_path: Path) -> None:
     """20 and 40 Hz are ten pixels apart, on either side."""
     circle = {"theta": turning(20.0), "y1": lambda t: np.cos(125.7 * t), "z1": lambda t: np.sin(125.7 * t)}
     data, lines = made(tmp_path, circle, 21.0), Lines(20.0, 0.5, "amplitude", log=False, to_hz=900.0)
@@ -71,7 +71,7 @@ def test_names_of_orders_can_be_read_in_a_wide_band(tmp_path: Path) -> None:
         assert not any(box.count_overlaps(boxes[:at]) for at, box in enumerate(boxes))
 
 
-def test_marks_of_a_shaft_that_stays_where_it_is_can_be_read(tmp_path: Path) -> None:
+def test_labels_of_a_centreline_that_does_not_move_do_not_overlap(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     noise = {"theta": turning(20.0), **{name: lambda t: rng.normal(0, 0.1, t.size) for name in ("y1", "z1")}}
     figure = drawn(centreline(made(tmp_path, noise, 60.0), "bearing", 1.0, None))
@@ -98,7 +98,7 @@ def test_orders_stay_sharp_while_the_speed_changes(tmp_path: Path) -> None:
     assert read_full_spectrum(data, pairs, 20.0, 0.5, orders=False).values_um.max() < 20
 
 
-def test_full_spectra_need_two_directions_and_orders_a_rotation(tmp_path: Path) -> None:
+def test_full_spectra_need_two_directions_and_orders_need_rotation(tmp_path: Path) -> None:
     data = made(tmp_path, {"y1": lambda t: np.sin(300 * t)}, 5.0)
     with pytest.raises(MachineFileError, match="--place is 'DE', where demo/lab has no displacements in y"):
         recorded_pairs(data, "DE")
@@ -107,7 +107,7 @@ def test_full_spectra_need_two_directions_and_orders_a_rotation(tmp_path: Path) 
 
 
 def test_probes_at_an_angle_are_turned_to_y_and_z() -> None:
-    """One 45° to the left of the top, one to its right, in different units; and a pair in y and z beside them."""
+    """Probes 45° to the left and right of the top, in different units; and a pair in y and z."""
     left, right, y, z = (
         Channel(name=name, quantity="displacement", location=place, direction=name[-1], unit=unit, angle_deg=angle)
         for name, place, unit, angle in (
@@ -172,7 +172,7 @@ def test_a_run_up_shows_the_critical_speed_of_a_simple_rotor(run_up: tuple[int, 
     assert hz[top] == pytest.approx(CRITICAL_HZ / np.sqrt(1 - 2 * DAMPING**2), rel=0.01)
     assert found.amplitude.max(axis=0) == pytest.approx(20 / (2 * DAMPING * np.sqrt(1 - DAMPING**2)), rel=0.03)
     lag = np.unwrap(np.radians(found.lag_deg), axis=0)
-    for number, before in ((0, 0.0), (1, sense * np.pi / 2)):  # a quarter turn after y, or before it
+    for number, before in ((0, 0.0), (1, sense * np.pi / 2)):  # z is a quarter turn after y, or before it
         turned = lag[:, number] - before
         turned -= 2 * np.pi * np.round(turned[0] / (2 * np.pi))
         assert np.interp(np.pi / 2, turned, hz) == pytest.approx(CRITICAL_HZ, rel=0.01)
@@ -190,7 +190,7 @@ def drawn(paint: Callable[[Look], Figure]) -> Figure:
 
 
 def test_a_polar_plot_counts_the_lag_against_the_rotation_from_the_sensor(run_up: tuple[int, Recorded]) -> None:
-    """At resonance y lags 90°: so the high spot is a quarter turn against the rotation from where y looks."""
+    """At resonance y lags 90°: the high spot is a quarter turn against the rotation from the sensor y."""
     sense, data = run_up
     for name, sensor in (("y2", 0.0), ("z2", np.pi / 2)):
         axes = drawn(polar(data, [name], 1, 4, None)).axes[0]
@@ -214,8 +214,8 @@ def test_a_bode_plot_marks_the_greatest_amplitude(run_up: tuple[int, Recorded]) 
     assert lower.get_title(loc="right").startswith("greatest: 2")
 
 
-def test_run_out_is_taken_away(tmp_path: Path) -> None:
-    """A shaft that is 3 µm out of round all along, and vibrates by 10 µm half a turn later when it is fast."""
+def test_the_slow_roll_vector_is_subtracted(tmp_path: Path) -> None:
+    """A shaft with 3 µm of run-out, and 10 µm of vibration half a turn later at high speed."""
 
     def fast(t: FloatArray) -> FloatArray:
         return np.asarray(t > 10.0, dtype=np.float64)
@@ -237,8 +237,8 @@ def test_run_out_is_taken_away(tmp_path: Path) -> None:
         read_run_up(data, channels, 1, 8, 100.0)
 
 
-def test_vectors_at_an_order_do_not_see_the_others(tmp_path: Path) -> None:
-    """Whatever the number of revolutions; and no point is of some on both sides of a gap."""
+def test_vectors_at_an_order_are_not_affected_by_other_orders(tmp_path: Path) -> None:
+    """Whatever the number of revolutions; and no point spans a gap."""
     turn = 2 * np.pi * 20.0
     amplitudes = {1: 10.0, 2: 4.0, 3: 2.0}
     signals: Signals = {
@@ -254,8 +254,8 @@ def test_vectors_at_an_order_do_not_see_the_others(tmp_path: Path) -> None:
         assert not ((found.time_ns > START_NS + 5.5 * S) & (found.time_ns < START_NS + 5.6 * S)).any()
 
 
-def test_without_a_keyphasor_the_speed_is_found_in_the_vibration_and_there_is_no_phase(tmp_path: Path) -> None:
-    """1× of 20 µm in noise, from 15 to 30 Hz; the noise alone is no rotation."""
+def test_without_a_keyphasor_the_speed_is_tracked_in_the_vibration_without_phase(tmp_path: Path) -> None:
+    """1× of 20 µm in noise, from 15 to 30 Hz; noise alone has no speed."""
     noise = np.random.default_rng(3).normal(size=round(60 * RATE_HZ))
 
     def rising(t: FloatArray) -> FloatArray:
@@ -282,10 +282,10 @@ def test_without_a_keyphasor_the_speed_is_found_in_the_vibration_and_there_is_no
 
 
 @pytest.mark.parametrize("keyphasor", [True, False])
-def test_a_centreline_is_the_mean_of_the_gaps(tmp_path: Path, keyphasor: bool) -> None:
-    """A shaft that lifts by 3 µm/s and goes aside by 1 µm/s while it runs up, vibrating by 50 µm.
+def test_a_centreline_is_the_mean_of_the_gap_readings(tmp_path: Path, keyphasor: bool) -> None:
+    """A shaft that rises by 3 µm/s and moves sideways by 1 µm/s during a run-up, vibrating by 50 µm.
 
-    Over whole revolutions the vibration has no mean; over seconds its part is that of less than a revolution.
+    Over whole revolutions the vibration has no mean; over seconds a part of a revolution remains.
     """
 
     def angle(t: FloatArray) -> FloatArray:
@@ -303,7 +303,7 @@ def test_a_centreline_is_the_mean_of_the_gaps(tmp_path: Path, keyphasor: bool) -
     found = read_centreline(data, recorded_pairs(data, "bearing"), 2.0)
     middle_s = (found.time_ns - START_NS) / S
     assert middle_s == pytest.approx(np.arange(1, 20, 2), abs=0.25)
-    leaks = 2.0 if keyphasor else 10.0  # the speed changes within the revolutions, too
+    leaks = 2.0 if keyphasor else 10.0  # the speed changes within revolutions, too
     assert found.y_um[:, 0] == pytest.approx(-400 + middle_s, abs=leaks)
     assert found.z_um[:, 0] == pytest.approx(-600 + 3 * middle_s, abs=leaks)
     assert found.y_um[-4:, 0] == pytest.approx(-400 + middle_s[-4:], abs=0.3 if keyphasor else 2.0)
@@ -337,7 +337,7 @@ def test_a_waveform_has_the_unit_of_its_channel_and_a_mark_at_each_pulse(
     assert values == pytest.approx(7, rel=1e-3)
 
 
-def test_a_waveform_ends_at_a_gap_and_goes_on_after_it(tmp_path: Path) -> None:
+def test_a_waveform_is_interrupted_at_a_gap(tmp_path: Path) -> None:
     data = made(tmp_path, {"y1": lambda t: np.sin(9 * t)}, 3.0, without=[25])
     axes = drawn(waveform(data, ["y1"], 1.0)).axes[0]
     starts = [float(np.asarray(line.get_xdata())[0]) for line in axes.lines[0:4:2]]

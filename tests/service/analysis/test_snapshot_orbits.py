@@ -20,7 +20,7 @@ from tests.service.analysis.snapshotting import (
 from tests.sure import sure
 
 
-def test_the_orbit_of_a_known_unbalance() -> None:
+def test_the_orbit_of_a_known_unbalance_follows_the_equations_of_motion() -> None:
     data = LatestData(window_of(LAB, quiet()), 1.0, (), "not asked", quiet()[-20:])
     snapshot = snapshots_of(LAB).orbits(data, 8)
     assert (snapshot.reason, snapshot.path_reason, snapshot.revolutions) == ("", "", 8)
@@ -57,8 +57,8 @@ def test_the_orbit_of_a_known_unbalance() -> None:
     assert quiet()[-1].end_ns - sure(snapshot.path_start_ns) < 9.1 * 2e9 * np.pi / W
 
 
-def test_errors_of_an_orbit_are_the_scatter_of_many() -> None:
-    """Twelve hops of the healthy machine against the errors of its amplitudes, and the estimated orbit's own size."""
+def test_stated_errors_of_an_orbit_are_the_scatter_of_hops() -> None:
+    """Scatter of twelve healthy hops against the stated errors; the estimated orbit has the nominal size."""
     data = latest()
     assert data.window is not None
     snapshot = snapshots_of(LAB).orbits(data)
@@ -73,8 +73,8 @@ def test_errors_of_an_orbit_are_the_scatter_of_many() -> None:
     assert all(orbit.path is None for orbit in snapshot.orbits)
 
 
-def test_a_shaft_that_turns_backwards() -> None:
-    """The angle falls, and the motion goes against the rotation; z is in another unit than y."""
+def test_a_backward_orbit_of_a_shaft_that_turns_the_other_way() -> None:
+    """The angle decreases and the orbit is backward; z is in another unit than y."""
     t = np.arange(round(71 * LAB.rate_hz)) / LAB.rate_hz
     turn = 2 * np.pi * 25.0 * t
     rng = np.random.default_rng(2)
@@ -101,7 +101,7 @@ def test_a_shaft_that_turns_backwards() -> None:
     assert np.ptp(numbers(sure(orbit.path).z)) == pytest.approx(20, rel=0.5)
 
 
-def test_without_a_phase_reference_size_and_sense_remain() -> None:
+def test_without_a_phase_reference_orbits_keep_size_and_sense() -> None:
     machine = Machine.model_validate(LAB.model_dump() | {"sensors": [c for c in LAB.sensors if c.name != "theta"]})
     data = LatestData(window_of(machine, stream(SECONDS, SEED)), 1.0, (), "", stream(SECONDS, SEED)[-20:])
     blind, seeing = snapshots_of(machine).orbits(data, 4), snapshots_of(LAB).orbits(latest())
@@ -121,7 +121,7 @@ def test_without_a_phase_reference_size_and_sense_remain() -> None:
     assert all(pair.nominal_z is not None and pair.nominal_z < 2.5 for pair in snapshot.pairs)
 
 
-def test_places_that_are_not_of_the_model_have_the_orbit_of_their_newest_revolutions() -> None:
+def test_places_outside_the_model_have_orbits_of_the_newest_revolutions() -> None:
     data = LatestData(None, 0.0, (), "not asked", quiet()[-20:])
     casing = elsewhere(LAB)
     moved = [one.model_copy(update={"location": "NDE"}) if one.name in {"y2", "z2"} else one for one in casing.sensors]

@@ -41,7 +41,7 @@ from tests.sure import sure
 
 
 @pytest.mark.parametrize("lagged", [True, False])
-def test_theory_is_within_the_errors_of_a_healthy_machine_and_apart_from_a_faulty_one(lagged: bool) -> None:
+def test_nominal_theory_fits_a_healthy_machine_and_not_a_faulty_one(lagged: bool) -> None:
     snapshot = snapshots_of(LAB).correlations(latest(lagged=lagged))
     assert (snapshot.reason, snapshot.theory.nominal_reason, snapshot.theory.estimated_reason) == ("", "", "")
     assert snapshot.method == ("samples" if lagged else "spectrum")
@@ -68,8 +68,8 @@ def test_theory_is_within_the_errors_of_a_healthy_machine_and_apart_from_a_fault
 
 
 @pytest.mark.parametrize("faults", [(), (K_BY,)])
-def test_predicted_correlations_are_those_of_the_ljapunov_equation(faults: tuple[Event, ...]) -> None:
-    """All quantities at all lags, with the sources that the simulator really had: what is left is their estimation."""
+def test_predicted_correlations_solve_the_lyapunov_equation(faults: tuple[Event, ...]) -> None:
+    """All quantities at all lags, with the simulator's true sources: the rest is the error of their estimates."""
     data = latest(*faults)
     window = sure(data.window)
     sources = tuple(Source(cutoff_hz=90.0, direction=tuple(np.eye(6)[dof]), force_rms_N=0.47) for dof in (0, 1, 3, 4))
@@ -89,8 +89,8 @@ def test_predicted_correlations_are_those_of_the_ljapunov_equation(faults: tuple
     assert {pair.unit for pair in snapshot.pairs} == {"m^2", "m*m/s", "m/s*m", "(m/s)^2"}
 
 
-def test_correlations_from_spectra_lack_what_lies_outside_the_band() -> None:
-    """At lag zero by as much as is stated, at no lag by more than a few per cent; their errors are of the same size."""
+def test_correlations_from_spectra_lack_the_power_outside_the_band() -> None:
+    """At lag zero by the stated amount, at no lag by more than 3 %; standard errors are of the same size."""
     made = snapshots_of(LAB)
     whole, band = (made.correlations(latest(lagged=lagged)) for lagged in (True, False))
     assert whole.lags_s == band.lags_s
@@ -107,8 +107,8 @@ def test_correlations_from_spectra_lack_what_lies_outside_the_band() -> None:
         assert 0.6 < np.median(ratio) < 1.7
 
 
-def test_short_segments_weaken_no_correlation() -> None:
-    """Segments of half a second, lags up to a quarter of them: the taper alone would take a third away."""
+def test_short_segments_do_not_reduce_correlations() -> None:
+    """Segments of half a second, lags up to a quarter of them: the taper alone would remove a third."""
     window = LAB.window.model_copy(update={"segment_s": 0.5})
     machine = NOTHING.model_copy(update={"sensors": LAB.sensors[:2], "window": window})
     made = snapshots_of(machine)
@@ -123,8 +123,8 @@ def test_short_segments_weaken_no_correlation() -> None:
         assert slope == pytest.approx(1.0, abs=0.06)
 
 
-def test_standard_errors_from_spectra_are_those_of_many_windows() -> None:
-    """Coloured noise in 25 windows: the scatter of the estimates against the error stated for each."""
+def test_standard_errors_from_spectra_agree_with_the_scatter_of_windows() -> None:
+    """Coloured noise in 25 windows: scatter of the estimates against their stated errors."""
     shorter = LAB.window.model_copy(update={"length_s": 30.0})
     machine = LAB.model_copy(update={"sensors": LAB.sensors[:2], "window": shorter})
     rng = np.random.default_rng(3)
@@ -141,7 +141,7 @@ def test_standard_errors_from_spectra_are_those_of_many_windows() -> None:
     assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.15)
 
 
-def test_densities_scatter_around_theory_as_their_degrees_of_freedom_say() -> None:
+def test_densities_scatter_around_theory_with_their_degrees_of_freedom() -> None:
     snapshot = snapshots_of(LAB).spectra(latest(K_BY), [name for name in NAMES if name != "theta"])
     assert snapshot.left_out_hz is not None
     frequencies_hz = np.array(snapshot.frequencies_hz)
@@ -165,7 +165,7 @@ def test_densities_scatter_around_theory_as_their_degrees_of_freedom_say() -> No
     assert unmoved.mean() == pytest.approx(1.0, abs=0.1)
 
 
-def test_units_of_densities() -> None:
+def test_densities_are_in_units_of_the_channel_or_si() -> None:
     made, data = snapshots_of(LAB), latest()
     own, si = (made.spectra(data, ["y1", "y1_dot"], ["y1"], ["y1_dot"], units=units) for units in ("channel", "SI"))
     assert [density.unit for density in own.densities] == ["um^2/Hz", "(mm/s)^2/Hz"]
@@ -173,7 +173,7 @@ def test_units_of_densities() -> None:
     assert numbers(own.densities[0].measured) == pytest.approx(1e12 * numbers(si.densities[0].measured), rel=1e-5)
     assert numbers(own.densities[1].nominal) == pytest.approx(1e6 * numbers(si.densities[1].nominal), rel=1e-5)
     assert (own.cross[0].unit, si.cross[0].unit) == ("um*mm/s/Hz", "m*m/s/Hz")
-    # A velocity leads its displacement by a quarter of a turn, and is the same motion.
+    # A velocity leads its displacement by 90°, and is coherent with it.
     assert np.median(numbers(own.cross[0].phase_deg)) == pytest.approx(90, abs=1)
     assert np.median(numbers(own.cross[0].coherence)) > 0.9
 
@@ -212,7 +212,7 @@ def test_a_wide_band_is_averaged_into_fewer_lines() -> None:
     assert measured.var() / measured.mean() ** 2 * sure(snapshot.degrees_of_freedom) / 2 == pytest.approx(1.0, abs=0.2)
 
 
-def test_a_part_of_the_band() -> None:
+def test_a_part_of_the_band_can_be_selected() -> None:
     made = snapshots_of(LAB)
     part, whole = made.spectra(latest(), ["y2"], band_hz=(25.0, 35.0)), made.spectra(latest(), ["y2"])
     assert (part.frequencies_hz[0], part.frequencies_hz[-1]) == (25.0, 35.0)
@@ -225,7 +225,7 @@ def test_a_part_of_the_band() -> None:
         made.spectra(latest(), ["y2"], band_hz=(200.0, 300.0))
 
 
-def test_nothing_is_known_of_the_machine() -> None:
+def test_without_known_parameters_there_is_no_theory() -> None:
     reason = "the machine's parameters are not known, so there is no theory to predict from"
     data, made = LatestData(latest().window, 1.0, (), "", stream(SECONDS, SEED)[-20:]), snapshots_of(NOTHING)
     correlations, spectra, orbits = (made.correlations(data), made.spectra(data, (), ["y1"]), made.orbits(data, 2))
@@ -241,7 +241,7 @@ def test_nothing_is_known_of_the_machine() -> None:
 
 
 @pytest.mark.parametrize(("elsewhere", "held"), [("bearing", ["y2", "z2"]), ("bearing disc", [])])
-def test_only_levels_are_watched_at_other_places(elsewhere: str, held: list[str]) -> None:
+def test_channels_at_places_outside_the_model_have_only_levels(elsewhere: str, held: list[str]) -> None:
     moved = tuple(
         one.model_copy(update={"location": "DE"}) if one.location in elsewhere.split() else one
         for one in NOTHING.sensors
@@ -258,7 +258,7 @@ def test_only_levels_are_watched_at_other_places(elsewhere: str, held: list[str]
             refused()
 
 
-def test_a_window_that_was_not_evaluated_is_predicted_as_nominal() -> None:
+def test_a_window_not_evaluated_has_only_nominal_theory() -> None:
     why = "demo/lab: gain of y1 is 20 % lower than when it was commissioned"
     data = LatestData(latest().window, 1.0, (), why)
     snapshot = snapshots_of(LAB).correlations(data)
@@ -270,7 +270,7 @@ def test_a_window_that_was_not_evaluated_is_predicted_as_nominal() -> None:
     assert unsaid.theory.estimated_reason == "no parameter was read in this window"
 
 
-def test_before_the_first_window() -> None:
+def test_before_the_first_window_only_paths_of_orbits_are_shown() -> None:
     data = LatestData(None, 0.25, (), "", stream(SECONDS, SEED)[:20])
     made = snapshots_of(LAB)
     correlations, spectra, orbits = made.correlations(data), made.spectra(data), made.orbits(data, 35)
@@ -283,7 +283,7 @@ def test_before_the_first_window() -> None:
     assert all(orbit.path is not None and orbit.ellipse is None for orbit in orbits.orbits)
 
 
-def test_a_channel_that_does_not_move() -> None:
+def test_a_stuck_channel_has_no_theory_and_no_coherence() -> None:
     stream_ = [
         SampleBlock(b.start_ns, b.sequence, b.run, b.rate_hz, np.where(np.array(NAMES) == "y1", 5.0, b.samples))
         for b in stream(SECONDS, SEED)
@@ -298,7 +298,7 @@ def test_a_channel_that_does_not_move() -> None:
     assert cross["coherence"][0] is None
 
 
-def test_channels_by_name_and_a_choice_without_displacements() -> None:
+def test_channels_are_chosen_by_name_and_velocities_by_default_without_displacements() -> None:
     made = snapshots_of(LAB)
     pairs = made.correlations(latest(), ["z2", "y1"]).pairs
     assert [(pair.first, pair.second) for pair in pairs] == [("z2", "z2"), ("y1", "y1")]
@@ -333,7 +333,7 @@ def test_the_theory_of_a_window_is_computed_once(monkeypatch: pytest.MonkeyPatch
     assert len(asked) == 2
 
 
-def test_an_answer_is_made_once_for_all_who_ask_the_same_of_a_window() -> None:
+def test_an_answer_on_a_window_is_made_once_for_equal_requests() -> None:
     now_s, made, fails = 0.0, 0, False
     answers, subject = WindowAnswers(lambda: now_s), snapshots_of(LAB)
 
@@ -357,10 +357,10 @@ def test_an_answer_is_made_once_for_all_who_ask_the_same_of_a_window() -> None:
     assert asked(later) == (0, body)
     assert asked(replace(data, filled=0.9))[0] == 1
     assert asked(latest(K_BY))[0] == 1
-    # Samples come all the time, and what holds them is made once a second.
+    # Samples arrive continuously; answers with samples are made once a second.
     assert [asked(one, "newest", of_samples=True)[0] for one in (data, later, data)] == [1, 0, 0]
     now_s, fails = 1.1, True
-    for _ in range(2):  # what was made before is no answer any more
+    for _ in range(2):  # an older answer is no longer used
         with pytest.raises(SnapshotError):
             asked(later, "newest", of_samples=True)
     fails = False
@@ -372,8 +372,8 @@ def test_an_answer_is_made_once_for_all_who_ask_the_same_of_a_window() -> None:
 
 
 @pytest.mark.parametrize("model", [CorrelationSnapshot, SpectrumSnapshot, OrbitSnapshot])
-def test_snapshots_as_json(model: type[BaseModel]) -> None:
-    """Every field has an example; what is written is read again; no number is anything but a number."""
+def test_snapshots_are_read_back_from_json(model: type[BaseModel]) -> None:
+    """Every field has an example; JSON is read back unchanged; no number is NaN or infinite."""
     model.model_validate(example(model))
     lab = snapshots_of(LAB)
     made: dict[type[BaseModel], Callable[[LatestData], BaseModel]] = {

@@ -1,4 +1,4 @@
-"""What is shown of a sensor that is not connected is nothing, and not a line at 0; the others are shown as always."""
+"""An unconnected sensor is shown as missing data, not as zeros; other sensors are shown as usual."""
 
 from dataclasses import replace
 from functools import cache
@@ -45,7 +45,7 @@ def dead(*names: str, between_s: tuple[float, float] = (0.0, SECONDS)) -> tuple[
 
 
 def shown(way: str, folder: Path, *names: str) -> tuple[LatestData, Sampled]:
-    """What a monitor holds, or what its recording gives."""
+    """Data held by a monitor, or read from its recording."""
     if way != "recorded":
         monitor = MachineMonitor(install(KIT, None))
         for block in dead(*names):
@@ -85,7 +85,7 @@ def test_a_dead_channel_is_shown_as_no_data(way: str, tmp_path: Path) -> None:
         waterfall_snapshot(samples, samples.channels(["z1"])[0], "time")
 
 
-def test_a_casing_sensor_that_is_dead_hides_no_theory() -> None:
+def test_a_dead_casing_sensor_does_not_hide_theory() -> None:
     monitor = MachineMonitor(install(RIG, None))
     for block in scenario_blocks(SECONDS):
         gap = np.full((len(block.samples), 1), np.nan, np.float32)
@@ -96,7 +96,7 @@ def test_a_casing_sensor_that_is_dead_hides_no_theory() -> None:
     assert {one.nominal is not None for one in spectra.densities} == {True}
 
 
-def test_what_the_history_has_of_the_others_is_shown() -> None:
+def test_plots_of_the_history_show_the_other_sensors() -> None:
     monitor = MachineMonitor(install(KIT, None))
     reports = tuple(report for block in dead("z1") for report in monitor.step(block).windows)
     past = Past(KIT, KIT.title, "the history", reports, ())
@@ -106,7 +106,7 @@ def test_what_the_history_has_of_the_others_is_shown() -> None:
 
 
 @pytest.mark.parametrize("way", ["live", "recorded"])
-def test_without_its_angle_a_machine_has_no_speed_of_0(way: str, tmp_path: Path) -> None:
+def test_without_its_angle_a_machine_has_no_speed_rather_than_0(way: str, tmp_path: Path) -> None:
     data, samples = shown(way, tmp_path, "theta")
     orbits = snapshots_of(KIT).orbits(data, 4)
     assert orbits.speed_rad_s is None
@@ -115,7 +115,7 @@ def test_without_its_angle_a_machine_has_no_speed_of_0(way: str, tmp_path: Path)
     assert waveform_snapshot(samples, samples.channels(["y1"]), 4, None).speed_rad_s is None
 
 
-def test_an_angle_that_is_back_is_shown_from_then_on() -> None:
+def test_plots_begin_where_a_lost_angle_returns() -> None:
     monitor = MachineMonitor(install(KIT, None))
     for block in dead("theta", between_s=(22.0, 23.0)):
         monitor.step(block)
@@ -127,7 +127,7 @@ def test_an_angle_that_is_back_is_shown_from_then_on() -> None:
     assert vector_series(samples, samples.channels(["y1"]), 1, 8, None).speeds_rad_s[-1] == wave.speed_rad_s
 
 
-def test_a_recorded_window_that_lacked_a_channel_for_a_time_is_shown_as_it_was_live(tmp_path: Path) -> None:
+def test_a_recorded_window_with_a_missing_channel_is_shown_as_live(tmp_path: Path) -> None:
     blocks, monitor = dead("z1", between_s=(12.0, 13.0)), MachineMonitor(install(KIT, None))
     for block in blocks:
         monitor.step(block)
@@ -142,7 +142,7 @@ def test_a_recorded_window_that_lacked_a_channel_for_a_time_is_shown_as_it_was_l
         assert one.rms is None or one.rms == pytest.approx(other.rms, rel=1e-4)
 
 
-def test_of_an_angle_alone_there_is_nothing_to_plot(tmp_path: Path) -> None:
+def test_with_only_the_angle_connected_there_is_nothing_to_plot(tmp_path: Path) -> None:
     _, samples = shown("recorded", tmp_path, *NAMES[:-1])
     with pytest.raises(RotorwatchError, match=r"no data of y1, z1, .*: sent as NaN"):
         samples.chosen(())

@@ -42,25 +42,25 @@ def http(seen: tuple[Runtime, MachineWorker]) -> Iterator[httpx.Client]:
         yield found
 
 
-def test_callers_learn_what_they_may_do(http: httpx.Client, tmp_path: Path) -> None:
+def test_callers_can_query_their_scopes(http: httpx.Client, tmp_path: Path) -> None:
     assert answered(http.get("/api/v1/caller"), CallerRights).scopes == ("read", "operate", "configure")
     with fed(tmp_path, GUARDED) as (runtime, _):
         text = token(runtime, Scope.READ, Scope.OPERATE)
         with client(runtime, text) as sent, client(runtime) as typed:
             rights = answered(sent.get("/api/v1/caller"), CallerRights)
             assert rights == CallerRights(name="anna", scopes=("read", "operate"))
-            typed.auth = ("anybody", text)  # nothing can be done with a password
+            typed.auth = ("anybody", text)  # a token sent as a password only reads
             assert answered(typed.get("/api/v1/caller"), CallerRights).scopes == ("read",)
 
 
-def test_configuration_is_the_machine_file(http: httpx.Client, seen: tuple[Runtime, MachineWorker]) -> None:
+def test_the_configuration_is_the_machine_file(http: httpx.Client, seen: tuple[Runtime, MachineWorker]) -> None:
     found = answered(http.get(f"{PLACE}/configuration"), MachineConfiguration)
     assert (file := Machine.model_validate(found.file)) == seen[1].machine
     assert (file.alarms.on_delay_s, file.rotor.k_by_N_per_m) == (10.0, load_machine("lab").rotor.k_by_N_per_m)
     assert found.machine_hash == seen[1].identity["machine_hash"]
 
 
-def test_health_names_the_fault_with_its_interval_since_when_and_who_agrees(http: httpx.Client) -> None:
+def test_health_names_the_fault_with_its_interval_time_and_agreement(http: httpx.Client) -> None:
     health = answered(http.get(f"{PLACE}/health"), Health)
     assert (health.state, health.filled) == ("alert", 1.0)
     report = sure(health.report)
@@ -89,7 +89,7 @@ def test_health_names_the_fault_with_its_interval_since_when_and_who_agrees(http
     assert health.stream.descriptor_mismatch == ()
 
 
-def test_measures_of_the_window_are_in_history_and_on_the_page(http: httpx.Client) -> None:
+def test_measures_of_the_window_are_in_the_history_and_on_the_page(http: httpx.Client) -> None:
     report = sure(answered(http.get(f"{PLACE}/health"), Health).report)
     page = (ROOT / "service/api/page/machine/data-quality.js").read_text(encoding="utf-8")
     for name, (field, measure) in MEASURES.items():
@@ -99,7 +99,7 @@ def test_measures_of_the_window_are_in_history_and_on_the_page(http: httpx.Clien
     assert problem(http.get(f"{PLACE}/readings?quantity=nose"), 422).detail.startswith("quantity: ")
 
 
-def test_readings_are_reduced_to_a_plot(http: httpx.Client) -> None:
+def test_readings_are_reduced_to_the_requested_number_of_points(http: httpx.Client) -> None:
     every = [one.value for one in answered(http.get(f"{PLACE}/readings?name=k_by"), ReadingList).readings]
     (whole,) = answered(http.get(f"{PLACE}/readings?name=k_by&points=1"), ReadingList).buckets
     assert (whole.name, whole.count, whole.minimum, whole.maximum) == ("k_by", 4, min(every), max(every))
@@ -143,8 +143,8 @@ def test_arguments_that_do_not_fit_together_are_explained(http: httpx.Client, qu
     assert problem(http.get(f"{PLACE}/{query}"), 422).detail.startswith(text)
 
 
-def test_what_is_in_the_history_alone_is_still_to_be_had(seen: tuple[Runtime, MachineWorker]) -> None:
-    """A channel that the machine file no longer has."""
+def test_readings_that_only_the_history_has_can_be_queried(seen: tuple[Runtime, MachineWorker]) -> None:
+    """As of a channel that the machine file no longer has."""
     history = seen[1].history
     history.commit(Step(readings=(StoredReading(START_NS, "level", "gone:overall", 2.5, None),)))
     with client(seen[0]) as http:
@@ -163,7 +163,7 @@ def test_alarms_are_filtered(http: httpx.Client, query: str, names: list[str]) -
     assert [one.name for one in answered(http.get(f"{PLACE}/alarms?{query}"), AlarmStates).alarms] == names
 
 
-def test_one_alarm_and_its_version(http: httpx.Client) -> None:
+def test_an_alarm_has_an_etag_of_its_version(http: httpx.Client) -> None:
     answer = http.get(f"{PLACE}/alarms/k_by")
     assert answer.headers["etag"] == '"0"'
     assert answered(answer, Alarm) == answered(http.get(f"{PLACE}/alarms"), AlarmStates).alarms[0]
@@ -175,7 +175,7 @@ def test_one_alarm_and_its_version(http: httpx.Client) -> None:
     )
 
 
-def test_detectable_changes(http: httpx.Client) -> None:
+def test_detectable_changes_of_each_parameter(http: httpx.Client) -> None:
     plain = answered(http.get(f"{PLACE}/detectable"), DetectableChanges)
     assert [parameter.name for parameter in plain.parameters] == list(PARAMETERS)
     assert {parameter.length_s for parameter in plain.parameters} == {None}
@@ -187,7 +187,7 @@ def test_detectable_changes(http: httpx.Client) -> None:
         assert (sure(parameter.length_s) < 60.0) == (parameter.loss > -0.1)
 
 
-def test_correlations_beside_theory(http: httpx.Client) -> None:
+def test_correlations_fit_theory_only_with_the_estimated_parameters(http: httpx.Client) -> None:
     found = answered(http.get(f"{PLACE}/correlations?first=y2&second=y2"), CorrelationSnapshot)
     (pair,) = found.pairs
     assert len(pair.measured) == len(sure(pair.estimated)) == len(found.lags_s) > 10
@@ -200,7 +200,7 @@ def test_correlations_beside_theory(http: httpx.Client) -> None:
     assert changes["k_by"] == pytest.approx(health.report.parameters[0].relative_change, rel=1e-5)
 
 
-def test_spectra_and_orbits(http: httpx.Client) -> None:
+def test_spectra_and_orbits_are_those_asked_for(http: httpx.Client) -> None:
     spectra = answered(
         http.get(f"{PLACE}/spectra?channel=y1&first=y1&second=y2&from_hz=10&to_hz=40&units=SI"), SpectrumSnapshot
     )
@@ -218,9 +218,9 @@ def test_spectra_and_orbits(http: httpx.Client) -> None:
     assert left_s == pytest.approx(60 / 1320, abs=0.001) or 0 <= left_s < 60 / 1320
 
 
-def test_the_description_is_made_once_and_seen_whole_by_all_who_ask_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_description_is_built_once_for_concurrent_callers(monkeypatch: pytest.MonkeyPatch) -> None:
     def finish(made: dict[str, object]) -> None:
-        sleep(0.05)  # for as long as it is not whole, others ask
+        sleep(0.05)  # others ask while it is incomplete
         made["times finished"] = int(str(made.get("times finished", 0))) + 1
 
     monkeypatch.setattr("service.api.description.share_problems", finish)
@@ -230,7 +230,7 @@ def test_the_description_is_made_once_and_seen_whole_by_all_who_ask_at_once(monk
     assert [one.get("times finished") for one in seen] == [1] * 8
 
 
-def test_page_for_people_is_kept_by_its_content(http: httpx.Client) -> None:
+def test_page_files_are_cached_by_version_and_contain_no_inline_code(http: httpx.Client) -> None:
     answer = http.get("/")
     assert (answer.headers["content-type"], answer.headers["cache-control"]) == ("text/html; charset=utf-8", "no-cache")
     assert "unsafe" not in answer.headers["content-security-policy"]
@@ -258,7 +258,7 @@ def test_page_for_people_is_kept_by_its_content(http: httpx.Client) -> None:
         ("/machines", "/api/v1/machines"), ("/heathz", "/healthz"), ("/favicon.ico", None), ("/" + 5000 * "x", None),
     ],
 )  # fmt: skip
-def test_an_unknown_path_is_named_with_the_nearest_there_is(http: httpx.Client, path: str, near: str | None) -> None:
+def test_an_unknown_path_gets_404_with_the_closest_match(http: httpx.Client, path: str, near: str | None) -> None:
     found = problem(http.get(path), 404)
     assert path[:64] in found.detail
     assert len(found.detail) < 400
@@ -280,13 +280,13 @@ def test_an_unknown_path_is_named_with_the_nearest_there_is(http: httpx.Client, 
         ("detectable?change=nan", "change: expected a finite number (found 'nan')"),
     ],
 )
-def test_wrong_argument_is_a_problem_that_names_it(http: httpx.Client, query: str, told: str) -> None:
-    """Of every route and argument `test_openapi` makes up more."""
+def test_an_invalid_argument_gets_422_with_its_name(http: httpx.Client, query: str, told: str) -> None:
+    """For all routes and arguments `test_openapi` generates more."""
     found = problem(http.get(f"{PLACE}/{query}"), 422)
     assert found.detail.startswith(told), found.detail
 
 
-def test_a_change_too_small_to_be_one_is_refused(http: httpx.Client) -> None:
+def test_a_change_too_small_to_detect_is_refused(http: httpx.Client) -> None:
     for change in ("0", "1e-300", "-9e-7"):
         found = problem(http.get(f"{PLACE}/detectable?change={change}"), 422)
         assert found.detail.endswith("is not a change that could be found, expected at least 0.000001 up or down")
@@ -294,7 +294,7 @@ def test_a_change_too_small_to_be_one_is_refused(http: httpx.Client) -> None:
     assert all(one.length_s is not None and one.length_s > 1e6 for one in tiny.parameters)
 
 
-def test_a_misspelt_argument_is_not_passed_over(http: httpx.Client) -> None:
+def test_a_misspelt_argument_is_refused(http: httpx.Client) -> None:
     found = problem(http.get(f"{PLACE}/reports?sinse_ns=5&limit=3"), 422)
     assert found.detail == ("sinse_ns: no argument of this route, expected one of before, limit, since_ns, until_ns")
     assert problem(http.get("/api/v1/machines?a=1"), 422).detail == "a: no argument of this route, expected none"
@@ -302,7 +302,7 @@ def test_a_misspelt_argument_is_not_passed_over(http: httpx.Client) -> None:
         assert http.get(path).status_code == 200
 
 
-def test_error_inside_is_a_problem_that_tells_nothing(
+def test_an_internal_error_gets_500_without_details(
     seen: tuple[Runtime, MachineWorker], http: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:

@@ -1,7 +1,7 @@
-"""The page on the HTTP API has every route, its arguments and examples as the service describes them itself.
+"""The page on the HTTP API has every route, its arguments and examples as in the service's own description.
 
-What stands under *Needs the scope* is made out of that description; ``python -m tests.service.api.test_api_doc`` writes
-it anew. The commands in the page are run as they stand, but for the address.
+The text after *Needs the scope* is generated from that description; ``python -m tests.service.api.test_api_doc`` writes
+it anew. The commands in the page are run unchanged except for the address.
 """
 
 import json
@@ -29,7 +29,7 @@ WIDTH = 118
 
 
 def description() -> dict[str, Any]:
-    """The service's own description, of a service that does not run."""
+    """The service's own description, without running it."""
     plan = settings("tcp/127.0.0.1:0")
     runtime = Runtime(plan)
     store = runtime.store
@@ -51,7 +51,7 @@ def routes(described: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def compact(value: Any, indent: int = 0) -> str:
-    """JSON in which what fits into a line is in one."""
+    """JSON with everything that fits on one line on one line."""
     line = json.dumps(value, ensure_ascii=False)
     if len(line) + indent <= WIDTH or not isinstance(value, dict | list) or not value:
         return line
@@ -63,7 +63,7 @@ def compact(value: Any, indent: int = 0) -> str:
 
 
 def meaning(argument: dict[str, Any]) -> str:
-    """What an argument is for, its limits and its default."""
+    """Purpose of an argument, its limits and its default."""
     schema = argument["schema"]
     inner = next((one for one in schema.get("anyOf", []) if one.get("type") != "null"), schema)
     text: str = argument["description"]
@@ -79,7 +79,7 @@ def meaning(argument: dict[str, Any]) -> str:
 
 
 def made(route: dict[str, Any], shown_before: dict[str, str], title: str) -> str:
-    """What the description says of a route; an answer that has been shown is not shown again."""
+    """Text on a route made from the description; a response already shown is not repeated."""
     scopes = [scope for part in route.get("security", []) for scope in part.get("token", [])]
     text = f"{MADE} `{scopes[0]}`.\n" if scopes else f"{NOBODY}.\n"
     arguments = [one for one in route.get("parameters", []) if one["in"] != "path"]
@@ -120,7 +120,7 @@ def overview(found: dict[str, dict[str, Any]]) -> str:
 
 
 def written(page: str, described: dict[str, Any]) -> str:
-    """The page with all that is made out of the description."""
+    """The page with its generated parts replaced."""
     found = routes(described)
     shown: dict[str, str] = {}
     parts = re.split(r"^(## .+)$", page, flags=re.MULTILINE)
@@ -138,12 +138,12 @@ def written(page: str, described: dict[str, Any]) -> str:
     return text.rstrip() + "\n"
 
 
-def test_every_route_has_its_section() -> None:
+def test_every_route_has_a_section() -> None:
     titles = set(sections(PAGE.read_text(encoding="utf-8")))
     assert titles == set(routes(description())) | {"Routes", "Errors"}
 
 
-def test_arguments_and_examples_are_those_of_the_description() -> None:
+def test_arguments_and_examples_agree_with_the_description() -> None:
     page = PAGE.read_text(encoding="utf-8")
     assert page == written(page, description()), "python -m tests.service.api.test_api_doc writes it anew"
 
@@ -165,7 +165,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]
 
 # The page's commands are for a terminal with curl; a fresh machine has Python, git and make alone.
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
-def test_commands_in_the_page_work(served: tuple[str, str], tmp_path: Path) -> None:
+def test_curl_commands_in_the_page_work(served: tuple[str, str], tmp_path: Path) -> None:
     url, text = served
     blocks = re.findall(r"```sh\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
     commands = [line for block in blocks for line in block.replace("\\\n", " ").splitlines() if line.startswith("curl")]

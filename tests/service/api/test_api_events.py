@@ -1,4 +1,4 @@
-"""The stream of events over HTTP: complete, in order, each once, however often the reader comes back."""
+"""The event stream over HTTP: complete, in order, each event once, however often the reader reconnects."""
 
 import asyncio
 import itertools
@@ -83,7 +83,7 @@ def log(worker: Monitored) -> list[str]:
     return [one.text for one in worker.history.events(after=-1, limit=10_000)]
 
 
-def test_what_happens_arrives_with_an_id_to_go_on_from(shared: Runtime) -> None:
+def test_events_arrive_with_an_id_to_resume_from(shared: Runtime) -> None:
     lab, heavy = shared.machines()
     before = lab.history.last_sequence(), heavy.history.last_sequence()
     with reading(shared) as reader:
@@ -101,8 +101,8 @@ def test_what_happens_arrives_with_an_id_to_go_on_from(shared: Runtime) -> None:
 @pytest.mark.parametrize(
     ("query", "by_header"), [("", True), ("?last_event_id=LAST", False), (f"?last_event_id={LAB}=0", True)]
 )
-def test_a_stream_goes_on_right_after_the_last_id(shared: Runtime, query: str, by_header: bool) -> None:
-    """Of the header, if there are both."""
+def test_a_stream_resumes_after_the_last_event_id(shared: Runtime, query: str, by_header: bool) -> None:
+    """The header takes precedence if both are given."""
     lab, _ = shared.machines()
     with reading(shared) as reader:
         last = reader.next("start").id
@@ -118,7 +118,7 @@ def test_a_stream_goes_on_right_after_the_last_id(shared: Runtime, query: str, b
         assert reader.next().data == log(lab)[-1]
 
 
-def test_the_whole_log_from_the_beginning_also_of_a_machine_that_is_new_to_the_reader(shared: Runtime) -> None:
+def test_the_whole_log_can_be_read_also_of_a_machine_not_in_the_cursor(shared: Runtime) -> None:
     lab, heavy = shared.machines()
     happen(lab, 230)  # more than two pages
     happen(heavy, 3)
@@ -136,8 +136,8 @@ def test_the_whole_log_from_the_beginning_also_of_a_machine_that_is_new_to_the_r
         assert [reader.next().data for _ in range(2)] == log(heavy)[:2]
 
 
-def test_a_reader_who_comes_back_again_and_again_has_the_exact_log(shared: Runtime) -> None:
-    """Cut off after some events, 25 times, while more and more happens: nothing is missing, doubled or out of order."""
+def test_a_reader_who_reconnects_repeatedly_gets_the_exact_log(shared: Runtime) -> None:
+    """Cut off 25 times while events go on: none is missing, repeated or out of order."""
     lab, _ = shared.machines()
     rng = np.random.default_rng(11)
     done = threading.Event()
@@ -166,18 +166,18 @@ def test_a_reader_who_comes_back_again_and_again_has_the_exact_log(shared: Runti
     assert found == log(lab)[first + 1 :]
 
 
-def test_what_is_told_first_is_how_the_machine_is_now(tmp_path: Path) -> None:
+def test_a_stream_begins_with_the_current_health(tmp_path: Path) -> None:
     with fed(tmp_path) as (runtime, feed):
         (worker,) = runtime.machines()
         with reading(runtime) as reader:
             assert Health.model_validate_json(reader.next("health").data).quality.accepted_blocks == 0
-            feed.put_good(3)  # too little for a report: nothing is news
+            feed.put_good(3)  # too little for a report: nothing new is published
             until(lambda: worker.health().quality.accepted_blocks == 3, "blocks")
         with reading(runtime) as reader:
             assert Health.model_validate_json(reader.next("health").data).quality.accepted_blocks == 3
 
 
-def test_health_is_told_at_once_and_when_it_changes(shared: Runtime) -> None:
+def test_health_is_sent_at_once_and_on_changes(shared: Runtime) -> None:
     lab, _ = shared.machines()
     with reading(shared, f"?machine={LAB}") as reader:
 
@@ -187,21 +187,21 @@ def test_health_is_told_at_once_and_when_it_changes(shared: Runtime) -> None:
 
         begun = reader.next("health")
         assert Health.model_validate_json(begun.data).machine == "lab"
-        # It is no place to go on from, and leaves the reader's own as it is.
+        # A health event does not change the id to resume from.
         assert begun.id == f"{LAB}={lab.history.last_sequence()}"
         shelved = lab.history.last_sequence() % 2 == 1
-        told_until(not shelved, begun)  # what happened last may not have been told yet
+        told_until(not shelved, begun)  # the last change may not have been sent yet
         happen(lab)
         told_until(shelved, reader.next("health"))
 
 
-def test_health_that_changed_and_changed_back_is_told(shared: Runtime) -> None:
-    """Whoever begins to listen in between has been told what is no longer so."""
+def test_health_that_changed_and_changed_back_is_sent(shared: Runtime) -> None:
+    """A reader who connects in between has received a state that is no longer true."""
     lab, _ = shared.machines()
     for _ in range(3):
         with reading(shared, f"?machine={LAB}") as reader:
             before = is_shelved(Health.model_validate_json(reader.next("health").data))
-        time.sleep(0.6)  # until that is what was published last
+        time.sleep(0.6)  # until that is the health published last
         happen(lab)
         with reading(shared, f"?machine={LAB}") as reader:
             begun = is_shelved(Health.model_validate_json(reader.next("health").data))
@@ -210,8 +210,8 @@ def test_health_that_changed_and_changed_back_is_told(shared: Runtime) -> None:
                 begun = is_shelved(Health.model_validate_json(reader.next("health").data))
 
 
-def test_whole_health_of_some_machines_and_of_the_others_what_matters_most(shared: Runtime) -> None:
-    """Made into text once each, however many listen."""
+def test_full_health_of_some_machines_and_overviews_of_others(shared: Runtime) -> None:
+    """Each is serialised once, however many readers there are."""
     with reading(shared, f"?detail=overview&in_full={HEAVY}") as reader:
         told = {
             (event.event, Health.model_validate_json(event.data).machine)
@@ -251,15 +251,15 @@ def test_whole_health_of_some_machines_and_of_the_others_what_matters_most(share
 @pytest.mark.parametrize(
     ("alarm", "settled", "vibration", "expected"),
     [
-        ("k_by", False, 1.0, {"k_by"}),  # what a raised alarm is about, however near others are
+        ("k_by", False, 1.0, {"k_by"}),  # the subject of a raised alarm, however near others are
         ("level:y1", False, 1.0, {"y1"}),
-        ("", False, 1.0, {"c_by"}),  # 3 % of what would be seen from 2 %, beside 25 % of 30 %, and 1.93 of 2.8
-        ("", True, 1.0, {"k_by"}),  # of c_by nothing is read
+        ("", False, 1.0, {"c_by"}),  # 3 % where 2 % is detectable, against 25 % of 30 %, and 1.93 of 2.8
+        ("", True, 1.0, {"k_by"}),  # c_by is not read
         ("", True, 2.5, {"z1"}),
         ("stream-lost", False, 3.0, {"z1"}),  # beyond its limit
     ],
 )
-def test_what_matters_most_of_a_window(alarm: str, settled: bool, vibration: float, expected: set[str]) -> None:
+def test_an_overview_keeps_what_matters_most(alarm: str, settled: bool, vibration: float, expected: set[str]) -> None:
     health = Health.model_validate(example(Health))
     report, raised = sure(health.report), health.alarms[0]
     one, seen, level = report.parameters[0], report.detectable[0], report.levels[0]
@@ -301,13 +301,13 @@ def test_what_matters_most_of_a_window(alarm: str, settled: bool, vibration: flo
         ("?from=tomorrow", "", 422, "from: expected one of now, beginning (found 'tomorrow')"),
     ],
 )
-def test_a_stream_that_cannot_begin_says_why(shared: Runtime, query: str, header: str, status: int, text: str) -> None:
+def test_invalid_stream_arguments_are_refused(shared: Runtime, query: str, header: str, status: int, text: str) -> None:
     with client(shared) as http:
         answer = http.get(EVENTS + query, headers={"last-event-id": header} if header else {})
         assert problem(answer, status).detail.startswith(text)
 
 
-def test_cursor_text_round_trip() -> None:
+def test_cursors_are_parsed_as_written_and_invalid_ones_refused() -> None:
     cursor = {"demo/lab": 17, "site-2/pump_7": -1}
     assert parsed_cursor(cursor_text(cursor)) == cursor
     for text in ("", ",", "demo/lab", "demo/lab=", "demo/lab=-2", "demo/lab=1,", "demo/lab=" + 19 * "9", "a/b/c=1"):
@@ -315,8 +315,8 @@ def test_cursor_text_round_trip() -> None:
             parsed_cursor(text)
 
 
-def test_a_reader_who_stops_reading_holds_up_nobody(shared: Runtime) -> None:
-    """It is left behind with a full pipe, while another one gets everything."""
+def test_a_stalled_reader_does_not_hold_up_others(shared: Runtime) -> None:
+    """It is left with a full pipe, while another reader gets everything."""
     lab, _ = shared.machines()
     first = lab.history.last_sequence()
     with (
@@ -327,13 +327,13 @@ def test_a_reader_who_stops_reading_holds_up_nobody(shared: Runtime) -> None:
         reader.next("start")
         happen(lab, 200)
         assert len(reader.alarms(200)) == 200
-        # What the other one was not sent for lack of room is there when it reads on.
+        # Events that were not sent for lack of room arrive when the stuck one reads on.
         events = httpx_sse.EventSource(stuck).iter_sse()
         alarms = (event for event in events if event.event == "alarm")
         assert [event.data for event in itertools.islice(alarms, first + 201)] == log(lab)
 
 
-def test_streams_are_counted_and_given_back() -> None:
+def test_streams_per_caller_are_limited_and_freed_on_close() -> None:
     limits = LimitSettings(requests_per_minute=1_000_000, streams_per_caller=2)
     with monitor(AccessSettings(open_on_loopback=True, limits=limits)) as runtime, client(runtime) as http:
         with reading(runtime) as one, reading(runtime) as two:
@@ -352,7 +352,7 @@ def test_streams_are_counted_and_given_back() -> None:
 
 
 def test_streams_end_when_the_service_stops(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was committed before is told, however slow the history is."""
+    """Events committed before are sent, however slow the history is."""
     with monitor() as runtime:
         lab, _ = runtime.machines()
         read = lab.history.events
@@ -370,7 +370,7 @@ def test_streams_end_when_the_service_stops(monkeypatch: pytest.MonkeyPatch) -> 
             expected = [one.text for one in read(after=-1, limit=1000)]
             stopping = threading.Thread(target=runtime.stop)
             stopping.start()
-            # An end, not a broken connection: the reader would raise.
+            # A regular end: on a broken connection the reader would raise.
             left += reader.events
             stopping.join(180)
             assert not stopping.is_alive()
@@ -392,7 +392,7 @@ def test_a_stream_ends_when_its_token_is_revoked(monkeypatch: pytest.MonkeyPatch
             problem(http.get(EVENTS), 401)
 
 
-def test_silence_is_filled_with_comments(shared: Runtime, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idle_streams_get_keep_alive_comments(shared: Runtime, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(event_feed, "_KEEP_ALIVE_S", 0.05)
     with client(shared) as http, http.stream("GET", EVENTS) as answer:
         assert answer.headers["content-type"].startswith("text/event-stream")
@@ -402,13 +402,13 @@ def test_silence_is_filled_with_comments(shared: Runtime, monkeypatch: pytest.Mo
     with reading(shared) as reader:
         reader.next("start")
         threading.Timer(0.5, happen, (shared.machines()[0],)).start()
-        # None of them is taken for an event.
+        # Comments are not taken for events.
         assert {event.event for event in itertools.takewhile(lambda event: event.event != "alarm", reader.events)} <= {
             "health"
         }
 
 
-def test_while_the_history_cannot_be_read_a_stream_waits(shared: Runtime, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stream_waits_while_the_history_cannot_be_read(shared: Runtime, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(event_feed, "_AGAIN_S", 0.05)
     lab, _ = shared.machines()
     asked = threading.Event()

@@ -68,7 +68,7 @@ def test_pages_back_and_forth_give_the_whole_log_once(busy: tuple[Runtime, httpx
         after = sure(one.next_after)
     assert forth == list(range(12))
     assert (one.next_before, one.next_after) == (None, 11)
-    assert page(busy[1], "after=11") == one  # what follows is asked for with the same number
+    assert page(busy[1], "after=11") == one  # later events are queried with the same number
     assert sequences(page(busy[1], "after=3&before=6")) == [4, 5]
 
 
@@ -83,7 +83,7 @@ def test_events_are_filtered(busy: tuple[Runtime, httpx.Client], query: str, exp
     assert sequences(page(busy[1], query)) == expected
 
 
-def test_events_are_cut_by_data_time_and_served_as_they_were_published(busy: tuple[Runtime, httpx.Client]) -> None:
+def test_events_are_filtered_by_data_time_and_served_as_published(busy: tuple[Runtime, httpx.Client]) -> None:
     runtime, http = busy
     times = [event.data.time_ns for event in page(http, "after=-1").events]
     assert times == sorted(times)
@@ -94,7 +94,7 @@ def test_events_are_cut_by_data_time_and_served_as_they_were_published(busy: tup
     )
 
 
-def test_audit_log_tells_who_did_what(busy: tuple[Runtime, httpx.Client]) -> None:
+def test_the_audit_log_shows_who_did_what(busy: tuple[Runtime, httpx.Client]) -> None:
     http = busy[1]
     newest = answered(http.get("/api/v1/audit?limit=2"), AuditList)
     done, begun = newest.entries
@@ -141,7 +141,7 @@ def test_infinite_and_undefined_numbers_become_null() -> None:
     assert Health.model_validate_json(text) == health
 
 
-def test_no_data_is_said_beside_a_raised_alarm_and_hides_it_not() -> None:
+def test_missing_data_do_not_hide_a_raised_alarm() -> None:
     state = AlarmState.UNACKNOWLEDGED
     alarm = Alarm("k_by", state, present=True, raised_ns=5, occurrence=1, change=-0.3, standard_error=0.01)
     latest = Report.model_validate(example(Report))
@@ -155,7 +155,7 @@ def test_no_data_is_said_beside_a_raised_alarm_and_hides_it_not() -> None:
     assert conversion.health(IDENTITY, calm, FLOWING).state == "healthy"
 
 
-def test_the_identity_of_an_event_is_stable_and_that_of_a_machine_file_follows_its_content() -> None:
+def test_event_ids_are_stable_and_machine_hashes_follow_the_files_content() -> None:
     alarm = Alarm("k_by", AlarmState.UNACKNOWLEDGED, occurrence=2)
     same = {alarm_cloud_event(IDENTITY, AlarmEvent(EventKind.RAISED, 77, 3, alarm)).id for _ in range(2)}
     other = alarm_cloud_event(IDENTITY, AlarmEvent(EventKind.ESCALATED, 77, 4, alarm))
@@ -171,7 +171,7 @@ def test_the_identity_of_an_event_is_stable_and_that_of_a_machine_file_follows_i
 
 
 def feed_on(runtime: Runtime, feed: Feed, blocks: int) -> None:
-    """Put blocks of 0.1 s in which the shaft turns at 22 Hz, and wait until they are taken."""
+    """Put blocks of 0.1 s in which the shaft turns at 22 Hz, and wait until they are accepted."""
     accepted = runtime.machines()[0].health().quality.accepted_blocks
     theta = [one.name for one in feed.machine.sensors].index("theta")
     for _ in range(blocks):
@@ -184,7 +184,7 @@ def feed_on(runtime: Runtime, feed: Feed, blocks: int) -> None:
     until(lambda: runtime.machines()[0].health().quality.accepted_blocks == accepted + blocks, "blocks")
 
 
-def test_samples_are_held_for_a_bounded_time_and_none_are_joined_across_a_gap(tmp_path: Path) -> None:
+def test_samples_are_held_for_a_bounded_time_and_not_joined_across_a_gap(tmp_path: Path) -> None:
     with fed(tmp_path) as (runtime, feed), client(runtime) as http:
         feed_on(runtime, feed, 20)
         before = answered(http.get(f"{PLACE}/orbits?revolutions=30"), OrbitSnapshot)

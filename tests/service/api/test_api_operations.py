@@ -1,4 +1,4 @@
-"""What operators do to alarms over HTTP, and what is refused: a real service with tokens."""
+"""Operations on alarms over HTTP, and refusals: a real service with tokens."""
 
 import threading
 from collections.abc import Iterator
@@ -42,7 +42,7 @@ def plant(tmp_path: Path) -> Iterator[tuple[Runtime, Feed, httpx.Client]]:
 
 @pytest.fixture(scope="module")
 def untouched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """The same, for requests after which it is as it was."""
+    """The same, for requests that leave it unchanged."""
     with gap(tmp_path_factory.mktemp("machine")) as (_, _, http):
         yield http
 
@@ -51,7 +51,7 @@ def state(http: httpx.Client) -> str:
     return answered(http.get(GAP), Alarm).state.value
 
 
-def test_acknowledge_with_the_etag(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
+def test_an_alarm_is_acknowledged_with_its_etag(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
     _, _, http = plant
     seen = http.get(GAP)
     assert seen.headers["etag"] == f'"{answered(seen, Alarm).version}"' == '"0"'
@@ -64,7 +64,7 @@ def test_acknowledge_with_the_etag(plant: tuple[Runtime, Feed, httpx.Client]) ->
     (event,) = done.events
     assert (event.data.kind, event.data.before, event.data.state) == ("acknowledged", "unacknowledged", "acknowledged")
     assert (event.data.actor, event.data.reason) == ("anna", "cable was moved")
-    # What is answered is committed, and is what everybody else hears.
+    # The event in the response is committed and is the one that others receive.
     assert answered(http.get(f"{PLACE}/alarms/events?limit=1"), AlarmEventList).events == (event,)
     assert http.get(GAP).headers["etag"] == '"1"'
 
@@ -80,14 +80,14 @@ def test_acknowledge_with_the_etag(plant: tuple[Runtime, Feed, httpx.Client]) ->
         (ANY, {"expected_state": "acknowledged"}),
     ],
 )
-def test_an_alarm_seen_otherwise_stays(untouched: httpx.Client, headers: dict[str, str], body: dict[str, str]) -> None:
+def test_an_outdated_version_is_refused(untouched: httpx.Client, headers: dict[str, str], body: dict[str, str]) -> None:
     found = problem(untouched.post(f"{GAP}/acknowledge", json=body, headers=headers), 409)
     assert found.detail.startswith("data-gap is unacknowledged (version 0), no longer as it was seen (")
     assert found.detail.endswith("): look again")
     assert state(untouched) == "unacknowledged"
 
 
-def test_each_way_of_saying_how_it_was_seen(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
+def test_the_alarms_version_or_state_can_be_given_in_several_ways(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
     _, _, http = plant
     by_state = {"expected_state": "unacknowledged"}
     for match, body in (('"{}"', {}), ('W/"{}"', {}), ("*", {}), ("", by_state), ('"{}"', by_state)):
@@ -95,12 +95,12 @@ def test_each_way_of_saying_how_it_was_seen(plant: tuple[Runtime, Feed, httpx.Cl
         headers = {"If-Match": match.format(seen.version)} if match else {}
         done = answered(http.post(f"{GAP}/acknowledge", json=body, headers=headers), OperationDone)
         assert (seen.state, done.alarm.state, state(http)) == ("unacknowledged", "acknowledged", "acknowledged")
-        for order in ("remove-from-service", "return-to-service"):  # after which nobody has acknowledged it
+        for order in ("remove-from-service", "return-to-service"):  # which undoes the acknowledgement
             again = {"reason": "x", "expected_state": answered(http.get(GAP), Alarm).state}
             answered(http.post(f"{GAP}/{order}", json=again), OperationDone)
 
 
-def test_of_two_operators_at_once_one_is_told_to_look_again(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
+def test_one_of_several_concurrent_operators_succeeds_others_get_409(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
     runtime, _, http = plant
     names = [f"operator {number}" for number in range(8)]
     both = threading.Barrier(len(names))
@@ -120,7 +120,7 @@ def test_of_two_operators_at_once_one_is_told_to_look_again(plant: tuple[Runtime
     assert answered(http.get(f"{PLACE}/alarms"), AlarmStates).sequence == 1
 
 
-def test_shelving_and_its_end_and_an_alarm_that_never_was(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
+def test_alarms_are_shelved_and_unshelved_even_if_never_raised(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
     _, _, http = plant
     body = {"reason": "sensor is being replaced", "duration_s": 600, "one_shot": True}
     done = answered(http.post(f"{GAP}/shelve", json=body, headers={"If-Match": '"0"'}), OperationDone)
@@ -137,9 +137,9 @@ def test_shelving_and_its_end_and_an_alarm_that_never_was(plant: tuple[Runtime, 
     assert sure(done.alarm.shelf).until_ns - done.events[0].data.time_ns == 3600e9
 
 
-def test_latched_alarms_are_reset_and_who_configures_takes_out(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
+def test_latched_alarms_are_reset_and_removal_needs_configure(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
     runtime, feed, http = plant
-    feed.put_good(130)  # until a hop is complete: then the data are free of gaps again
+    feed.put_good(130)  # until a hop is complete, which ends the gap
     until(lambda: state(http) == "latched-unacknowledged", "end of the gap")
     answered(http.post(f"{GAP}/acknowledge", json={"expected_state": "latched-unacknowledged"}), OperationDone)
     done = answered(http.post(f"{GAP}/reset", json={"expected_state": "latched-acknowledged"}), OperationDone)
@@ -180,7 +180,7 @@ def test_latched_alarms_are_reset_and_who_configures_takes_out(plant: tuple[Runt
         ("events/acknowledge", ANY, {}, 404, "no alarm events; there are:"),
     ],
 )  # fmt: skip
-def test_orders_that_cannot_be_followed_are_explained(
+def test_impossible_operations_are_explained(
     untouched: httpx.Client, path: str, headers: dict[str, str], body: Any, status: int, text: str
 ) -> None:
     answer = untouched.post(f"{PLACE}/alarms/{path}", json=body, headers=headers)
@@ -188,7 +188,7 @@ def test_orders_that_cannot_be_followed_are_explained(
     assert answered(untouched.get(f"{PLACE}/alarms"), AlarmStates).sequence == 0
 
 
-def test_bodies_that_are_none_are_problems(untouched: httpx.Client) -> None:
+def test_malformed_bodies_are_refused(untouched: httpx.Client) -> None:
     kind = {"content-type": "application/json"}
     for content, headers, status in (
         (b"{", kind, 422), (b"\xff{}", kind, 400), (b"", kind, 422), (b'{"reason":"\\ud800"}', kind, 422),
@@ -199,7 +199,7 @@ def test_bodies_that_are_none_are_problems(untouched: httpx.Client) -> None:
     assert state(untouched) == "unacknowledged"
 
 
-def test_what_was_done_and_what_was_refused_is_in_the_audit_log(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
+def test_operations_and_refusals_are_in_the_audit_log(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
     runtime, _, http = plant
     with client(runtime, token(runtime, READ, name="screen")) as screen:
         problem(screen.post(f"{GAP}/acknowledge", json={}, headers=ANY), 403)
@@ -215,7 +215,7 @@ def test_what_was_done_and_what_was_refused_is_in_the_audit_log(plant: tuple[Run
     ]
 
 
-def test_a_monitor_that_is_being_stopped_says_so(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
+def test_a_stopping_monitor_answers_503(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
     runtime, _, http = plant
     worker_of(runtime).stop()
     found = problem(http.post(f"{GAP}/acknowledge", json={}, headers=ANY), 503)

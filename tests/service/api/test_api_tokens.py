@@ -1,4 +1,4 @@
-"""Tokens over HTTP: what is told of them, who may give which scopes, and what the audit log says."""
+"""Tokens over HTTP: what is shown of them, who may grant which scopes, and what the audit log holds."""
 
 import time
 from pathlib import Path
@@ -54,7 +54,7 @@ def test_a_token_is_created_used_and_revoked(monitor: Guarded, capfd: pytest.Cap
         again = chief.delete(f"{TOKENS}/{told.token_id}").raise_for_status().json()
         assert again["revoked_ns"] == gone.revoked_ns
         assert create(chief).token.token_id != told.token_id  # the name is free again
-        for text in ("000000000000", made.text):  # whoever mistakes one for the other has not told anybody
+        for text in ("000000000000", made.text):  # a secret given as an id is not repeated
             assert made.text not in problem(chief.delete(f"{TOKENS}/{text}"), 404)
 
     secret = made.text.rpartition("_")[2]
@@ -69,7 +69,7 @@ def test_a_token_is_created_used_and_revoked(monitor: Guarded, capfd: pytest.Cap
     assert secret not in repr(monitor.store.tokens.all())
 
 
-def test_nobody_gives_a_scope_that_is_not_his_own(monitor: Guarded) -> None:
+def test_a_token_cannot_create_one_with_scopes_that_it_lacks(monitor: Guarded) -> None:
     with monitor.client(monitor.token(READ, CONFIGURE, name="clerk")) as clerk:
         for scopes in (["operate"], ["read", "operate", "configure"]):
             told = problem(clerk.post(TOKENS, json={"name": "more", "scopes": scopes}), 403)
@@ -81,7 +81,7 @@ def test_nobody_gives_a_scope_that_is_not_his_own(monitor: Guarded) -> None:
     assert "more, operate" in refused[0].reason
 
 
-def test_nobody_gives_a_token_that_is_valid_for_longer_than_his_own(monitor: Guarded) -> None:
+def test_a_token_cannot_create_one_that_is_valid_for_longer(monitor: Guarded) -> None:
     with monitor.client(monitor.token(*Scope, name="guest", days=30)) as guest:
         for days in (31, None):
             wish = {"name": "heir", "scopes": ["read"], "days": days}
@@ -98,7 +98,7 @@ def test_nobody_gives_a_token_that_is_valid_for_longer_than_his_own(monitor: Gua
         ({"days": 0}, "days: "), ({"days": 3651}, "days: "), ({"secret": "x"}, "secret: "),
     ],
 )  # fmt: skip
-def test_wrong_wishes_are_refused(monitor: Guarded, wish: dict[str, Any], said: str) -> None:
+def test_invalid_token_requests_are_refused(monitor: Guarded, wish: dict[str, Any], said: str) -> None:
     with monitor.client(monitor.token(*Scope, name="chief")) as chief:
         told = problem(chief.post(TOKENS, json={"name": "x", "scopes": ["read"], **wish}), 422)
         assert said in told
@@ -107,7 +107,7 @@ def test_wrong_wishes_are_refused(monitor: Guarded, wish: dict[str, Any], said: 
     assert 43 * "0" not in repr(monitor.entries())
 
 
-def test_where_no_token_is_needed_that_is_said(tmp_path: Path) -> None:
+def test_the_token_list_says_whether_tokens_are_needed(tmp_path: Path) -> None:
     settings = AccessSettings.model_validate({"open_on_loopback": True})
     with guarded(tmp_path, settings) as monitor, monitor.client() as client:
         create(client, scopes=["read", "operate", "configure"])

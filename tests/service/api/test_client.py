@@ -1,6 +1,6 @@
-"""The client against a running service with tokens: what it reads, what it does, and how it goes on after a loss.
+"""The client against a running service with tokens: reading, operating, and resuming after a lost connection.
 
-One that a generator of others makes out of the description works too; by hand the same was done with
+A client generated from the description with a third-party tool works too; the same was tried by hand with
 ``openapi-typescript``.
 """
 
@@ -69,7 +69,7 @@ def _token(runtime: Runtime) -> str:
     return _TOKENS[id(runtime)]
 
 
-def test_what_there_is(plant: Client, seen: tuple[Runtime, MachineWorker]) -> None:
+def test_machine_configuration_and_health_are_read(plant: Client, seen: tuple[Runtime, MachineWorker]) -> None:
     _, worker = seen
     (machine,) = plant.machines()
     assert machine == plant.machine(PLACE)
@@ -79,7 +79,7 @@ def test_what_there_is(plant: Client, seen: tuple[Runtime, MachineWorker]) -> No
     assert plant.detectable(PLACE, -0.05) == worker.detectable(-0.05)
 
 
-def test_alarms_and_their_log(plant: Client, seen: tuple[Runtime, MachineWorker]) -> None:
+def test_alarms_and_their_log_are_read(plant: Client, seen: tuple[Runtime, MachineWorker]) -> None:
     _, worker = seen
     assert plant.alarms(PLACE) == worker.alarms()
     everything = plant.alarms(PLACE, everything=True)
@@ -111,7 +111,7 @@ def test_pages_are_joined(plant: Client, seen: tuple[Runtime, MachineWorker], mo
     assert [entry.number for entry in entries] == sorted((entry.number for entry in entries), reverse=True)
 
 
-def test_readings_over_time_and_snapshots(plant: Client) -> None:
+def test_readings_trends_and_snapshots_are_read(plant: Client) -> None:
     readings = list(plant.readings(PLACE, "parameter", "k_by"))
     shown = [one.parameters[0] for one in plant.reports(PLACE) if one.parameters][::-1]
     assert [one.value for one in readings] == [one.relative_change for one in shown]
@@ -143,14 +143,14 @@ def test_readings_over_time_and_snapshots(plant: Client) -> None:
         (lambda plant: next(plant.events(after="demo/lab=900")), LogReplaced, "the log of demo/lab ends at"),
     ],
 )
-def test_refusals_are_exceptions_in_its_own_words(plant: Client, ask: Any, kind: type[Exception], told: str) -> None:
+def test_refusals_raise_with_the_services_message(plant: Client, ask: Any, kind: type[Exception], told: str) -> None:
     with pytest.raises(ClientError) as caught:
         ask(plant)
     assert type(caught.value) is kind
     assert told in str(caught.value)
 
 
-def test_tokens(seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_tokens_are_refused(seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyPatch) -> None:
     runtime, _ = seen
     monkeypatch.delenv("ROTORWATCH_TOKEN", raising=False)
     with Client(runtime.http_url) as stranger:
@@ -177,7 +177,7 @@ def test_tokens(seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyP
         assert "screen has read" in str(caught.value)
 
 
-def test_nobody_there_or_an_address_that_no_service_can_have() -> None:
+def test_an_unreachable_service_or_invalid_url_is_named() -> None:
     for url in ("127.0.0.1:8080", "", "ftp://plant", "http://", "http://[::1", "http://plant:99999"):
         with pytest.raises(ClientError, match=re.escape(f"url is {url!r}, expected http://HOST:PORT")):
             Client(url)
@@ -191,7 +191,7 @@ def test_nobody_there_or_an_address_that_no_service_can_have() -> None:
 
 @contextmanager
 def gapped(plan: ServiceSettings, *, feed_it: bool = True) -> Iterator[Runtime]:
-    """A service with a gap in its stream, which is an alarm at once."""
+    """A service with a gap in its stream, which raises an alarm at once."""
     with feeding(plan) as (runtime, feed):
         if feed_it:
             feed.gap()
@@ -204,7 +204,7 @@ def plan(folder: Path, **changes: object) -> ServiceSettings:
     return settings(endpoint(), machine_file(folder, IN_ORDER, latching), when_full="wait").model_copy(update=changes)
 
 
-def test_operators_work(tmp_path: Path) -> None:
+def test_operations_on_alarms_and_conflicts(tmp_path: Path) -> None:
     with gapped(plan(tmp_path)) as runtime, Client(runtime.http_url, "") as plant:
         first = plant.alarm(PLACE, "data-gap")
         done = plant.acknowledge(PLACE, first, "cable was moved")
@@ -217,7 +217,7 @@ def test_operators_work(tmp_path: Path) -> None:
         assert done.alarm.shelf is not None
         assert (done.alarm.shelf.one_shot, done.alarm.shelf.reason) == (True, "is being repaired")
         done = plant.unshelve(PLACE, done.alarm)
-        with pytest.raises(Conflict, match="data-gap"):  # not latched: the condition is there
+        with pytest.raises(Conflict, match="data-gap"):  # not latched: the condition persists
             plant.reset(PLACE, done.alarm, "too early")
         done = plant.remove_from_service(PLACE, done.alarm, "for good")
         done = plant.return_to_service(PLACE, done.alarm, "after all")
@@ -225,8 +225,8 @@ def test_operators_work(tmp_path: Path) -> None:
         assert kinds == ["acknowledged", "shelved", "unshelved", "removed-from-service", "returned-to-service"]
 
 
-def test_events_go_on_after_a_restart(tmp_path: Path) -> None:
-    """The service stops, comes back on the same port with its history, and goes on: each event once, in order."""
+def test_events_continue_after_a_restart(tmp_path: Path) -> None:
+    """The service restarts on the same port with its history: each event arrives once, in order."""
     port = int(endpoint().rsplit(":", 1)[1])
     kept = plan(tmp_path, history=kept_in(tmp_path), http=HttpSettings(port=port), access=OPEN)
     heard: list[ServiceEvent] = []
@@ -256,7 +256,7 @@ def test_events_go_on_after_a_restart(tmp_path: Path) -> None:
             work(other)
             latest = runtime.machines()[0].alarms().sequence
             until(lambda: errors != [] or heard[-1].cursor == f"{PLACE}={latest}", "all events")
-            # Another listener, with the cursor of one of them.
+            # Another listener, from the cursor of one of the events.
             later = plant_events_after(other, heard[4].cursor, latest - 4)
         with gapped(plan(tmp_path, http=HttpSettings(port=port), access=OPEN), feed_it=False):
             listener.join(180.0)  # a history without these events
@@ -270,7 +270,7 @@ def plant_events_after(plant: Client, cursor: str, count: int) -> list[ServiceEv
     return [next(stream) for _ in range(count)]
 
 
-def test_encrypted(tmp_path: Path) -> None:
+def test_https_with_a_private_authority(tmp_path: Path) -> None:
     with running(plan(tmp_path, access=AccessSettings(tls=files(tmp_path, trustme.CA())))) as runtime:
         text = token(runtime)
         with Client(runtime.http_url, text, ca=tmp_path / "ca.pem") as plant:
@@ -284,7 +284,7 @@ def test_encrypted(tmp_path: Path) -> None:
 def test_examples_in_the_page_run(
     seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any
 ) -> None:
-    """In the order of the page, Python and shell mixed, as a reader would try them."""
+    """In the order of the page, Python and shell mixed, as a reader would run them."""
     runtime, worker = seen
     assert shutil.which("curl")
     monkeypatch.chdir(tmp_path)
@@ -328,11 +328,11 @@ def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
 
 @pytest.fixture(scope="module")
 def generated(runtime: Runtime, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ModuleType]:
-    """The generated package; a warning of the generator is a failure."""
+    """The generated package; a warning of the generator fails the test."""
     folder = tmp_path_factory.mktemp("generated")
     with client(runtime, token(runtime, Scope.READ, name="generator")) as http:
         (folder / "openapi.json").write_bytes(http.get("/openapi.json").raise_for_status().content)
-    (folder / "config.json").write_text(json.dumps({"post_hooks": []}), encoding="utf-8")  # nobody reads it
+    (folder / "config.json").write_text(json.dumps({"post_hooks": []}), encoding="utf-8")  # no formatting
     options = ["--path", "openapi.json", "--config", "config.json", "--output-path", PACKAGE, "--meta", "none"]
     done = subprocess.run(
         [sys.executable, "-m", "openapi_python_client", "generate", *options, "--fail-on-warning"], cwd=folder,
@@ -349,7 +349,7 @@ def generated(runtime: Runtime, tmp_path_factory: pytest.TempPathFactory) -> Ite
             del sys.modules[name]
 
 
-def test_a_generated_client_asks_orders_and_understands_refusals(generated: ModuleType, runtime: Runtime) -> None:
+def test_a_generated_client_reads_operates_and_parses_refusals(generated: ModuleType, runtime: Runtime) -> None:
     def operation(name: str) -> ModuleType:
         return importlib.import_module(f"{PACKAGE}.api.{name}")
 

@@ -1,4 +1,4 @@
-"""Connections that keep the HTTP server waiting are ended and keep nobody away: a real monitor, real sockets."""
+"""Connections that keep the HTTP server waiting are closed and keep nobody out: a real monitor, real sockets."""
 
 import os
 import resource
@@ -39,7 +39,7 @@ def monitor(access: AccessSettings = OPEN, **http: float) -> Iterator[Runtime]:
 
 @contextmanager
 def connections(url: str, count: int, sends: bytes = b"") -> Iterator[list[socket.socket]]:
-    """So many connections that have sent something and wait."""
+    """Open `count` connections that have sent something and wait."""
     place = httpx.URL(url)
     with ExitStack() as opened:
         found = []
@@ -51,7 +51,7 @@ def connections(url: str, count: int, sends: bytes = b"") -> Iterator[list[socke
 
 
 def stalled(url: str) -> socket.socket:
-    """A connection of a reader that has asked for much and takes nothing."""
+    """A connection of a client that has requested much and reads nothing."""
     place, one = httpx.URL(url), socket.socket()
     one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     one.connect((place.host, place.port))
@@ -60,7 +60,7 @@ def stalled(url: str) -> socket.socket:
 
 
 def over(connection: socket.socket) -> bool:
-    """Whether the server has ended a connection; reads what has arrived."""
+    """Whether the server has closed a connection; reads what has arrived."""
     try:
         while select.select([connection], [], [], 0)[0]:
             if not connection.recv(65536):
@@ -75,14 +75,14 @@ def healthy(url: str) -> bool:
 
 
 def trickle(slow: Sequence[socket.socket]) -> bool:
-    """Send one byte more on each that is open; whether all are over."""
+    """Send one more byte on each open connection; return whether all are closed."""
     for one in slow:
         with suppress(OSError):
             one.send(b"x")
     return all(over(one) for one in slow)
 
 
-def test_requests_whose_head_never_ends_are_ended() -> None:
+def test_connections_with_endless_request_heads_are_closed() -> None:
     with monitor(head_timeout_s=0.5) as runtime, ExitStack() as opened:
         url = runtime.http_url
         silent = opened.enter_context(connections(url, 10))
@@ -93,14 +93,14 @@ def test_requests_whose_head_never_ends_are_ended() -> None:
 
 
 @pytest.mark.parametrize("access", [OPEN, AccessSettings()], ids=["awaited", "refused before"])
-def test_requests_whose_body_never_ends_are_ended(access: AccessSettings) -> None:
+def test_connections_with_endless_request_bodies_are_closed(access: AccessSettings) -> None:
     with monitor(access, body_timeout_s=0.5) as runtime, connections(runtime.http_url, 20, SHELVE) as waiting:
         until(lambda: trickle(waiting), "end of all slow bodies")
         assert runtime.machines()[0].history.last_sequence() == -1
 
 
-def test_streams_and_regular_callers_go_on() -> None:
-    """While others are ended, whoever is being answered stays, and so does whoever asks now and then."""
+def test_streams_and_regular_callers_stay_connected() -> None:
+    """While others are closed, streams stay open, and so do clients that send requests now and then."""
     with (
         monitor(head_timeout_s=1, body_timeout_s=1, send_timeout_s=1) as runtime,
         connections(runtime.http_url, 3, EVENTS) as streams,
@@ -112,7 +112,7 @@ def test_streams_and_regular_callers_go_on() -> None:
         assert not any(map(over, streams))
 
 
-def test_whoever_takes_nothing_of_an_answer_is_cut_off() -> None:
+def test_a_client_that_does_not_read_its_response_is_cut_off() -> None:
     with (
         monitor(send_timeout_s=0.5) as runtime,
         stalled(runtime.http_url) as reader,
@@ -125,7 +125,7 @@ def test_whoever_takes_nothing_of_an_answer_is_cut_off() -> None:
             steady.setblocking(False)
             with suppress(BlockingIOError):
                 taken += len(steady.recv(65536))
-            # What is sent into a connection that was reset fails; nothing is taken from it meanwhile.
+            # The socket reports an error once the connection was reset; nothing is read from it.
             return reader.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) != 0
 
         until(cut_off, "end of the reader that stopped")
@@ -134,7 +134,7 @@ def test_whoever_takes_nothing_of_an_answer_is_cut_off() -> None:
 
 
 def test_half_open_requests_make_room_for_others() -> None:
-    """Nobody waits for them to run out of time: the one that has waited longest goes when somebody else comes."""
+    """Without waiting for their timeout: the oldest is closed when another connection comes."""
     with (
         monitor(connections_per_address=8, head_timeout_s=600) as runtime,
         connections(runtime.http_url, 60, HEAD) as waiting,
@@ -144,7 +144,7 @@ def test_half_open_requests_make_room_for_others() -> None:
         assert not over(waiting[-1])
 
 
-def test_no_more_connections_than_the_settings_say() -> None:
+def test_connections_beyond_the_limit_get_503() -> None:
     with monitor(connections=3) as runtime, connections(runtime.http_url, 3, EVENTS) as streams:
         for one in streams:
             assert one.recv(15) == b"HTTP/1.1 200 OK"
@@ -160,8 +160,8 @@ def test_no_more_connections_than_the_settings_say() -> None:
         assert not any(map(over, streams[1:]))
 
 
-def test_readers_that_stop_make_room_for_others() -> None:
-    """Not at once, but long before their time is over."""
+def test_stalled_readers_make_room_for_others() -> None:
+    """Not at once, but long before their timeout."""
     with monitor(connections=3, send_timeout_s=3600) as runtime, ExitStack() as opened:
         for _ in range(3):
             opened.enter_context(stalled(runtime.http_url))
@@ -178,7 +178,7 @@ def test_a_proxy_may_have_more_connections_than_others() -> None:
         assert not any(map(over, waiting))
 
 
-def test_handshakes_that_never_end_make_room_for_others(tmp_path: Path) -> None:
+def test_endless_tls_handshakes_make_room_for_others(tmp_path: Path) -> None:
     authority = trustme.CA()
     access = AccessSettings(tls=files(tmp_path, authority))
     with (
@@ -190,13 +190,13 @@ def test_handshakes_that_never_end_make_room_for_others(tmp_path: Path) -> None:
         until(lambda: all(map(over, waiting)), "end of the handshakes")
 
 
-def test_a_client_that_has_nothing_to_ask_is_no_trouble(tmp_path: Path) -> None:
+def test_the_end_of_an_idle_connection_is_not_logged(tmp_path: Path) -> None:
     authority = trustme.CA()
     access = AccessSettings(tls=files(tmp_path, authority))
     with monitor(access, head_timeout_s=0.5) as runtime, capture_logs() as logs:
         with httpx.Client(verify=trusting(authority), trust_env=False, timeout=180.0) as client:
             assert client.get(f"{runtime.http_url}/healthz").status_code == 200
-            pool = client._transport._pool  # type: ignore[attr-defined]  # a connection that nobody asks anything on
+            pool = client._transport._pool  # type: ignore[attr-defined]  # a connection without requests
             (idle,) = pool.connections
             line = idle._connection._network_stream.get_extra_info("socket")
             until(lambda: bool(select.select([line], [], [], 0)[0]), "end of the idle connection")
@@ -206,7 +206,7 @@ def test_a_client_that_has_nothing_to_ask_is_no_trouble(tmp_path: Path) -> None:
         assert [one["why"] for one in logs if one["event"].startswith("connection ended")] != []
 
 
-def test_a_full_table_of_files_is_said_once_a_minute() -> None:
+def test_running_out_of_file_descriptors_is_logged_once() -> None:
     app = FastAPI()
     app.get("/healthz")(lambda: True)
     server = HttpServer(HttpSettings(port=0), AccessSettings())
@@ -233,11 +233,11 @@ def test_a_full_table_of_files_is_said_once_a_minute() -> None:
 
 
 @pytest.mark.parametrize(("soft", "expected"), [(1024, 300), (256, 85), (20_000, 300), (2, 1)])
-def test_the_monitor_keeps_most_files_for_itself(soft: int, expected: int) -> None:
+def test_http_gets_only_part_of_the_file_descriptors(soft: int, expected: int) -> None:
     assert http_connections(HttpSettings(), soft) == expected
 
 
-def test_the_monitor_may_open_as_many_files_as_the_system_allows(tmp_path: Path) -> None:
+def test_the_monitor_raises_its_limit_of_open_files(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     with ExitStack() as undo:
         undo.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))

@@ -1,8 +1,8 @@
 """The whole description of the API against a running service with data, tokens on.
 
-Every route of the application is asked without a token, with a wrong one, and with one that lacks nothing but the
-scope. Then requests of all kinds are made up out of the description, valid and invalid ones, and every answer must be
-as it says. In the ordinary run there are few, the same every time; for a long search with others::
+Every route of the application is requested without a token, with a wrong one, and with one that lacks only the
+scope. Then requests are made up from the description, valid and invalid ones, and every response must agree with it.
+An ordinary run makes few, the same every time; for a long search with others::
 
     ROTORWATCH_API_CASES=2000 python -m pytest tests/service/api/test_openapi.py -k made_up -s
 """
@@ -35,19 +35,19 @@ READ, OPERATE, CONFIGURE = Scope
 POSITIVE, NEGATIVE = schemathesis.GenerationMode.POSITIVE, schemathesis.GenerationMode.NEGATIVE
 STREAMS = {"/api/v1/events", "/api/v1/replays/{replay_id}/events"}
 PUBLIC = {("GET", "/"), ("GET", "/healthz"), ("GET", "/page/{version}/{name:path}")}
-#: What is there and in no description of an interface for programs.
+#: Routes that exist but are not part of the interface for programs.
 UNDESCRIBED = {
     ("GET", "/"), ("GET", "/openapi.json"), ("GET", "/docs"), ("GET", "/docs/{name}"),
     ("GET", "/page/{version}/{name:path}"),
 }  # fmt: skip
-#: What there is not: whoever has no token does not even learn that.
+#: Routes that do not exist, which is not revealed without a token.
 STRAY = {("GET", "/nowhere"), ("PATCH", "/api/v1/machines"), ("POST", "/healthz")}
 VALUES = {
     "site": "demo", "version": "0", "machine": "lab", "name": "k_by", "replay_id": "0123456789ab",
     "token_id": "0123456789ab",
 }  # fmt: skip
 CASES = int(os.environ.get("ROTORWATCH_API_CASES", "0"))
-#: Routes of whose arguments more must hold than a schema can say, such as that one is above another.
+#: Routes with conditions on their arguments that a schema cannot state, such as one above another.
 DEPENDENT = {
     "GET /api/v1/events", "GET /api/v1/machines/{site}/{machine}/alarms",
     "GET /api/v1/machines/{site}/{machine}/alarms/events", "GET /api/v1/machines/{site}/{machine}/correlations",
@@ -57,9 +57,9 @@ DEPENDENT = {
     "GET /api/v1/machines/{site}/{machine}/waveforms", "GET /api/v1/trends", "POST /api/v1/replays",
     "POST /api/v1/tokens",
 }  # fmt: skip
-#: What a request that is as described may be answered with: there is no such thing, not now, or not unseen.
+#: Errors that a valid request may get: not found, conflict, or precondition required.
 STATE = {404, 409, 428}
-#: Of the checks there are, those that a description can be held to.
+#: The checks that apply to this description.
 CHECKS = [
     schemathesis.checks.not_a_server_error, checks.status_code_conformance, checks.content_type_conformance,
     checks.response_headers_conformance, checks.response_schema_conformance, checks.negative_data_rejection,
@@ -104,7 +104,7 @@ def needed(method: str, path: str) -> Scope:
 
 
 def ask(http: httpx.Client, method: str, path: str) -> httpx.Response:
-    """Send a request that would be understood; of streams only the beginning is read."""
+    """Send a well-formed request; of streams only the beginning is read."""
     body = {"reason": "x", "expected_state": "shelved"} if "/alarms/" in path else {"recordings": ["a/b/c.mcap"]}
     address = path.replace(":path", "").format(**VALUES)
     with http.stream(method, address, json=body if method == "POST" else None) as answer:
@@ -144,10 +144,10 @@ def test_a_wrong_method_and_an_unknown_machine_are_refused_by_name(http: httpx.C
             assert found.detail == "no machine demo/pump; there are: demo/lab", path
 
 
-def test_routes_are_described_and_ask_for_their_scope(
+def test_routes_are_described_and_require_their_scope(
     runtime: Runtime, http: httpx.Client, description: Any, described: Any
 ) -> None:
-    """With all scopes but the one a route is refused, with that one alone it is not."""
+    """A route refuses a token with all scopes but its own, and accepts one with that scope alone."""
     assert routes(application(runtime)) <= described | UNDESCRIBED
     assert len(described) >= 30
     with_scope = {scope: token(runtime, scope, name=f"only {scope}") for scope in Scope}
@@ -170,7 +170,7 @@ def test_routes_are_described_and_ask_for_their_scope(
     assert http.get("/openapi.json").status_code == 200
 
 
-def test_the_page_of_the_api_loads_nothing_from_elsewhere(http: httpx.Client) -> None:
+def test_the_api_page_loads_nothing_from_other_hosts(http: httpx.Client) -> None:
     page = http.get("/docs")
     assert page.headers["content-type"] == "text/html; charset=utf-8"
     loaded = re.findall(r'(?:src|href|url)(?:=|: )"([^"]*)"', page.text)
@@ -184,7 +184,7 @@ def test_the_page_of_the_api_loads_nothing_from_elsewhere(http: httpx.Client) ->
 
 
 def test_everything_is_described_with_examples(description: dict[str, Any]) -> None:
-    """Every argument in words, every body and answer with an example that its own schema accepts."""
+    """Every argument has a text, every body and response an example that fits its schema."""
     schemas = description["components"]["schemas"]
     for name, schema in schemas.items():
         for field, part in schema.get("properties", {}).items():
@@ -226,7 +226,7 @@ def inner(value: object) -> Iterator[dict[str, Any]]:
             yield from inner(one)
 
 
-def test_generators_find_names_tags_and_forms_that_they_understand(description: dict[str, Any]) -> None:
+def test_names_tags_and_schemas_suit_code_generators(description: dict[str, Any]) -> None:
     assert description["info"]["version"] == __version__
     names = [route["operationId"] for methods in description["paths"].values() for route in methods.values()]
     assert len(set(names)) == len(names)
@@ -238,7 +238,7 @@ def test_generators_find_names_tags_and_forms_that_they_understand(description: 
     tuples = [one for one in inner(description) if isinstance(one.get("prefixItems"), list)]
     assert tuples
     assert all("items" in one for one in tuples)
-    # With every problem written out at every operation it was half a megabyte.
+    # With every problem spelt out at every operation it was half a megabyte.
     assert len(json.dumps(description, ensure_ascii=False)) < 5_000 * len(names)
     there = {one["name"] for one in description["tags"]}
     used = {tag for methods in description["paths"].values() for route in methods.values() for tag in route["tags"]}
@@ -253,7 +253,7 @@ def check(schemas: dict[str, Any], schema: dict[str, Any], shown: object, place:
 
 
 def validated(case: schemathesis.Case[Any], url: str, text: str) -> Any:
-    """Send a request that was made up, and hold the answer to the description."""
+    """Send a made-up request and check the response against the description."""
     headers = {"Authorization": f"Bearer {text}"}
     if case.operation.path in STREAMS:
         arguments = case.as_transport_kwargs(base_url=url, headers=headers)
@@ -264,7 +264,7 @@ def validated(case: schemathesis.Case[Any], url: str, text: str) -> Any:
                 params=arguments.get("params"),
                 headers={name: value for name, value in arguments["headers"].items() if value is not None},
             )
-        except httpx.InvalidURL:  # so long that nobody could send it
+        except httpx.InvalidURL:  # too long to be sent
             hypothesis.reject()
         with httpx.Client(trust_env=False, timeout=180.0) as reader:
             streamed = reader.send(request, stream=True)
@@ -282,7 +282,7 @@ def validated(case: schemathesis.Case[Any], url: str, text: str) -> Any:
 def made_up(
     operation: Any, mode: schemathesis.GenerationMode, path: dict[str, str] | None, cases: int, url: str, text: str
 ) -> list[tuple[str, int]]:
-    """Send requests to one route; what they were answered with."""
+    """Send requests to one route; return the statuses."""
     found: list[tuple[str, int]] = []
     there = {one.name for one in operation.query}
 
@@ -292,27 +292,27 @@ def made_up(
     )  # fmt: skip
     @hypothesis.given(case=operation.as_strategy(mode, path_parameters=path))
     def run(case: schemathesis.Case[Any]) -> None:
-        if mode is POSITIVE:  # by the letter of OpenAPI other arguments may be given as well
+        if mode is POSITIVE:  # OpenAPI allows other arguments as well
             case.query = {name: value for name, value in (case.query or {}).items() if name in there}
         answer = validated(case, url, text)
         found.append((operation.label, answer.status_code))
         if mode is POSITIVE and not 200 <= answer.status_code < 300 and answer.status_code not in STATE:
             refusal = answer.json()
-            # What is wrong with one argument alone, the description would have said.
+            # An error in a single argument would contradict the description.
             assert answer.status_code == 422, refusal
             assert operation.label in DEPENDENT, refusal
             assert "errors" not in refusal, refusal
 
     try:
         run()
-    except hypothesis.errors.Unsatisfiable:  # nothing about it can be invalid
+    except hypothesis.errors.Unsatisfiable:  # no request to it can be invalid
         assert mode is NEGATIVE
     return found
 
 
 @pytest.mark.slow
-def test_requests_made_up_out_of_the_description(runtime: Runtime, description: dict[str, Any]) -> None:
-    # Tokens are the affair of the tests above; here they are always there.
+def test_made_up_requests_are_answered_as_described(runtime: Runtime, description: dict[str, Any]) -> None:
+    # Tokens are tested above; here they are always sent.
     plain = json.loads(json.dumps(description))
     del plain["components"]["securitySchemes"]
     for methods in plain["paths"].values():
@@ -326,7 +326,7 @@ def test_requests_made_up_out_of_the_description(runtime: Runtime, description: 
         assert isinstance(found, Ok)
         operation = found.ok()
         known = {one.name: VALUES[one.name] for one in operation.path_parameters if one.name in VALUES} or None
-        # What is unknown is a text like any other: a name that is none is hardly found.
+        # A random text is hardly ever the name of a machine, so known names are used too.
         for mode, fixed, cases in ((POSITIVE, known, 2), (POSITIVE, None, 1), (NEGATIVE, known, 3)):
             for label, status in made_up(operation, mode, fixed, CASES or cases, runtime.http_url, text):
                 seen[label, status] += 1
@@ -334,9 +334,9 @@ def test_requests_made_up_out_of_the_description(runtime: Runtime, description: 
     statuses = Counter[int]()
     for (_, status), count in seen.items():
         statuses[status] += count
-    print(f"{sum(statuses.values())} requests to {looked_at} routes: {dict(sorted(statuses.items()))}")  # noqa: T201  # what a long search is for
+    print(f"{sum(statuses.values())} requests to {looked_at} routes: {dict(sorted(statuses.items()))}")  # noqa: T201  # the result of a long search
     assert looked_at == sum(len(methods) for methods in description["paths"].values())
-    # Each was answered as asked, or would have been if there were such a machine, recording or replay.
+    # Each succeeded, or would have if the machine, recording or replay existed.
     assert {label for label, status in seen if status in (200, 201, 404)} == {label for label, _ in seen}
-    # 503 would be documented, but nothing was wrong with the service.
+    # 503 is documented too, but the service had no fault.
     assert set(statuses) == {200, 201, 400, 404, 409, 422, 428}

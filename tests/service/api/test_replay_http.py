@@ -39,7 +39,7 @@ def machine_text(name: str) -> str:
 
 
 def plan(directory: Path | None, **replay: object) -> ServiceSettings:
-    # The service records there too; recordings of January stay.
+    # The service records there too; the recordings of January must stay.
     recording = RecordingSettings(directory=None if directory is None else str(directory), keep_days=36_500.0)
     return settings(endpoint(), bundle="lab", recording=recording, replay=ReplaySettings.model_validate(replay))
 
@@ -84,7 +84,7 @@ def ended(client: httpx.Client, job: ReplayJob) -> ReplayJob:
     return get(client, f"{REPLAYS}/{job.id}", ReplayJob)
 
 
-def test_recordings_are_listed(client: httpx.Client) -> None:
+def test_recordings_are_listed_and_filtered(client: httpx.Client) -> None:
     first, second, part = get(client, RECORDINGS, RecordingList, until_ns=START_NS + DAY_NS).recordings
     assert first.id == ID
     assert (first.site, first.machine, first.messages, first.complete) == ("demo", "lab", 701, True)
@@ -113,7 +113,7 @@ def test_a_recording_is_downloaded_whole_or_in_part(client: httpx.Client, direct
     whole = (directory / ID).read_bytes()
     answer = client.get(f"{RECORDINGS}/{ID}/download").raise_for_status()
     assert answer.content == whole
-    # As written: what leads out of the directory is no recording, however a place is spelt.
+    # Paths that lead out of the directory are not recordings, however they are spelt.
     for place in ("demo/lab/link.mcap", "demo/lab/%2e%2e/%2e%2e/secret.mcap", "demo/lab/..%2f..%2fsecret.mcap"):
         problem(client.get(f"{RECORDINGS}/{place}/download"), 404)
     assert 'filename="20260101T000000Z.mcap"' in answer.headers["content-disposition"]
@@ -128,11 +128,11 @@ def test_a_recording_is_downloaded_whole_or_in_part(client: httpx.Client, direct
 @pytest.mark.parametrize(
     "name", ["../../secret.mcap", "demo/lab/../../secret.mcap", "/etc/passwd", "demo/lab/link.mcap", "--offline", ""]
 )
-def test_no_replay_leads_out_of_the_directory(client: httpx.Client, name: str) -> None:
+def test_no_replay_can_read_outside_the_directory(client: httpx.Client, name: str) -> None:
     problem(client.post(REPLAYS, json={"recordings": [name]}), 404)
 
 
-def test_an_offline_replay_over_http_finds_what_it_finds_on_the_command_line(
+def test_an_offline_replay_over_http_serves_reports_alarms_and_events(
     client: httpx.Client, runtime: Runtime, directory: Path
 ) -> None:
     job = start(client)
@@ -198,7 +198,7 @@ def test_a_paced_replay_is_paused_moved_and_stopped(client: httpx.Client, runtim
     assert runtime.machines()[0].health().quality.accepted_blocks == 0
 
 
-def test_a_stretch_and_another_machine_from_our_own_page(client: httpx.Client, runtime: Runtime) -> None:
+def test_the_page_can_replay_a_section_with_a_shipped_machine_file(client: httpx.Client, runtime: Runtime) -> None:
     own = {"Origin": runtime.http_url, "Sec-Fetch-Site": "same-origin"}
     done = ended(client, start(client, own, machine="lab", from_ns=START_NS + 10**9, to_ns=START_NS + 31 * 10**9))
     assert (done.state, done.machine) == ("finished", "lab")
@@ -211,7 +211,7 @@ def test_a_stretch_and_another_machine_from_our_own_page(client: httpx.Client, r
     assert failed.summary is None
 
 
-def test_what_would_have_been_raised_with_a_machine_file_that_is_sent_and_another_limit(client: httpx.Client) -> None:
+def test_a_replay_with_an_uploaded_machine_file_and_other_limits(client: httpx.Client) -> None:
     text = machine_text("lab") + "\n[alarms.parameters.k_by]\nraise_above = 0.7\ndanger_above = 0.9\n"
     calm = "alarms.parameters.c_bz = {raise_above = 0.8, danger_above = 0.9}"
     job = start(client, machine_file=text, machine_file_name="calm.toml", changes=[calm])
@@ -224,7 +224,7 @@ def test_what_would_have_been_raised_with_a_machine_file_that_is_sent_and_anothe
     assert (found.summary.site, found.summary.machine) == ("demo", "lab")
     with_networks = start(client, machine_file=text, bundle="heavy")
     assert with_networks.machine == "sent.toml@heavy"
-    failed = ended(client, with_networks)  # those of another machine
+    failed = ended(client, with_networks)  # networks of another machine
     assert failed.state == "failed"
     assert "trained for another machine" in failed.error
 
@@ -256,20 +256,20 @@ def test_what_would_have_been_raised_with_a_machine_file_that_is_sent_and_anothe
         ({"changes": ["alarms.on_delay_s = 1"], "mode": "paced"}, 422, "changes: nothing is evaluated"),
     ],
 )  # fmt: skip
-def test_wrong_requests_are_refused(client: httpx.Client, changes: dict[str, Any], status: int, detail: str) -> None:
+def test_invalid_requests_are_refused(client: httpx.Client, changes: dict[str, Any], status: int, detail: str) -> None:
     before = get(client, REPLAYS, ReplayList).replays
     found = problem(client.post(REPLAYS, json={"recordings": [ID], **changes}), status)
     assert detail in found.detail
     assert get(client, REPLAYS, ReplayList).replays == before
 
 
-def test_unknown_replays(client: httpx.Client) -> None:
+def test_unknown_replays_get_404(client: httpx.Client) -> None:
     for path in ("", "/reports", "/alarms", "/events"):
         problem(client.get(f"{REPLAYS}/nothing{path}"), 404)
     problem(client.delete(f"{REPLAYS}/nothing"), 404)
 
 
-def test_what_the_settings_do_not_allow_names_them(directory: Path) -> None:
+def test_replays_refused_by_settings_name_the_setting(directory: Path) -> None:
     with running(plan(None)) as runtime, monitored.client(runtime) as client:
         assert "[recording] directory" in problem(client.get(RECORDINGS), 404).detail
         assert "[recording] directory" in problem(client.post(REPLAYS, json={"recordings": [ID]}), 404).detail
@@ -298,12 +298,12 @@ def test_what_the_settings_do_not_allow_names_them(directory: Path) -> None:
         ("127.0.0.1", False, False),
     ],
 )
-def test_started_by_default_only_on_loopback(host: str, enabled: bool | None, expected: bool) -> None:
+def test_replays_are_enabled_by_default_only_on_loopback(host: str, enabled: bool | None, expected: bool) -> None:
     asked = plan(None, enabled=enabled).model_copy(update={"http": HttpSettings(host=host)})
     assert ReplayRequests(asked, None).enabled is expected
 
 
-def test_the_service_ends_its_replays_and_old_results_make_room(directory: Path) -> None:
+def test_the_service_stops_its_replays_and_deletes_old_results(directory: Path) -> None:
     folder = directory / ".replays"
     with running(plan(directory, kept=1)) as runtime, monitored.client(runtime) as client:
         first = ended(client, start(client, to_ns=START_NS + 10**9))
@@ -320,7 +320,7 @@ def test_the_service_ends_its_replays_and_old_results_make_room(directory: Path)
 
 
 def processes_with(text: str) -> list[str]:
-    """Command lines of this computer that hold a text."""
+    """Command lines of processes on this computer that contain a text."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) != os.getpid():

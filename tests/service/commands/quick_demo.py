@@ -1,4 +1,4 @@
-"""The demo with shorter stretches between its events: ``python -m tests.service.commands.quick_demo``."""
+"""The demo with shorter intervals between its events: ``python -m tests.service.commands.quick_demo``."""
 
 import sys
 

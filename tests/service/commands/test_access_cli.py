@@ -39,7 +39,7 @@ def status(monitor: Guarded, token: str, method: str = "GET", path: str = "/heal
         return client.request(method, path).status_code
 
 
-def test_a_token_works_at_once_and_not_a_request_longer(tmp_path: Path, config: str) -> None:
+def test_a_token_works_from_its_creation_until_its_revocation(tmp_path: Path, config: str) -> None:
     with guarded(tmp_path) as monitor:
         created = run("token", "create", "control room", "--scope", "read", "--days", "90", "--config", config)
         assert created.exit_code == 0, created.output
@@ -83,13 +83,13 @@ def test_a_token_works_at_once_and_not_a_request_longer(tmp_path: Path, config: 
         (("revoke", "000000000000"), "there is no token '000000000000'"),
     ],
 )
-def test_mistakes_exit_2_and_say_so(config: str, arguments: tuple[str, ...], expected: str) -> None:
+def test_wrong_arguments_exit_2_with_a_message(config: str, arguments: tuple[str, ...], expected: str) -> None:
     result = run("token", *arguments, "--config", config)
     assert result.exit_code == 2
     assert expected in result.stderr
 
 
-def test_narrow_terminals_show_whole_lists(config: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_narrow_terminals_show_all_columns(config: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     scopes = [word for scope in Scope for word in ("--scope", scope)]
     token = run("token", "create", "a dashboard beside the door", *scopes, "--config", config).stdout
@@ -99,7 +99,7 @@ def test_narrow_terminals_show_whole_lists(config: str, monkeypatch: pytest.Monk
     assert line.endswith(f"create-token: {token_id}, a dashboard beside the door, {' '.join(Scope)}")
 
 
-def test_tokens_in_memory_make_no_sense(tmp_path: Path) -> None:
+def test_token_commands_refuse_a_history_in_memory(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text('[history]\nurl = "sqlite:///:memory:"\n', encoding="utf-8")
     result = run("token", "list", "--config", str(path))
@@ -133,8 +133,8 @@ def test_the_audit_log_shows_each_action_once(tmp_path: Path, config: str) -> No
         assert "GET /health" not in run("audit", "--actor", "control room", "--config", config).stdout
 
 
-def test_the_command_that_a_monitor_prints_creates_a_token_that_it_takes(tmp_path: Path) -> None:
-    """Where its history is, is said by its environment, over the settings file."""
+def test_the_command_printed_by_a_monitor_creates_a_valid_token(tmp_path: Path) -> None:
+    """The address of its history comes from its environment, which overrides the settings file."""
     folder = tmp_path / "a plant"
     folder.mkdir()
     (folder / "plant.toml").write_text('[history]\nurl = "sqlite:///other.sqlite"\n', encoding="utf-8")
@@ -156,7 +156,7 @@ def test_the_command_that_a_monitor_prints_creates_a_token_that_it_takes(tmp_pat
         assert httpx.get(f"{url}/api/v1/machines", headers=headers, trust_env=False, timeout=180.0).status_code == 200
 
 
-def test_the_hint_knows_the_history_and_shows_no_password(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_hint_names_the_history_without_a_password(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert f"ROTORWATCH_HISTORY__URL=sqlite:///{tmp_path}/" in access_commands.creation_hint(None, HistorySettings())
     url = "postgresql://watch:secret@db/plant"

@@ -1,4 +1,4 @@
-"""The container set-up: what the file promises, and its own command lines as processes on loopback; who may be reached.
+"""The container set-up: the compose file, its command lines as processes on loopback, and who may be reached.
 
 No container engine is needed: the same commands run in the same topology, with host names and ports rewritten.
 """
@@ -27,7 +27,7 @@ MODULES = {"rotorwatch": "service", "rotorsim": "simulator.rotorsim"}
 PROGRAMS = {"rotorwatch": rotorwatch, "rotorsim": rotorsim}
 
 
-def test_the_three_services_start_in_order_and_only_loopback_of_the_host_is_published() -> None:
+def test_services_start_in_order_and_ports_are_published_only_on_loopback() -> None:
     assert set(SERVICES) == {"router", "monitor", "simulator"}
     assert SERVICES["monitor"]["depends_on"] == {"router": {"condition": "service_healthy"}}
     assert SERVICES["simulator"]["depends_on"] == {"monitor": {"condition": "service_healthy"}}
@@ -39,7 +39,7 @@ def test_the_three_services_start_in_order_and_only_loopback_of_the_host_is_publ
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_service_has_no_more_rights_than_it_needs_and_a_command_and_check_that_exist(name: str) -> None:
+def test_services_have_minimal_rights_and_existing_commands_and_health_checks(name: str) -> None:
     service = SERVICES[name]
     user, group = service["user"].split(":")
     assert int(user) > 0
@@ -68,7 +68,7 @@ def test_service_has_no_more_rights_than_it_needs_and_a_command_and_check_that_e
     assert {word for word in words if word.startswith("--")} <= known
 
 
-def test_image_is_pinned_unprivileged_and_built_from_what_is_not_ignored() -> None:
+def test_the_image_is_pinned_unprivileged_and_copies_only_unignored_files() -> None:
     text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
     bases = re.findall(r"^FROM (\S+)", text, flags=re.MULTILINE)
     assert bases
@@ -92,7 +92,7 @@ def check_health(name: str, *rewrites: tuple[str, str]) -> subprocess.CompletedP
     return subprocess.run(command, capture_output=True, text=True, timeout=180, check=False)
 
 
-def test_the_commands_work_together(tmp_path: Path) -> None:
+def test_the_services_commands_work_together(tmp_path: Path) -> None:
     address = endpoint()
     router_port, api_port = address.rsplit(":", 1)[1], endpoint().rsplit(":", 1)[1]
     settings = tmp_path / "monitor.toml"
@@ -149,16 +149,16 @@ EVERYWHERE = "0.0.0.0"  # noqa: S104  # refused, or a free port for the length o
         "vsock/1:2",
     ],
 )  # fmt: skip
-def test_others_reach_nothing_without_grants(far: str) -> None:
+def test_listening_beyond_this_computer_needs_grants_or_without_grants(far: str) -> None:
     link = LinkSettings(listen=("tcp/127.0.0.1:7447", far))
     with pytest.raises(MachineFileError) as refused:
         link.check_reach("plant.toml")
     assert all(word in str(refused.value) for word in ("plant.toml", far, "grants", "without_grants = true"))
     link.model_copy(update={"without_grants": True}).check_reach("plant.toml")
-    LinkSettings(connect=(far,)).check_reach("plant.toml")  # who may connect there is for others to say
+    LinkSettings(connect=(far,)).check_reach("plant.toml")  # the other side decides who may connect
 
 
-def test_the_shipped_grants_are_enough_and_this_computer_needs_none(tmp_path: Path) -> None:
+def test_grants_with_users_are_enough_and_loopback_needs_none(tmp_path: Path) -> None:
     for near in (
         "tcp/127.0.0.1:7447",
         "tcp/127.8.0.1:7447",
@@ -171,7 +171,7 @@ def test_the_shipped_grants_are_enough_and_this_computer_needs_none(tmp_path: Pa
     grants = ({"who": ("a",), "publishes": ("demo/lab",)},)
     link = {"listen": ("tcp/0.0.0.0:7447",), "passwords_file": tmp_path / "p"}
     LinkSettings.model_validate({**link, "grants": grants}).check_reach("settings")
-    with pytest.raises(MachineFileError):  # whoever has a password could do everything
+    with pytest.raises(MachineFileError):  # anybody with a password could do everything
         LinkSettings.model_validate(link).check_reach("settings")
     with pytest.raises(ValueError, match="without_grants"):
         LinkSettings.model_validate({**link, "grants": grants, "without_grants": True})
@@ -189,7 +189,7 @@ OPEN_API = '[http]\nhost = "{}"\nport = {}\n[access]\nopen_on_loopback = true'
     ],
     ids=["settings of the link", "settings of the API", "run", "router"],
 )  # fmt: skip
-def test_what_is_open_to_others_does_not_start(tmp_path: Path, name: str, text: str, cure: str) -> None:
+def test_programs_open_to_other_computers_do_not_start(tmp_path: Path, name: str, text: str, cure: str) -> None:
     port, file = endpoint().rpartition(":")[2], tmp_path / "plant.toml"
     file.write_text(text.format(EVERYWHERE, port), encoding="utf-8")
     options = ("--config", str(file)) if text else ("--listen", f"tcp/{EVERYWHERE}:{port}")
@@ -201,7 +201,7 @@ def test_what_is_open_to_others_does_not_start(tmp_path: Path, name: str, text: 
 
 
 @pytest.mark.slow
-def test_settings_that_say_so_in_so_many_words_are_obeyed(tmp_path: Path) -> None:
+def test_without_grants_lets_programs_listen_everywhere(tmp_path: Path) -> None:
     where = endpoint().replace("127.0.0.1", EVERYWHERE)
     with program(tmp_path, "service", "router", "--listen", where, "--without-grants") as router:
         router.wait_for("listening")

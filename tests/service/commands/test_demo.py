@@ -1,4 +1,4 @@
-"""The main job as a stranger runs it: separate programs on loopback, faults and seeds that training never saw."""
+"""The demo as a new user runs it: separate programs on loopback, faults and seeds not used in training."""
 
 import json
 import os
@@ -26,7 +26,7 @@ def children_of(pid: int) -> list[int]:
         try:
             fields = stat.read_text().rpartition(")")[2].split()
         except OSError:
-            continue  # it ended meanwhile
+            continue  # it has ended meanwhile
         if int(fields[1]) == pid and fields[0] != "Z":
             found.append(int(stat.parent.name))
     return found
@@ -50,7 +50,7 @@ def check_lines(output: str) -> None:
     for line in output.splitlines():
         assert len(line.rstrip()) <= 100
         assert not ("healthy" in line and "changed" in line)
-        assert not re.search(r"(?<!\S)-\d", line)  # the true minus sign is another one
+        assert not re.search(r"(?<!\S)-\d", line)  # the page and programs print the true minus sign
         assert "stream lost" not in line
 
 
@@ -73,7 +73,7 @@ def test_the_demo_names_exactly_the_injected_fault(fault: str, seed: int, tmp_pa
 
 
 @pytest.mark.slow
-def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path: Path) -> None:
+def test_watch_and_status_follow_a_demo_that_repairs_and_breaks_the_machine(tmp_path: Path) -> None:
     with demo(tmp_path, *QUICK, "--fault", "c_bz") as one:
         one.wait_for("found")
         lines = one.output().splitlines()
@@ -84,7 +84,7 @@ def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path:
             status = ran("service", *printed[1], "--json")
             alarms = {one["name"]: one["raised"] for one in json.loads(status.stdout)["machines"][0]["alarms"]}
             assert "c_bz" in alarms
-            # The demo goes on meanwhile: on a busy computer the machine is repaired before the answer comes.
+            # The demo goes on: on a busy computer the machine may be repaired before the response comes.
             assert status.returncode == int(any(alarms.values())), status.stdout
             one.wait_for("(e) changed by")
             watch.stop(signal.SIGINT)
@@ -110,7 +110,7 @@ def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path:
         ),
     ],
 )
-def test_however_a_demo_ends_it_leaves_nothing(number: signal.Signals, code: int, running: int, tmp_path: Path) -> None:
+def test_a_demo_always_leaves_nothing_behind(number: signal.Signals, code: int, running: int, tmp_path: Path) -> None:
     """While the monitor starts, and later beside the simulator."""
     with demo(tmp_path, *WHOLE) as one:
         until(lambda: len(children_of(one.process.pid)) == running, "programs")
@@ -120,7 +120,7 @@ def test_however_a_demo_ends_it_leaves_nothing(number: signal.Signals, code: int
         none_is_left(children)
 
 
-def test_the_first_line_comes_before_anything_heavy_is_imported() -> None:
+def test_the_demo_prints_before_importing_heavy_modules() -> None:
     code = (
         "import sys\nfrom service.commands.rotorwatch import app\n"
         "class Told:\n"
@@ -141,7 +141,7 @@ def test_the_first_line_comes_before_anything_heavy_is_imported() -> None:
     assert "zenoh" not in found.stdout
 
 
-def test_the_demo_breaks_what_the_shipped_scenarios_break() -> None:
+def test_the_demos_faults_are_those_of_the_shipped_scenarios() -> None:
     for name, change in FAULTS.items():
         events = load_scenario(name)[0].events
         assert [(event.parameter, event.relative_change) for event in events] == [(name, change)]

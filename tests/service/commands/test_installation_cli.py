@@ -1,4 +1,4 @@
-"""From nothing to the first trend: `rotorwatch init`, `doctor`, `run` and `plot trend` on a stranger's two sensors."""
+"""From nothing to the first trend: `rotorwatch init`, `doctor`, `run` and `plot trend` with a user's two sensors."""
 
 import os
 import subprocess
@@ -46,7 +46,7 @@ def blocks(seconds: float, rate_hz: float = RATE_HZ, every_s: float = 0.5) -> It
 
 @contextmanager
 def publishing(folder: Path, address: str, seconds: float, pace: float, rate_hz: float = RATE_HZ) -> Iterator[None]:
-    """Somebody's sensors: they wait for a subscriber and send until the end."""
+    """Publish a user's sensors: wait for a subscriber and send until the end."""
     stop = threading.Event()
     machine = load_machine_file(folder / "fan.toml").model_copy(update={"rate_hz": rate_hz})
     every_s = 0.5 if machine.schedule is None else machine.schedule.every_s
@@ -62,7 +62,7 @@ def publishing(folder: Path, address: str, seconds: float, pace: float, rate_hz:
         sender.join()
 
 
-def test_init_writes_files_that_the_other_commands_take(tmp_path: Path) -> None:
+def test_init_writes_files_that_other_commands_accept(tmp_path: Path) -> None:
     tmp_path /= "of a plant"
     done = run(*FAN, "--folder", str(tmp_path), "--speed-rpm", "1488")
     assert done.returncode == 0, done.stderr
@@ -89,7 +89,7 @@ def test_init_writes_files_that_the_other_commands_take(tmp_path: Path) -> None:
         (("init", "--site", "a plant", *FAN[3:]), "a plant"),
     ],
 )
-def test_init_says_what_is_wrong_and_writes_nothing(tmp_path: Path, arguments: tuple[str, ...], says: str) -> None:
+def test_init_refuses_wrong_arguments_and_writes_nothing(tmp_path: Path, arguments: tuple[str, ...], says: str) -> None:
     done = run(*arguments, "--folder", str(tmp_path))
     assert done.returncode == 2
     assert says in done.stderr
@@ -102,12 +102,12 @@ def examined_by_doctor(folder: Path, *more: str, rate_hz: float = RATE_HZ) -> su
         return run("doctor", "--machine", str(folder / "fan.toml"), "--listen", address, *more)
 
 
-def test_the_doctor_says_what_arrives(tmp_path: Path) -> None:
+def test_the_doctor_reports_rate_levels_and_zones(tmp_path: Path) -> None:
     run(*FAN, "--folder", str(tmp_path))
     done = examined_by_doctor(tmp_path, "--seconds", "2")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "sampling rate 2560 Hz, expected 2560" in done.stdout
-    # Of however many blocks arrived: a busy computer gives fewer, and noise does the rest.
+    # Not exact: a busy computer delivers fewer blocks, and there is noise.
     said = float(done.stdout.split("DE-H ")[1].split()[0])
     assert said == pytest.approx(np.hypot(0.04 / np.sqrt(2), 0.05), rel=0.05)
     assert "zone" in done.stdout
@@ -117,12 +117,12 @@ def test_the_doctor_waits_for_snapshots(tmp_path: Path) -> None:
     run(*FAN, "--folder", str(tmp_path), "--snapshots", "0.5 2")
     done = examined_by_doctor(tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "listening for 12.5 s" in done.stdout  # ten, and a period with its snapshot
+    assert "listening for 12.5 s" in done.stdout  # ten seconds, and a period with its snapshot
     assert "0.5 s in the latest snapshot, in blocks of 1280 samples" in done.stdout
     assert "DE-H 0.05" in done.stdout
 
 
-def test_the_doctor_says_what_is_wrong(tmp_path: Path) -> None:
+def test_the_doctor_reports_a_wrong_rate_and_missing_data(tmp_path: Path) -> None:
     run(*FAN, "--folder", str(tmp_path))
     done = examined_by_doctor(tmp_path, "--seconds", "2", rate_hz=2000.0)
     assert done.returncode == 1
@@ -134,7 +134,7 @@ def test_the_doctor_says_what_is_wrong(tmp_path: Path) -> None:
     assert "no publisher answers a query for it (docs/wire.md)" in silent.stdout
 
 
-def test_the_doctor_sums_up_gaps_and_says_for_how_long_a_sensor_was_not_connected(tmp_path: Path) -> None:
+def test_the_doctor_sums_up_gaps_and_disconnected_sensors(tmp_path: Path) -> None:
     run(*FAN, "--folder", str(tmp_path))
     machine = load_machine_file(tmp_path / "fan.toml")
 
@@ -154,7 +154,7 @@ def test_the_doctor_sums_up_gaps_and_says_for_how_long_a_sensor_was_not_connecte
     assert trouble == "NDE-V: sent as NaN, the last time for 1.5 s, expected numbers: its sensor is not connected"
 
 
-def test_a_strangers_two_sensors_have_a_trend_in_three_commands(tmp_path: Path) -> None:
+def test_two_sensors_have_a_trend_after_init_run_and_plot(tmp_path: Path) -> None:
     run(*FAN, "--folder", str(tmp_path))
     address, settings = endpoint(), tmp_path / "rotorwatch.toml"
     text = settings.read_text(encoding="utf-8")
@@ -180,7 +180,7 @@ def test_a_strangers_two_sensors_have_a_trend_in_three_commands(tmp_path: Path) 
     assert "DE-H" in (tmp_path / "trend.svg").read_text(encoding="utf-8")
 
 
-def test_init_asks_until_a_channel_is_empty_and_again_for_what_cannot_be_used(tmp_path: Path) -> None:
+def test_init_prompts_until_an_empty_channel_and_repeats_invalid_entries(tmp_path: Path) -> None:
     keyboard, terminal = os.openpty()
     wrong = "two thousand", "DE-H acceleration g DE", "DE-H acceleration furlong DE horizontal"
     typed = ("plant", "fan", wrong[0], "2560", *wrong[1:], FAN[10], FAN[12], "")

@@ -1,4 +1,4 @@
-"""`rotorwatch plot`: pictures as files, the same bytes for the same input, and errors that say what was looked for."""
+"""`rotorwatch plot`: pictures as files, the same bytes for the same input, and errors that name the cause."""
 
 import struct
 import sys
@@ -48,7 +48,7 @@ def pixels(path: Path) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("kind", [pytest.param("trend", marks=pytest.mark.long), "correlation", "spectrum"])
-def test_a_steady_machine(faulty: Path, tmp_path: Path, kind: str) -> None:
+def test_plots_of_a_steady_machine(faulty: Path, tmp_path: Path, kind: str) -> None:
     out = tmp_path / "picture.svg"
     code, said = run(kind, faulty, "--out", out, "--size", "8x6")
     assert (code, said.strip()) == (0, str(out)), said
@@ -67,7 +67,7 @@ def test_a_steady_machine(faulty: Path, tmp_path: Path, kind: str) -> None:
         ("waveform", ("--channel", "y2_dot", "--window", "2.5")),
     ],
 )
-def test_a_run_up_of_the_simulator(run_up: Path, tmp_path: Path, kind: str, options: tuple[str, ...]) -> None:
+def test_plots_of_a_simulated_run_up(run_up: Path, tmp_path: Path, kind: str, options: tuple[str, ...]) -> None:
     out = tmp_path / "picture.png"
     code, said = run(kind, run_up, "--from", "1", *options, "--out", out, "--size", "8x6", "--dpi", "50")
     assert (code, said.strip()) == (0, str(out)), said
@@ -127,7 +127,7 @@ def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path) -> No
         (("orbit", "--size", "big"), "--size is 'big', expected width x height in inches"),
     ],
 )
-def test_what_cannot_be_drawn_is_said(faulty: Path, tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
+def test_impossible_plots_are_explained(faulty: Path, tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
     out = tmp_path / "picture.png"
     kind, *options = arguments
     code, said = run(kind, faulty, *options, "--out", out)
@@ -136,7 +136,7 @@ def test_what_cannot_be_drawn_is_said(faulty: Path, tmp_path: Path, arguments: t
     assert not out.exists()
 
 
-def test_names_of_pictures(faulty: Path, tmp_path: Path) -> None:
+def test_output_files_are_checked_and_not_overwritten(faulty: Path, tmp_path: Path) -> None:
     code, said = run("orbit", faulty, "--out", tmp_path / "orbit.pdf")
     assert (code, "expected a name that ends in .png or .svg" in said) == (2, True)
     out = tmp_path / "orbit.PNG"
@@ -169,7 +169,7 @@ def test_without_a_keyphasor_there_are_spectra_but_no_orbits(without_angle: Path
         assert code == 0, said
 
 
-def test_a_recording_that_lacks_samples_reports_or_its_descriptor(faulty: Path, tmp_path: Path) -> None:
+def test_missing_samples_reports_or_descriptor_are_named(faulty: Path, tmp_path: Path) -> None:
     path = write(
         tmp_path / "truth.mcap", [RecordedMessage(LAB.keys.truth, b"{}", b"", "application/json", START_NS, 0)]
     )
@@ -181,7 +181,7 @@ def test_a_recording_that_lacks_samples_reports_or_its_descriptor(faulty: Path, 
     assert (code, "no channel descriptor on rotorwatch/demo/lab/descriptor" in said) == (1, True)
 
 
-def test_without_matplotlib_it_says_so(faulty: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)  # what import does then is what it does without the package
+def test_without_matplotlib_its_package_is_named(faulty: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)  # import then fails as without the package
     code, said = run("orbit", faulty, "--out", tmp_path / "orbit.png")
     assert (code, "pip install 'rotorwatch[plots]'" in said) == (2, True)

@@ -27,7 +27,7 @@ def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
 run = partial(rotorwatch, "replay")
 
 
-def test_lines_go_to_a_file_or_to_the_terminal_and_are_the_same(faulty: Path, tmp_path: Path) -> None:
+def test_output_is_the_same_in_a_file_and_on_the_terminal(faulty: Path, tmp_path: Path) -> None:
     out = tmp_path / "reports.jsonl"
     to_file = run(faulty, "--offline", "--out", out)
     to_terminal = run(faulty, "--offline")
@@ -45,7 +45,7 @@ def test_lines_go_to_a_file_or_to_the_terminal_and_are_the_same(faulty: Path, tm
     assert out.read_text(encoding="utf-8") == text
 
 
-def test_a_disk_that_is_full_leaves_no_half_file(faulty: Path, tmp_path: Path) -> None:
+def test_a_full_disk_leaves_no_partial_results_file(faulty: Path, tmp_path: Path) -> None:
     out = tmp_path / "reports.jsonl"
     command = (sys.executable, "-m", "service", "replay", str(faulty), "--offline", "--out", str(out))
     limited = ("sh", "-c", 'ulimit -f 16; exec "$@"', "sh", *command)
@@ -54,7 +54,7 @@ def test_a_disk_that_is_full_leaves_no_half_file(faulty: Path, tmp_path: Path) -
     assert not out.exists()
 
 
-def test_a_full_disk_of_the_progress_is_not_told_of_the_file_of_the_lines(faulty: Path, tmp_path: Path) -> None:
+def test_a_full_output_for_progress_is_not_blamed_on_the_results_file(faulty: Path, tmp_path: Path) -> None:
     out = tmp_path / "reports.jsonl"
     command = (sys.executable, "-m", "service", "replay", str(faulty), "--offline", "--progress", "json")
     with Path("/dev/full").open("w", encoding="utf-8") as full:
@@ -63,7 +63,7 @@ def test_a_full_disk_of_the_progress_is_not_told_of_the_file_of_the_lines(faulty
     assert (found.returncode, found.stderr) == (1, "the output cannot be written (No space left on device)\n")
 
 
-def test_interrupted_offline_replay_is_no_success_and_says_what_it_leaves(faulty: Path, tmp_path: Path) -> None:
+def test_an_interrupted_offline_replay_exits_130_and_names_its_partial_output(faulty: Path, tmp_path: Path) -> None:
     out = tmp_path / "reports.jsonl"
     command = ("service", "replay", str(faulty), "--offline", "--progress", "json", "--out", str(out))
     with program(tmp_path, *command) as started:
@@ -73,8 +73,8 @@ def test_interrupted_offline_replay_is_no_success_and_says_what_it_leaves(faulty
         assert f"{out} holds the lines up to that point" in started.errors()
 
 
-def test_what_if_with_another_machine_file_and_another_limit(faulty: Path, tmp_path: Path) -> None:
-    """A machine of another name says so and is evaluated; with a higher limit the alarm is not raised."""
+def test_offline_replay_with_another_machine_file_and_limit(faulty: Path, tmp_path: Path) -> None:
+    """Another machine name is reported and evaluated; with a higher limit the alarm is not raised."""
     file = machine_file(tmp_path, ('name = "lab"', 'name = "lab2"'))
     calm = "alarms.parameters.c_bz = {raise_above = 0.8, danger_above = 0.9}"
     found = run(faulty, "--offline", "--machine", file, "--set", calm, "--out", tmp_path / "out.jsonl")
@@ -85,7 +85,7 @@ def test_what_if_with_another_machine_file_and_another_limit(faulty: Path, tmp_p
     assert "800 blocks accepted, refused: none" in found.stderr
 
 
-def test_channels_that_do_not_fit_are_said(faulty: Path, tmp_path: Path) -> None:
+def test_mismatching_channels_are_named(faulty: Path, tmp_path: Path) -> None:
     file = machine_file(tmp_path, ('unit = "mm/s"', 'unit = "m/s"'))
     found = run(faulty, "--offline", "--machine", file, "--to", "2")
     assert found.returncode == 1
@@ -111,7 +111,7 @@ def test_channels_that_do_not_fit_are_said(faulty: Path, tmp_path: Path) -> None
         (("--prefix", "", "--loop", "2"), "--loop needs a prefix"),
     ],
 )  # fmt: skip
-def test_options_that_cannot_be_used(faulty: Path, arguments: tuple[str, ...], message: str) -> None:
+def test_invalid_options_are_refused(faulty: Path, arguments: tuple[str, ...], message: str) -> None:
     from typer.testing import CliRunner  # noqa: PLC0415  # in this process: a dozen starts would take a minute
 
     from service.commands.rotorwatch import app  # noqa: PLC0415
@@ -121,7 +121,7 @@ def test_options_that_cannot_be_used(faulty: Path, arguments: tuple[str, ...], m
     assert message in found.stderr
 
 
-def test_files_and_addresses_that_cannot_be_used(tmp_path: Path, faulty: Path) -> None:
+def test_unusable_files_and_addresses_are_named(tmp_path: Path, faulty: Path) -> None:
     (tmp_path / "text.mcap").write_text("no recording", encoding="utf-8")
     found = run(tmp_path / "text.mcap", "--offline")
     assert found.returncode == 2
@@ -134,8 +134,8 @@ def test_files_and_addresses_that_cannot_be_used(tmp_path: Path, faulty: Path) -
     assert (found.returncode, "nothing answers there" in found.stderr) == (1, True)
 
 
-def test_a_monitor_in_the_namespace_of_a_replay(faulty: Path, tmp_path: Path) -> None:
-    """By the commands of the page: monitor, replay, alarm; and without a directory, nothing is recorded."""
+def test_a_monitor_in_a_replays_namespace_raises_its_alarms(faulty: Path, tmp_path: Path) -> None:
+    """By the commands of the documentation: monitor, replay, alarm; a replay is not recorded."""
     address = endpoint()
     text = '[recording]\ndirectory = "recordings"\n\n[queue]\nwhen_full = "wait"\n'
     (tmp_path / "plant.toml").write_text(text, encoding="utf-8")
@@ -154,8 +154,8 @@ def test_a_monitor_in_the_namespace_of_a_replay(faulty: Path, tmp_path: Path) ->
     assert not (tmp_path / "recordings").exists()
 
 
-def test_endpoints_of_the_command_line_replace_those_of_a_link_file(tmp_path: Path) -> None:
-    """All of them: who connects elsewhere with the file of a router does not listen where the router does."""
+def test_endpoints_on_the_command_line_replace_those_of_a_link_file(tmp_path: Path) -> None:
+    """All of them: connecting elsewhere with a router's file does not listen at the router's endpoint."""
     file, here, there = tmp_path / "link.toml", "tcp/127.0.0.1:7001", "tcp/127.0.0.1:7002"
     file.write_text(f'[link]\nmode = "router"\nlisten = ["{here}"]\nmax_message_mb = 3\n', encoding="utf-8")
     ends = [(one.mode, one.listen, one.connect) for one in (

@@ -57,10 +57,10 @@ def test_every_command_has_an_example(command: str) -> None:
     assert found.returncode == 0
     assert "Example" in found.stdout
     assert f"rotorwatch {command}" in found.stdout
-    assert ("[link]" in found.stdout) == (command in ("run", "watch", "router"))  # names of tables are no markup
+    assert ("[link]" in found.stdout) == (command in ("run", "watch", "router"))  # table names are not taken for markup
 
 
-def test_a_paragraph_of_help_fills_the_lines_and_an_example_has_its_own() -> None:
+def test_help_wraps_paragraphs_and_keeps_examples_on_their_own_lines() -> None:
     def lines(*command: str) -> list[str]:
         found = run(*command, "--help", COLUMNS="80")
         return [" ".join(line.split()) for line in found.stdout.splitlines()]
@@ -73,17 +73,17 @@ def test_a_paragraph_of_help_fills_the_lines_and_an_example_has_its_own() -> Non
     assert "3 no data, 4 no answer" in " ".join(run("--help").stdout.split())
 
 
-def test_a_file_of_somebody_else_is_told_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_inaccessible_file_is_reported_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(typer.Exit) as ended, exit_codes():
         raise PermissionError(errno.EACCES, "Permission denied", "/var/lib/rotorwatch/history.sqlite")
     assert ended.value.exit_code == 2
     assert capsys.readouterr().err == "/var/lib/rotorwatch/history.sqlite: Permission denied\n"
-    with pytest.raises(PermissionError), exit_codes():  # of no file: a defect
+    with pytest.raises(PermissionError), exit_codes():  # without a file it is a defect
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
 
 @pytest.mark.parametrize("command", [("size", "--machines", "3"), ("check-config", "models/machines/lab.toml")])
-def test_an_output_that_has_no_room_is_told_in_a_line(command: tuple[str, ...]) -> None:
+def test_a_full_disk_is_reported_in_one_line(command: tuple[str, ...]) -> None:
     with Path("/dev/full").open("w", encoding="utf-8") as full:
         argv = [sys.executable, "-m", "service", *command]
         found = subprocess.run(argv, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False)
@@ -98,7 +98,7 @@ def test_another_file_that_has_no_room_is_not_told_as_the_output(capsys: pytest.
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_run_says_where_it_is_needs_no_torch_and_stops_cleanly(tmp_path: Path, number: signal.Signals) -> None:
+def test_run_prints_its_addresses_needs_no_torch_and_stops_cleanly(tmp_path: Path, number: signal.Signals) -> None:
     address = endpoint()
     with program(
         tmp_path, "service", "run", "--listen", address, "--http-port", "0", ROTORWATCH_LOG__FORMAT="json"
@@ -116,7 +116,7 @@ def test_run_says_where_it_is_needs_no_torch_and_stops_cleanly(tmp_path: Path, n
 
 
 @pytest.mark.parametrize("command", ["run", "router"])
-def test_signal_that_another_thread_receives_stops_the_program_too(tmp_path: Path, command: str) -> None:
+def test_a_signal_received_by_another_thread_stops_the_program_too(tmp_path: Path, command: str) -> None:
     more = ("--machine", "lab", "--http-port", "0") if command == "run" else ()
     with program(tmp_path, "service", command, "--listen", endpoint(), *more) as started:
         started.wait_for("HTTP API" if command == "run" else "router listening")
@@ -126,7 +126,7 @@ def test_signal_that_another_thread_receives_stops_the_program_too(tmp_path: Pat
         assert started.process.wait(180) == 0
 
 
-def test_status_without_a_monitor_says_so_as_json_too() -> None:
+def test_status_without_a_monitor_reports_no_answer_in_json() -> None:
     url = endpoint().replace("tcp/", "http://")
     found = run("status", "--url", url, "--json")
     said = json.loads(found.stdout)
@@ -135,7 +135,7 @@ def test_status_without_a_monitor_says_so_as_json_too() -> None:
     assert said["reason"].endswith("--url says where it is")
 
 
-def test_status_tells_data_that_have_stopped_from_an_alarm(tmp_path: Path) -> None:
+def test_status_distinguishes_stopped_data_from_an_alarm(tmp_path: Path) -> None:
     with fed_service(machine_file(tmp_path, IMPATIENT)) as (runtime, worker, feed):
         feed.put_good()
         until(lambda: worker.health().quality.accepted_blocks == 1, "a block")
@@ -187,7 +187,7 @@ def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
             Report.model_validate(record["message"])
 
 
-def test_watch_notices_a_monitor_that_goes_and_comes_back(tmp_path: Path) -> None:
+def test_watch_reports_the_loss_and_return_of_a_monitor(tmp_path: Path) -> None:
     address = endpoint()
     with ExitStack() as started:
         with service(address):
@@ -200,7 +200,7 @@ def test_watch_notices_a_monitor_that_goes_and_comes_back(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("form", [(), ("--json",)])
-def test_watch_ends_when_nobody_reads_any_more(form: tuple[str, ...]) -> None:
+def test_watch_ends_when_its_output_is_closed(form: tuple[str, ...]) -> None:
     address = endpoint()
     command = [sys.executable, "-m", "service", "watch", "--connect", address, *form]
     with (
@@ -215,7 +215,7 @@ def test_watch_ends_when_nobody_reads_any_more(form: tuple[str, ...]) -> None:
         assert sure(watcher.stderr).read() == b""
 
 
-def test_lines_for_terminals() -> None:
+def test_reports_alarms_and_health_as_terminal_lines() -> None:
     report = Report.model_validate(example(Report))
     shape = Shape.model_validate(example(Shape))
     start, tail = "00:03:25  demo/lab  alert          ", "  |  changed: k_by  |  relation agrees"

@@ -1,4 +1,4 @@
-"""Settings: file, environment over it, and what is said about mistakes."""
+"""Settings: the file, the environment that overrides it, and messages about mistakes."""
 
 from pathlib import Path
 
@@ -40,7 +40,7 @@ def test_defaults_watch_the_shipped_machine_on_loopback() -> None:
     assert settings.queue.when_full == "drop"
 
 
-def test_file_is_read_with_paths_beside_it_and_the_environment_over_it(
+def test_paths_are_relative_to_the_file_and_the_environment_overrides_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = load_settings(written(tmp_path, GOOD))
@@ -65,7 +65,7 @@ def test_file_is_read_with_paths_beside_it_and_the_environment_over_it(
         '[[webhooks]]\nname = "pager"\nulr = "https://pager.example/?key=bolt"\n',
     ],
 )
-def test_a_mistake_shows_no_password(tmp_path: Path, text: str) -> None:
+def test_an_error_in_settings_shows_no_password(tmp_path: Path, text: str) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(MachineFileError, match=r"plant.toml: (history|webhooks)") as caught:
@@ -73,7 +73,7 @@ def test_a_mistake_shows_no_password(tmp_path: Path, text: str) -> None:
     assert "bolt" not in str(caught.value)
 
 
-def test_check_config_says_what_is_fine_and_what_is_not(tmp_path: Path) -> None:
+def test_check_config_reports_valid_and_invalid_files(tmp_path: Path) -> None:
     good = written(tmp_path, GOOD)
     wrong_machine = tmp_path / "wrong.toml"
     wrong_machine.write_text(
@@ -82,7 +82,7 @@ def test_check_config_says_what_is_fine_and_what_is_not(tmp_path: Path) -> None:
     )
     wrong_bundle = tmp_path / "bundle.toml"
     wrong_bundle.write_text('[[machines]]\nfile = "heavy"\nbundle = "lab"\n', encoding="utf-8")
-    forgotten = tmp_path / "forgotten.toml"  # a field, which is no mistake
+    forgotten = tmp_path / "forgotten.toml"  # a missing field is not an error
     lines = (tmp_path / "machine.toml").read_text(encoding="utf-8").splitlines()
     forgotten.write_text("\n".join(one for one in lines if "I2p_kg_m2" not in one), encoding="utf-8")
     fine = run("check-config", str(good), str(tmp_path / "machine.toml"), str(forgotten))

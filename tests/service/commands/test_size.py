@@ -1,4 +1,4 @@
-"""``rotorwatch size``: it reckons from what was measured, exactly where it can, and says what was not."""
+"""``rotorwatch size``: estimates from measured costs, exact where possible, with a warning outside of their range."""
 
 import json
 
@@ -25,12 +25,12 @@ def told(*arguments: str) -> str:
 
 
 @pytest.mark.parametrize("what", ["processor_ms", "memory_mb", "reports_kb", "readings_kb", "told_kb"])
-def test_the_model_is_near_every_kind_that_was_measured(what: Measured) -> None:
+def test_the_cost_model_is_close_to_every_measured_case(what: Measured) -> None:
     for case in COSTS.cases:
         assert COSTS.of(case, what) == pytest.approx(getattr(case, what), rel=0.35), case
 
 
-def test_costs_that_follow_the_model_are_found_again() -> None:
+def test_costs_that_follow_the_model_are_recovered() -> None:
     def processor_ms(kind: Kind) -> float:
         return 20.0 + 2.0 * kind.hop_s + 30.0 * kind.samples + kind.diagnosed * (40.0 + 50.0 * kind.samples)
 
@@ -46,19 +46,19 @@ def test_costs_that_follow_the_model_are_found_again() -> None:
     assert Costs.model_validate(made).of(between, "processor_ms") == pytest.approx(processor_ms(between), rel=1e-6)
 
 
-def test_what_needs_no_measurement_is_exact() -> None:
+def test_rates_and_disk_space_are_exact() -> None:
     costs = COSTS.model_copy(update={"recording": RecordingCost(compressed=0.5, processor_s_per_mb=0.01)})
     found = size_of(LAB, 100, costs)
     assert found.network_in_mb_s == pytest.approx(100 * 9 * 2000 * 4 / 1e6)
     assert found.recorded_gb_day == pytest.approx(100 * 9 * 2000 * 4 * 86_400 / 1e9 * 0.5)
     assert found.recording_cores == pytest.approx(100 * 0.072 * 0.01)
-    # A machine's 3.1 GB a day go into 20 GB before seven days have passed.
+    # At 3.1 GB a day a machine fills 20 GB in less than seven days.
     assert found.recordings_days == pytest.approx(20 / 3.1104)
     assert found.recordings_gb == pytest.approx(100 * 20)
     assert found.cores == pytest.approx(100 * COSTS.of(LAB, "processor_ms") / 1e3 / 5)
 
 
-def test_processes_and_computers_are_those_that_would_be_started() -> None:
+def test_numbers_of_processes_and_computers_follow_the_load() -> None:
     assert (size_of(LAB, 29, cores=2).shards, size_of(LAB, 30, cores=2).shards) == (0, 2)
     assert size_of(LAB, 300, cores=64).shards == 20
     busy = size_of(LAB.model_copy(update={"hop_s": 0.1}), 10, cores=1)
@@ -73,7 +73,7 @@ def test_processes_and_computers_are_those_that_would_be_started() -> None:
     assert fleet.memory_mb == pytest.approx(201 * COSTS.process_mb + 3000 * COSTS.of(LAB, "memory_mb"))
 
 
-def test_more_of_anything_costs_no_less() -> None:
+def test_more_channels_or_a_higher_rate_cost_no_less() -> None:
     base = size_of(LAB, 50)
     for field, larger in (("channels", 13), ("rate_hz", 4000.0)):
         more = size_of(LAB.model_copy(update={field: larger}), 50)
@@ -81,7 +81,7 @@ def test_more_of_anything_costs_no_less() -> None:
     assert size_of(LAB.model_copy(update={"diagnosed": False, "networks": False}), 50).cores < base.cores
 
 
-def test_the_answer_is_told_in_80_columns_and_says_what_was_not_measured() -> None:
+def test_output_fits_80_columns_and_names_what_was_not_measured() -> None:
     asked = ("--machines", "200", "--channels", "12", "--rate", "4000", "--hop", "5")
     assert "OUTSIDE of what was measured: rate 4000 Hz" in told(*asked)  # networks were measured at 2 kHz
     inside = told(*asked, "--no-networks")
@@ -101,7 +101,7 @@ def test_the_answer_is_told_in_80_columns_and_says_what_was_not_measured() -> No
     ("option", "value", "field"),
     [("--keep-days", "0", "keep_days"), ("--hop", "inf", "hop_s"), ("--rate", "nan", "rate_hz")],
 )
-def test_what_cannot_be_is_refused(option: str, value: str, field: str) -> None:
+def test_impossible_options_are_refused(option: str, value: str, field: str) -> None:
     result = CliRunner().invoke(app, ["size", "--machines", "2", option, value])
     assert result.exit_code == 2
     assert field in result.output

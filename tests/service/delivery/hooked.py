@@ -1,4 +1,4 @@
-"""Receivers of webhooks: real HTTP servers that do as they are told and remember what they got."""
+"""Receivers of webhooks: real HTTP servers that answer as the test says and keep what they received."""
 
 import json
 import ssl
@@ -32,7 +32,7 @@ class Got:
         return self.headers["webhook-id"]
 
     def verified(self, secret: str) -> Any:
-        """The body, if another implementation finds the signature right."""
+        """The body, if an independent implementation accepts the signature."""
         return Webhook(secret).verify(self.body, dict(self.headers))
 
 
@@ -42,7 +42,7 @@ def _taken(_: Got) -> tuple[int, Mapping[str, str]]:
 
 @dataclass(slots=True)
 class Hook:
-    """A receiver; `answer` says with what it answers a request, and may take its time over it."""
+    """A receiver; `answer` returns the response to a request and may take its time."""
 
     url: str = ""
     got: list[Got] = field(default_factory=list)
@@ -76,7 +76,7 @@ def hook(answer: Answering = _taken, context: ssl.SSLContext | None = None) -> I
                 if status != 204:
                     self.send_header("content-length", "0")
                 self.end_headers()
-            except OSError:  # nobody waits for the answer any more
+            except OSError:  # the client no longer waits for the response
                 self.close_connection = True
 
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002  # the library's name
@@ -108,7 +108,7 @@ def settings_for(receiver: Hook | str, folder: Path, secret: str | None = None, 
 
 
 def alarm_event(sequence: int, place: str = "demo/lab", *, annunciated: bool = True, **changes: str) -> StoredEvent:
-    """An entry in a machine's log as the monitor writes it."""
+    """An entry of a machine's alarm log as the monitor writes it."""
     fields = {"kind": "raised", "severity": "alert", "alarm": "k_by"} | changes
     text = json.dumps(example(AlarmCloudEvent))
     event = AlarmCloudEvent.model_validate_json(text)

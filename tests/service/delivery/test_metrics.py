@@ -1,4 +1,4 @@
-"""Metrics of a running service are what happened, and the page on them lists every one."""
+"""Metrics of a running service agree with what happened, and their page in the documentation lists all of them."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -70,7 +70,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def served(folder: Path) -> Iterator[tuple[Runtime, str, Read]]:
-    """12 good blocks, one with a nan, one of a number that was there, 3 s missing, 2 good blocks; recorded."""
+    """12 good blocks, one repeated, one with a NaN, 3 s missing, 2 good blocks; recorded."""
     (folder / "recordings").mkdir()
     with hook() as receiver:
         plan = settings(
@@ -101,7 +101,7 @@ def read(served: tuple[Runtime, str, Read]) -> Read:
     return served[2]
 
 
-def test_data_and_alarms_are_counted_as_they_came(read: Read, served: tuple[Runtime, str, Read]) -> None:
+def test_data_and_alarms_are_counted(read: Read, served: tuple[Runtime, str, Read]) -> None:
     worker = served[0].machines()[0]
     quality = worker.health().quality
     assert read.of_lab("blocks_accepted_total") == 14
@@ -133,7 +133,7 @@ def test_data_and_alarms_are_counted_as_they_came(read: Read, served: tuple[Runt
     assert read.of_lab("machine_info", bundle="", machine_hash=identity["machine_hash"]) == 1.0
 
 
-def test_blocks_that_wait_are_told_as_seconds_of_data(served: tuple[Runtime, str, Read]) -> None:
+def test_waiting_blocks_are_exported_as_a_lag_in_seconds(served: tuple[Runtime, str, Read]) -> None:
     worker = served[0].machines()[0]
     waiting = replace(worker.status(), queue_blocks=40, tally=Tally(blocks=16, data_s=1.4))  # two of them refused
     health = worker.health()
@@ -143,7 +143,7 @@ def test_blocks_that_wait_are_told_as_seconds_of_data(served: tuple[Runtime, str
     assert [one.value for one in families["rotorwatch_lag_seconds"].samples] == [pytest.approx(4.0)]
 
 
-def test_the_service_itself(read: Read, served: tuple[Runtime, str, Read]) -> None:
+def test_recorder_webhook_and_process_metrics(read: Read, served: tuple[Runtime, str, Read]) -> None:
     recorder = sure(served[0].machines()[0].status().recorder)
     assert (read.of_lab("recorder_state", state="recording"), read.of_lab("recorder_state", state="off")) == (1.0, 0.0)
     assert 16 <= read.of_lab("recorder_received_messages_total") <= recorder.received
@@ -199,7 +199,7 @@ def test_the_page_lists_every_metric_with_its_labels_and_type_and_no_other(read:
     for name, kind in read.kinds.items():
         if name.startswith("rotorwatch_"):
             real[name] = (read.labels(name), kind)
-    assert real["rotorwatch_blocks_refused_total"][0]  # or the comparison would be of nothing
+    assert real["rotorwatch_blocks_refused_total"][0]  # or the comparison would be empty
     del listed["rotorwatch_level"], real["rotorwatch_level"]  # without a hop there are none: test_installation_cli
     assert listed == real
     for name in re.findall(r"rotorwatch_\w+", page):
@@ -208,7 +208,7 @@ def test_the_page_lists_every_metric_with_its_labels_and_type_and_no_other(read:
     assert abs(read.series(**LAB) - int(stated)) <= 5
 
 
-def test_webhooks_over_http(served: tuple[Runtime, str, Read]) -> None:
+def test_webhook_status_over_http_hides_the_path_and_needs_read(served: tuple[Runtime, str, Read]) -> None:
     runtime, text, _ = served
     with client(runtime, text) as http:
         (webhook,) = http.get("/api/v1/webhooks").raise_for_status().json()["webhooks"]
@@ -220,7 +220,7 @@ def test_webhooks_over_http(served: tuple[Runtime, str, Read]) -> None:
         assert http.get("/api/v1/webhooks").status_code == http.get("/metrics").status_code == 403
 
 
-def test_settings_over_http_are_those_in_use_without_what_may_be_secret(served: tuple[Runtime, str, Read]) -> None:
+def test_settings_over_http_are_those_in_use_without_secrets(served: tuple[Runtime, str, Read]) -> None:
     runtime, text, _ = served
     with client(runtime, token(runtime, Scope.CONFIGURE, name="who sets it up")) as http:
         answer = http.get("/api/v1/settings").raise_for_status()
@@ -233,7 +233,7 @@ def test_settings_over_http_are_those_in_use_without_what_may_be_secret(served: 
         assert http.get("/api/v1/settings").status_code == 403
 
 
-def test_after_a_restart(tmp_path: Path) -> None:
+def test_counters_start_at_0_after_a_restart_and_alarms_are_restored(tmp_path: Path) -> None:
     plan = settings(endpoint(), machine_file(tmp_path, IN_ORDER), when_full="wait", history=kept_in(tmp_path))
     with feeding(plan) as (runtime, feed):
         feed.gap()

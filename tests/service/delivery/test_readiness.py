@@ -1,4 +1,4 @@
-"""Readiness means it: what is broken makes it 503 with the reason, what is mended makes it 200 again."""
+"""Readiness: a fault makes it 503 with the reason, and its repair 200 again."""
 
 import sqlite3
 import threading
@@ -27,17 +27,17 @@ def asked(runtime: Runtime) -> tuple[int, Readiness]:
     return answer.status_code, Readiness.model_validate(fields)
 
 
-def test_a_history_that_cannot_be_written_is_a_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_not_ready_while_the_history_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "history.sqlite"
-    # As the runtime makes it, but not as patient with its database.
+    # As the runtime makes it, but with shorter timeouts of the database.
     monkeypatch.setattr("service.runtime.runtime.Store", partial(Store, timeout_s=2.0, retry_s=0.05))
     plan = settings(endpoint(), machine_file(tmp_path, IN_ORDER), when_full="wait", history=kept_in(tmp_path))
     with feeding(plan) as (runtime, feed):
-        assert asked(runtime) == (200, runtime.readiness())  # nothing has come that could be on its way
+        assert asked(runtime) == (200, runtime.readiness())  # no data have come yet, so nothing is in flight
         assert runtime.readiness().ready
         feed.put_good()
         until(lambda: runtime.machines()[0].health().quality.accepted_blocks == 1, "the first block")
-        blocker = sqlite3.connect(file, isolation_level=None)  # another program that does not let go of the file
+        blocker = sqlite3.connect(file, isolation_level=None)  # another program that keeps the file locked
         blocker.execute("BEGIN IMMEDIATE")
         feed.skip()
         feed.put_good()  # an alarm on the gap, which must be written
@@ -60,7 +60,7 @@ def test_a_history_that_cannot_be_written_is_a_reason(tmp_path: Path, monkeypatc
         assert (read("ready"), read.of_lab("alarm_events_total", kind="raised")) == (1.0, 1.0)
 
 
-def test_a_stuck_worker_is_a_reason_until_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_not_ready_while_a_worker_is_stuck_or_after_it_has_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.runtime.runtime.STUCK_S", 0.5)
     release = threading.Event()
     with service(endpoint()) as (runtime, worker):
@@ -83,8 +83,8 @@ def test_a_stuck_worker_is_a_reason_until_it_goes_on(monkeypatch: pytest.MonkeyP
         assert httpx.get(f"{runtime.http_url}/healthz", trust_env=False, timeout=180.0).json() == {"alive": True}
 
 
-def test_webhooks_and_recorders_are_stated_and_no_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.delivery.webhooks.dispatcher._QUIET_S", 1e6)  # they are woken, or they sleep on
+def test_failing_webhooks_do_not_affect_readiness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.delivery.webhooks.dispatcher._QUIET_S", 1e6)  # only a wake-up ends their sleep
     machine = machine_file(tmp_path, IN_ORDER)
     with hook(lambda _: (503, {})) as receiver:
         plan = settings(endpoint(), machine, when_full="wait", webhooks=(settings_for(receiver, tmp_path),))
@@ -96,8 +96,8 @@ def test_webhooks_and_recorders_are_stated_and_no_reason(tmp_path: Path, monkeyp
             assert found.machines[0].recording == "off"
 
 
-def test_a_replay_tells_nobody(tmp_path: Path) -> None:
-    """A monitor in a namespace hears a recording, whose alarms are none of today's."""
+def test_no_webhook_is_sent_by_a_monitor_of_a_replay(tmp_path: Path) -> None:
+    """A monitor in a namespace evaluates a recording, whose alarms are not current."""
     with hook() as receiver:
         plan = settings(endpoint(), webhooks=(settings_for(receiver, tmp_path),))
         assert started(plan) == ["pager"]
@@ -128,7 +128,7 @@ def machine(**changes: object) -> MachineReadiness:
         ({"history_trouble": "disk full"}, "the history cannot be written; events wait in memory: disk full"),
     ],
 )
-def test_each_reason_in_a_sentence(change: dict[str, object], reason: str) -> None:
+def test_each_reason_for_not_being_ready_is_a_sentence(change: dict[str, object], reason: str) -> None:
     good: dict[str, object] = {
         "session_open": True, "history_open": True, "history_trouble": "", "history_lost": "",
         "failing_webhooks": ("pager: 404",), "machines": [machine()],
@@ -138,7 +138,7 @@ def test_each_reason_in_a_sentence(change: dict[str, object], reason: str) -> No
     assert (found.ready, found.reasons) == (False, (reason,))
 
 
-def test_a_pulse_that_nobody_will_answer_is_not_waited_for() -> None:
+def test_a_pulse_that_cannot_be_sent_does_not_count_as_busy() -> None:
     pulse = Pulse(lambda _: False, lambda: None, clock=iter([1.0, 100.0]).__next__)
     pulse.beat()
     assert pulse.busy_s == 0.0

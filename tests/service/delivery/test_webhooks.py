@@ -1,4 +1,4 @@
-"""What a receiver of webhooks gets, in which order, and what becomes of its answers: a real history, real HTTP."""
+"""What a receiver of webhooks gets, in which order, and how its responses are handled: real history, real HTTP."""
 
 import socket
 import ssl
@@ -54,7 +54,7 @@ def history(tmp_path: Path) -> Iterator[Plant]:
 
 @dataclass
 class Turned:
-    """A dispatcher whose turns the test makes, on a clock that the test moves."""
+    """A dispatcher whose turns and clock are driven by the test."""
 
     dispatcher: Dispatcher
     clock: Clock
@@ -87,7 +87,7 @@ def delivering(
         yield receiver, webhook
 
 
-def test_the_receiver_gets_the_very_event_signed_as_the_specification_says(tmp_path: Path, history: Plant) -> None:
+def test_the_receiver_gets_the_stored_event_with_a_valid_signature(tmp_path: Path, history: Plant) -> None:
     secret, former = new_secret(), new_secret()
     with hook() as receiver, turned(settings_for(receiver, tmp_path, f"{secret}\n\n{former}"), history) as webhook:
         event = alarm_event(0)
@@ -112,7 +112,7 @@ def test_the_receiver_gets_the_very_event_signed_as_the_specification_says(tmp_p
         }  # fmt: skip
 
 
-def test_events_come_in_order_over_one_connection_and_a_new_webhook_begins_now(tmp_path: Path, history: Plant) -> None:
+def test_events_arrive_in_order_over_one_connection_and_not_those_of_before(tmp_path: Path, history: Plant) -> None:
     history.happen(*(alarm_event(number) for number in range(3)))
     baked = (200, {"set-cookie": "who=me; path=/"})
     with delivering(tmp_path, history, lambda _: baked) as (receiver, webhook):
@@ -124,14 +124,14 @@ def test_events_come_in_order_over_one_connection_and_a_new_webhook_begins_now(t
         ids = receiver.ids()
         assert [one for one in ids if one.startswith("demo/lab")] == [event.id for event in new]
         assert [one for one in ids if one.startswith("demo/pump")] == [event.id for event in pumps]
-        assert ids[1::2][:5] == [event.id for event in pumps]  # many of one machine do not hold up another's
+        assert ids[1::2][:5] == [event.id for event in pumps]  # many events of one machine do not delay another's
         assert receiver.connections == 1
         assert webhook.turns() > 0.0
         assert not any("cookie" in got.headers for got in receiver.got)
         assert len(receiver.got) == 255
 
 
-def test_only_what_is_wanted_is_sent(tmp_path: Path, history: Plant) -> None:
+def test_only_events_that_pass_the_filters_are_sent(tmp_path: Path, history: Plant) -> None:
     wishes: dict[str, Any] = {"machines": ["demo/l*"], "kinds": ["raised", "escalated"], "severities": ["danger"]}
     with delivering(tmp_path, history, annunciated_only=True, **wishes) as (receiver, webhook):
         wanted = alarm_event(4, severity="danger", kind="escalated")
@@ -146,7 +146,7 @@ def test_only_what_is_wanted_is_sent(tmp_path: Path, history: Plant) -> None:
         assert webhook.dispatcher.status().pending == 0
 
 
-def test_trouble_is_followed_by_ever_longer_pauses_and_nothing_is_left_out(tmp_path: Path, history: Plant) -> None:
+def test_failures_lead_to_ever_longer_pauses_and_no_event_is_skipped(tmp_path: Path, history: Plant) -> None:
     statuses = (500, 503, 429, 408, 425, 502, 500, 500)
     answers = iter((*statuses, *[200] * 4))
     with delivering(tmp_path, history, lambda _: (next(answers), {}), longest_pause_s=20.0) as (receiver, webhook):
@@ -161,7 +161,7 @@ def test_trouble_is_followed_by_ever_longer_pauses_and_nothing_is_left_out(tmp_p
             assert status.last_error.startswith(f"{refusal} ")
             webhook.clock.now_s += 0.99 * pauses[-1]
             assert webhook.turns() == pytest.approx(0.01 * pauses[-1])
-            assert len(receiver.got) == attempt  # not before its time
+            assert len(receiver.got) == attempt  # no attempt before its time
             webhook.clock.now_s += 0.011 * pauses[-1]
         assert pauses == pytest.approx([1.0, 2.0, 4.0, 8.0, 16.0, 20.0, 20.0, 20.0])
         webhook.turns()
@@ -207,8 +207,8 @@ def test_a_refused_event_holds_up_its_own_machine_only(tmp_path: Path, history: 
         assert elsewhere.got == []
 
 
-def test_a_receiver_that_refuses_is_there(tmp_path: Path, history: Plant) -> None:
-    """Pauses begin anew after it."""
+def test_a_refusal_shows_that_the_receiver_is_up_and_resets_the_pauses(tmp_path: Path, history: Plant) -> None:
+    """Pauses start from the shortest again after it."""
     statuses = [500, 500, 500, 404, 500]
     with delivering(tmp_path, history, lambda _: (statuses.pop(0), {})) as (_, webhook):
         history.happen(alarm_event(0))
@@ -219,7 +219,7 @@ def test_a_receiver_that_refuses_is_there(tmp_path: Path, history: Plant) -> Non
         assert statuses == []
 
 
-def test_how_far_it_has_come_is_remembered_at_once(tmp_path: Path, history: Plant) -> None:
+def test_the_cursor_is_saved_after_each_delivery(tmp_path: Path, history: Plant) -> None:
     with delivering(tmp_path, history) as (receiver, webhook):
         history.happen(alarm_event(0), alarm_event(1))
         for number in (1, 2):
@@ -227,7 +227,7 @@ def test_how_far_it_has_come_is_remembered_at_once(tmp_path: Path, history: Plan
             assert history.store.webhooks.get("pager", "demo/lab") == number == len(receiver.got)
 
 
-def test_gone_disables_until_the_next_start(tmp_path: Path, history: Plant) -> None:
+def test_410_gone_disables_a_webhook_until_the_next_start(tmp_path: Path, history: Plant) -> None:
     with hook(lambda _: (410, {})) as receiver:
         settings = settings_for(receiver, tmp_path)
         with turned(settings, history) as webhook:
@@ -244,8 +244,8 @@ def test_gone_disables_until_the_next_start(tmp_path: Path, history: Plant) -> N
             assert receiver.ids()[1:] == [alarm_event(0).id, alarm_event(1).id]
 
 
-def test_what_is_not_delivered_at_the_end_is_sent_after_the_next_start(tmp_path: Path) -> None:
-    """Also where nothing had ever been delivered: a webhook that began with an empty log is not a new one."""
+def test_undelivered_events_are_sent_after_the_next_start(tmp_path: Path) -> None:
+    """Even where nothing had ever been delivered: a webhook that began with an empty log is not a new one."""
     file = tmp_path / "history.sqlite"
     with hook(lambda _: (503, {})) as receiver:
         settings = settings_for(receiver, tmp_path)
@@ -272,7 +272,7 @@ def test_what_is_not_delivered_at_the_end_is_sent_after_the_next_start(tmp_path:
 
 
 class Failing(WebhookCursors):
-    """The cursors of a real history, which fails when told to."""
+    """Cursors of a real history, which fail while `broken`."""
 
     broken = False
 
@@ -282,7 +282,7 @@ class Failing(WebhookCursors):
         super().set(name, machine_key, sequence)
 
 
-def test_alarms_are_delivered_although_it_cannot_be_remembered(tmp_path: Path, history: Plant) -> None:
+def test_alarms_are_delivered_even_when_the_cursor_cannot_be_saved(tmp_path: Path, history: Plant) -> None:
     cursors = Failing(history.store.webhooks._database)
     with hook() as receiver:
         settings = settings_for(receiver, tmp_path)
@@ -290,7 +290,7 @@ def test_alarms_are_delivered_although_it_cannot_be_remembered(tmp_path: Path, h
             webhook.turns()
             cursors.broken = True
             history.happen(alarm_event(0), alarm_event(1))
-            assert webhook.turns() == 1.0  # to be saved
+            assert webhook.turns() == 1.0  # until it tries to save again
             assert receiver.ids() == [alarm_event(0).id, alarm_event(1).id]
             assert webhook.dispatcher.status().last_error == "the disk is full"
         with turned(settings, history, cursors) as webhook:  # as after a kill: once more, with the same ids
@@ -304,7 +304,7 @@ def test_alarms_are_delivered_although_it_cannot_be_remembered(tmp_path: Path, h
             assert len(receiver.got) == 4
 
 
-def test_a_history_that_cannot_be_read_is_looked_into_again(tmp_path: Path) -> None:
+def test_an_unreadable_history_pauses_delivery_and_is_reported(tmp_path: Path) -> None:
     with plant(tmp_path / "history.sqlite") as history, hook() as receiver:
         with turned(settings_for(receiver, tmp_path), history) as webhook:
             webhook.turns()
@@ -312,7 +312,7 @@ def test_a_history_that_cannot_be_read_is_looked_into_again(tmp_path: Path) -> N
             history.store.close()
             assert webhook.turns() == 1.0
             assert "history is closed" in webhook.dispatcher.status().last_error
-            assert webhook.turns() == 1.0  # not before, whatever news there are
+            assert webhook.turns() == 1.0  # no earlier, whatever is new
             webhook.clock.now_s += 0.5
             assert webhook.turns() == 0.5
         assert receiver.got == []
@@ -320,7 +320,7 @@ def test_a_history_that_cannot_be_read_is_looked_into_again(tmp_path: Path) -> N
 
 @pytest.fixture
 def silent() -> Iterator[Answering]:
-    """An answer that does not come before the test is over."""
+    """A response that does not come before the test is over."""
     over = threading.Event()
 
     def answer(_: Got) -> tuple[int, Mapping[str, str]]:
@@ -331,7 +331,7 @@ def silent() -> Iterator[Answering]:
     over.set()
 
 
-def test_a_slow_receiver_is_left(tmp_path: Path, history: Plant, silent: Answering) -> None:
+def test_a_slow_receiver_times_out_and_is_tried_again(tmp_path: Path, history: Plant, silent: Answering) -> None:
     with delivering(tmp_path, history, silent, timeout_s=2.0) as (receiver, webhook):
         history.happen(alarm_event(0))
         assert (webhook.turns(), webhook.dispatcher.status().last_error) == (1.0, "no answer within 2 s")
@@ -342,8 +342,8 @@ def test_a_slow_receiver_is_left(tmp_path: Path, history: Plant, silent: Answeri
         assert webhook.dispatcher.status().state == "working"
 
 
-def test_a_receiver_that_drips_is_left_as_well(tmp_path: Path, history: Plant) -> None:
-    """Every byte comes in time, the answer never does."""
+def test_a_receiver_that_answers_byte_by_byte_times_out(tmp_path: Path, history: Plant) -> None:
+    """Every byte comes in time, the end of the response never does."""
     over = threading.Event()
     with socket.create_server(("127.0.0.1", 0)) as listening:
 
@@ -381,7 +381,7 @@ def test_stopping_does_not_wait_for_a_receiver(tmp_path: Path, history: Plant, s
         assert dispatcher.status().failed_attempts == 0
 
 
-def test_nobody_listens(tmp_path: Path, history: Plant) -> None:
+def test_an_unreachable_receiver_pauses_delivery_and_is_reported(tmp_path: Path, history: Plant) -> None:
     with hook() as receiver:
         pass
     with turned(settings_for(receiver, tmp_path), history) as webhook:
@@ -390,7 +390,7 @@ def test_nobody_listens(tmp_path: Path, history: Plant) -> None:
         assert webhook.dispatcher.status().last_error.startswith("no connection: ")
 
 
-def test_https_and_whose_certificate_is_believed(tmp_path: Path, history: Plant) -> None:
+def test_https_accepts_only_certificates_of_the_configured_authority(tmp_path: Path, history: Plant) -> None:
     authority = trustme.CA(key_type=trustme.KeyType.ECDSA)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     authority.issue_cert("127.0.0.1", key_type=trustme.KeyType.ECDSA).configure_cert(context)

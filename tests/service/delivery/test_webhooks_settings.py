@@ -1,4 +1,4 @@
-"""Settings of webhooks, their secrets and commands; what answers mean; no alarm is lost by a kill."""
+"""Settings of webhooks, their secrets and commands; the meaning of responses; pauses between attempts."""
 
 import re
 from pathlib import Path
@@ -39,7 +39,7 @@ def written(folder: Path, text: str) -> Path:
     return file
 
 
-def test_paths_are_beside_the_settings_filters_are_kept_and_http_elsewhere_is_to_be_said(tmp_path: Path) -> None:
+def test_paths_are_relative_to_the_settings_file_and_plain_http_needs_insecure(tmp_path: Path) -> None:
     pager, here = load_settings(written(tmp_path, GOOD)).webhooks
     assert pager.secret_file == tmp_path / "pager.secret"
     assert (pager.machines, pager.kinds, pager.severities) == (("demo/*",), ("raised", "escalated"), ("danger",))
@@ -94,7 +94,7 @@ def with_secret(folder: Path, text: str, mode: int = 0o600) -> WebhookSettings:
     ["", "\n", "whsec_", "whsec_c2hvcnQ=", "whsec_" + 4 * "!" * 12, new_secret().removeprefix("whsec_"), "tooth"],
     ids=["empty", "a line end", "nothing after the mark", "too short", "no base64", "no mark", "a word"],
 )
-def test_what_is_no_secret(tmp_path: Path, text: str) -> None:
+def test_malformed_secrets_are_refused_without_being_shown(tmp_path: Path, text: str) -> None:
     with pytest.raises(
         MachineFileError, match=r"webhooks\.pager: secret_file .*expected whsec_ and 24 to 64 bytes"
     ) as e:
@@ -102,13 +102,13 @@ def test_what_is_no_secret(tmp_path: Path, text: str) -> None:
     assert not text.strip() or len(text.strip()) < 7 or text.strip() not in str(e.value)
 
 
-def test_a_secret_that_others_can_read_or_that_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_or_world_readable_secret_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(MachineFileError, match=r"readable by every user of this computer: chmod 600"):
         signing_keys(with_secret(tmp_path, new_secret(), 0o644))
     missing = WebhookSettings(name="pager", url="https://p.example/", secret_file=tmp_path / "none")
     with pytest.raises(MachineFileError, match=r"none cannot be read: No such file"):
         signing_keys(missing)
-    with pytest.raises(MachineFileError, match=r"webhooks\.pager: secret_file"):  # rather than telling nobody of alarms
+    with pytest.raises(MachineFileError, match=r"webhooks\.pager: secret_file"):  # not without the webhook
         Runtime(settings(endpoint(), webhooks=(missing,)))
     variable = WebhookSettings.model_validate(
         {"name": "pager", "url": "https://p.example/", "secret_variable": "HOOK_SECRET"}
@@ -121,14 +121,14 @@ def test_a_secret_that_others_can_read_or_that_is_missing(tmp_path: Path, monkey
     assert signing_keys(variable) == (parse_secret(secret),)
 
 
-def test_an_authority_that_is_none(tmp_path: Path) -> None:
+def test_an_unusable_authority_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "ca.pem").write_text("tooth", encoding="utf-8")
     for file, said in (("ca.pem", "holds no certificate"), ("none.pem", "cannot be read: No such file")):
         with pytest.raises(MachineFileError, match=said):
             Receiver(settings_for("https://pager.example/", tmp_path, ca_file=tmp_path / file))
 
 
-def test_commands_make_secrets_and_send_a_test_event_that_is_no_alarm(tmp_path: Path) -> None:
+def test_commands_make_secrets_and_send_a_test_event(tmp_path: Path) -> None:
     secret = new_secret()
     with hook() as receiver:
         settings_for(receiver, tmp_path, secret)
@@ -165,7 +165,7 @@ def test_commands_make_secrets_and_send_a_test_event_that_is_no_alarm(tmp_path: 
         (499, Meaning.REFUSED), (500, Meaning.TROUBLE), (599, Meaning.TROUBLE),
     ],
 )  # fmt: skip
-def test_meaning_of_answers(status: int, meaning: Meaning) -> None:
+def test_meaning_of_response_statuses(status: int, meaning: Meaning) -> None:
     answer = answer_of(status, {}, 0.0)
     assert answer.meaning is meaning
     assert (answer.text == "") == (meaning is Meaning.DELIVERED)
@@ -179,13 +179,13 @@ def test_meaning_of_answers(status: int, meaning: Meaning) -> None:
         ("Wed, 31 Dec 2025 00:00:00 GMT", 0.0), ("Fri, 01 Jan 2100 00:00:00 GMT", 3600.0),
     ],
 )  # fmt: skip
-def test_a_receiver_may_say_when_to_come_back(text: str, wished_s: float) -> None:
+def test_retry_after_sets_the_pause(text: str, wished_s: float) -> None:
     answer = answer_of(503, {"retry-after": text}, 1_767_225_600.0)
     assert answer.retry_after_s == wished_s
     assert pause_s(answer, 1, 300.0, 1.0) == max(1.0, wished_s)
 
 
-def test_pauses_differ_by_chance_and_are_bounded() -> None:
+def test_pauses_have_jitter_and_are_bounded() -> None:
     refused = Answer(Meaning.REFUSED, "404 Not Found")
     assert pause_s(Answer(Meaning.TROUBLE), 3, 300.0, 0.0) == 2.0
     assert pause_s(Answer(Meaning.TROUBLE), 3, 300.0, 0.5) == 3.0
@@ -195,7 +195,7 @@ def test_pauses_differ_by_chance_and_are_bounded() -> None:
     assert pause_s(refused, 1, 5.0, 1.0) == 5.0
 
 
-def test_a_monitor_logs_what_is_not_delivered_and_no_secret(tmp_path: Path) -> None:
+def test_a_monitor_logs_failed_deliveries_without_secrets(tmp_path: Path) -> None:
     secret, path, address = new_secret(), "hush-hush-path", endpoint()
     machine_file(tmp_path, IN_ORDER)
     with hook(lambda _: (503, {})) as receiver:
@@ -215,6 +215,6 @@ def test_a_monitor_logs_what_is_not_delivered_and_no_secret(tmp_path: Path) -> N
             assert monitor.stop() == 0
     assert {got.path for got in receiver.got} == {f"/hook/{path}"}
     said = monitor.errors() + monitor.output()
-    assert "not delivered" in said  # what is looked for is looked for in the right place
+    assert "not delivered" in said  # the log is where failures are reported
     assert path not in said
     assert secret.removeprefix("whsec_") not in said

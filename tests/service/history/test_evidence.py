@@ -1,4 +1,4 @@
-"""What an alarm rests on is kept: before it, when it was raised, and once the change is all there is."""
+"""Evidence of an alarm is kept: from before it, when it was raised, and once the window holds only changed data."""
 
 import time
 from pathlib import Path
@@ -25,7 +25,7 @@ HOP = 50
 """Blocks of a hop."""
 
 
-def test_an_alarm_can_be_understood_long_after_its_window_is_gone(
+def test_evidence_from_before_at_and_after_an_alarm_survives_a_restart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("service.runtime.machines._TICK_S", 0.1)
@@ -78,23 +78,23 @@ def test_an_alarm_can_be_understood_long_after_its_window_is_gone(
     assert best.explained > 0.9
     assert {one.names for one in others} >= {(), ("c_by",), ("k_bz",), ("c_bz",), ("e",)}
     assert all(one.probability <= best.probability for one in others)
-    # A monitor that is started again knows it.
+    # A restarted monitor still has it.
     with running(plan) as runtime:
         assert runtime.machines()[0].history.evidence("k_by", 1) == answer.text
 
 
-def test_a_database_that_is_away_does_not_fill_the_log() -> None:
+def test_an_unreachable_database_is_logged_once() -> None:
     away = Mock()
     away.history.evidence.side_effect = StoreError("the database is away")
     collector = EvidenceCollector(away)
     with capture_logs() as logged:
-        for _ in range(40):  # looks of ten seconds
+        for _ in range(40):  # a look every ten seconds
             collector.look(Health.model_validate(example(Health)))
     assert [one["why"] for one in logged] == ["the database is away"]
 
 
-def test_a_history_that_begins_anew_gets_what_an_alarm_rests_on_when_the_change_is_all_there_is() -> None:
-    """And another picture of the machine while nothing is wrong."""
+def test_a_new_history_gets_the_evidence_once_the_change_has_settled() -> None:
+    """And a new picture of the healthy machine."""
     kept: dict[tuple[str, int], str] = {}
     worker = Mock()
     worker.history.evidence.side_effect = lambda name, occurrence=0: kept.get((name, occurrence))
@@ -126,7 +126,7 @@ def test_a_history_that_begins_anew_gets_what_an_alarm_rests_on_when_the_change_
     assert Picture.model_validate_json(kept["", 0]).report.end_ns == 50 * 10**9
 
 
-def test_evidence_of_many_occurrences_does_not_grow_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_newest_evidence_of_an_alarm_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.history.machine._MOST_EVIDENCE", 3)
     clock = iter(range(1, 100))
     with opened("sqlite:///:memory:", now_ns=lambda: next(clock)) as store:

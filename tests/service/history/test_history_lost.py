@@ -1,4 +1,4 @@
-"""A history that is locked at the end, deleted, replaced or damaged: it is said, and monitoring goes on."""
+"""A history that is locked at the end, deleted, replaced or damaged: it is reported, and monitoring goes on."""
 
 import sqlite3
 import stat
@@ -24,14 +24,14 @@ TOKEN = TokenRecord("aaaa", "control room", ("read",), b"hash", T0, None, None)
 
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether the file is still there is looked at every two seconds otherwise."""
+    """Check more often than every two seconds whether the file is still there."""
     monkeypatch.setattr("service.history.writer._LOOK_S", 0.2)
 
 
-def test_a_monitor_that_could_not_write_the_last_of_it_says_what_is_lost(tmp_path: Path) -> None:
+def test_a_monitor_that_cannot_write_its_last_state_exits_1_and_says_what_is_lost(tmp_path: Path) -> None:
     with running(tmp_path, endpoint(), machine_file(tmp_path, PATIENT)) as at:
         at.url()
-        blocker = sqlite3.connect(tmp_path / "history.sqlite", isolation_level=None)  # does not let go of the file
+        blocker = sqlite3.connect(tmp_path / "history.sqlite", isolation_level=None)  # keeps the file locked
         blocker.execute("BEGIN IMMEDIATE")
         assert at.stop() == 1
         blocker.close()
@@ -40,7 +40,7 @@ def test_a_monitor_that_could_not_write_the_last_of_it_says_what_is_lost(tmp_pat
         assert "database is locked" in said
 
 
-def test_a_monitor_whose_latest_step_was_refused_does_not_end_as_if_all_were_well(tmp_path: Path) -> None:
+def test_a_monitor_whose_last_step_was_refused_exits_1_and_names_the_machine(tmp_path: Path) -> None:
     with running(tmp_path, endpoint(), machine_file(tmp_path, PATIENT)) as at:
         at.url()
         event = asdict(alarm_event(0))  # another program took the number of the next event
@@ -58,7 +58,7 @@ def history_of(folder: Path) -> Path:
 
 
 def in_file(folder: Path, query: str, **values: object) -> list[tuple[object, ...]]:
-    """What is found at the path, by whoever opens it."""
+    """Query the file at the path from outside the monitor."""
     return executed(f"sqlite:///{history_of(folder)}", query, **values)
 
 
@@ -69,7 +69,7 @@ def ticked(at: Bench) -> bool:
 
 
 @pytest.mark.parametrize("moved", [False, True], ids=["deleted", "moved"])
-def test_a_deleted_history_is_written_again_with_all_it_held(tmp_path: Path, moved: bool) -> None:
+def test_a_deleted_or_moved_history_is_written_again_in_full(tmp_path: Path, moved: bool) -> None:
     folder = tmp_path / "kept"
     with bench(folder) as at:
         at.put(*map(block, range(12)), block(40, run=2, sequence=0))
@@ -97,7 +97,7 @@ def test_a_deleted_history_is_written_again_with_all_it_held(tmp_path: Path, mov
 
 
 @pytest.mark.parametrize("damaged", [False, True], ids=["another", "damaged"])
-def test_a_history_that_was_replaced_goes_on_with_the_numbers_of_the_alarms(tmp_path: Path, damaged: bool) -> None:
+def test_a_replaced_history_continues_the_alarm_sequence_numbers(tmp_path: Path, damaged: bool) -> None:
     other = tmp_path / "other"
     if damaged:
         other.write_bytes(b"\xff no database " * 1000)
@@ -115,7 +115,7 @@ def test_a_history_that_was_replaced_goes_on_with_the_numbers_of_the_alarms(tmp_
         until(lambda: at.history.waiting == 0, "the state in the new file")
         assert at.log() == [(last + 1, "raised", FAULT)]
         assert in_file(tmp_path, "SELECT count(*) FROM checkpoints") == state == [(1,)]
-        # Nobody else gets the machine meanwhile.
+        # No other monitor can take the machine meanwhile.
         with (
             opened(f"sqlite:///{history_of(tmp_path)}") as second,
             pytest.raises(StoreError, match="another monitor writes the history of demo/lab"),
@@ -128,7 +128,7 @@ def test_a_history_that_was_replaced_goes_on_with_the_numbers_of_the_alarms(tmp_
         assert [number for number, _, _ in at.log()][:2] == [last + 1, last + 2]
 
 
-def test_a_machine_without_a_new_alarm_keeps_its_numbers_in_a_file_begun_anew(tmp_path: Path) -> None:
+def test_sequence_numbers_continue_when_the_file_has_lost_its_alarm_events(tmp_path: Path) -> None:
     with bench(tmp_path) as at:
         at.put(*map(block, range(12)), block(40, run=2, sequence=0))
         last = at.history.last_sequence()
@@ -141,7 +141,7 @@ def test_a_machine_without_a_new_alarm_keeps_its_numbers_in_a_file_begun_anew(tm
 
 
 @pytest.mark.parametrize("where", ["head", "tables"])
-def test_a_monitor_starts_with_a_damaged_history_and_keeps_it_aside(tmp_path: Path, where: str) -> None:
+def test_a_monitor_starts_with_a_damaged_history_and_sets_it_aside(tmp_path: Path, where: str) -> None:
     file = history_of(tmp_path)
     plan = settings(endpoint(), machine_file(tmp_path, PATIENT), history=kept_in(tmp_path))
     with running_here(plan):
@@ -171,7 +171,7 @@ def history(folder: Path, *arguments: str) -> tuple[int, str]:
     return done.exit_code, done.output
 
 
-def test_a_backup_is_taken_from_a_running_monitor_and_restored_without_one(tmp_path: Path) -> None:
+def test_a_backup_is_taken_from_a_running_monitor_and_restored_to_a_stopped_one(tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     with bench(tmp_path) as at:
         at.put(*map(block, range(12)), block(40, run=2, sequence=0))
@@ -202,7 +202,7 @@ def test_a_backup_is_taken_from_a_running_monitor_and_restored_without_one(tmp_p
     assert history(tmp_path, "check")[0] == 1
 
 
-def test_a_server_has_its_own_programs_for_backups() -> None:
+def test_history_check_on_postgresql_refers_to_pg_dump() -> None:
     address = {"ROTORWATCH_HISTORY__URL": "postgresql://anna:secret@host/db"}
     done = CliRunner().invoke(app, ["history", "check"], env=address)
     assert (done.exit_code, "pg_dump" in done.output, "secret" in done.output) == (2, True, False)

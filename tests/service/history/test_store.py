@@ -46,7 +46,7 @@ def shared(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 @pytest.fixture
 def lab(shared: Store) -> MachineStore:
-    """A machine of one's own, beside those of other tests."""
+    """A machine for one test alone, in the shared history."""
     return shared.machine("demo", f"lab-{next(NUMBERS)}")
 
 
@@ -69,7 +69,7 @@ def head(end_ns: int, **changes: object) -> CheckpointHead:
 
 
 def hop_step(number: int, ring: int = 3, **parts: object) -> Step:
-    """The step of a hop: a report, readings and a checkpoint with so many parts, one of which is new."""
+    """The step of a hop: a report, readings and a checkpoint of `ring` parts, one of which is new."""
     end_ns = T0 + number * 5 * NS
     keep = tuple(f"part {each:06}" for each in range(max(0, number - ring + 1), number))
     fields: dict[str, object] = {
@@ -113,7 +113,7 @@ def test_machines_do_not_see_each_other(store: Store) -> None:
     assert pump.last_sequence() == 0
 
 
-def test_the_parts_of_a_checkpoint_are_those_that_are_to_remain(lab: MachineStore) -> None:
+def test_a_checkpoint_holds_its_new_parts_and_those_to_keep(lab: MachineStore) -> None:
     for number in range(4):
         lab.commit(hop_step(number))
     cleared = head(T0, bundle="lab", alarms='{"k_by": 1}', state=b"")
@@ -126,7 +126,7 @@ def test_the_parts_of_a_checkpoint_are_those_that_are_to_remain(lab: MachineStor
     assert lab.restore() == Checkpoint(cleared, (("c", b"b"), ("e", b"c")))
 
 
-def test_a_step_that_is_written_twice_leaves_its_events_once(lab: MachineStore) -> None:
+def test_a_step_written_twice_stores_its_events_once(lab: MachineStore) -> None:
     events = tuple(alarm_event(number) for number in range(3))
     assert lab.commit(Step(events=events[:2]))
     assert lab.commit(Step(events=events))
@@ -163,14 +163,14 @@ def test_events_that_contradict_the_log_are_refused_with_their_step(lab: Machine
         (Step(checkpoint=CheckpointStep(head(-5), (), ())), "checkpoint: end_ns is -5"),
     ],
 )
-def test_what_no_database_takes_is_refused_by_name(lab: MachineStore, step: Step, message: str) -> None:
+def test_values_no_database_can_store_are_refused_by_name(lab: MachineStore, step: Step, message: str) -> None:
     with pytest.raises(StoreError, match=rf"demo/lab-\d+: .*{message}"):
         lab.commit(step)
     assert lab.waiting == 0
     assert lab.commit(hop_step(1, events=(alarm_event(0),)))
 
 
-def test_steps_that_wait_together_are_committed_together(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waiting_steps_are_committed_together(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     machines = [store.machine("demo", f"m{number}") for number in range(12)]
     commits: list[int] = []
     event.listen(store._database.engine, "commit", lambda connection: commits.append(1))
@@ -189,7 +189,7 @@ def test_steps_that_wait_together_are_committed_together(store: Store, monkeypat
     assert 10 <= len(commits) < 120 // 2  # 120 steps
 
 
-def test_who_reads_does_not_hold_up_who_writes(store: Store) -> None:
+def test_readers_do_not_block_writers(store: Store) -> None:
     lab = store.machine("demo", "lab")
     with store._database.reading() as connection:
         assert connection.scalar(text("SELECT count(*) FROM alarm_events")) == 0
@@ -200,7 +200,7 @@ def test_who_reads_does_not_hold_up_who_writes(store: Store) -> None:
 
 
 @pytest.mark.parametrize("table", ["alarm_events", "audit_log"])
-def test_what_is_kept_for_ever_cannot_be_changed(store: Store, url: str, table: str) -> None:
+def test_append_only_tables_cannot_be_changed(store: Store, url: str, table: str) -> None:
     lab = store.machine("demo", "lab")
     lab.commit(Step(events=(alarm_event(0),)))
     store.audit.append(**AUDIT)
@@ -216,7 +216,7 @@ def test_what_is_kept_for_ever_cannot_be_changed(store: Store, url: str, table: 
     assert (lab.events(), store.audit.entries()) == before
 
 
-def test_one_monitor_writes_a_machine(store: Store, url: str) -> None:
+def test_only_one_monitor_can_write_a_machine(store: Store, url: str) -> None:
     store.machine("demo", "lab").commit(Step(events=(alarm_event(0),)))
     with pytest.raises(StoreError, match="another monitor writes the history of demo/lab"):
         store.machine("demo", "lab")
@@ -229,7 +229,7 @@ def test_one_monitor_writes_a_machine(store: Store, url: str) -> None:
 
 
 @pytest.mark.parametrize("url", ["postgresql"], indirect=True)
-def test_a_server_may_take_its_time_to_notice_that_a_monitor_was_killed(store: Store, url: str) -> None:
+def test_a_new_monitor_waits_until_the_server_releases_the_old_lock(store: Store, url: str) -> None:
     store.machine("demo", "lab").commit(Step(events=(alarm_event(0),)))
     with opened(url) as other:
         ending = threading.Timer(0.3, store.close)
@@ -238,7 +238,7 @@ def test_a_server_may_take_its_time_to_notice_that_a_monitor_was_killed(store: S
         ending.join()
 
 
-def test_a_monitor_that_was_replaced_writes_nothing_more(store: Store, url: str) -> None:
+def test_a_replaced_monitor_can_no_longer_write(store: Store, url: str) -> None:
     lab = store.machine("demo", "lab")
     assert lab.commit(hop_step(0))
     executed(url, "UPDATE machines SET owner = 'other'")
@@ -255,7 +255,7 @@ AUDIT: dict[str, Any] = {
 }  # fmt: skip
 
 
-def test_audit_log_is_numbered_and_found(store: Store) -> None:
+def test_audit_entries_are_numbered_paged_and_filtered(store: Store) -> None:
     numbers = [
         store.audit.append(
             **AUDIT | {"actor": f"actor {n % 2}", "machine": f"demo/m{n % 3}", "reason": f"{n} \0 \ud800"}
@@ -274,7 +274,7 @@ def test_audit_log_is_numbered_and_found(store: Store) -> None:
             asked_for()
 
 
-def test_tokens_are_kept_and_revoked_once_and_cursors_of_webhooks_kept(store: Store) -> None:
+def test_tokens_are_revoked_once_and_webhook_cursors_are_kept(store: Store) -> None:
     first = TokenRecord("aaaa", "control room", ("read", "operate"), b"\0hash", T0, None, None)
     second = TokenRecord("bbbb", "script", (), b"other", T0 + 1, T0 + 5, None)
     store.tokens.add(second)
@@ -338,13 +338,13 @@ def test_history_in_memory_serves_readers_and_writers_at_once() -> None:
         ("postgresql://anna:secret@host:port/db", "the URL cannot be read"),
     ],
 )
-def test_addresses_of_no_known_form_are_refused(url: str, message: str) -> None:
+def test_invalid_database_urls_are_refused_without_showing_the_password(url: str, message: str) -> None:
     with pytest.raises(StoreError, match=message) as caught:
         Store(url, Retention())
     assert "secret" not in str(caught.value)
 
 
-def test_a_server_that_is_not_there_is_named_without_the_password(tmp_path: Path) -> None:
+def test_an_unreachable_server_is_named_without_its_password(tmp_path: Path) -> None:
     store = Store(f"postgresql://anna:s%65cret@/db?host={tmp_path}", Retention(), timeout_s=1.0)
     with pytest.raises(StoreError, match=r"postgresql://anna:\*\*\*@/db") as caught:
         store.open()
@@ -353,7 +353,7 @@ def test_a_server_that_is_not_there_is_named_without_the_password(tmp_path: Path
     store.close()
 
 
-def test_a_file_that_is_no_database_is_named(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_history_is_named_and_left_alone(tmp_path: Path) -> None:
     file = tmp_path / "history.sqlite"
     file.write_bytes(b"no database " * 100)
     store = Store(f"sqlite:///{file}", Retention())
@@ -381,7 +381,7 @@ def test_sqlite_is_set_up_to_survive_a_power_failure(tmp_path: Path) -> None:
 
 
 def test_a_killed_writer_leaves_whole_steps(url: str, tmp_path: Path) -> None:
-    """And no event twice, and what was called durable is there."""
+    """No event twice, and everything printed as durable is there."""
     rng = np.random.default_rng(3)
     safe = -1
     for _ in range(4):
@@ -395,7 +395,7 @@ def test_a_killed_writer_leaves_whole_steps(url: str, tmp_path: Path) -> None:
             last = lab.last_sequence()
             steps = (last + 1) // 2
             assert last % 2 == 1  # both events of a step or none
-            assert steps - 2 <= safe < steps  # what was called durable, and at most the step in mid-write
+            assert steps - 2 <= safe < steps  # all steps printed as durable, and at most one more
             assert [event.id for event in lab.events(limit=10_000)] == [f"event-{n}" for n in range(last + 1)]
             texts = [report.text for _, report in lab.reports(limit=10_000)]
             assert texts == [f'{{"number": {n}}}' for n in range(steps - 1, -1, -1)]
@@ -406,7 +406,7 @@ def test_a_killed_writer_leaves_whole_steps(url: str, tmp_path: Path) -> None:
 
 
 def write_for_ever(url: str) -> None:
-    """Go on from what is there; say what has become durable. What the test of a killed process starts."""
+    """Continue from what is there and print what has become durable; run by the test of a killed writer."""
     with opened(url) as store:
         lab = store.machine("demo", "lab")
         for number in count(lab.last_sequence() // 2 + 1):

@@ -36,7 +36,7 @@ Parts = tuple[str, Callable[[], object], Callable[[], object]]
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[PostgresServer]:
-    """A server that may be stopped: other tests have theirs."""
+    """A server of this module alone, which its tests may stop."""
     with postgres_server() as made:
         yield made
 
@@ -49,7 +49,7 @@ def parts(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Parts]:
         yield server.new_database(), server.stop, server.start
         return
     file = tmp_path / "history.sqlite"
-    blocker = sqlite3.connect(file, isolation_level=None)  # another program that does not let go of the file
+    blocker = sqlite3.connect(file, isolation_level=None)  # another program that keeps the file locked
     try:
         yield f"sqlite:///{file}", lambda: blocker.execute("BEGIN IMMEDIATE"), lambda: blocker.execute("ROLLBACK")
     finally:
@@ -65,7 +65,7 @@ def written(machine: MachineStore, step: Step) -> None:
     until(lambda: machine.waiting == 0, "step in the database")
 
 
-def test_nothing_is_lost_while_the_database_is_away(parts: Parts) -> None:
+def test_nothing_is_lost_while_the_database_is_unreachable(parts: Parts) -> None:
     url, fail, mend = parts
     with opened(url) as store:
         lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
@@ -96,7 +96,7 @@ def test_nothing_is_lost_while_the_database_is_away(parts: Parts) -> None:
         assert [part for _, part in restored.parts] == [b"part 38", b"part 39", b"part 40"]
 
 
-def test_what_waits_is_bounded_and_events_are_never_dropped(parts: Parts) -> None:
+def test_waiting_reports_are_bounded_and_events_are_never_dropped(parts: Parts) -> None:
     url, fail, mend = parts
     with opened(url, waiting_reports=5) as store:
         lab = store.machine("demo", "lab")
@@ -117,7 +117,7 @@ def test_what_waits_is_bounded_and_events_are_never_dropped(parts: Parts) -> Non
         assert [part for _, part in restored.parts] == [b"part 57", b"part 58", b"part 59"]
 
 
-def test_what_waits_is_written_at_closing(parts: Parts) -> None:
+def test_waiting_steps_are_written_on_close(parts: Parts) -> None:
     url, fail, mend = parts
     with history_opened(url, timeout_s=QUICK_S, retry_s=3600.0) as store:
         lab = store.machine("demo", "lab")
@@ -129,11 +129,11 @@ def test_what_waits_is_written_at_closing(parts: Parts) -> None:
         assert store.machine("demo", "lab").last_sequence() == 1
 
 
-def test_one_machine_whose_step_fails_does_not_hold_up_the_others(tmp_path: Path) -> None:
+def test_a_failing_step_of_one_machine_does_not_hold_up_the_others(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/history.sqlite"
     with opened(url) as store:
         lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
-        # Something that only the database notices: the number of a step in the database that is no number any more.
+        # A fault that only the database notices: a number of reports that is not a number any more.
         executed(url, "UPDATE machines SET reports = 'many' WHERE name = 'lab'")
         assert not lab.commit(hop_step(0, events=(alarm_event(0),)))
         pump.commit(hop_step(0, events=(alarm_event(0),)))
@@ -150,7 +150,7 @@ def test_one_machine_whose_step_fails_does_not_hold_up_the_others(tmp_path: Path
 
 
 class LosingProxy(socketserver.ThreadingUnixStreamServer):
-    """Stands before a server's socket and, when told, swallows the answer to a commit and hangs up."""
+    """Proxy for a server's socket that, when armed, drops the reply to a commit and hangs up."""
 
     def __init__(self, server: PostgresServer, folder: Path) -> None:
         super().__init__(str(folder / ".s.PGSQL.5432"), _Relay)
@@ -171,7 +171,7 @@ class _Relay(socketserver.BaseRequestHandler):
                 for source in sockets.select([client, target], [], [])[0]:
                     data = source.recv(65536)
                     if source is target and losing:
-                        assert b"COMMIT" in data  # the server has done it
+                        assert b"COMMIT" in data  # the server has committed
                         self.server.armed.clear()
                         self.server.swallowed += 1
                         return
@@ -183,7 +183,7 @@ class _Relay(socketserver.BaseRequestHandler):
 
 @contextmanager
 def losing_proxy(server: PostgresServer) -> Iterator[tuple[LosingProxy, str]]:
-    # Not below pytest's folders: the path of a socket may have a hundred letters.
+    # Not below pytest's folders: the path of a socket is limited to about a hundred characters.
     with tempfile.TemporaryDirectory(prefix="pg-") as folder, LosingProxy(server, Path(folder)) as proxy:
         thread = threading.Thread(target=proxy.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
@@ -194,7 +194,7 @@ def losing_proxy(server: PostgresServer) -> Iterator[tuple[LosingProxy, str]]:
             thread.join()
 
 
-def test_a_step_whose_commit_was_not_answered_is_there_once(server: PostgresServer) -> None:
+def test_a_step_whose_commit_reply_was_lost_is_stored_once(server: PostgresServer) -> None:
     url = server.new_database()
     with losing_proxy(server) as (proxy, folder), opened(url.replace(str(server.folder), folder)) as store:
         lab = store.machine("demo", "lab")
@@ -211,7 +211,7 @@ def test_a_step_whose_commit_was_not_answered_is_there_once(server: PostgresServ
 
 @contextmanager
 def hanging(store: Store) -> Iterator[None]:
-    """The server's process for the writer's connection does nothing for a while."""
+    """Suspend the server's process for the writer's connection."""
     ((pid,),) = store._database.rows(
         select(text("pid")).select_from(text("pg_locks")).where(text("locktype = 'advisory' AND objid = 1"))
     )
@@ -223,7 +223,7 @@ def hanging(store: Store) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("encoding", ["SQL_ASCII", "LATIN1"])
-def test_a_database_that_cannot_hold_every_text_is_refused(server: PostgresServer, encoding: str) -> None:
+def test_a_database_without_utf8_encoding_is_refused(server: PostgresServer, encoding: str) -> None:
     name = f"history_{encoding.lower()}"
     place = ("-h", str(server.folder), "-U", USER)
     server.run("createdb", *place, "-T", "template0", "-E", encoding, "--locale=C", name)
@@ -232,7 +232,7 @@ def test_a_database_that_cannot_hold_every_text_is_refused(server: PostgresServe
         database.start()
 
 
-def test_a_server_that_hangs_is_turned_away_from(server: PostgresServer) -> None:
+def test_the_writer_uses_another_connection_when_the_server_hangs(server: PostgresServer) -> None:
     with opened(server.new_database()) as store:
         lab = store.machine("demo", "lab")
         written(lab, hop_step(0, events=(alarm_event(0),)))
@@ -242,7 +242,7 @@ def test_a_server_that_hangs_is_turned_away_from(server: PostgresServer) -> None
             assert len(lab.events()) == 2
 
 
-def test_no_reader_waits_for_a_server_that_hangs(server: PostgresServer) -> None:
+def test_a_reader_gets_an_error_when_the_server_hangs_and_then_a_new_connection(server: PostgresServer) -> None:
     database = Database(server.new_database(), QUICK_S)
     database.start()
     ((pid,),) = database.rows(select(func.pg_backend_pid()))  # of the one connection in the pool
@@ -267,7 +267,7 @@ def test_no_reader_waits_for_a_server_that_hangs(server: PostgresServer) -> None
         database.stop()
 
 
-def test_a_connection_that_the_server_has_ended_is_noticed_by_nobody(server: PostgresServer) -> None:
+def test_a_connection_closed_by_the_server_is_replaced_silently(server: PostgresServer) -> None:
     url = server.new_database()
     database, other = Database(url, QUICK_S), Database(url, QUICK_S)
     database.start()
@@ -294,7 +294,7 @@ def test_a_start_waits_for_a_migration_as_long_as_it_takes(server: PostgresServe
     database.stop()
 
 
-def test_the_end_does_not_wait_for_a_server_that_hangs(server: PostgresServer) -> None:
+def test_close_does_not_wait_for_a_hung_server(server: PostgresServer) -> None:
     with opened(server.new_database()) as store:
         written(store.machine("demo", "lab"), hop_step(0))
         ending = threading.Thread(target=store.close, daemon=True)
@@ -304,7 +304,7 @@ def test_the_end_does_not_wait_for_a_server_that_hangs(server: PostgresServer) -
             assert not ending.is_alive()
 
 
-def test_nobody_waits_twice_for_a_disk_that_hangs(tmp_path: Path) -> None:
+def test_commits_return_while_the_disk_hangs_and_are_written_later(tmp_path: Path) -> None:
     with opened(f"sqlite:///{tmp_path}/history.sqlite") as store:
         lab = store.machine("demo", "lab")
         with store._writer._turn:  # the writer's thread comes no further than this
@@ -320,14 +320,14 @@ def test_nobody_waits_twice_for_a_disk_that_hangs(tmp_path: Path) -> None:
 
 ONES = select(literal(1).label("n")).cte("ones", recursive=True)
 ENDLESS = select(func.count()).select_from(ONES.union_all(select(ONES.c.n)))
-"""A query that comes to no end by itself."""
+"""A query that never ends by itself."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_whoever_asks_a_closing_history_is_answered(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_queries_running_at_close_end_with_an_error(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.history.database._FINISH_S", 0.05)
     database = Database(database_url(kind, tmp_path), QUICK_S)
-    database.answer_s = 5.0  # as long as a PostgreSQL server goes on with a query that nobody waits for
+    database.answer_s = 5.0  # as long as PostgreSQL continues a query that no client waits for
     database.start()
     database.answer_s = 60.0
     answers: list[str] = []
@@ -352,7 +352,7 @@ def test_whoever_asks_a_closing_history_is_answered(kind: str, tmp_path: Path, m
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "memory"])
-def test_a_query_that_takes_too_long_is_broken_off(kind: str, tmp_path: Path) -> None:
+def test_a_query_that_takes_too_long_is_cancelled(kind: str, tmp_path: Path) -> None:
     database = Database("sqlite:///:memory:" if kind == "memory" else database_url(kind, tmp_path), QUICK_S)
     database.answer_s = 5.0  # after which a PostgreSQL server ends a query by itself
     database.start()

@@ -1,4 +1,4 @@
-"""The tables are made once, whoever comes first; those of older versions are migrated, those of others left alone."""
+"""Tables are created once, by whoever comes first; old versions are migrated, those of other programs left alone."""
 
 import hashlib
 import shutil
@@ -23,8 +23,8 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     return database_url(request.param, tmp_path, empty=True)
 
 
-def test_tables_change_with_their_revision() -> None:
-    """Whoever changes a table writes a migration, and then changes what is expected here."""
+def test_a_change_of_tables_needs_a_new_revision() -> None:
+    """After changing a table, write a migration, then update what is expected here."""
     made = []
     engine = create_mock_engine("sqlite://", lambda statement, *_, **__: made.append(statement))
     metadata.create_all(engine, checkfirst=False)
@@ -48,7 +48,7 @@ def test_tables_of_older_versions_are_migrated(url: str, tmp_path: Path, monkeyp
         assert [one.value for one in store.machine("demo", "lab").readings(quantity="parameter", name="e")] == [0.1]
     assert executed(url, "SELECT colour FROM tokens") == []
     assert executed(url, "SELECT version_num FROM alembic_version") == [("0006",)]
-    opened_and_closed(url)  # which is nothing then
+    opened_and_closed(url)  # nothing left to migrate
 
 
 def test_several_monitors_open_an_empty_database_at_once(url: str) -> None:
@@ -57,7 +57,7 @@ def test_several_monitors_open_an_empty_database_at_once(url: str) -> None:
     assert executed(url, "SELECT version_num FROM alembic_version") == [(REVISION,)]
 
 
-def test_a_database_that_is_up_to_date_is_opened_without_what_only_migrations_need(url: str) -> None:
+def test_opening_an_up_to_date_database_does_not_import_alembic(url: str) -> None:
     opened_and_closed(url)
     code = (
         "import sys; from service.history.store import Store; from service.history.records import Retention; "
@@ -75,14 +75,14 @@ def test_a_database_that_is_up_to_date_is_opened_without_what_only_migrations_ne
         ("DROP TABLE alembic_version", "a table 'alarm_events' not of the history"),
     ],
 )
-def test_a_database_of_others_is_left_alone(url: str, change: str, message: str) -> None:
+def test_a_history_of_unknown_revision_is_refused(url: str, change: str, message: str) -> None:
     opened_and_closed(url)
     executed(url, change)
     with pytest.raises(StoreError, match=message):
         opened_and_closed(url)
 
 
-def test_nothing_is_put_into_the_database_of_another_program(url: str) -> None:
+def test_the_database_of_another_program_is_refused_unchanged(url: str) -> None:
     executed(url, "CREATE TABLE orders (number INTEGER)")
     file = Path(url.removeprefix("sqlite:///"))
     before = file.read_bytes() if file.is_file() else b""
@@ -92,8 +92,8 @@ def test_nothing_is_put_into_the_database_of_another_program(url: str) -> None:
     assert executed(url, "SELECT * FROM orders") == []
 
 
-def test_reports_that_were_compressed_by_themselves_are_read() -> None:
-    """Those of earlier versions; and what all are compressed against is what it was, or none could be read."""
+def test_reports_compressed_without_a_dictionary_are_read() -> None:
+    """Those of earlier versions; and the dictionary is unchanged, or no later report could be read."""
     assert unpack(zstandard.compress(b'{"state": "healthy"}')) == '{"state": "healthy"}'
     dictionary = Path(claim.__file__).with_name("reports.dictionary").read_bytes()
     assert hashlib.sha256(dictionary).hexdigest() == "af2696c3ddde702e4bf51e00016417f4cb4fa04bf9e1e9b5ee9fba2fa27ef8ac"

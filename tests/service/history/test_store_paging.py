@@ -1,4 +1,4 @@
-"""Pages laid end to end are everything, once and in order, whatever the clock did and whatever is asked for."""
+"""Pages joined together give every entry once and in order, whatever the clock did and whatever the filter."""
 
 import uuid
 from collections.abc import Callable, Iterator, Sequence
@@ -50,7 +50,7 @@ def within(times: Sequence[int], since: int | None, until: int | None) -> list[i
 
 @settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(times=TIMES, cuts=st.lists(st.integers(0, 25), max_size=3), since=BOUND, until=BOUND, limit=LIMIT)
-def test_pages_are_everything_once(
+def test_pages_give_every_entry_once_in_order(
     store: Store, times: list[int], cuts: list[int], since: int | None, until: int | None, limit: int
 ) -> None:
     lab = store.machine("demo", uuid.uuid4().hex)

@@ -1,4 +1,4 @@
-"""What is dropped and when, and that reduced readings say what numpy says of the readings themselves."""
+"""What is dropped and when; reduced readings agree with numpy."""
 
 import threading
 from collections.abc import Iterator
@@ -57,7 +57,7 @@ class Written:
 
 
 def write(lab: MachineStore, clock: Clock, hops: int, per_step: int = 40) -> Written:
-    """Readings of many hops; the computer's time goes along with the data's."""
+    """Readings of many hops; the clock follows the data."""
     rng = np.random.default_rng(8)
     ends = T0 + HOP * np.arange(1, hops + 1) + rng.integers(0, NS, hops)
     values = {"k_by": rng.standard_normal(hops), "e": 1e6 + rng.standard_normal(hops)}
@@ -80,7 +80,7 @@ def write(lab: MachineStore, clock: Clock, hops: int, per_step: int = 40) -> Wri
 
 
 def by_numpy(written: Written, name: str, places: npt.NDArray[np.int64], grid: StoredBucket) -> list[StoredBucket]:
-    """Buckets on the grid of another one, from the readings themselves; `places` are the times that decide."""
+    """Expected buckets on the grid of another one; `places` are the times that assign readings to buckets."""
     expected = []
     numbers = (places - grid.start_ns) // grid.length_ns
     for number in np.unique(numbers):
@@ -109,7 +109,7 @@ def assert_same(found: list[StoredBucket], expected: list[StoredBucket]) -> None
         )
 
 
-def test_downsampled_is_what_numpy_says(store: Store, clock: Clock) -> None:
+def test_downsampling_agrees_with_numpy(store: Store, clock: Clock) -> None:
     lab = store.machine("demo", "lab")
     written = write(lab, clock, 600)
     for points in (1, 7, 300, 5000):
@@ -119,7 +119,7 @@ def test_downsampled_is_what_numpy_says(store: Store, clock: Clock) -> None:
             of_name = [bucket for bucket in found if bucket.name == name]
             assert len(of_name) <= points
             assert_same(of_name, by_numpy(written, name, written.ends, of_name[0]))
-    # And of what was asked for alone.
+    # And between bounds, of one parameter.
     since, until = int(written.ends[100]), int(written.ends[500])
     found = lab.downsampled(quantity="parameter", names=["k_by"], since_ns=since, until_ns=until, points=11)
     part = written.part(slice(100, 500))
@@ -129,7 +129,7 @@ def test_downsampled_is_what_numpy_says(store: Store, clock: Clock) -> None:
     assert lab.downsampled(quantity="parameter", since_ns=until, until_ns=since) == ()
 
 
-def test_reduced_readings_and_those_that_are_still_there_are_one_trend(store: Store, clock: Clock) -> None:
+def test_reduced_and_remaining_readings_form_one_trend(store: Store, clock: Clock) -> None:
     lab = store.machine("demo", "lab")
     written = write(lab, clock, 1500)
     assert store.reduction.run(clock.now_ns) == Dropped()
@@ -143,7 +143,7 @@ def test_reduced_readings_and_those_that_are_still_there_are_one_trend(store: St
         assert {(bucket.length_ns, bucket.start_ns % (600 * NS)) for bucket in found} == {(600 * NS, 0)}
         assert sum(bucket.count for bucket in found) == 1500
         assert_same(found, by_numpy(written, name, written.ends, found[0]))
-    # Everything goes, in two more parts that meet within a bucket; what was merged says the same.
+    # The rest is reduced in two parts that meet within a bucket; merged buckets agree as well.
     store.reduction.run(int(written.ends[1111]) + 90 * DAY)
     store.reduction.run(int(written.ends[-1]) + 90 * DAY + 1)
     assert not lab.readings(quantity="parameter", name="k_by")
@@ -154,7 +154,7 @@ def test_reduced_readings_and_those_that_are_still_there_are_one_trend(store: St
         assert_same(found, by_numpy(written, name, starts, found[0]))
 
 
-def test_a_trend_of_many_windows_is_of_buckets(store: Store, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trend_of_many_windows_uses_buckets(store: Store, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.history.trend._SINGLE", 100)
     lab = store.machine("demo", "lab")
     written = write(lab, clock, 1500)
@@ -173,7 +173,7 @@ def test_a_trend_of_many_windows_is_of_buckets(store: Store, clock: Clock, monke
     assert few[0].start_ns == written.ends[0]
 
 
-def test_what_is_not_finite_is_kept_and_has_no_mean(store: Store) -> None:
+def test_non_finite_readings_are_kept_but_left_out_of_means(store: Store) -> None:
     lab = store.machine("demo", "lab")
     for number, value in enumerate((float("inf"), 1.0, float("-inf"))):
         assert lab.commit(Step(readings=(StoredReading(T0 + number, "misfit", "misfit", value, None),)))
@@ -183,7 +183,7 @@ def test_what_is_not_finite_is_kept_and_has_no_mean(store: Store) -> None:
     assert (bucket.count, bucket.mean) == (1, 1.0)
 
 
-def test_everything_goes_in_its_time_but_alarms_and_audit(store: Store, clock: Clock) -> None:
+def test_everything_expires_except_alarm_events_and_audit_entries(store: Store, clock: Clock) -> None:
     lab = store.machine("demo", "lab")
     assert lab.commit(Step(events=(alarm_event(0),)))
     store.audit.append(**AUDIT)
@@ -201,7 +201,7 @@ def test_everything_goes_in_its_time_but_alarms_and_audit(store: Store, clock: C
     assert len(store.audit.entries()) == 1
 
 
-def test_nothing_is_dropped_for_a_clock_that_was_set_forward(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clock_set_forward_drops_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.history.reduction._EVERY_S", 0.001)
     looked, clock = threading.Semaphore(0), Clock()
 
@@ -218,7 +218,7 @@ def test_nothing_is_dropped_for_a_clock_that_was_set_forward(tmp_path: Path, mon
         assert len(lab.readings(quantity="parameter", name="k_by", limit=1000)) == 100
 
 
-def test_what_is_written_meanwhile_stays(store: Store, clock: Clock) -> None:
+def test_readings_written_during_a_reduction_are_kept(store: Store, clock: Clock) -> None:
     lab = store.machine("demo", "lab")
     write(lab, clock, 2000, per_step=400)
     stop, numbers = threading.Event(), iter(range(1_000_000))
@@ -246,12 +246,12 @@ def test_what_is_written_meanwhile_stays(store: Store, clock: Clock) -> None:
 @pytest.mark.parametrize(
     "fields", [{"reports_days": 0}, {"readings_days": -1}, {"bucket_s": 0}, {"bucket_s": 90_000}, {"keep": 1}]
 )
-def test_retention_is_bounded(fields: dict[str, float]) -> None:
+def test_invalid_retention_settings_are_refused(fields: dict[str, float]) -> None:
     with pytest.raises(ValidationError):
         Retention.model_validate(fields)
 
 
-def test_it_is_told_how_far_back_the_history_goes(store: Store, clock: Clock) -> None:
+def test_status_states_how_far_back_the_history_goes(store: Store, clock: Clock) -> None:
     lab, idle = store.machine("demo", "lab"), store.machine("demo", "idle")
     assert idle.last_sequence() == -1
     empty = store.status()

@@ -1,4 +1,4 @@
-"""Readings of a window in one value, and when they are added to buckets."""
+"""Readings of a window packed into one value, and when they are added to buckets."""
 
 import math
 
@@ -44,7 +44,7 @@ def counts(lab: MachineStore, points: int = 100) -> list[int]:
 
 
 @given(st.lists(WINDOW, max_size=4))
-def test_readings_come_out_of_their_value_as_they_went_in(windows: list[list[tuple[int, float, float]]]) -> None:
+def test_readings_are_unpacked_as_they_were_packed(windows: list[list[tuple[int, float, float]]]) -> None:
     arrays = [np.array(each, READING) for each in windows]
     places, found = unpacked([packed(each) for each in arrays], READING)
     assert found.tobytes() == b"".join(each.tobytes() for each in arrays)
@@ -52,7 +52,7 @@ def test_readings_come_out_of_their_value_as_they_went_in(windows: list[list[tup
 
 
 @pytest.mark.parametrize("first", [-3, 0])
-def test_readings_are_added_up_by_place_and_series_wherever_that_is(first: int) -> None:
+def test_readings_are_summed_by_place_and_series(first: int) -> None:
     readings = np.zeros(6, READING)
     readings["series_id"], readings["value"] = 1_000_000 * np.array([0, 1, 0, 1, 0, 1]), range(1, 7)
     places, made = add_up(singles(readings), first + np.array([0, 0, 0, 1, 1, 1]))
@@ -61,7 +61,7 @@ def test_readings_are_added_up_by_place_and_series_wherever_that_is(first: int) 
     assert (made["count"].tolist(), made["total"].tolist()) == ([2, 1, 1, 2], [4.0, 2.0, 5.0, 10.0])
 
 
-def test_windows_go_into_their_bucket_when_one_of_another_comes(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_windows_are_added_to_a_bucket_when_the_next_one_begins(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.history.trend._SINGLE", 0)
     lab = store.machine("demo", "lab")
     commit(lab, 10)
@@ -97,7 +97,7 @@ def test_a_trend_begins_with_the_first_reading_and_ends_with_the_newest_window(s
     assert store.machine("demo", "none").latest("parameter", "e", span_ns=30 * NS, points=4) == ()
 
 
-def test_what_is_asked_coarsely_of_many_is_made_of_buckets(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_coarse_query_over_many_windows_uses_buckets(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.history.trend._SINGLE_FOR_COARSE", 100)
     lab = store.machine("demo", "lab")
     commit(lab, *range(0, 7200, 60))
@@ -112,7 +112,7 @@ def test_what_is_asked_coarsely_of_many_is_made_of_buckets(store: Store, monkeyp
     assert lab.downsampled(quantity="parameter", names=["e"], points=24)[0].length_ns == 7260 * NS // 24 + 1
 
 
-def test_readings_count_once_when_buckets_are_longer_after_a_restart(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readings_count_once_when_the_bucket_length_changes(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.history.trend._SINGLE", 0)
     for number, bucket_s in enumerate((600, 60, 600)):
         with opened(url, Retention(bucket_s=bucket_s)) as store:
@@ -122,7 +122,7 @@ def test_readings_count_once_when_buckets_are_longer_after_a_restart(url: str, m
             assert sum(counts(lab)) == 6 * (number + 1)
 
 
-def test_a_window_whose_readings_are_damaged_is_passed_over(store: Store, url: str) -> None:
+def test_a_window_with_damaged_readings_is_skipped_and_logged(store: Store, url: str) -> None:
     lab = store.machine("demo", "lab")
     for time_s in (10, 20, 30):
         commit(lab, time_s)
@@ -135,7 +135,7 @@ def test_a_window_whose_readings_are_damaged_is_passed_over(store: Store, url: s
     assert sum(counts(lab)) == 3
 
 
-def test_a_series_that_is_seldom_read_is_found_page_by_page(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sparse_series_is_found_page_by_page(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.history.machine._AT_ONCE", 2)
     lab = store.machine("demo", "lab")
     for number in range(12):

@@ -1,4 +1,4 @@
-"""The life cycle of alarms: the table, the documentation that shows it, and walks through it at random."""
+"""The life cycle of alarms: the table, the documentation that shows it, and random walks through it."""
 
 import re
 from collections.abc import Iterable
@@ -33,13 +33,13 @@ def written(cell: Cell) -> str:
     return " / ".join(cell) if isinstance(cell, tuple) else str(cell)
 
 
-def test_the_documentation_tells_what_every_alarm_says() -> None:
+def test_the_documentation_lists_every_alarm() -> None:
     text = (ROOT / "docs/alarms.md").read_text(encoding="utf-8").partition("## Kinds")[2].partition("##")[0]
     first = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
     assert {name for cell in first for name in re.findall("`(.*?)`", cell)} == set(ALARMS)
 
 
-def test_the_documentation_shows_the_table() -> None:
+def test_the_table_in_the_documentation_is_up_to_date() -> None:
     text = (ROOT / "docs/alarms.md").read_text(encoding="utf-8")
     rows = [re.split(r"\s*\|\s*", line.strip("| \n")) for line in text.splitlines() if line.startswith("|")]
     head = next(row for row in rows if row[0] == "what happens")
@@ -53,7 +53,7 @@ def test_the_documentation_shows_the_table() -> None:
 
 
 @pytest.mark.parametrize("kind", EventKind)
-def test_every_cell_leads_where_it_says(kind: EventKind) -> None:
+def test_every_cell_of_the_table_leads_to_its_state(kind: EventKind) -> None:
     for state, present, latching in product(AlarmState, (False, True), (False, True)):
         cell, owed = TABLE[state, kind], AlarmState.LATCHED_ACKNOWLEDGED
         found = follow(state, kind, present=present, latching=latching, owed=owed)
@@ -64,8 +64,8 @@ def test_every_cell_leads_where_it_says(kind: EventKind) -> None:
             assert found == {REFUSED: None, STAYS: state}.get(cell, cell), state
 
 
-def test_what_nobody_asks_for_is_never_refused_and_operators_are_told() -> None:
-    """Only what operators ask for can be refused: a condition comes and goes in every state."""
+def test_only_operations_can_be_refused() -> None:
+    """Only operations can be refused: a condition comes and goes in every state."""
     asked = set(KIND_OF_EVENT.values())
     assert {kind for (_, kind), cell in TABLE.items() if cell == REFUSED} <= asked
     assert set(EventKind) - asked == {
@@ -94,7 +94,7 @@ def act(kind: str, name: str = "k_by", **more: object) -> OperatorAction:
     return OperatorAction(kind, name, "anna", **{"reason": "told so", **more})  # type: ignore[arg-type]
 
 
-def test_acknowledged_and_cleared_in_any_order_is_normal_and_danger_opens_it_again() -> None:
+def test_acknowledging_and_clearing_end_an_alarm_and_danger_reopens_it() -> None:
     book, now_s = raised()
     (event,) = book.operate(act("acknowledge"), now_s * S)
     assert (event.kind, event.actor, event.before, event.alarm.state) == (
@@ -113,7 +113,7 @@ def test_acknowledged_and_cleared_in_any_order_is_normal_and_danger_opens_it_aga
     assert (event.kind, event.alarm.state, event.alarm.occurrence) == ("escalated", AlarmState.UNACKNOWLEDGED, 1)
 
 
-def test_shelving_ends_by_itself_and_what_is_there_then_is_unacknowledged() -> None:
+def test_shelving_expires_and_a_present_alarm_is_unacknowledged_then() -> None:
     book, now_s = raised()
     book.operate(act("shelve", duration_s=600), now_s * S)
     assert not any(alarm.raised for alarm in book.alarms)
@@ -124,7 +124,7 @@ def test_shelving_ends_by_itself_and_what_is_there_then_is_unacknowledged() -> N
     assert state_of(book) is AlarmState.UNACKNOWLEDGED
 
 
-def test_one_shot_shelving_ends_with_the_condition_and_other_shelving_follows_it_unheard() -> None:
+def test_one_shot_shelving_ends_when_the_alarm_clears_other_shelving_goes_on() -> None:
     book, now_s = raised()
     book.operate(act("shelve", duration_s=HOUR_S), now_s * S)
     assert [event.kind for event in cleared(book, "k_by", now_s + 5)] == ["cleared"]
@@ -141,7 +141,7 @@ def test_one_shot_shelving_ends_with_the_condition_and_other_shelving_follows_it
     assert state_of(book) is AlarmState.NORMAL
 
 
-def test_shelving_needs_a_reason_and_has_a_longest_time() -> None:
+def test_shelving_needs_a_reason_and_has_a_maximum_time() -> None:
     book, now_s = raised()
     with pytest.raises(OperationRefused, match="reason is empty"):
         book.operate(act("shelve", reason=" "), now_s * S)
@@ -152,7 +152,7 @@ def test_shelving_needs_a_reason_and_has_a_longest_time() -> None:
     assert state_of(book) is AlarmState.UNACKNOWLEDGED
 
 
-def test_rules_suppress_and_give_back() -> None:
+def test_rules_suppress_and_unsuppress_alarms() -> None:
     book, now_s = raised()
     book.update_state("data-stuck", True, now_s * S, "y1 stands still", at_once=True)
     told = book.suppress(1320.0, now_s * S)
@@ -160,12 +160,12 @@ def test_rules_suppress_and_give_back() -> None:
         ("suppressed", "model", "a sensor is stuck"),
         ("suppressed", "k_by", "a sensor is stuck"),
     ]
-    assert book.suppress(500.0, now_s * S) == ()  # one more reason for the model, no news
+    assert book.suppress(500.0, now_s * S) == ()  # a second reason for the model, no new event
     book.update_state("data-stuck", False, (now_s + 5) * S, at_once=True)
-    told = book.suppress(None, (now_s + 5) * S)  # an unknown speed changes nothing of what depends on it
+    told = book.suppress(None, (now_s + 5) * S)  # an unknown speed changes no rule that depends on it
     assert [(event.kind, event.alarm.name) for event in told] == [("unsuppressed", "k_by")]
     assert (state_of(book), state_of(book, "model")) == (AlarmState.UNACKNOWLEDGED, AlarmState.SUPPRESSED)
-    book.suppress(-1320.0, (now_s + 10) * S)  # the other way round
+    book.suppress(-1320.0, (now_s + 10) * S)  # turning the other way
     assert state_of(book, "model") is AlarmState.NORMAL
     assert [event.alarm.name for event in book.suppress(-500.0, (now_s + 15) * S)] == ["model"]
 
@@ -180,7 +180,7 @@ def test_rules_suppress_and_give_back() -> None:
     ],
 )
 @pytest.mark.parametrize("cleared_before", [False, True])
-def test_a_rule_takes_no_acknowledgement(name: str, acknowledged: bool, owed: AlarmState, cleared_before: bool) -> None:
+def test_rules_keep_acknowledgements(name: str, acknowledged: bool, owed: AlarmState, cleared_before: bool) -> None:
     book, now_s = raised(name)
     if acknowledged:
         book.operate(act("acknowledge", name), now_s * S)
@@ -199,7 +199,7 @@ def test_a_rule_takes_no_acknowledgement(name: str, acknowledged: bool, owed: Al
     assert state_of(book, name) is owed
 
 
-def test_who_shelved_what_a_rule_suppresses_finds_it_suppressed_afterwards() -> None:
+def test_an_unshelved_alarm_that_a_rule_suppresses_becomes_suppressed() -> None:
     book, now_s = raised()
     book.operate(act("shelve"), now_s * S)
     book.update_state("data-stuck", True, now_s * S, at_once=True)
@@ -209,7 +209,7 @@ def test_who_shelved_what_a_rule_suppresses_finds_it_suppressed_afterwards() -> 
     assert state_of(book) is AlarmState.SUPPRESSED
 
 
-def test_a_clock_that_is_set_leaves_shelving_as_long_as_it_was_meant() -> None:
+def test_a_stepped_clock_does_not_change_the_length_of_shelving() -> None:
     book, now_s = raised()
     book.operate(act("shelve", duration_s=600), now_s * S)
     book.clock_stepped((now_s + 10**6) * S, 10**6 * S)
@@ -225,7 +225,7 @@ def test_a_clock_that_is_set_leaves_shelving_as_long_as_it_was_meant() -> None:
         ("suppress", [{"alarms": ["e"], "while_alarm": "y", "because": "x"}], "while_alarm: y is not an alarm"),
     ],
 )
-def test_settings_that_make_no_sense(field: str, value: object, match: str) -> None:
+def test_invalid_alarm_settings_are_refused(field: str, value: object, match: str) -> None:
     with pytest.raises(ValueError, match=match):
         AlarmSettings.model_validate({field: value})
 
@@ -278,7 +278,7 @@ def walk(stories: Iterable[tuple[str, object, object]], *, restarts: bool = True
 
 @settings(max_examples=300)
 @given(stories=st.lists(steps, max_size=60))
-def test_walks_keep_what_must_hold(stories: list[tuple[str, object, object]]) -> None:
+def test_invariants_hold_on_random_walks(stories: list[tuple[str, object, object]]) -> None:
     book, events = walk(stories)
     assert [event.sequence for event in events] == list(range(len(events)))
     latest: dict[str, Alarm] = {}
@@ -292,7 +292,7 @@ def test_walks_keep_what_must_hold(stories: list[tuple[str, object, object]]) ->
     for event in events:
         name, state = event.alarm.name, event.alarm.state
         if event.actor:
-            due.discard(name)  # somebody has seen to it
+            due.discard(name)  # an operator has acted on it
         if state is AlarmState.UNACKNOWLEDGED:
             due.add(name)
         assert state is not AlarmState.NORMAL or name not in due, "nobody has acknowledged it"
@@ -314,7 +314,7 @@ def test_walks_keep_what_must_hold(stories: list[tuple[str, object, object]]) ->
 
 @settings(max_examples=200)
 @given(stories=st.lists(steps, max_size=60))
-def test_restarts_change_nothing(stories: list[tuple[str, object, object]]) -> None:
+def test_restarts_on_random_walks_change_nothing(stories: list[tuple[str, object, object]]) -> None:
     book, events = walk(stories)
     other, same = walk(stories, restarts=False)
     assert events == same

@@ -1,4 +1,4 @@
-"""What must not cost an alarm: defects, a history that refuses, clocks that are set, programs that stand still."""
+"""No alarm may be lost: defects, a history that refuses steps, stepped clocks, stopped processes."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -46,7 +46,7 @@ YEAR_NS = 365 * 86400 * S
 
 
 def machine(**alarms: object) -> Machine:
-    """The rotor kit; a data path that waits for up to 8 blocks."""
+    """The rotor kit, with a data path that waits for up to 8 blocks."""
     fields = LAB.model_dump()
     fields["ingest"] |= {"reorder_blocks": 8}
     fields["alarms"] |= alarms
@@ -65,7 +65,7 @@ def order(kind: str, name: str, **more: object) -> OperatorAction:
 
 
 class Outlet:
-    """Takes what is published; if told so, the network is gone."""
+    """Collects published events; fails while `is_gone`, as without a network."""
 
     def __init__(self) -> None:
         self.events: list[str] = []
@@ -138,8 +138,8 @@ TWO_HOLES = (*range(21), *range(25, 29), *range(41, 44))
 TOLD = [(0, "raised", GAP), (1, "raised", STREAM_LOST), (2, "cleared", STREAM_LOST)]
 
 
-def test_log_and_state_agree_in_every_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Several blocks that are due at once: a crash between two commits must not leave alarms without their events."""
+def test_log_and_alarm_state_agree_in_every_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Several blocks are due at once: a crash between two commits must not leave alarms without events."""
     committed = [0]
 
     def agree(step: Step) -> None:
@@ -151,7 +151,7 @@ def test_log_and_state_agree_in_every_commit(tmp_path: Path, monkeypatch: pytest
     watched(monkeypatch, agree)
     with bench(tmp_path) as at:
         at.put(*map(block, TWO_HOLES))
-        assert at.log() == []  # what leaves a hole waits
+        assert at.log() == []  # blocks after a hole wait
         at.put(block(44, run=2, sequence=0))
         assert at.worker.errors == 0, at.worker.last_error
         assert at.log() == TOLD
@@ -175,7 +175,7 @@ def test_a_defect_after_an_alarm_loses_no_event(tmp_path: Path, monkeypatch: pyt
         assert (at.log(), len(at.outlet.events)) == ([*TOLD, (3, "raised", FAULT), (4, "acknowledged", GAP)], 5)
 
 
-def test_what_the_history_refused_goes_with_the_next_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_events_refused_by_the_history_are_written_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     refusing = [True]
 
     def refuse(step: Step) -> None:
@@ -185,21 +185,21 @@ def test_what_the_history_refused_goes_with_the_next_step(tmp_path: Path, monkey
     watched(monkeypatch, refuse)
     with bench(tmp_path) as at:
         at.put(block(0), block(30, run=2, sequence=0))
-        # Operators hear of it all the same, and what was refused goes into the log before the alarm on that.
+        # Events are published all the same, and the refused ones enter the log before the alarm on the refusal.
         assert [len(at.outlet.events), at.worker.errors] == [4, 2]
-        # It is that machine's: the history of others works.
+        # The trouble is of this machine: the history of others works.
         assert {FAULT, GAP} <= {alarm.name for alarm in at.worker.alarms().alarms if alarm.raised}
         assert ("refused" in at.worker.trouble, at.store.trouble) == (True, "")
         refusing.clear()
         at.worker.operate(order("acknowledge", GAP))
         assert at.worker.trouble == ""
         assert [kind for _, kind, _ in at.log()] == ["raised", "cleared", "raised", "raised", "acknowledged"]
-        assert (at.log()[3], len(at.outlet.events)) == ((3, "raised", FAULT), 5)  # and once
+        assert (at.log()[3], len(at.outlet.events)) == ((3, "raised", FAULT), 5)  # once only
     with bench(tmp_path) as at:
         assert at.worker.restart.startswith("resumed")
 
 
-def test_a_network_that_is_gone_fails_no_operation(tmp_path: Path) -> None:
+def test_an_operation_succeeds_without_a_network(tmp_path: Path) -> None:
     with bench(tmp_path) as at:
         at.put(block(0))
         at.outlet.is_gone = True
@@ -209,7 +209,7 @@ def test_a_network_that_is_gone_fails_no_operation(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("by_the_log", "expected"), [(5, 5), (1, 3)], ids=["log ahead", "log begun anew"])
-def test_no_number_of_an_event_is_given_twice(by_the_log: int, expected: int) -> None:
+def test_no_sequence_number_is_used_twice(by_the_log: int, expected: int) -> None:
     book = AlarmBook(AlarmSettings())
     for _ in range(3):
         book.operate(order("shelve", "k_by"), 0)
@@ -219,7 +219,7 @@ def test_no_number_of_an_event_is_given_twice(by_the_log: int, expected: int) ->
     assert event.sequence == expected
 
 
-def test_alarms_of_another_version_are_left_aside() -> None:
+def test_alarms_of_unknown_names_are_not_restored() -> None:
     book = AlarmBook(AlarmSettings())
     book.operate(order("shelve", "k_by"), 0)
     book.operate(order("shelve", "model"), 0)
@@ -228,14 +228,14 @@ def test_alarms_of_another_version_are_left_aside() -> None:
     assert [one.name for one in again.alarms] == ["model"]
 
 
-def test_a_state_of_unknown_health_is_damaged() -> None:
+def test_a_checkpoint_with_an_unknown_health_state_is_refused() -> None:
     monitor = MachineMonitor(install(machine(), None))
     arrays = from_bytes(monitor.state().state) | {"calm": np.array(["splendid"])}
     with pytest.raises(CheckpointError, match=r"calm is .*splendid.*, expected one of warming, healthy"):
         MachineMonitor(install(machine(), None)).restore(to_bytes(arrays), ())
 
 
-def test_shelving_after_a_wrong_clock_was_set_right_is_as_long_as_it_says(tmp_path: Path) -> None:
+def test_shelving_keeps_its_length_when_a_wrong_clock_is_corrected(tmp_path: Path) -> None:
     with bench(tmp_path) as at:
         at.put(*(block(number, START_NS + YEAR_NS) for number in range(3)))
         at.worker.operate(order("shelve", "k_by", duration_s=HOUR_S))
@@ -246,18 +246,18 @@ def test_shelving_after_a_wrong_clock_was_set_right_is_as_long_as_it_says(tmp_pa
         assert at.shelf_s("k_by") == pytest.approx(HOUR_S, abs=60)
 
 
-def test_shelving_before_any_data_is_as_long_as_it_says(tmp_path: Path) -> None:
+def test_shelving_before_any_data_keeps_its_length(tmp_path: Path) -> None:
     with bench(tmp_path) as at:
         at.worker.operate(order("shelve", "k_by", duration_s=HOUR_S))
-    with bench(tmp_path) as at:  # and over a restart
+    with bench(tmp_path) as at:  # and after a restart
         at.worker.operate(order("remove-from-service", "e"))
-        at.put(block(0))  # the data's clock is months from the time of day
+        at.put(block(0))  # data time is months away from the time of day
         at.worker.operate(order("shelve", "model", duration_s=HOUR_S))
         assert at.shelf_s("k_by") == pytest.approx(HOUR_S, abs=60)
         assert at.shelf_s("model") == pytest.approx(HOUR_S, abs=60)
 
 
-def test_shelving_ends_without_data_too(tmp_path: Path) -> None:
+def test_shelving_expires_without_data(tmp_path: Path) -> None:
     now_ns = [START_NS]
     with bench(tmp_path, Clocks(utc_ns=lambda: now_ns[0])) as at:
         at.worker.operate(order("shelve", "k_by", duration_s=HOUR_S))
@@ -266,7 +266,7 @@ def test_shelving_ends_without_data_too(tmp_path: Path) -> None:
         assert at.log() == [(0, "shelved", "k_by"), (1, "unshelved", "k_by")]
 
 
-def test_shelving_ends_while_blocks_come_in() -> None:
+def test_shelving_expires_while_blocks_come_in() -> None:
     monitor = MachineMonitor(install(machine(), None))
     monitor.step(block(0))
     monitor.operate(order("shelve", "k_by", duration_s=1.5), START_NS + S)
@@ -285,7 +285,7 @@ def test_shelving_ends_while_blocks_come_in() -> None:
         (YEAR_NS, [("raised", CLOCK)]),
     ],
 )
-def test_another_machine_file_keeps_the_time_of_the_alarms(later_ns: int, expected: list[tuple[str, str]]) -> None:
+def test_alarms_keep_their_data_time_under_another_machine_file(later_ns: int, expected: list[tuple[str, str]]) -> None:
     before = MachineMonitor(install(machine(), None))
     before.step(block(0))
     end_ns = block(0).end_ns
@@ -313,8 +313,8 @@ def test_a_lost_stream_is_noticed_after_the_machine_file_has_changed() -> None:
     assert (event.kind, event.alarm.name, event.time_ns) == ("raised", STREAM_LOST, START_NS + 5 * S)
 
 
-def test_a_stream_of_which_nothing_is_of_use_says_why() -> None:
-    """A sensor that gives NaN costs all channels of its blocks; what is said does not depend on a restart."""
+def test_stream_lost_names_why_blocks_were_refused() -> None:
+    """NaN in a sensor costs whole blocks; the text does not depend on a restart."""
     monitor = MachineMonitor(install(machine(), None))
     for number in range(4):
         one = block(number)
@@ -326,8 +326,8 @@ def test_a_stream_of_which_nothing_is_of_use_says_why() -> None:
         assert "the first block since was refused: demo/lab: block 1, channel y1_dot: sample 10 is nan" in event.text
 
 
-def test_what_was_refused_after_the_stream_was_lost_is_not_said_then() -> None:
-    """Whether or not time passed meanwhile: an offline replay says what the monitor said."""
+def test_stream_lost_does_not_name_blocks_refused_later() -> None:
+    """Whether or not time passed before: an offline replay must give the monitor's text."""
     for live in (True, False):
         monitor = MachineMonitor(install(machine(), None))
         monitor.step(block(0))
@@ -341,7 +341,7 @@ def test_what_was_refused_after_the_stream_was_lost_is_not_said_then() -> None:
 
 
 @pytest.mark.parametrize("start_ns", [-1, 2**63 - 1, 10**30])
-def test_times_that_fit_nowhere_are_refused(start_ns: int) -> None:
+def test_blocks_with_impossible_times_are_refused(start_ns: int) -> None:
     monitor = MachineMonitor(install(machine(), None))
     verdict = monitor.step(replace(block(0), start_ns=start_ns)).verdict
     assert verdict.reason is Reason.MALFORMED
@@ -349,11 +349,11 @@ def test_times_that_fit_nowhere_are_refused(start_ns: int) -> None:
     assert monitor.step(block(0)).verdict.accepted
 
 
-def test_a_program_that_stood_still_calls_nobody_silent(tmp_path: Path) -> None:
+def test_a_stopped_program_does_not_report_a_silence_at_once(tmp_path: Path) -> None:
     now_s = [0.0]
     with bench(tmp_path, Clocks(monotonic_s=lambda: now_s[0])) as at:
         at.put(block(0))
-        now_s[0] += 60.0  # stopped by the system: what came meanwhile is still on its way
+        now_s[0] += 60.0  # stopped by the system: blocks of that time are still to come
         at.tick()
         assert not at.worker.health().stream.silent
         at.put(block(1))
@@ -363,14 +363,14 @@ def test_a_program_that_stood_still_calls_nobody_silent(tmp_path: Path) -> None:
             at.tick()
         assert at.worker.health().stream.silent
         assert at.log() == [(0, "raised", STREAM_LOST)]
-        for _ in range(3):  # and goes on being silent, however often the program stands still
+        for _ in range(3):  # and stays silent, however often the program is stopped
             now_s[0] += 2.5
             at.tick()
             assert at.worker.health().stream.silent
         assert at.log() == [(0, "raised", STREAM_LOST)]
 
 
-def test_a_stream_has_time_to_be_heard_again_after_a_restart(tmp_path: Path) -> None:
+def test_a_stream_gets_time_to_resume_after_a_restart(tmp_path: Path) -> None:
     now_s, now_ns = [0.0], [START_NS]
     clocks = Clocks(monotonic_s=lambda: now_s[0], utc_ns=lambda: now_ns[0])
     with bench(tmp_path, clocks) as at:
@@ -378,7 +378,7 @@ def test_a_stream_has_time_to_be_heard_again_after_a_restart(tmp_path: Path) -> 
         assert at.worker.health().state is HealthState.WARMING
     now_ns[0] += 3600 * S
     with bench(tmp_path, clocks) as at:
-        assert at.worker.health().state is HealthState.NO_DATA  # how it was an hour ago is not how it is
+        assert at.worker.health().state is HealthState.NO_DATA  # the state of an hour ago is not current
         for seconds, expected in ((19, []), (2, [(0, "raised", STREAM_LOST)])):
             for _ in range(seconds):
                 now_s[0] += 1.0
@@ -388,7 +388,7 @@ def test_a_stream_has_time_to_be_heard_again_after_a_restart(tmp_path: Path) -> 
         assert not at.worker.health().stream.silent
 
 
-def test_others_see_blocks_that_wait_every_half_second_and_the_last_one_at_once(tmp_path: Path) -> None:
+def test_health_is_updated_twice_a_second_and_after_the_last_waiting_block(tmp_path: Path) -> None:
     now_s, seen = [0.0], list[int]()
     with opened(f"sqlite:///{tmp_path / 'history.sqlite'}") as store:
         clocks = Clocks(monotonic_s=lambda: now_s[0])
@@ -403,12 +403,12 @@ def test_others_see_blocks_that_wait_every_half_second_and_the_last_one_at_once(
     assert seen == [1, 1, 1, 4, 5]
 
 
-def test_a_silence_is_longer_than_a_block() -> None:
+def test_no_data_after_s_must_exceed_the_longest_block() -> None:
     with pytest.raises(ValueError, match="no_data_after_s is 5, expected more than block_to_s, 30"):
         IngestSettings(block_to_s=30.0)
 
 
-def test_an_alarm_comes_back_when_its_rule_is_taken_out_of_the_machine_file() -> None:
+def test_an_alarm_is_unsuppressed_when_its_rule_is_removed() -> None:
     rules = [{"alarms": ["k_by"], "while_alarm": "data-stuck", "because": "a sensor is stuck"}]
     book = AlarmBook(AlarmSettings.model_validate({"suppress": rules}))
     book.update_state("data-stuck", True, 0, at_once=True)
@@ -420,14 +420,14 @@ def test_an_alarm_comes_back_when_its_rule_is_taken_out_of_the_machine_file() ->
     assert {one.name: one.state for one in without.alarms}["k_by"] is AlarmState.UNACKNOWLEDGED
 
 
-def test_rules_with_the_same_words_are_told_apart_and_an_unknown_speed_keeps_only_what_depends_on_it() -> None:
+def test_rules_with_equal_texts_are_distinguished_and_an_unknown_speed_keeps_speed_rules() -> None:
     rules = [
         {"alarms": ["model"], "while_alarm": "data-stuck", "because": "known"},
         {"alarms": ["model"], "below_rpm": 600, "because": "known"},
     ]
     book = AlarmBook(AlarmSettings.model_validate({"suppress": rules}))
     book.update_state("data-stuck", True, 0, at_once=True)
-    book.suppress(1320.0, 1)  # the machine turns fast: only the stuck sensor suppresses
+    book.suppress(1320.0, 1)  # the machine runs at speed: only the stuck sensor suppresses
     book.update_state("data-stuck", False, 2, at_once=True)
     again = AlarmBook(AlarmSettings.model_validate({"suppress": rules}))
     again.restore(book.checkpoint())
@@ -437,21 +437,21 @@ def test_rules_with_the_same_words_are_told_apart_and_an_unknown_speed_keeps_onl
         assert one.suppress(None, 4) == ()
 
 
-def test_a_rule_on_a_lost_stream_holds_while_it_is_lost() -> None:
+def test_a_rule_on_stream_lost_suppresses_while_it_is_raised() -> None:
     rules = [{"alarms": ["data-gap"], "while_alarm": "stream-lost", "because": "said already"}]
     monitor = MachineMonitor(install(machine(suppress=rules), None))
     monitor.step(block(0))
     assert named(monitor.passed(START_NS + 9 * S)) == [("raised", STREAM_LOST), ("suppressed", GAP)]
 
 
-def test_danger_too_must_have_been_found() -> None:
+def test_an_alarm_escalates_only_if_the_change_is_named() -> None:
     book = AlarmBook(AlarmSettings(on_delay_s=0))
     assert book.update("k_by", -0.2, 0.01, 0, named=True)
     assert not book.update("k_by", -0.9, 0.5, S, named=False)
     assert [event.kind for event in book.update("k_by", -0.9, 0.5, 2 * S, named=True)] == ["escalated"]
 
 
-def test_a_gap_and_a_silence_name_the_time_without_data_and_do_not_end_before_they_began() -> None:
+def test_gaps_and_silences_have_the_time_without_data_as_evidence() -> None:
     monitor = MachineMonitor(install(machine(), None))
     monitor.step(block(0))
     lost, again, gap = monitor.step(block(21, sequence=21, run=2)).events
@@ -468,7 +468,7 @@ def test_a_gap_and_a_silence_name_the_time_without_data_and_do_not_end_before_th
     assert again.time_ns == lost.time_ns == block(0).end_ns + 5 * S
 
 
-def test_a_reading_that_is_no_number_is_left_out_and_holds_nothing_up() -> None:
+def test_a_nan_reading_is_left_out_of_the_history() -> None:
     said = {"speed_rad_s": float("nan"), "misfit_z": 2.0, "parameters": (), "equations": (), "levels": ()}
     window = Report.model_validate(example(Report) | said)
     assert [one.quantity for one in stored_readings([window])] == ["misfit"]

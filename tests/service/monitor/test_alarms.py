@@ -43,25 +43,25 @@ def play(story: str, settings: AlarmSettings = SETTINGS) -> tuple[str, AlarmBook
     [
         ("..xx......", "          "),  # shorter than the on-delay
         ("..xxx.....", "    ^   v "),
-        ("..xx.xxx..", "       ^  "),  # interrupted: the delay starts anew
+        ("..xx.xxx..", "       ^  "),  # interrupted: the delay starts again
         ("..xxxxx.....", "    ^     v "),
         ("..xxx.x.....", "    ^     v "),  # chattering while clearing does not raise again
         ("..xxxoooooo", "    ^      "),  # between the limits: neither clears nor raises
         ("oooooooo", "        "),
         ("..xxxXX....", "    ^!    v"),
         ("XXX.....", "  ^   v "),  # straight to danger: one event
-        ("..xxx____....", "    ^       v"),  # missing data clears nothing
+        ("..xxx____....", "    ^       v"),  # missing data do not clear an alarm
         ("..x____xx", "       ^ "),  # and does not stop a pending delay, which is data time
         ("..xxx....xxx", "    ^   v  ^"),
-        ("????????", "        "),  # a change must have been found
-        ("..xxx???...", "    ^      "),  # nor does a large reading clear what it did not raise
+        ("????????", "        "),  # a change must have been named
+        ("..xxx???...", "    ^      "),  # a large reading that is not named does not clear
     ],
 )
-def test_stories(story: str, expected: str) -> None:
+def test_delays_limits_and_deadband_of_an_alarm(story: str, expected: str) -> None:
     assert play(story)[0] == expected
 
 
-def test_outside_the_model_is_an_alarm_of_its_own() -> None:
+def test_outside_the_model_has_its_own_alarm() -> None:
     book = AlarmBook(SETTINGS)
     told = [event for n in range(4) for event in book.update_state(MODEL, True, n * 5_000_000_000)]
     assert [(event.kind, event.alarm.name) for event in told] == [("raised", "model")]
@@ -74,7 +74,7 @@ def test_outside_the_model_is_an_alarm_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("error", [0.05, 0.15, 0.0, float("inf"), float("nan")])
-def test_a_large_change_clears_no_alarm_however_uncertain_it_is(error: float) -> None:
+def test_a_large_change_does_not_clear_an_alarm_however_uncertain(error: float) -> None:
     _, book, _ = play("xxx")
     for number in range(3, 10):
         assert not book.update("k_by", -0.2, error, number * 5_000_000_000, named=False)
@@ -84,13 +84,13 @@ def test_a_large_change_clears_no_alarm_however_uncertain_it_is(error: float) ->
 @pytest.mark.parametrize(
     ("error", "said"), [(0.0003, "-20.0% ± 0.1%"), (0.0002, "-19.999% ± 0.039%"), (0.00001234, "-19.9990% ± 0.0024%")]
 )
-def test_an_interval_that_would_be_rounded_to_nothing_has_two_digits(error: float, said: str) -> None:
+def test_a_narrow_interval_has_two_significant_digits(error: float, said: str) -> None:
     book = AlarmBook(SETTINGS)
     told = [event for n in range(3) for event in book.update("k_by", -0.19999, error, n * 5_000_000_000, named=True)]
     assert [event.text for event in told] == [f"ALERT: bearing stiffness, horizontal (k_by) changed by {said}"]
 
 
-def test_events_carry_occurrence_sequence_severity_and_a_sentence() -> None:
+def test_events_have_occurrence_sequence_severity_and_text() -> None:
     _, book, events = play("xxx....xxxX....")
     assert [event.sequence for event in events] == [0, 1, 2, 3, 4]
     assert [event.alarm.occurrence for event in events] == [1, 1, 2, 2, 2]
@@ -105,7 +105,7 @@ def test_events_carry_occurrence_sequence_severity_and_a_sentence() -> None:
     assert [one.severity for one in (play("xxx")[1], both)] == [Severity.ALERT, Severity.DANGER]
 
 
-def test_own_limits_of_a_parameter() -> None:
+def test_a_parameter_can_have_its_own_limits() -> None:
     settings = AlarmSettings.model_validate({"on_delay_s": 0, "parameters": {"k_by": {"raise_above": 0.3}}})
     assert "^" not in play("xxx", settings)[0]
     assert "^" in play("X", settings)[0]
@@ -119,7 +119,7 @@ def test_a_stepped_clock_restarts_the_delays() -> None:
     assert book.update("k_by", -0.2, 0.01, 12 * 10**9, named=True)[0].kind == "raised"
 
 
-def test_missing_data_and_data_health_are_alarms_of_their_own_and_not_of_the_machine() -> None:
+def test_stream_and_data_alarms_do_not_affect_machine_severity() -> None:
     _, book, _ = play("xxx")
     (event,) = book.update_state(STREAM_LOST, True, 10**11, "no data for 5 s", at_once=True)
     assert event.text == "ALERT: stream lost: no data for 5 s"
@@ -128,7 +128,7 @@ def test_missing_data_and_data_health_are_alarms_of_their_own_and_not_of_the_mac
     (event,) = book.update_state(STREAM_LOST, False, 3 * 10**11, at_once=True)
     assert event.text == "cleared: data are arriving again"
     empty = AlarmBook(SETTINGS)
-    assert not empty.update_state("data-gap", False, 0)  # what was never seen makes no alarm
+    assert not empty.update_state("data-gap", False, 0)  # clearing an unknown alarm creates none
     assert [*empty.alarms] == []
     empty.update_state("data-stuck", True, 0, "y1 stands still", at_once=True)
     assert empty.severity is None
@@ -136,8 +136,8 @@ def test_missing_data_and_data_health_are_alarms_of_their_own_and_not_of_the_mac
 
 
 @pytest.mark.parametrize("kind", FaultKind)
-def test_every_kind_of_fault_of_a_sensor_raises_its_alarm(kind: FaultKind) -> None:
-    """One that does not would make the machine not evaluable, and tell nobody."""
+def test_every_kind_of_sensor_fault_raises_its_alarm(kind: FaultKind) -> None:
+    """Otherwise the machine would be not evaluable without an alarm."""
     machine = load_machine("lab").model_copy(update={"alarms": AlarmSettings(on_delay_s=0)})
     book = AlarmBook(machine.alarms)
     fault = SensorFault(states=("y1",), kind=kind, text="y1 is at fault", value=1.0)
@@ -149,7 +149,7 @@ def test_every_kind_of_fault_of_a_sensor_raises_its_alarm(kind: FaultKind) -> No
 
 
 def judged(hops: Sequence[Mapping[str, float]], **more: bool) -> list[str]:
-    """What alarms say of hops, each with the probability of every parameter; the likelier half is what has changed."""
+    """Alarm events for hops given as probabilities of parameters; those above 0.5 have changed."""
     return [f"{event.kind} {event.alarm.name}" for event in happened(hops, **more)]
 
 
@@ -181,17 +181,17 @@ def happened(
 NOT_SURE, SURE = {"c_by": 0.4, "c_bz": 0.6}, {"c_by": 0.03, "c_bz": 0.97}
 
 
-def test_a_name_needs_to_be_as_good_as_certain() -> None:
+def test_a_parameter_is_named_only_if_nearly_certain() -> None:
     assert judged([SURE] * 3) == ["raised c_bz"]
     assert judged([NOT_SURE] * 3) == ["raised changed"]
-    assert judged([SURE, NOT_SURE] * 3) == []  # neither for as long as the on-delay
+    assert judged([SURE, NOT_SURE] * 3) == []  # neither lasts for the on-delay
     assert judged([NOT_SURE] * 3, outside=True) == ["raised model"]
-    assert judged([SURE | {"c_by": 0.6}] * 3) == ["raised c_bz"]  # one name is there: the other is waited for
-    assert judged([SURE] * 3 + [NOT_SURE] * 6) == ["raised c_bz"]  # what has its alarm raises no other
+    assert judged([SURE | {"c_by": 0.6}] * 3) == ["raised c_bz"]  # one is named: the other is waited for
+    assert judged([SURE] * 3 + [NOT_SURE] * 6) == ["raised c_bz"]  # a parameter with an alarm raises no second one
     assert judged([NOT_SURE] * 3 + [SURE] * 6) == ["raised changed", "raised c_bz", "cleared changed"]
 
 
-def test_where_most_has_changed_outside_the_model_or_a_line_hides_the_machine_nothing_is_named() -> None:
+def test_no_name_if_outside_the_model_with_most_changed_or_a_line_hiding_the_machine() -> None:
     most = dict.fromkeys(("k_by", "c_by", "k_bz", "c_bz"), 0.99)
     assert judged([most] * 3) == [f"raised {name}" for name in most]
     assert judged([most] * 3, outside=True) == ["raised model"]
@@ -206,7 +206,7 @@ def test_where_most_has_changed_outside_the_model_or_a_line_hides_the_machine_no
 
 
 @pytest.mark.parametrize("change", [-0.08, 0.2, -0.6])  # below and above all limits
-def test_where_a_wrong_gain_would_explain_it_as_well_both_are_told(change: float) -> None:
+def test_an_equally_likely_wrong_gain_is_named_beside_the_parameters(change: float) -> None:
     book = AlarmBook(SETTINGS)
     for number in range(3):
         book.found(verdict(SURE, change=change), "", "gain of z1: 1.16 times", number * 5_000_000_000, hidden=True)
@@ -216,11 +216,11 @@ def test_where_a_wrong_gain_would_explain_it_as_well_both_are_told(change: float
     assert judged([SURE] * 3, outside=True, hidden=True) == ["raised model"]
 
 
-def test_what_reads_stiffer_or_has_no_alarm_explains_no_levels_and_a_repaired_shaft_has_no_reserve() -> None:
+def test_stiffening_or_small_changes_explain_no_levels_and_a_repaired_shaft_clears() -> None:
     book = AlarmBook(SETTINGS)
     changes = ({"EI": 0.99}, 0.2), ({"EI": 0.99}, -0.2), ({"EI": 0.99, "e": 0.99}, 0.2)
     assert [book.found(verdict(of, change=change), "", "", 0) for of, change in changes] == [False, True, True]
-    # Nobody hears of a change below its limit: it must not keep levels from being told.
+    # A change below its limit raises no alarm, so it must not suppress level alarms.
     assert [AlarmBook(SETTINGS).found(verdict({"e": 0.99}, change=size), "", "", 0) for size in (0.01, 0.2)] == [
         False,
         True,
@@ -249,10 +249,10 @@ def test_what_reads_stiffer_or_has_no_alarm_explains_no_levels_and_a_repaired_sh
         ((), "baseline", False, False),
     ],
 )
-def test_an_unbalance_beside_bearings_without_parameters_is_named_with_reserve(
+def test_a_baseline_unbalance_beside_bearing_changes_has_low_confidence(
     others: tuple[str, ...], by: str, settled: bool, reserve: bool
 ) -> None:
-    """What the bearings stand on may have changed, or one of them in this window; then no unbalance is read right."""
+    """The foundation may have changed, or a bearing in this window; then the unbalance is misread."""
     book, found = AlarmBook(SETTINGS), verdict(dict.fromkeys((*others, "e"), 1.0), settled=settled)
     current = tuple(one.model_copy(update={"by": by}) for one in found.current)
     for number in range(3):
@@ -265,10 +265,10 @@ def test_an_unbalance_beside_bearings_without_parameters_is_named_with_reserve(
     ("vertical", "by", "reserve"),
     [(-0.14, "baseline", True), (-0.03, "baseline", False), (0.2, "baseline", False), (-0.14, "likelihood", False)],
 )
-def test_an_unbalance_is_named_with_reserve_while_both_bearing_stiffnesses_read_softer(
+def test_an_unbalance_has_low_confidence_while_both_stiffnesses_read_softer(
     vertical: float, by: str, *, reserve: bool
 ) -> None:
-    """As of a foundation that has gone soft, where the unbalance happened to explain the window better."""
+    """As of a softened foundation, where an unbalance happened to explain the window better."""
     book, found = AlarmBook(SETTINGS), verdict({"e": 1.0, "k_by": 0.1, "k_bz": 0.1})
     changes = {"e": 0.17, "k_by": -0.3, "k_bz": vertical}
     current = tuple(one.model_copy(update={"by": by, "relative_change": changes[one.name]}) for one in found.current)
@@ -277,7 +277,7 @@ def test_an_unbalance_is_named_with_reserve_while_both_bearing_stiffnesses_read_
     assert {event.alarm.name: event.alarm.low_confidence for event in book.take()} == {"e": reserve}
 
 
-def test_a_name_is_held_with_reserve_once_nothing_explains_the_machine() -> None:
+def test_a_named_alarm_gets_low_confidence_while_nothing_explains_the_machine() -> None:
     book, named = AlarmBook(SETTINGS), verdict({"c_bz": 0.97})
     unexplained = named.model_copy(update={"current": (), "candidates": (), "outside_model": True})
     reserves = []
@@ -295,7 +295,7 @@ def test_a_name_is_held_with_reserve_once_nothing_explains_the_machine() -> None
         ("", 60.0, "if a parameter has just changed, it can be named in 60 s"),
     ],
 )
-def test_what_a_machine_outside_the_model_may_have_is_told(suspect: str, astride_s: float, said: str) -> None:
+def test_an_alarm_outside_the_model_states_its_suspect_or_wait(suspect: str, astride_s: float, said: str) -> None:
     book, outside = AlarmBook(SETTINGS), verdict({}, outside=True, settled=False)
     for number in range(3):
         left_s = max(0.0, astride_s - 5.0 * number)
@@ -304,10 +304,10 @@ def test_what_a_machine_outside_the_model_may_have_is_told(suspect: str, astride
     assert event.text == f"ALERT: outside the model: {said}"
 
 
-def test_a_name_that_is_taken_back_is_cleared_however_large_its_reading() -> None:
+def test_a_withdrawn_name_clears_its_alarm_however_large_its_reading() -> None:
     nothing = {"c_by": 0.02, "c_bz": 0.04}
     assert judged([SURE] * 3 + [nothing] * 3) == ["raised c_bz"]
     assert judged([SURE] * 3 + [nothing] * 4) == ["raised c_bz", "cleared c_bz"]
     text = happened([SURE] * 3 + [nothing] * 4)[-1].text
     assert text == "cleared: bearing damping, vertical (c_bz) is no longer named as changed; it reads +20.0% ± 5.9%"
-    assert judged([SURE] * 3 + [nothing] * 9, settled=False) == ["raised c_bz"]  # too little data to take it back
+    assert judged([SURE] * 3 + [nothing] * 9, settled=False) == ["raised c_bz"]  # too little data to withdraw the name

@@ -1,4 +1,4 @@
-"""The monitor of a machine that was commissioned without its parameters, from block to alarm."""
+"""The monitor of a machine commissioned without known parameters, from block to alarm."""
 
 from collections.abc import Callable, Sequence
 from copy import deepcopy
@@ -31,7 +31,7 @@ MACHINE = NOTHING.model_copy(update={"alarms": AlarmSettings(on_delay_s=0.0)})
 
 
 def before() -> Sequence[SampleBlock]:
-    """The healthy machine: where equations can be evaluated 150 s are enough to commission it."""
+    """The healthy machine: 150 s are enough to commission it where equations can be evaluated."""
     return stream(250.0, SEED)
 
 
@@ -72,7 +72,7 @@ def test_a_change_is_named_alone(name: str, change: float) -> None:
 
 
 @pytest.mark.parametrize(("alarm", "sign", "source"), [("data-gain", -1, "y1"), ("data-swapped", 1, "z1")])
-def test_all_sensors_of_a_place_reversed_or_exchanged_are_told_and_no_parameter(
+def test_reversed_or_exchanged_sensors_of_a_place_raise_a_data_alarm_and_no_parameter(
     alarm: str, sign: int, source: str
 ) -> None:
     """They agree with each other, and the machine is as it was."""
@@ -87,8 +87,8 @@ def test_all_sensors_of_a_place_reversed_or_exchanged_are_told_and_no_parameter(
     assert not any(window.parameters for window in full(windows))
 
 
-def test_a_change_within_the_window_is_named_and_is_not_outside_the_model() -> None:
-    """Windows astride it fit neither the machine as it was nor as it is; their latest data fit."""
+def test_a_change_within_the_window_is_named_and_not_outside_the_model() -> None:
+    """Windows across the change fit neither state of the machine; their latest data fit."""
     begins_s = 63.0
     change = Event(at_s=begins_s, parameter="k_by", relative_change=-0.35)
     blocks = stream(97.0, SEED + 5, change)
@@ -99,8 +99,8 @@ def test_a_change_within_the_window_is_named_and_is_not_outside_the_model() -> N
     assert (told[0].time_ns - blocks[0].start_ns) / 1e9 < begins_s + 25.0
 
 
-def test_an_unbalance_that_does_not_explain_the_latest_data_is_named_with_reserve() -> None:
-    """As where a foundation goes soft: most of the window is of before, so that it fits all the same."""
+def test_an_unbalance_that_does_not_explain_the_latest_data_has_low_confidence() -> None:
+    """As when a foundation softens: most of the window is from before, so that it still fits."""
     changes = {"e": 1.0, "k_by": -0.15, "k_bz": -0.15}
     at_once = [Event(at_s=63.0, parameter=name, relative_change=change) for name, change in changes.items()]
     _, events = feed(MachineMonitor(installed()), stream(82.0, SEED + 5, *at_once))
@@ -109,12 +109,12 @@ def test_an_unbalance_that_does_not_explain_the_latest_data_is_named_with_reserv
     assert told["e"].low_confidence
 
 
-def test_another_speed_is_not_evaluable_here_and_raises_nothing_but_levels() -> None:
+def test_a_speed_not_commissioned_is_not_evaluable_and_raises_only_levels() -> None:
     faster = Event(at_s=0.0, speed_rpm=1.15 * LAB.operation.speed_rpm)
     windows, events = feed(MachineMonitor(installed()), stream(65.0, SEED + 3, faster))
     assert {window.state for window in full(windows)} <= {HealthState.NOT_EVALUABLE, HealthState.ALERT}
     assert all("not evaluable here: speed is 1518 rpm" in window.reason for window in full(windows))
-    # Louder than it was at the commissioned speed is said, and what that is worth.
+    # Growth against the commissioned speed is reported with that caveat.
     assert all("commissioned at another speed" in event.alarm.note for event in events)
 
 
@@ -131,7 +131,7 @@ def test_another_speed_is_not_evaluable_here_and_raises_nothing_but_levels() -> 
         ),
     ],
 )
-def test_a_rub_is_told_and_names_with_reserve(clearance_m: float, size: float, of: Callable[[], Installed]) -> None:
+def test_a_rub_is_suspected_and_names_uncertain(clearance_m: float, size: float, of: Callable[[], Installed]) -> None:
     scenario, machine = load_scenario("healthy")
     rubbing = scenario.model_copy(
         update={"rub": Rub(clearance_m=clearance_m), "events": (Event(at_s=0.0, anomaly="rub", size=size),)}
@@ -142,12 +142,12 @@ def test_a_rub_is_told_and_names_with_reserve(clearance_m: float, size: float, o
     assert "as by a rub" in raised[MODEL].note
     named = [alarm for name, alarm in raised.items() if name in PARAMETERS]
     assert all(alarm.low_confidence for alarm in named)
-    # Its size would be a danger, were it one of that parameter.
+    # A real change of that size would be a danger.
     assert {alarm.severity for alarm in named} <= {Severity.ALERT}
 
 
-def test_what_grows_beside_a_name_is_heard_where_the_name_does_not_explain_it() -> None:
-    """An unbalance has been named when a 2x comes, from which on the machine is outside the model."""
+def test_level_growth_that_a_named_change_does_not_explain_raises_its_alarm() -> None:
+    """A 2x appears after an unbalance was named, and the machine is outside the model from then on."""
     begins = 700
     after = stream(110.0, SEED + 2, Event(at_s=0.0, parameter="e", relative_change=0.5))
     samples = samples_of(after)
@@ -165,7 +165,7 @@ def test_what_grows_beside_a_name_is_heard_where_the_name_does_not_explain_it() 
 
 
 @pytest.mark.parametrize("place", ["1", "2"])
-def test_a_wrong_gain_of_a_place_is_told_and_no_parameter_is_named(place: str) -> None:
+def test_a_wrong_gain_at_a_place_is_suspected_and_no_parameter_named(place: str) -> None:
     names = [channel.name for channel in LAB.sensors]
     wrong = [names.index(f"y{place}"), names.index(f"y{place}_dot")]
     healthy = stream(70.0, SEED + 8)
@@ -188,7 +188,7 @@ def test_a_wrong_gain_of_a_place_is_told_and_no_parameter_is_named(place: str) -
         ),
     ],
 )
-def test_a_line_that_the_healthy_machine_did_not_have_is_told(hz: float, told: tuple[str, ...]) -> None:
+def test_a_line_that_the_healthy_machine_lacked_is_suspected(hz: float, told: tuple[str, ...]) -> None:
     healthy = stream(70.0, SEED + 9)
     samples = samples_of(healthy)
     turned = 2 * np.pi * hz * np.arange(len(samples)) / LAB.rate_hz
@@ -204,8 +204,8 @@ def test_a_line_that_the_healthy_machine_did_not_have_is_told(hz: float, told: t
     assert all(alarm.low_confidence for name, alarm in raised.items() if name in PARAMETERS)
 
 
-def test_where_a_line_is_nearly_all_there_is_nothing_is_named() -> None:
-    """A 1x and a sine with phases of their own in every channel are no motion of a rotor, and whatever fits them."""
+def test_nothing_is_named_where_a_line_dominates_the_vibration() -> None:
+    """A 1x and a sine with random phases in every channel are no rotor's motion, whatever fits them."""
     healthy, rng = stream(70.0, SEED + 9), np.random.default_rng(1)
     samples = samples_of(healthy)
     names = [channel.name for channel in LAB.sensors]
@@ -225,7 +225,7 @@ def test_where_a_line_is_nearly_all_there_is_nothing_is_named() -> None:
     assert not raised & set(PARAMETERS)
 
 
-def test_a_2x_beyond_a_limit_of_ones_own_has_not_grown_and_doubts_nothing() -> None:
+def test_a_2x_beyond_a_configured_limit_raises_its_level_alarm_only() -> None:
     own = LevelSettings.model_validate({"limits": [{"channel": "y1", "measure": "x2", "alert": 1e-3, "danger": 1e3}]})
     machine = MACHINE.model_copy(update={"levels": own})
     monitor = MachineMonitor(Installed(machine, None, installed().commissioned))
@@ -235,7 +235,7 @@ def test_a_2x_beyond_a_limit_of_ones_own_has_not_grown_and_doubts_nothing() -> N
 
 
 def _faulty(kind: str) -> list[SampleBlock]:
-    """What follows on a healthy full window: a sensor at fault."""
+    """Data after a healthy full window, with a faulty sensor."""
     blocks = stream(125.0, SEED + 4)[_FULL : 1250 if kind == "swapped" else 830 if kind == "gain drift" else 730]
     samples = samples_of(blocks)
     names = [channel.name for channel in LAB.sensors]
@@ -264,11 +264,11 @@ def _watching() -> MachineMonitor:
     [
         ("gain drift", "gain"),
         ("offset", "offset"),
-        ("swapped", "swapped"),  # as long as the window holds both, it is only incoherent
+        ("swapped", "swapped"),  # while the window holds both, it is only incoherent
         ("delayed", "delay"),
     ],
 )
-def test_a_sensor_at_fault_is_told_from_the_machine(kind: str, told: str) -> None:
+def test_a_faulty_sensor_raises_a_data_alarm_and_no_machine_alarm(kind: str, told: str) -> None:
     windows, events = feed(deepcopy(_watching()), _faulty(kind))
     last = full(windows)[-1]
     assert last.state is HealthState.DATA_HEALTH
@@ -288,7 +288,7 @@ def with_sensors(columns: list[int], duration_s: float) -> Installed:
     return Installed(machine, None, sure(made.commissioned))
 
 
-def test_with_too_few_sensors_only_changed_or_not_changed_is_said() -> None:
+def test_with_too_few_sensors_only_a_change_of_shape_and_levels_is_reported() -> None:
     bearing = [n for n, channel in enumerate(MACHINE.sensors) if channel.location != "disc"]
     few = with_sensors(bearing, 250.0)
     windows, events = feed(MachineMonitor(few), of_sensors(bearing, stream(85.0, SEED + 1)[:650]))
@@ -303,7 +303,7 @@ def test_with_too_few_sensors_only_changed_or_not_changed_is_said() -> None:
     assert all(reading.relative_change is None for reading in full(windows)[-1].parameters)
 
 
-def test_a_swap_that_no_pair_of_sensors_shows_is_not_called_healthy() -> None:
+def test_swapped_displacement_sensors_are_not_called_healthy() -> None:
     displacements = [n for n, channel in enumerate(MACHINE.sensors) if channel.quantity != "velocity"]
     made = with_sensors(displacements, 150.0)
     names = [channel.name for channel in made.machine.sensors]
@@ -314,5 +314,5 @@ def test_a_swap_that_no_pair_of_sensors_shows_is_not_called_healthy() -> None:
     windows, events = feed(MachineMonitor(made), with_samples(blocks, samples))
     assert HealthState.HEALTHY not in {window.state for window in full(windows)}
     assert "model" in {event.alarm.name for event in events}
-    # A level is what a channel shows, whatever it is taken for.
+    # Levels are of channels, whatever sensor these really are.
     assert all(event.alarm.low_confidence for event in events if not event.alarm.name.startswith(("model", LEVEL)))

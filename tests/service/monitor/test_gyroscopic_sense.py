@@ -1,4 +1,4 @@
-"""A rotor whose gyroscopic moments have the sense of nature, of which the theory takes the other one first."""
+"""A rotor with the physical sense of gyroscopic moments, opposite to that of the theory's equations."""
 
 from dataclasses import replace
 from functools import cache
@@ -27,8 +27,8 @@ def stream(duration_s: float, seed: int, *events: Event) -> tuple[SampleBlock, .
     return tuple(block for block, _ in blocks(scenario, in_sense(LAB, "opposite")))
 
 
-def test_the_other_sense_is_another_rotor() -> None:
-    """Whirl with the rotation, from y to z, rises with the speed in nature; where y and z are alike it is a circle."""
+def test_forward_whirl_rises_with_speed_only_in_the_opposite_sense() -> None:
+    """Physically, the frequency of forward whirl, from y to z, rises with speed; with equal y and z it is a circle."""
     forward: dict[float, list[float]] = {}
     for machine in (LAB, in_sense(LAB, "opposite")):
         rotor = machine.rotor.model_copy(update={"k_bz_N_per_m": machine.rotor.k_by_N_per_m})
@@ -41,7 +41,7 @@ def test_the_other_sense_is_another_rotor() -> None:
     assert forward[-LAB.rotor.I2p_kg_m2][1] > forward[-LAB.rotor.I2p_kg_m2][0]
 
 
-def test_the_healthy_machine_is_healthy_in_its_own_sense() -> None:
+def test_a_healthy_machine_of_the_opposite_sense_is_healthy() -> None:
     going = MachineMonitor(Installed(LAB))
     windows, events = feed(going, stream(75.0, SEED)[:700])
     assert not events
@@ -54,7 +54,7 @@ def test_the_healthy_machine_is_healthy_in_its_own_sense() -> None:
     assert feed(resumed(going, Installed(LAB)), rest) == feed(going, rest)
 
 
-def test_what_has_changed_from_the_beginning_is_named() -> None:
+def test_a_change_from_the_beginning_is_named_in_the_opposite_sense() -> None:
     softer = Event(at_s=0.0, parameter="k_by", relative_change=-0.2)
     windows, events = feed(MachineMonitor(Installed(LAB)), stream(80.0, SEED + 1, softer))
     assert [event.alarm.name for event in events if not event.alarm.name.startswith("level:")] == ["k_by"]
@@ -63,8 +63,8 @@ def test_what_has_changed_from_the_beginning_is_named() -> None:
 
 
 @pytest.mark.parametrize("machine", [LAB, PARTIAL, blind(LAB)])
-def test_a_commissioning_finds_the_sense(machine: MachineFile) -> None:
-    """With a shaft angle or without, where the size of the unbalance is identified."""
+def test_commissioning_finds_the_sense(machine: MachineFile) -> None:
+    """With a shaft angle, or without one, where the size of the unbalance is identified."""
     seen = stream(75.0, SEED + 2)
     seen = seen if "theta" in machine.descriptor.states else tuple(without_angle(seen))
     made = commissioned(machine, recording(machine, seen))
@@ -78,14 +78,14 @@ def test_a_commissioning_finds_the_sense(machine: MachineFile) -> None:
     assert windows[-1].gyroscopic == "opposite"
 
 
-def test_a_commissioning_keeps_the_sense_that_explains_its_recordings() -> None:
+def test_commissioning_keeps_the_sense_of_eq_27_if_it_explains_the_recordings() -> None:
     made = commissioned(LAB, healthy(LAB, 75.0, SEED))
     assert made.commissioned is not None
     assert made.commissioned.gyroscopic == "Eq. 27"
     assert "gyroscopic" not in made.commissioned.model_dump()
 
 
-def test_a_disturbance_in_the_first_window_does_not_keep_the_sense_from_being_found() -> None:
+def test_the_sense_is_found_despite_a_disturbance_in_the_first_window() -> None:
     disturbed = [
         replace(block, samples=block.samples * np.float32(4.0)) if 20 <= number < 60 else block
         for number, block in enumerate(stream(80.0, SEED))

@@ -1,4 +1,4 @@
-"""A heavy spot that is not where a machine file without its angle has it looked for."""
+"""A heavy spot at another angle than assumed, with and without its angle in the machine file."""
 
 import math
 from copy import deepcopy
@@ -37,7 +37,7 @@ def stream(duration_s: float, phase_rad: float, *events: Event) -> tuple[SampleB
 
 @cache
 def watching(angle: bool) -> MachineMonitor:
-    """A monitor that has seen the first 80 s, which are the same whatever comes then; not to be fed."""
+    """A monitor that has seen the first 80 s, the same for all changes; copy it before feeding."""
     sensors = LAB.sensors if angle else tuple(one for one in LAB.sensors if one.name != "theta")
     target = MachineMonitor(Installed(LAB.model_copy(update={"sensors": sensors})))
     assert not feed(target, stream(80.0, 0.15) if angle else without_angle(stream(80.0, 0.15)))[1]
@@ -45,7 +45,7 @@ def watching(angle: bool) -> MachineMonitor:
 
 
 def changed(duration_s: float, parameter: str, change: float, *, angle: bool = True) -> list[AlarmEvent]:
-    """What is told of a change after 80 s."""
+    """Alarm events for a change after 80 s."""
     parts = stream(duration_s, 0.15, Event(at_s=80.0, parameter=parameter, relative_change=change))
     return feed(deepcopy(watching(angle)), parts[800:] if angle else without_angle(parts[800:]))[1]
 
@@ -60,10 +60,10 @@ def e_of(parameters: tuple[Parameter, ...]) -> float:
     ("phase_rad", "angle", "backward"),
     [(0.15, True, False), (2.5, True, False), (2.5, False, False), (2.5, False, True)],
 )
-def test_where_the_file_does_not_say_where_the_heavy_spot_is_its_angle_is_no_unbalance(
+def test_without_an_unbalance_phase_in_the_file_any_heavy_spot_angle_is_healthy(
     phase_rad: float, angle: bool, backward: bool
 ) -> None:
-    """With a shaft angle or without, also after a restart, whichever way it turns; in a mirror it turns the other."""
+    """With a shaft angle or without, after a restart, in either sense of rotation; a mirror image turns backwards."""
     sensors = tuple(one for one in LAB.sensors if angle or one.name != "theta")
     mirror = np.array([-1.0 if backward and one.direction == "z" else 1.0 for one in sensors], dtype=np.float32)
     larger = Event(at_s=80.0, parameter="e", relative_change=0.5)
@@ -76,31 +76,31 @@ def test_where_the_file_does_not_say_where_the_heavy_spot_is_its_angle_is_no_unb
     windows, events = feed(resumed(going, installed), parts[750:])
     assert [name for kind, name in named(events) if kind == "raised"] == ["e"]
     assert e_of(windows[-1].parameters) == pytest.approx(0.5, abs=0.1)
-    assert angle or all(one.vector is None for one in windows[-1].parameters)  # without it, it has no direction
+    assert angle or all(one.vector is None for one in windows[-1].parameters)  # which needs an angle
 
 
 @pytest.mark.parametrize("angle", [True, False])
-def test_an_unbalance_that_has_become_smaller_is_no_danger(angle: bool) -> None:
+def test_a_smaller_unbalance_is_an_alert_and_no_danger(angle: bool) -> None:
     events = changed(130.0, "e", -0.6, angle=angle)
     assert [(event.kind, event.alarm.name, event.alarm.severity) for event in events] == [("raised", "e", "alert")]
 
 
-def test_a_shaft_that_reads_stiffer_is_named_with_reserve() -> None:
-    """As where a coupling has locked: in a shaft that has cracked there is none."""
+def test_a_stiffer_shaft_has_low_confidence() -> None:
+    """As with a locked coupling; a softer shaft, as with a crack, is named with full confidence."""
     for change, reserve in ((0.2, True), (-0.2, False)):
         (event,) = (one for one in changed(120.0, "EI", change) if one.alarm.name == "EI")
         assert event.alarm.low_confidence is reserve
         assert ("locked coupling" in event.text) is reserve
 
 
-def test_where_the_file_says_it_another_angle_is_a_change() -> None:
+def test_with_an_unbalance_phase_in_the_file_another_angle_is_a_change() -> None:
     windows, events = feed(MachineMonitor(Installed(with_heavy_spot(0.0))), stream(75.0, 2.5))
-    assert [(event.alarm.name, event.alarm.severity) for event in events] == [("e", "alert")]  # no more than it was
+    assert [(event.alarm.name, event.alarm.severity) for event in events] == [("e", "alert")]  # its size is as before
     assert "turned by 143°: the heavy spot has moved, or the zero of the shaft angle" in events[0].text
     assert e_of(windows[-1].parameters) == pytest.approx(2 * math.sin(2.5 / 2), abs=0.1)
 
 
-def test_loading_a_file_keeps_whether_it_says_it() -> None:
+def test_loading_a_file_keeps_whether_the_unbalance_phase_was_set() -> None:
     given = "unbalance_phase_rad"
     assert given not in LAB.operation.model_fields_set
     assert given not in load_machine_file("lab").operation.model_fields_set  # type: ignore[union-attr]

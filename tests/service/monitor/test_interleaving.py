@@ -1,4 +1,4 @@
-"""Whatever the network and the power supply do within reason, the log of alarms is the same."""
+"""Repetitions, reordering and restarts within bounds do not change the alarm log."""
 
 import sqlite3
 import tempfile
@@ -28,11 +28,11 @@ from tests.sure import sure
 
 SEED = 7_700_501
 REORDERED = 8
-"""How far blocks are out of order, and how many the monitor waits for."""
+"""How far blocks are out of order, and how many of them the monitor waits for."""
 CACHED = 120
-"""Blocks a publisher sends again to a monitor that comes back; more than a window, the gap and what is out of order."""
+"""Blocks that a publisher resends to a restarted monitor; more than a window, the gap and the reordering."""
 BEHIND = 20
-"""How far a monitor may be behind when it is struck down; with a hop and what is out of order, the cache covers it."""
+"""How far a monitor may be behind when it is killed; with a hop and the reordering, the cache covers it."""
 MISSING = range(136, 158)
 """Blocks that are lost for good: 11 s, longer than a silence may last."""
 
@@ -49,7 +49,7 @@ def installed() -> Installed:
 
 @cache
 def stream() -> tuple[SampleBlock, ...]:
-    """Two minutes in blocks of half a second: a bearing loses stiffness, gains it back; a probe gets stuck."""
+    """Two minutes in blocks of half a second: a bearing loses stiffness and regains it; a probe gets stuck."""
     scenario, _ = load_scenario("healthy")
     events = [
         {"at_s": 27.0, "parameter": "k_by", "relative_change": -0.5},
@@ -65,12 +65,12 @@ def stream() -> tuple[SampleBlock, ...]:
 
 @cache
 def expected() -> tuple[AlarmEvent, ...]:
-    """The log without any of it."""
+    """The log of an undisturbed run."""
     monitor = MachineMonitor(installed())
     return tuple(event for block in stream() for event in monitor.step(block).events)
 
 
-def test_the_story_is_worth_telling() -> None:
+def test_the_undisturbed_log_has_all_kinds_of_events() -> None:
     told = [(event.kind.value, event.alarm.name) for event in expected()]
     assert {("raised", "k_by"), ("cleared", "k_by"), ("raised", "stream-lost"), ("raised", "data-gap")} <= set(told)
     assert ("raised", "data-stuck") in told
@@ -78,7 +78,7 @@ def test_the_story_is_worth_telling() -> None:
 
 
 class Plant:
-    """A monitor that can be struck down, and the database it left."""
+    """A monitor that can be killed, and the database that it leaves."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -97,7 +97,7 @@ class Plant:
         inbox.put(RawBlock(*encode_block(block, installed().machine.descriptor.schema_hash)))
 
     def strike(self) -> None:
-        """Go on from an image of the database as it is now, whatever the monitor is doing, and let the old one be."""
+        """Restart from a copy of the database as it is now, whatever the monitor is doing."""
         before = self._folder / str(self._number)
         self._number += 1
         with sqlite3.connect(before) as source, sqlite3.connect(self._folder / str(self._number)) as image:
@@ -122,7 +122,7 @@ def test_repetitions_reordering_and_restarts_change_nothing(seed: int, strikes: 
     rng = np.random.default_rng(seed)
     sent = stream()
     jitter = rng.uniform(0, REORDERED, len(sent))
-    jitter[-2 * REORDERED :] = 0.0  # what comes last must not wait for ever
+    jitter[-2 * REORDERED :] = 0.0  # the last blocks must not wait for ever
     jitter[:1] = 0.0
     order = np.argsort(np.arange(len(sent)) + jitter, kind="stable").tolist()
     struck = set(rng.integers(1, len(sent), strikes).tolist())
@@ -145,5 +145,5 @@ def test_repetitions_reordering_and_restarts_change_nothing(seed: int, strikes: 
             plant.stop()
         identity = plant.at.worker.identity
         assert [one.text for one in log] == [stored_event(identity, event, 0).text for event in expected()]
-        # Whoever listened to all of it heard every event, some perhaps twice with the same id, in the end in order.
+        # A subscriber received every event in order, some perhaps twice with the same id.
         assert list(dict.fromkeys(plant.heard.events)) == [one.text for one in log]

@@ -39,7 +39,7 @@ def stream(duration_s: float, *events: Event) -> Sequence[SampleBlock]:
 
 
 def healthy(duration_s: float) -> Sequence[SampleBlock]:
-    """The first blocks of one stream, which no test may write to."""
+    """The first blocks of one shared stream, read-only."""
     return stream(180.0)[: round(10 * duration_s)]
 
 
@@ -56,7 +56,7 @@ def watching() -> MachineMonitor:
 
 
 @pytest.mark.slow
-def test_reports_do_not_depend_on_the_blocks() -> None:
+def test_reports_do_not_depend_on_the_block_length() -> None:
     """Tenths of a second, uneven lengths, 1.9 s blocks, and encoded bytes: the same reports to the last bit."""
     fine = healthy(63.0)
     expected, _ = feed(monitor(), fine)
@@ -103,7 +103,7 @@ def test_every_parameter_and_equation_is_accounted_for() -> None:
     assert {one.verdict for one in relation.agreement if one.name == "EI"} == {"only-one"}
 
 
-def test_a_gap_is_reported_and_is_neither_a_fault_nor_healthy() -> None:
+def test_after_a_gap_the_window_refills_before_the_machine_is_healthy() -> None:
     everything = healthy(180.0)
     target = watching()
     after, events = feed(target, everything[1050:])  # 40 s are lost: too much for the window's span
@@ -113,10 +113,10 @@ def test_a_gap_is_reported_and_is_neither_a_fault_nor_healthy() -> None:
     assert "40 s of data are missing" in quality.last_gap
     begin_ns = everything[0].start_ns
     assert [(event.kind, event.alarm.name, (event.time_ns - begin_ns) / 1e9) for event in events] == [
-        ("raised", "stream-lost", 70.0),  # 5 s after the last data, as it would have been live
+        ("raised", "stream-lost", 70.0),  # 5 s after the last data, as live
         ("cleared", "stream-lost", 105.0),
         ("raised", "data-gap", 105.0),
-        ("cleared", "data-gap", 172.5),  # the first whole hop after the gap, and the off-delay
+        ("cleared", "data-gap", 172.5),  # after the first whole hop and the off-delay
     ]
     states = [report.state for report in after]
     refilled = states.index(HealthState.HEALTHY)
@@ -134,8 +134,8 @@ def test_a_gap_is_reported_and_is_neither_a_fault_nor_healthy() -> None:
         pytest.param(40_000, 2, [], id="started anew far later"),
     ],
 )
-def test_a_publisher_started_anew_is_no_clock_that_was_set(step_s: int, run: int, told: list[str]) -> None:
-    """Whatever its time: a restart is stated as one, and the window fills anew."""
+def test_a_restarted_publisher_is_not_a_stepped_clock(step_s: int, run: int, told: list[str]) -> None:
+    """Whatever its time, a restart is stated as one, and the window fills again."""
     everything = healthy(129.0)
     target = watching()
     later = [
@@ -154,8 +154,8 @@ def test_a_publisher_started_anew_is_no_clock_that_was_set(step_s: int, run: int
     assert windows[-1].start_ns >= later[9].start_ns
 
 
-def test_a_publisher_started_anew_while_the_monitor_was_away() -> None:
-    """Its state does not fit, so that it knows no runs: sequence 0 is the beginning of one."""
+def test_a_publisher_restarted_while_the_monitor_was_down_is_no_stepped_clock() -> None:
+    """Its state does not fit, so it knows no runs: sequence 0 begins one."""
     everything = healthy(20.0)
     for first, told in ((0, []), (3, ["data-clock"])):
         target = monitor()
@@ -167,7 +167,7 @@ def test_a_publisher_started_anew_while_the_monitor_was_away() -> None:
 
 
 @pytest.mark.parametrize("torn", ["times that are not counted in samples", "lost blocks"])
-def test_where_no_hop_is_whole_nothing_stays_healthy(torn: str) -> None:
+def test_the_state_is_not_evaluable_while_no_hop_is_complete(torn: str) -> None:
     target, after = watching(), healthy(170.0)[650:]
     spoilt = after[:400]
     if torn == "lost blocks":
@@ -180,7 +180,7 @@ def test_where_no_hop_is_whole_nothing_stays_healthy(torn: str) -> None:
     assert "no 5 s without a gap for 2" in events[0].alarm.note
     assert target.health().state is HealthState.NOT_EVALUABLE
     assert "nothing is evaluated: blocks are lost, or their times" in target.health().reason
-    stopped = watching()  # a restart in the middle of it delays nothing
+    stopped = watching()  # a restart meanwhile causes no delay
     feed(stopped, spoilt[:100])
     assert feed(resumed(stopped, KIT), spoilt[100:])[1] == events
     windows, events = feed(target, after[400:])
@@ -189,8 +189,8 @@ def test_where_no_hop_is_whole_nothing_stays_healthy(torn: str) -> None:
 
 
 @pytest.mark.parametrize("restarted", [False, True])
-def test_a_phase_reference_that_jumps_is_no_unbalance_for_good(restarted: bool) -> None:
-    """Nor after a restart; the same turn of the vectors without a jump of the angle is one."""
+def test_a_jump_of_the_phase_reference_is_never_an_unbalance(restarted: bool) -> None:
+    """Nor after a restart."""
     target, turned = watching(), rotor_kit.samples_of(healthy(180.0)[650:])
     turned[:, -1] = np.mod(turned[:, -1] + np.pi / 2, 2 * np.pi)
     after = with_samples(healthy(180.0)[650:], turned)
@@ -205,13 +205,13 @@ def test_a_phase_reference_that_jumps_is_no_unbalance_for_good(restarted: bool) 
     assert target.health().state is HealthState.HEALTHY
 
 
-def test_a_load_that_steps_is_inside_the_model() -> None:
+def test_a_step_of_the_load_is_inside_the_model() -> None:
     windows, events = feed(monitor(), stream(125.0, Event(at_s=65.0, excitation_level=3.0)))
     assert events == []
     assert {one.verdict.outside_model for one in windows if one.verdict is not None} == {False}
 
 
-def test_mains_hum_hides_no_rotor_and_another_line_is_told_with_its_frequency() -> None:
+def test_mains_hum_is_tolerated_and_another_line_is_named_with_its_frequency() -> None:
     windows, events = feed(monitor(), with_lines(healthy(75.0), {50.02: 0.1, 150.06: 0.03}))
     assert {one.state for one in windows if one.filled == 1.0} == {HealthState.HEALTHY}
     assert events == []
@@ -221,8 +221,8 @@ def test_mains_hum_hides_no_rotor_and_another_line_is_told_with_its_frequency() 
     assert last.reason.endswith("if this is its healthy state, commission it")
 
 
-def test_a_machine_that_runs_down_raises_nothing() -> None:
-    """On one source, where the least that is left of the rotation would be a misfit; nor when it hardly turns."""
+def test_a_run_down_raises_no_alarm() -> None:
+    """With one source, where any residual of the rotation would be a misfit; also when it hardly turns."""
     draw = Draw(LAB, SEED, Purpose.EVALUATION, 0, layout=Layout.ONE_SOURCE)
     scenario = draw_condition(draw, 1)
     stop = Event(at_s=65.0, ramp_s=60.0, speed_rpm=0.1)
@@ -232,7 +232,7 @@ def test_a_machine_that_runs_down_raises_nothing() -> None:
     assert windows[-1].state is HealthState.NOT_EVALUABLE
 
 
-def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
+def test_a_speed_out_of_range_is_not_evaluable_and_no_alarm() -> None:
     windows, events = feed(MachineMonitor(Installed(LAB)), stream(75.0, Event(at_s=0.0, speed_rpm=2000.0)))
     assert windows[-1].state is HealthState.NOT_EVALUABLE
     assert "speed is 2000 rpm, off 1320 rpm by 51.5 %, evaluation limit 20 %" in windows[-1].reason
@@ -252,7 +252,7 @@ def test_an_unsteady_speed_is_not_evaluable() -> None:
     assert not events
 
 
-# How each is found, the checks of sensors show.
+# The tests of sensor checks show how each is found.
 @pytest.mark.parametrize(
     "kind",
     [
@@ -260,7 +260,7 @@ def test_an_unsteady_speed_is_not_evaluable() -> None:
         *(pytest.param(kind, marks=pytest.mark.long) for kind in ("backwards", "constant channel", "twins")),
     ],
 )
-def test_sick_channels_are_stated_and_never_become_a_fault(kind: str) -> None:
+def test_faulty_channels_raise_data_alarms_and_no_machine_alarm(kind: str) -> None:
     healthy_ = healthy(73.0)  # three full windows: long enough for an alarm
     samples = rotor_kit.samples_of(healthy_)
     match kind:
@@ -283,7 +283,7 @@ def test_sick_channels_are_stated_and_never_become_a_fault(kind: str) -> None:
     assert all(window.reason or "diagnosed without it" in window.sensors[0].text for window in seen[11:])
 
 
-def test_parameters_that_the_sensors_cannot_see_are_not_read() -> None:
+def test_parameters_that_the_sensors_do_not_measure_are_not_read() -> None:
     horizontal = [column for column, sensor in enumerate(LAB.sensors) if sensor.direction != "z"]
     part = LAB.model_copy(update={"sensors": tuple(LAB.sensors[column] for column in horizontal)})
     blocks_ = [replace(block, samples=block.samples[:, horizontal]) for block in healthy(63.0)]
@@ -302,8 +302,8 @@ def test_one_wild_sample_does_not_blind_the_monitor() -> None:
     assert not events
 
 
-def test_where_peaks_are_cut_off_now_and_then_the_range_is_what_is_told() -> None:
-    """Too few samples lie there to be called clipped, and enough to bend the spectra."""
+def test_occasional_clipping_names_the_measuring_range_as_suspect() -> None:
+    """Too few samples to be called clipped, but enough to distort the spectra."""
     blocks = healthy(63.0)
     samples = rotor_kit.samples_of(blocks)
     measured = samples[:, [channel.quantity != "shaft_angle" for channel in LAB.sensors]]
@@ -318,16 +318,16 @@ def test_where_peaks_are_cut_off_now_and_then_the_range_is_what_is_told() -> Non
         assert told in found
 
 
-def test_without_a_bundle_the_equations_say_so() -> None:
+def test_without_a_bundle_equations_state_the_missing_network() -> None:
     window = feed(MachineMonitor(Installed(LAB)), healthy(63.0))[0][-1]
     assert {equation.reason for equation in window.equations} == {"no trained network"}
 
 
-def test_a_1x_that_no_unbalance_makes_is_outside_the_model() -> None:
+def test_a_1x_that_no_unbalance_can_cause_is_outside_the_model() -> None:
     blocks_, names = healthy(75.0), [channel.name for channel in LAB.sensors]
     samples = rotor_kit.samples_of(blocks_)
     turning = np.exp(1j * samples[:, names.index("theta")])
-    for place, side in (("y1", 1.0), ("z1", -1j)):  # at the bearing, where no force of the disc moves it alone
+    for place, side in (("y1", 1.0), ("z1", -1j)):  # at the bearing alone, which no force on the disc does
         at, rate = names.index(place), names.index(f"{place}_dot")
         wave = 1.4 * samples[:, at].std() * side * turning
         samples[:, at] += wave.real
@@ -337,8 +337,8 @@ def test_a_1x_that_no_unbalance_makes_is_outside_the_model() -> None:
     assert [event.alarm.name for event in events if event.alarm.name in {MODEL, *PARAMETERS}] == [MODEL]
 
 
-def test_a_converter_that_samples_one_channel_after_the_other_is_told_where_nothing_is_read() -> None:
-    """The rotor kit's displacements under one force, 60 µs from channel to channel, of which its file is silent."""
+def test_sequential_sampling_of_channels_is_suspected_if_nothing_is_read() -> None:
+    """The rotor kit's displacements under one force, with 60 µs between channels not stated in its file."""
     sensors = [one for one in LAB.sensors if not one.name.endswith("_dot")]
     late = [
         one if one.name == "theta" else one.model_copy(update={"delay_us": -60.0 * number})
@@ -355,8 +355,8 @@ def test_a_converter_that_samples_one_channel_after_the_other_is_told_where_noth
     assert event.alarm.note.endswith(windows[-1].suspect)
 
 
-def test_healthy_is_said_of_what_is_read() -> None:
-    """Sensors in one plane: the bearing has lost stiffness in the other."""
+def test_a_healthy_verdict_names_the_parameters_not_read() -> None:
+    """Sensors in one plane only: the bearing has lost stiffness in the other."""
     kit = rotor_kit.LAB
     seen = [number for number, one in enumerate(kit.sensors) if one.name[0] in "yt"]
     file = kit.model_copy(update={"sensors": tuple(kit.sensors[number] for number in seen)})

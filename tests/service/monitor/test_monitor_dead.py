@@ -1,4 +1,4 @@
-"""A machine with known parameters is diagnosed without a sensor that shows nothing."""
+"""A machine with known parameters is diagnosed without its dead sensors."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -33,7 +33,7 @@ def dying(
 
 
 @pytest.mark.parametrize(("columns", "value"), [([0], 12e-6), ([2, 5], np.nan)])
-def test_a_change_is_named_without_sensors_that_are_dead(columns: list[int], value: float) -> None:
+def test_a_change_is_named_without_the_dead_sensors(columns: list[int], value: float) -> None:
     installed = install(KIT, None)
     monitor = MachineMonitor(installed, remembered=True)
     stream = list(dying(columns, value, parse_fault(f"k_by=-0.2@{CHANGE_S}")))
@@ -51,14 +51,14 @@ def test_a_change_is_named_without_sensors_that_are_dead(columns: list[int], val
     assert same == reports
     window = monitor.window() if monitor.window else None
     assert window is not None
-    assert window.lines == ()  # in the rounding of a dead channel there are lines anywhere
+    assert window.lines == ()  # the rounding noise of a dead channel has lines anywhere
     assert {name for name in raised(monitor) if not name.startswith("data-")} == {"k_by"}
     change = {one.name: one for one in reports[-1].parameters}["k_by"]
     assert abs((change.relative_change or 0.0) + 0.2) < 4 * (change.standard_error or 0.0) < 0.1
 
 
 @pytest.mark.parametrize("columns", [[0, 1, 2, 3], [0, 8]])
-def test_nothing_is_read_where_half_of_the_sensors_or_the_shaft_angle_is_dead(columns: list[int]) -> None:
+def test_nothing_is_read_if_half_of_the_sensors_or_the_shaft_angle_is_dead(columns: list[int]) -> None:
     reports, _ = feed(MachineMonitor(install(KIT, None)), dying(columns, np.nan, end_s=60.0))
     dead = [one for one in reports if one.filled == 1 and one.sensors]
     assert len(dead) == 4
@@ -67,7 +67,7 @@ def test_nothing_is_read_where_half_of_the_sensors_or_the_shaft_angle_is_dead(co
 
 
 @pytest.mark.parametrize("why", ["this computer cannot keep up", "off 1980 rpm"])
-def test_a_dead_sensor_comes_before_what_else_keeps_a_window_from_being_evaluated(why: str) -> None:
+def test_a_dead_sensor_keeps_state_data_health_when_windows_are_not_evaluated(why: str) -> None:
     skips, speed = "keep up" in why, LAB.operation.speed_rpm
     fast = LAB.operation.model_copy(update={"speed_rpm": speed if skips else 1.5 * speed})
     installed = install(KIT.model_copy(update={"operation": fast}), None)
@@ -79,7 +79,7 @@ def test_a_dead_sensor_comes_before_what_else_keeps_a_window_from_being_evaluate
     assert not (skips and any("is diagnosed" in fault.text for one in dead for fault in one.sensors))
 
 
-def test_a_dead_sensor_is_no_suspect_for_what_does_not_fit() -> None:
+def test_a_dead_sensor_is_not_a_suspect_for_a_misfit() -> None:
     heavier = Event(at_s=0.0, anomaly="added_mass", size=0.25)
     reports, _ = feed(MachineMonitor(install(KIT, None)), dying([0], 500.0, heavier, dead_s=42.0, end_s=58.0))
     suspects = {one.suspect for one in reports if one.filled == 1 and one.sensors}
@@ -97,7 +97,7 @@ def test_an_identified_machine_is_diagnosed_without_a_dead_sensor() -> None:
     assert [one.name for one in reports[-1].parameters if one.relative_change is not None] == list(PARAMETERS)
 
 
-def test_of_two_sensors_at_an_angle_either_is_needed() -> None:
+def test_without_one_of_two_angled_probes_both_planes_are_left_out() -> None:
     plan = plan_for(LAB)
     assert plan.states_without(["z1"]) == tuple(state for state in plan.states if state != "z1")
     turn = np.eye(len(plan.states))

@@ -1,4 +1,4 @@
-"""A defect in the monitor, a history that refuses, a computer that cannot keep up: each is said to be what it is."""
+"""A defect in the monitor, a state that cannot be saved, a computer that cannot keep up: each has its own alarm."""
 
 from pathlib import Path
 
@@ -51,11 +51,11 @@ def machine_in_order() -> Machine:
 
 
 def soon_over(machine: Machine) -> Machine:
-    """The same machine, with alarms that clear after 10 s."""
+    """The machine with alarms that clear after 10 s."""
     return machine.model_copy(update={"alarms": machine.alarms.model_copy(update={"off_delay_s": 10.0})})
 
 
-def test_a_defect_in_evaluation_is_an_alarm_and_no_health(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_defect_in_evaluation_raises_an_alarm_and_is_not_healthy(monkeypatch: pytest.MonkeyPatch) -> None:
     monitor = MachineMonitor(install(soon_over(LAB), None))
     *stream, later = scenario_blocks(92.1)
     for one in stream[:660]:
@@ -72,11 +72,11 @@ def test_a_defect_in_evaluation_is_an_alarm_and_no_health(monkeypatch: pytest.Mo
     health = monitor.health()
     assert (health.state, raised(monitor)) == (HealthState.NOT_EVALUABLE, {FAULT})
     assert DEFECT in health.reason
-    # And when it is over, that is said as well.
+    # Its end clears the alarm.
     events = [event for one in stream[710:] for event in monitor.step(one).events]
     assert named(events) == [("cleared", FAULT)]
     assert (monitor.health().state, monitor.health().reason) == (HealthState.HEALTHY, "")
-    # And before the evaluation.
+    # A defect before the evaluation.
     monkeypatch.setattr(monitor._window, "feed", defective)
     report = monitor.step(later)
     assert (str(report.fault), named(report.events)) == (DEFECT, [("raised", FAULT)])
@@ -84,7 +84,7 @@ def test_a_defect_in_evaluation_is_an_alarm_and_no_health(monkeypatch: pytest.Mo
     assert DEFECT in monitor.health().reason
 
 
-def test_a_service_with_a_defect_is_not_ready_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_with_a_defect_is_not_ready_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(KnownMachineEvaluator, "evaluate", defective)
     address = endpoint()
     with service(address, machine_file(tmp_path, PATIENT), when_full="wait") as (runtime, worker):
@@ -103,7 +103,7 @@ def test_a_service_with_a_defect_is_not_ready_and_says_why(tmp_path: Path, monke
         until(lambda: worker.errors == worker.tally.windows - 11, "an error for each window that was full")
 
 
-def test_what_the_monitor_dropped_is_no_gap() -> None:
+def test_blocks_dropped_by_the_monitor_are_overload_and_no_gap() -> None:
     monitor, stream = MachineMonitor(install(machine_in_order(), None)), scenario_blocks(60.0)
 
     def give(number: int, dropped: int) -> None:
@@ -123,7 +123,7 @@ def test_what_the_monitor_dropped_is_no_gap() -> None:
     (alarm,) = monitor.health().alarms
     assert "120 blocks" in alarm.note
     assert "12 s" in alarm.note
-    # A hole in the stream itself is still one.
+    # A gap in the stream itself is still one.
     give(450, 0)
     assert raised(monitor) == {OVERLOADED, GAP}
 
@@ -138,7 +138,7 @@ def test_overload_clears_when_the_monitor_keeps_up() -> None:
     assert named(events) == [("raised", OVERLOADED), ("cleared", OVERLOADED)]
 
 
-def test_a_full_queue_says_so_to_operators(tmp_path: Path) -> None:
+def test_a_full_queue_raises_the_overload_alarm(tmp_path: Path) -> None:
     with fed_service(machine_file(tmp_path, IN_ORDER), bound=30) as (_, worker, feed):
         feed.put_good()
         until(lambda: worker.health().quality.accepted_blocks == 1, "first block")
@@ -156,7 +156,7 @@ def test_a_full_queue_says_so_to_operators(tmp_path: Path) -> None:
         assert event.alarm == OVERLOADED
 
 
-def test_a_state_that_cannot_be_built_keeps_no_alarm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_alarms_are_logged_even_if_no_checkpoint_can_be_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with bench(tmp_path) as at:
         at.put(block(0))
         with monkeypatch.context() as patch:
@@ -173,14 +173,14 @@ def test_a_state_that_cannot_be_built_keeps_no_alarm(tmp_path: Path, monkeypatch
     with bench(tmp_path) as at:
         assert at.worker.restart.startswith("resumed")
         assert at.log()[-1][1:] == ("acknowledged", GAP)
-        monkeypatch.setattr(MachineMonitor, "state", defective)  # nor does it keep the last step from being made
+        monkeypatch.setattr(MachineMonitor, "state", defective)  # nor does it prevent the last step
         at.worker.stop()
         assert not at.worker.status().alive
         assert DEFECT in at.worker.last_error
 
 
 @pytest.mark.parametrize("kind", ["unheard-of", "gap"])
-def test_an_event_without_words_holds_up_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+def test_an_event_without_a_text_holds_up_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     told = []
     with bench(tmp_path) as at:
         at.put(block(0))
@@ -210,7 +210,7 @@ INTEGER = st.one_of(st.integers(-(2**70), 2**70), st.sampled_from([0, 2**16 - 1,
     start_ns=st.one_of(st.just(START_NS), INTEGER),
 )
 @example(headers=[(0, 0, LAB.rate_hz, 0), (0, 0, LAB.rate_hz, 1)], start_ns=START_NS)  # two versions of one block
-def test_whatever_is_accepted_can_be_restored(headers: list[tuple[int, int, float, int]], start_ns: int) -> None:
+def test_the_state_after_any_headers_can_be_restored(headers: list[tuple[int, int, float, int]], start_ns: int) -> None:
     installed = install(machine_in_order(), None)
     monitor = MachineMonitor(installed)
     good = block(0)
@@ -227,5 +227,5 @@ def test_whatever_is_accepted_can_be_restored(headers: list[tuple[int, int, floa
 
 
 def decimal(value: int) -> str:
-    """A whole number in decimal, however many digits it has."""
+    """An integer in decimal, also beyond Python's limit of digits."""
     return str(value) if abs(value) < 10**4000 else "1" + "0" * 4300

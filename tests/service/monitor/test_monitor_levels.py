@@ -1,4 +1,4 @@
-"""Machines of which nothing is known but their sensors: levels are watched from the first hop on."""
+"""Machines with nothing known but their sensors: levels are watched from the first hop on."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -47,7 +47,7 @@ FAN = MachineFile.model_validate({
 def blocks(
     seed: int, seconds: float, growth: tuple[float, float] = (1e9, 1.0), first: int = 0
 ) -> Iterator[SampleBlock]:
-    """A fan whose drive end becomes louder from a time on, s from the start of all streams."""
+    """A fan whose drive end becomes louder at a time, in seconds from the start of all streams."""
     rng = np.random.default_rng([91, seed, first])
     size = round(BLOCK_S * RATE_HZ)
     for number in range(first, first + round(seconds / BLOCK_S)):
@@ -60,7 +60,7 @@ def blocks(
 
 
 def run(monitor: MachineMonitor, stream: Iterator[SampleBlock]) -> tuple[list[str], list[tuple[EventKind, str, float]]]:
-    """Reports as JSON, and alarm events: what happened, to which alarm, when, s from the start of all streams."""
+    """Reports as JSON, and alarm events: kind, alarm and time, in seconds from the start of all streams."""
     windows, events = [], []
     for block in stream:
         report = monitor.step(block)
@@ -75,7 +75,7 @@ def latest(monitor: MachineMonitor) -> Report:
     return sure(monitor.health().latest)
 
 
-def test_a_machine_file_with_nothing_but_sensors_is_watched_from_the_first_hop_on() -> None:
+def test_levels_are_watched_from_the_first_hop_with_only_sensors_in_the_file() -> None:
     monitor = MachineMonitor(install(FAN, None))
     windows, events = run(monitor, blocks(1, 30))
     assert len(windows) == 5  # the first hop needs a second of history
@@ -90,7 +90,7 @@ def test_a_machine_file_with_nothing_but_sensors_is_watched_from_the_first_hop_o
     assert (drive.unit, other.unit, other.velocity) == ("m/s2", "mm/s", None)
 
 
-def test_a_running_speed_in_the_machine_file_is_followed_in_the_vibration() -> None:
+def test_a_running_speed_in_the_machine_file_is_tracked_in_the_vibration() -> None:
     monitor = MachineMonitor(install(FAN.model_copy(update={"operation": Operation(speed_rpm=1500.0)}), None))
     run(monitor, blocks(1, 30))
     health = monitor.health()
@@ -99,7 +99,7 @@ def test_a_running_speed_in_the_machine_file_is_followed_in_the_vibration() -> N
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
-def test_a_machine_that_doubles_after_its_first_windows_raises_the_alarm_of_its_channel(seed: int) -> None:
+def test_doubling_after_the_first_windows_raises_the_channels_level_alarm(seed: int) -> None:
     monitor = MachineMonitor(install(FAN, None))
     _, events = run(monitor, blocks(seed, 140, growth=(90.0, 2.0)))
     assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
@@ -110,7 +110,7 @@ def test_a_machine_that_doubles_after_its_first_windows_raises_the_alarm_of_its_
     assert monitor.health().state is HealthState.ALERT
 
 
-def test_a_growth_by_four_is_a_danger_and_clears_when_it_is_gone() -> None:
+def test_growth_to_four_times_is_a_danger_and_clears_when_it_ends() -> None:
     monitor = MachineMonitor(install(FAN, None))
     _, events = run(monitor, blocks(4, 120, growth=(80.0, 4.0)))
     kinds = [kind for kind, name, _ in events if name == "level:DE-H"]
@@ -136,7 +136,7 @@ def test_an_alarm_stays_in_the_deadband_and_clears_below_it() -> None:
         assert book.present("level:DE-H") == raised, level
 
 
-def test_a_monitor_that_is_restarted_goes_on_to_the_last_bit() -> None:
+def test_a_restarted_monitor_continues_bit_for_bit() -> None:
     stream = list(blocks(5, 100, growth=(85.0, 3.0)))
     expected = run(MachineMonitor(install(FAN, None)), iter(stream))
     first = MachineMonitor(install(FAN, None))
@@ -158,8 +158,8 @@ def test_a_monitor_that_is_restarted_goes_on_to_the_last_bit() -> None:
         ({"sensors": (FAN.sensors[0].model_copy(update={"unit": "g"}), FAN.sensors[1])}, False),
     ],
 )
-def test_first_windows_outlast_whatever_they_do_not_depend_on(changes: dict[str, Any], kept: bool) -> None:
-    """Or a machine that has become louder would be healthy after an update of the program."""
+def test_first_windows_are_kept_unless_sensors_or_their_settings_change(changes: dict[str, Any], kept: bool) -> None:
+    """Otherwise a machine that has become louder would be healthy after an update of the program."""
     before = install(FAN, None)
     monitor = MachineMonitor(before)
     run(monitor, blocks(8, 65))
@@ -172,7 +172,7 @@ def test_first_windows_outlast_whatever_they_do_not_depend_on(changes: dict[str,
     assert [name for kind, name, _ in events if kind is EventKind.RAISED] == (["level:DE-H"] if kept else [])
 
 
-def test_commissioned_levels_are_the_reference_and_say_what_is_unchanged(tmp_path: Path) -> None:
+def test_commissioned_levels_are_the_reference_and_the_state_is_unchanged(tmp_path: Path) -> None:
     found = healthy_from_blocks("healthy.mcap", FAN, [(block, "") for block in blocks(6, 150)])
     made = commissioned(FAN, found)
     assert made.commissioned is not None, made.report.summary
@@ -188,7 +188,7 @@ def test_commissioned_levels_are_the_reference_and_say_what_is_unchanged(tmp_pat
     assert monitor.health().state is HealthState.ALERT
 
 
-def test_levels_are_judged_at_a_speed_that_was_not_commissioned() -> None:
+def test_levels_are_judged_at_a_speed_not_commissioned() -> None:
     machine = elsewhere(NOTHING)
     made = sure(commissioned(machine, healthy(machine, 70.0, 60163)).commissioned)
     faster = Event(at_s=0.0, speed_rpm=1.06 * LAB.operation.speed_rpm)
@@ -204,7 +204,7 @@ def test_levels_are_judged_at_a_speed_that_was_not_commissioned() -> None:
 def drive(
     seconds: float, speed_hz: Callable[[FloatArray], FloatArray], line: float = 0.0, *, by_angle: bool = True
 ) -> tuple[list[tuple[ChannelLevels, ...]], list[tuple[EventKind, str]]]:
-    """Levels and alarms of a drive with four first windows; a line at 61 Hz comes at 100 s.
+    """Levels and alarms of a drive with four first windows and a line at 61 Hz from 100 s on.
 
     Its speed is known by a shaft angle, or followed in the vibration near 1380 rpm.
     """
@@ -233,21 +233,21 @@ def set_points(slow_hz: float, *slow: tuple[float, float]) -> Callable[[FloatArr
     return lambda t: np.where(np.any([(t >= begin) & (t < end) for begin, end in slow], axis=0), slow_hz, 24.8)
 
 
-def test_a_drive_that_goes_to_its_other_set_point_has_not_grown() -> None:
-    # The first windows, two at either set point; later it changes within a hop.
+def test_a_change_to_a_known_set_point_is_not_growth() -> None:
+    # Two first windows at each set point; later the speed changes within a hop.
     found, _ = drive(160, set_points(22.3, (41.0, 81.0), (106.0, 126.4)))
     for levels in found:
         assert all((one.growth or 1.0) < 1.5 for one in levels)  # up to 150
 
 
-def test_without_a_shaft_angle_nothing_has_grown_while_the_speed_is_not_known() -> None:
+def test_without_a_shaft_angle_no_growth_is_stated_while_the_speed_is_unknown() -> None:
     found, alarms = drive(165, set_points(20.5, (41.0, 81.0), (106.0, 126.4)), by_angle=False)
     assert not alarms
-    told = [all(one.growth is not None for one in levels) for levels in found[16:]]  # since there is a reference
+    told = [all(one.growth is not None for one in levels) for levels in found[16:]]  # once there is a reference
     unknown = [all(one.x1 is None for one in levels) for levels in found[16:]]
     assert any(unknown)
     assert not any(growth and lost for growth, lost in zip(told, unknown, strict=True))
-    assert told.count(False) <= unknown.count(True) + 3  # the hop in which a change ended is waited for
+    assert told.count(False) <= unknown.count(True) + 3  # until the hop in which a change ended is over
 
 
 @pytest.mark.parametrize("by_angle", [True, False])
@@ -256,7 +256,7 @@ def test_a_line_stays_raised_while_the_set_point_changes(by_angle: bool) -> None
     assert alarms == [(EventKind.RAISED, "level:DE-H"), (EventKind.RAISED, "level:NDE-V")]
 
 
-def test_where_the_speed_always_varies_growth_is_told_all_the_same() -> None:
+def test_growth_is_found_at_a_speed_that_always_varies() -> None:
     def varying(t: FloatArray) -> FloatArray:
         return np.asarray(23.55 + 1.25 * np.sin(2 * np.pi * t / 20.0), dtype=np.float64)
 
@@ -264,7 +264,7 @@ def test_where_the_speed_always_varies_growth_is_told_all_the_same() -> None:
     assert all(sure(one.growth) > 1.5 for one in found[-1])
 
 
-def test_a_machine_that_is_watched_says_what_would_have_been_seen() -> None:
+def test_a_watched_machine_states_the_detectable_level_growth() -> None:
     monitor = MachineMonitor(install(FAN, None))
     run(monitor, blocks(1, 30))
     before = sure(latest(monitor).level_growth)
@@ -278,10 +278,10 @@ def test_a_machine_that_is_watched_says_what_would_have_been_seen() -> None:
     assert 0.5 < now.level_growth.growth < 0.9
     _, events = run(monitor, blocks(1, 40, growth=(0.0, 1.05 * (1 + now.level_growth.growth)), first=200))
     assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
-    assert latest(monitor).level_growth is None  # an alert says more
+    assert latest(monitor).level_growth is None  # the alert replaces it
 
 
-def test_status_says_what_would_have_been_seen_and_fits_narrow_terminals(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_status_shows_the_detectable_growth_and_fits_narrow_terminals(monkeypatch: pytest.MonkeyPatch) -> None:
     growth = LevelGrowth.model_validate(example(LevelGrowth))
     report = Report.model_validate(example(Report)).model_copy(update={"level_growth": growth})
     health = Health.model_validate(example(Health)).model_copy(update={"report": report})
@@ -296,14 +296,14 @@ def test_status_says_what_would_have_been_seen_and_fits_narrow_terminals(monkeyp
 
 
 def held(stream: Iterator[SampleBlock], column: int, value: float) -> Iterator[SampleBlock]:
-    """The stream with a channel that gives nothing but one value."""
+    """The stream with one channel stuck at a value."""
     for block in stream:
         samples = block.samples.copy()
         samples[:, column] = value
         yield replace(block, samples=samples)
 
 
-def test_a_dead_sensor_at_whatever_place_is_a_fault_of_that_sensor_and_no_quiet_machine() -> None:
+def test_a_dead_sensor_anywhere_is_a_sensor_fault() -> None:
     monitor = MachineMonitor(install(FAN, None))
     _, events = run(monitor, held(blocks(5, 60), 1, 0.25))
     assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "data-stuck")]
@@ -313,7 +313,7 @@ def test_a_dead_sensor_at_whatever_place_is_a_fault_of_that_sensor_and_no_quiet_
     assert monitor.health().state is HealthState.DATA_HEALTH
 
 
-def test_a_probe_at_fault_makes_no_large_orbit_of_the_other_probe_of_its_place() -> None:
+def test_a_faulty_probe_does_not_raise_s_max_of_the_other_probe() -> None:
     probe = {"quantity": "displacement", "location": "bearing", "unit": "um"}
     sensors = [{**probe, "name": f"DE-{one}", "direction": one, "angle_deg": at} for one, at in (("X", 45), ("Y", 135))]
     pump = MachineFile.model_validate(FAN.model_dump(include={"site", "name", "rate_hz"}) | {"sensors": sensors})
@@ -332,7 +332,7 @@ def test_a_probe_at_fault_makes_no_large_orbit_of_the_other_probe_of_its_place()
     assert sure(latest(monitor).levels[0].s_max) < 100
 
 
-def test_a_dead_sensor_elsewhere_is_told_and_the_rotor_is_diagnosed_as_before() -> None:
+def test_a_dead_casing_sensor_does_not_change_the_diagnosis_of_the_rotor() -> None:
     casing = Sensor(name="DE-H", quantity="acceleration", location="DE", direction="horizontal", unit="m/s2")
     rig = LAB.model_copy(update={"sensors": (*LAB.sensors, casing)})
     monitor, alone = MachineMonitor(install(rig, None)), MachineMonitor(install(LAB, None))
@@ -347,10 +347,10 @@ def test_a_dead_sensor_elsewhere_is_told_and_the_rotor_is_diagnosed_as_before() 
 
 
 MESH = 17.0
-"""Times running speed; twice the band that the likelihood looks at."""
+"""Times running speed; twice the band that the likelihood uses."""
 
 
-def test_a_machine_that_was_not_commissioned_shows_lines_that_theory_does_not_have() -> None:
+def test_lines_unknown_to_the_theory_are_found_without_commissioning() -> None:
     monitor = MachineMonitor(install(LAB, "lab"))
     fast = [n for n, one in enumerate(LAB.sensors) if (one.quantity, one.location) == ("velocity", "bearing")]
     meshing: list[SampleBlock] = []

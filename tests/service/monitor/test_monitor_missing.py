@@ -1,4 +1,4 @@
-"""A channel without numbers costs what is read of that channel, and nothing of the others."""
+"""A channel of NaN loses only its own readings, and none of the others."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -36,7 +36,7 @@ FROM_S, TO_S, END_S = 31.0, 33.0, 125.0
 def without(
     column: int, from_s: float, to_s: float, value: float = np.nan, *, end_s: float = END_S
 ) -> Iterator[SampleBlock]:
-    """A stream in which a channel has no numbers for a time."""
+    """A stream in which one channel is NaN, or another value, for a time."""
     stream = scenario_blocks(end_s)
     for block in stream:
         samples = block.samples.copy()
@@ -56,12 +56,12 @@ def ends_s(reports: Sequence[Report], first_ns: int) -> list[float]:
 
 @cache
 def usual(end_s: float, *, moved: bool = False) -> Sequence[Report]:
-    """Of a stream that lacks nothing, with the sensors where they are or on the casing."""
+    """Reports of a complete stream, with the sensors in place or on the casing."""
     return feed(MachineMonitor(Installed(elsewhere(KIT) if moved else SOON)), scenario_blocks(end_s))[0]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_missing_samples_are_told_of_their_channel_until_the_window_has_left_them(value: float) -> None:
+def test_a_missing_channel_is_reported_until_its_gap_has_left_the_window(value: float) -> None:
     monitor, sound = MachineMonitor(install(SOON, None)), usual(85.0)
     stream = list(without(Z1_DOT, FROM_S, TO_S, value, end_s=85.0))
     reports, events = feed(monitor, stream)
@@ -79,7 +79,7 @@ def test_missing_samples_are_told_of_their_channel_until_the_window_has_left_the
     assert named(events) == [("raised", "data-missing"), ("cleared", "data-missing")]
     gone = [level for one in lacking for level in one.levels if level.channel == "z1_dot"]
     assert {(one.overall, one.x1, one.growth) for one in gone} == {(None, None, None)}  # not 0
-    # Levels of the other channels are the same to the last bit, and the machine is diagnosed again.
+    # Levels of the other channels are identical, and the machine is diagnosed again.
     for one, other in zip(reports, sound, strict=True):
         kept = [level for level in one.levels if level.channel != "z1_dot"]
         assert kept == [level for level in other.levels if level.channel != "z1_dot"]
@@ -89,7 +89,7 @@ def test_missing_samples_are_told_of_their_channel_until_the_window_has_left_the
 
 
 @pytest.mark.parametrize("column", [0, 1])
-def test_the_distance_of_a_shaft_is_not_told_where_one_of_its_two_probes_lacks_numbers(column: int) -> None:
+def test_s_max_is_not_stated_if_one_of_its_two_probes_is_missing(column: int) -> None:
     monitor = MachineMonitor(install(KIT, None))
     reports, _ = feed(monitor, without(column, 31.0, 45.0, end_s=50.0))
     told = {level.channel: level for level in reports[-1].levels}
@@ -100,7 +100,7 @@ def test_the_distance_of_a_shaft_is_not_told_where_one_of_its_two_probes_lacks_n
 
 
 @pytest.mark.parametrize(("measure", "column"), [("overall", 0), ("x1", 0), ("s_max", 1)])
-def test_a_level_alarm_stays_while_numbers_are_missing_of_which_its_level_is_made(measure: str, column: int) -> None:
+def test_a_level_alarm_stays_while_samples_of_its_level_are_missing(measure: str, column: int) -> None:
     own = LAB.levels.model_copy(update={"limits": (LevelLimit(channel="y1", measure=measure, alert=0.1),)})
     soon = AlarmSettings(on_delay_s=1.0, off_delay_s=1.0)
     monitor = MachineMonitor(install(KIT.model_copy(update={"levels": own, "alarms": soon}), None))
@@ -108,7 +108,7 @@ def test_a_level_alarm_stays_while_numbers_are_missing_of_which_its_level_is_mad
     assert named(events) == [("raised", "level:y1"), ("raised", "data-missing")]
 
 
-def test_a_channel_that_is_not_connected_leaves_the_rotor_diagnosed_as_it_is_without_it() -> None:
+def test_an_unconnected_casing_sensor_does_not_change_the_diagnosis() -> None:
     monitor, alone = MachineMonitor(install(RIG, None)), MachineMonitor(install(KIT, None))
     stream = scenario_blocks(40.0)
     gap = np.full((len(stream[0].samples), 1), np.nan, np.float32)
@@ -121,9 +121,7 @@ def test_a_channel_that_is_not_connected_leaves_the_rotor_diagnosed_as_it_is_wit
 @pytest.mark.parametrize(
     ("column", "state", "alarm"), [(THETA, "theta", PHASE_REFERENCE), (2, "y1_dot", "data-missing")]
 )
-def test_a_sensor_that_was_never_connected_is_told_before_the_first_window_is_full(
-    column: int, state: str, alarm: str
-) -> None:
+def test_a_sensor_never_connected_is_reported_before_the_first_full_window(column: int, state: str, alarm: str) -> None:
     monitor, stream = MachineMonitor(install(KIT, None)), list(without(column, 0.0, END_S))
     reports = feed(monitor, stream[:190])[0]
     assert [[fault.states for fault in one.sensors] for one in reports] == [[(state,)]] * len(reports)
@@ -135,8 +133,8 @@ def test_a_sensor_that_was_never_connected_is_told_before_the_first_window_is_fu
 
 
 @pytest.mark.parametrize("lost", [np.nan, 1.0])
-def test_a_phase_reference_that_is_lost_is_all_that_is_wrong(lost: float) -> None:
-    """The hop in which it was lost turned half as far; nothing there is at a multiple of that speed."""
+def test_a_lost_phase_reference_raises_only_its_own_alarm(lost: float) -> None:
+    """The hop in which it was lost turned half as far; no vibration is at a multiple of that speed."""
     made = commissioned(KIT, recording(KIT, scenario_blocks(END_S)[:800])).commissioned
     monitor, told = MachineMonitor(Installed(KIT, None, made)), set[str]()
     levels: dict[bool, list[ChannelLevels]] = {True: [], False: []}
@@ -152,8 +150,8 @@ def test_a_phase_reference_that_is_lost_is_all_that_is_wrong(lost: float) -> Non
 
 
 @pytest.mark.parametrize("lost", [np.nan, 1.0])
-def test_first_windows_in_which_the_angle_was_lost_are_no_reference(lost: float) -> None:
-    """The speed seems another one in them."""
+def test_first_windows_with_a_lost_angle_are_not_a_reference(lost: float) -> None:
+    """The speed seems to differ in them."""
     first = LAB.levels.model_copy(update={"reference": "first windows", "reference_windows": 2})
     monitor = MachineMonitor(install(KIT.model_copy(update={"levels": first}), None))
     feed(monitor, without(THETA, 25.0, 26.0, lost, end_s=80.0))
@@ -168,7 +166,7 @@ def at_speed(rpm: float, end_s: float) -> Sequence[SampleBlock]:
     return stream(end_s, 20263313 + round(rpm), Event(at_s=0.0, speed_rpm=rpm))
 
 
-def test_without_an_angle_a_machine_is_not_compared_with_itself_at_another_speed() -> None:
+def test_without_an_angle_levels_are_not_compared_with_another_speed() -> None:
     rig = elsewhere(KIT)
     healthy = [recording(rig, at_speed(rpm, end_s), f"{rpm}.mcap") for rpm, end_s in ((1320.0, 85.0), (2600.0, 45.0))]
     monitor, told = MachineMonitor(Installed(rig, None, commissioned(rig, *healthy).commissioned)), set[str]()
@@ -180,18 +178,18 @@ def test_without_an_angle_a_machine_is_not_compared_with_itself_at_another_speed
 
 
 @pytest.mark.parametrize("lost", [np.nan, 1.0])
-def test_run_out_is_no_fault_of_sensors_while_the_angle_that_it_turns_with_is_lost(lost: float) -> None:
+def test_run_out_is_not_a_sensor_fault_while_the_angle_is_lost(lost: float) -> None:
     stream = []
     for block in without(THETA, 0.0, 0.0, end_s=38.0):
         samples = block.samples
-        samples[:, 0] += 50.0 * np.cos(samples[:, THETA])  # µm; of the motion it has 24 (rms)
+        samples[:, 0] += 50.0 * np.cos(samples[:, THETA])  # µm; the motion has 24 (rms)
         samples[:, THETA] = lost
         stream.append(block)
     assert blamed(stream) == {"theta"}
 
 
 @pytest.mark.parametrize("lost", [np.nan, 1.0])
-def test_a_phase_reference_that_is_lost_is_no_machine_that_has_slowed_down(lost: float) -> None:
+def test_a_lost_phase_reference_is_not_taken_for_a_slow_machine(lost: float) -> None:
     rule = {"alarms": ["model"], "below_rpm": 600, "because": "coasting down"}
     alarms = AlarmSettings.model_validate({"suppress": [rule]})
     monitor = MachineMonitor(install(KIT.model_copy(update={"alarms": alarms}), None))
@@ -200,7 +198,7 @@ def test_a_phase_reference_that_is_lost_is_no_machine_that_has_slowed_down(lost:
 
 
 @pytest.mark.parametrize(("from_s", "faults"), [(0.0, {"theta", "z1", "z1_dot"}), (28.0, {"theta"})])
-def test_without_an_angle_other_sensors_are_watched_but_not_where_it_comes_or_goes(
+def test_without_an_angle_other_sensors_are_checked_except_where_it_comes_or_goes(
     from_s: float, faults: set[str]
 ) -> None:
     stream = list(without(THETA, from_s, END_S, end_s=38.0))
@@ -212,7 +210,7 @@ def test_without_an_angle_other_sensors_are_watched_but_not_where_it_comes_or_go
 @pytest.mark.parametrize(
     ("rows", "columns"), [((7, 8), (3, 4)), ((7, None), (3, 4)), ((7, 8), (0, 9)), ((0, None), (0, 9))]
 )
-def test_lost_samples_and_a_block_of_nothing_else_are_refused(
+def test_blocks_with_single_nan_samples_or_only_nan_are_refused(
     rows: tuple[int, int | None], columns: tuple[int, int]
 ) -> None:
     (block, *_), monitor = scenario_blocks(1.0), MachineMonitor(install(KIT, None))
@@ -223,10 +221,10 @@ def test_lost_samples_and_a_block_of_nothing_else_are_refused(
     assert "is nan, expected a finite number" in done.verdict.text
 
 
-def test_a_restored_monitor_and_a_recalled_window_go_on_to_the_last_bit() -> None:
+def test_a_restored_monitor_with_a_recalled_window_continues_bit_for_bit() -> None:
     stream = list(without(Z1_DOT, FROM_S, TO_S))
     monitor = MachineMonitor(install(KIT, None))
-    half = 340  # a second after the last sample that is missing
+    half = 340  # a second after the last missing sample
     feed(monitor, stream[:half])[0]
     again = resumed(monitor, install(KIT, None), whole=False)
     for block in stream[:half]:
@@ -235,7 +233,7 @@ def test_a_restored_monitor_and_a_recalled_window_go_on_to_the_last_bit() -> Non
     assert feed(again, stream[half:])[0] == feed(monitor, stream[half:])[0]
 
 
-def test_it_is_told_in_hops_that_end_within_a_block_and_of_blocks_whose_times_jitter() -> None:
+def test_missing_time_is_right_with_jitter_and_hops_that_end_within_blocks() -> None:
     simulated, size = scenario_blocks(61.0), 270
     samples, first = np.concatenate([block.samples for block in simulated]), simulated[0]
     samples[230 * size : 270 * size, Z1_DOT] = np.nan  # 31.05 s to 36.45 s
@@ -246,12 +244,12 @@ def test_it_is_told_in_hops_that_end_within_a_block_and_of_blocks_whose_times_ji
     ]
     reports = [one for one in feed(MachineMonitor(install(KIT, None)), stream)[0] if one.filled == 1]
     told = [[(fault.kind.value, round(fault.value or 0.0, 2)) for fault in one.sensors] for one in reports]
-    # What a hop needs before it counts, too: 2.5 s here.
+    # Including what a hop needs before it counts: 2.5 s here.
     lacking = ((1.45,), (5.4,), (5.4,), (5.4,), (5.4,), (1.45,))
     assert told == [[], [], *([("missing", value) for value in values] for values in lacking)]
 
 
-def test_a_casing_sensor_that_is_unplugged_is_no_wrong_gain_of_its_place() -> None:
+def test_an_unplugged_casing_sensor_is_not_a_wrong_gain() -> None:
     noise, stream = np.random.default_rng(20263312), list[SampleBlock]()
     for block in scenario_blocks(END_S + 1):
         shaken = np.diff(block.samples[:, 2:3], axis=0, append=block.samples[-1:, 2:3]) * block.rate_hz
@@ -269,7 +267,7 @@ def test_a_casing_sensor_that_is_unplugged_is_no_wrong_gain_of_its_place() -> No
 
 
 @pytest.mark.parametrize("missing_to_s", [30.0, 150.0])
-def test_the_first_windows_are_a_reference_of_the_channels_that_are_there(missing_to_s: float) -> None:
+def test_the_first_windows_are_a_reference_for_the_channels_present(missing_to_s: float) -> None:
     rig = elsewhere(KIT)
     monitor, reports = MachineMonitor(Installed(rig)), list[Report]()
     for block in without(Z1_DOT, 0.0, missing_to_s, end_s=170.0):
@@ -281,7 +279,7 @@ def test_the_first_windows_are_a_reference_of_the_channels_that_are_there(missin
         assert len(level.limits) == (len(other.limits) if limited or level == other else 0)
 
 
-def test_what_was_missing_before_a_clock_was_set_back_is_not_told_for_hours() -> None:
+def test_a_clock_set_back_ends_the_report_of_earlier_missing_samples() -> None:
     missing = MissingNumbers(LAB.sensors[:1])
     block = SampleBlock(5_000_000_000, 0, 0, 1000.0, np.full((2, 1), np.nan))
     missing.take(block)

@@ -1,4 +1,4 @@
-"""A machine that stops and starts raises nothing on its sensors; a phase reference that is lost while it runs does."""
+"""A machine that stops and starts raises no sensor alarm; a phase reference lost while it runs does."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -32,7 +32,7 @@ WITHOUT_ANGLE = NEW.model_copy(update={"sensors": NEW.sensors[:-1]})
 def stopping(machine: MachineFile, what: str) -> Iterator[SampleBlock]:
     """A machine that runs, slows down, stands and runs again; or whose ``angle``, or ``signals``, stand for that time.
 
-    The running machine's own samples, at times that pass as fast as it turns; forces go with the square of speed.
+    The running machine's samples, with time scaled by speed; forces follow the square of speed.
     """
     stream = scenario_blocks(END_S)
     samples = np.concatenate([block.samples for block in stream]).astype(float)
@@ -63,7 +63,7 @@ def monitor_of(machine: MachineFile) -> MachineMonitor:
 
 @cache
 def stopped() -> Sequence[SampleBlock]:
-    """The rotor kit that stops and starts; not to be written to."""
+    """The rotor kit that stops and starts; read-only."""
     return tuple(stopping(KIT, "machine"))
 
 
@@ -72,7 +72,7 @@ def usual() -> Sequence[Report]:
     return feed(monitor_of(KIT), stopped())[0]
 
 
-def test_a_machine_that_stops_and_starts_raises_nothing_and_is_healthy_again_after_a_restart_too() -> None:
+def test_a_stop_and_start_raise_no_alarm_and_the_machine_is_healthy_again() -> None:
     stream = stopped()
     half = len(stream) // 2  # while it stands
     monitor = monitor_of(KIT)
@@ -90,13 +90,13 @@ def test_a_machine_that_stops_and_starts_raises_nothing_and_is_healthy_again_aft
 
 
 @pytest.mark.parametrize(("what", "alarm"), [("angle", PHASE_REFERENCE), ("signals", "data-stuck")])
-def test_what_is_lost_while_the_machine_runs_is_told(what: str, alarm: str) -> None:
+def test_signals_lost_while_the_machine_runs_raise_a_data_alarm(what: str, alarm: str) -> None:
     _, events = feed(monitor_of(KIT), stopping(KIT, what))
     assert named(events) == [("raised", alarm)]
 
 
 @pytest.mark.parametrize("dead", [0, 3])
-def test_beside_a_dead_channel_a_machine_that_stops_has_no_other_fault(dead: int) -> None:
+def test_a_stop_with_a_dead_channel_adds_no_other_sensor_fault(dead: int) -> None:
     name = KIT.sensors[dead].name
     silent = [
         replace(block, samples=np.where(np.arange(len(KIT.sensors)) == dead, np.float32(0), block.samples))
@@ -107,7 +107,7 @@ def test_beside_a_dead_channel_a_machine_that_stops_has_no_other_fault(dead: int
         assert found - {(name,)} == {states for states in known if name not in states}
 
 
-def test_without_a_shaft_angle_no_sensor_is_blamed_but_levels_have_fallen() -> None:
+def test_without_a_shaft_angle_a_stop_raises_only_level_alarms() -> None:
     reports, events = feed(monitor_of(WITHOUT_ANGLE), stopping(WITHOUT_ANGLE, "machine"))
     assert any("all its sensors have lost their supply" in one.reason for one in reports)
     assert {one.alarm.name for one in events} == {f"level:{one.name}" for one in WITHOUT_ANGLE.sensors}
@@ -120,7 +120,7 @@ def made_healthy() -> Installed:
 
 
 @pytest.mark.parametrize("turns", [False, True])
-def test_a_level_has_fallen_while_the_first_window_fills_only_where_the_machine_turns(turns: bool) -> None:
+def test_fallen_levels_in_the_first_window_raise_alarms_only_if_the_machine_turns(turns: bool) -> None:
     quiet = [NOISE] * (len(KIT.sensors) - 1) + [1.0]
     first = [replace(block, samples=(block.samples * quiet).astype(np.float32)) for block in scenario_blocks(18.0)]
     if not turns:
@@ -131,7 +131,7 @@ def test_a_level_has_fallen_while_the_first_window_fills_only_where_the_machine_
 
 
 @pytest.mark.parametrize("machine", [NEW, WITHOUT_ANGLE])
-def test_levels_of_a_machine_that_stands_are_no_reference_for_it_when_it_runs(machine: MachineFile) -> None:
+def test_levels_at_standstill_are_no_reference_for_running(machine: MachineFile) -> None:
     monitor = monitor_of(machine)
     stream = list(stopping(machine, "machine"))[round(10 * STANDS_S) :]
     starts, found = round(10 * (STARTS_S - STANDS_S)), []
@@ -146,13 +146,13 @@ def test_levels_of_a_machine_that_stands_are_no_reference_for_it_when_it_runs(ma
         assert found[0] == ([], [])
         assert not any(found[1][0])
         assert found[1][1] == []
-    else:  # it is told once that the machine has become louder
+    else:  # it alarms once that the machine has become louder
         assert found[0] == ([True], [])
         assert found[1][0] == [True, False]
         assert set(found[1][1]) == {f"level:{one.name}" for one in machine.sensors}
 
 
-def test_a_stop_is_left_out_of_a_healthy_recording_with_its_run_down_and_run_up() -> None:
+def test_a_stop_with_run_down_and_run_up_is_left_out_of_a_healthy_recording() -> None:
     stream = [(block, "") for block in stopping(LAB, "machine")]
     recorded = healthy_from_blocks("healthy.mcap", LAB, stream)
     hop_s = LAB.window.hop_s

@@ -1,4 +1,4 @@
-"""Snapshots: samples of so many seconds, again and again, with silence between them that is no gap."""
+"""Snapshots: some seconds of samples at regular intervals, with silence between them that is no gap."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -49,7 +49,7 @@ KIT = Machine.model_validate(scheduled(ON_S, EVERY_S, length_s=6 * EVERY_S))
 
 
 def snapshots(everything: Sequence[SampleBlock], machine: MachineFile) -> tuple[SampleBlock, ...]:
-    """Those of a stream that lie in snapshots, as a sender numbers them that sends nothing else."""
+    """Blocks of a stream that lie in snapshots, numbered consecutively."""
     schedule = sure(machine.schedule)
     within = [
         one
@@ -70,7 +70,7 @@ def run(monitor: MachineMonitor, sent: Sequence[SampleBlock]) -> list[MonitorRep
     return [monitor.step(block) for block in sent]
 
 
-def test_what_follows_from_a_schedule() -> None:
+def test_a_schedule_sets_the_defaults_of_windows_and_ingest() -> None:
     minute = Machine.model_validate(scheduled(10.0, 60.0))
     assert (minute.window.hop_s, minute.window.length_s, minute.window.segment_s) == (60.0, 720.0, 2.0)
     assert (minute.hop_data_s, minute.window_data_s) == (10.0, 120.0)
@@ -94,14 +94,14 @@ def test_what_follows_from_a_schedule() -> None:
         ((0.1, 10.0), {"lag_to_s": 0.06}, "window.lag_to_s is 0.06, expected at most half of a snapshot, 0.05"),
     ],
 )
-def test_mistakes_are_told(tmp_path: Path, schedule: tuple[float, float] | None, window: Any, says: str) -> None:
+def test_bad_schedules_are_named(tmp_path: Path, schedule: tuple[float, float] | None, window: Any, says: str) -> None:
     fields = scheduled(*schedule, **window) if schedule else LAB.model_dump(mode="json") | {"window": window}
     with pytest.raises(MachineFileError) as told:
         checked(Machine, fields, tmp_path / "kit.toml")
     assert says in str(told.value)
 
 
-def test_the_simulator_sends_snapshots_of_the_same_motion() -> None:
+def test_the_simulator_sends_snapshots_of_the_continuous_motion() -> None:
     scenario = load_scenario("healthy")[0].overridden(duration_s=3 * EVERY_S, seed=9)
     everything = [block for block, _ in blocks(scenario, LAB)]
     for one, other in zip(blocks(scenario, KIT), snapshots(everything, KIT), strict=True):
@@ -109,7 +109,7 @@ def test_the_simulator_sends_snapshots_of_the_same_motion() -> None:
         np.testing.assert_array_equal(one[0].samples, other.samples)
 
 
-def test_silence_between_snapshots_is_no_gap_and_a_missing_snapshot_is_one() -> None:
+def test_silence_between_snapshots_is_no_gap_but_a_missing_snapshot_is() -> None:
     gate, per = Gate(KIT), round(ON_S / 0.1)
     sent = stream()[: 4 * per]
     told = [gate.judge(one) for one in (*sent[: 2 * per], *sent[3 * per :])]
@@ -121,7 +121,7 @@ def test_silence_between_snapshots_is_no_gap_and_a_missing_snapshot_is_one() -> 
     assert set(told[2 * per + 1 :]) == {Admission()}
 
 
-def test_what_a_sender_missed_or_the_network_lost_is_told() -> None:
+def test_missing_snapshots_and_lost_blocks_are_reported() -> None:
     gate, (first, second) = Gate(KIT), stream()[:2]
     assert gate.judge(first).accepted
     late = gate.judge(replace(second, start_ns=second.start_ns + 50 * SECOND))
@@ -139,7 +139,7 @@ def si(sent: Sequence[SampleBlock]) -> FloatArray:
 
 @settings(max_examples=5)
 @given(cuts=st.lists(st.integers(1, 3 * 8000 - 1), max_size=12))
-def test_hops_are_snapshots_however_they_are_cut(cuts: list[int]) -> None:
+def test_hops_are_snapshots_however_the_blocks_are_cut(cuts: list[int]) -> None:
     plan, per = plan_for(KIT), round(ON_S / 0.1)
     window = SlidingWindow(plan)
     ends: list[int] = []
@@ -162,7 +162,7 @@ def test_hops_are_snapshots_however_they_are_cut(cuts: list[int]) -> None:
 
 @settings(max_examples=5)
 @given(cuts=st.lists(st.integers(1, 60 * 2000 - 1), max_size=20))
-def test_of_a_stream_without_silence_the_snapshots_are_taken(cuts: list[int]) -> None:
+def test_snapshots_are_taken_from_a_continuous_stream(cuts: list[int]) -> None:
     plan = plan_for(KIT)
     rng = np.random.default_rng(5)
     samples = rng.standard_normal((60 * 2000, plan.width))
@@ -193,7 +193,7 @@ def not_stopped() -> list[MonitorReport]:
 
 # Before the last block of a snapshot, before a snapshot, within one.
 @pytest.mark.parametrize(("at", "whole"), [(279, False), (280, True), (297, False)])
-def test_a_monitor_stopped_between_or_in_snapshots_goes_on_to_the_last_bit(at: int, whole: bool) -> None:
+def test_a_monitor_stopped_between_or_in_snapshots_continues_bit_for_bit(at: int, whole: bool) -> None:
     sent = stream()[:360]
     first = MachineMonitor(install(KIT, None))
     done = run(first, sent[:at])
@@ -204,13 +204,13 @@ def test_a_monitor_stopped_between_or_in_snapshots_goes_on_to_the_last_bit(at: i
     assert done + run(again, sent[at:]) == not_stopped()
 
 
-def test_healthy_snapshots_make_windows_and_none_is_lost() -> None:
+def test_a_healthy_recording_of_snapshots_uses_all_of_them() -> None:
     found = healthy_from_blocks("kit", KIT, ((one, "") for one in stream()[:480]))
     assert (len(found.hops), len(windows_of(found)), found.gaps) == (12, 2, 0)
     assert found.duration_s == 12 * ON_S
 
 
-def test_what_gets_louder_in_short_snapshots_is_heard() -> None:
+def test_growth_in_short_snapshots_raises_level_alarms() -> None:
     machine = Machine.model_validate(scheduled(0.1, 10.0, length_s=40.0) | {"levels": {"reference_windows": 3}})
     sent = snapshots(scenario_blocks(180.0), machine)
     quiet, loud = sent[:14], [replace(one, samples=one.samples * np.float32(3)) for one in sent[14:]]

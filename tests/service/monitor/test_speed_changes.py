@@ -1,4 +1,4 @@
-"""A known machine whose speed changes faster than its rotation can be taken out of the window: healthy all the same."""
+"""A healthy machine with known parameters whose speed changes faster than its rotation can be removed."""
 
 from functools import cache
 
@@ -24,7 +24,7 @@ WITHOUT_ANGLE = LAB.model_copy(update={"sensors": tuple(one for one in LAB.senso
 
 
 def watched(machine: Machine, moving: Machine, duration_s: float, change: Event) -> tuple[list[Report], set[str]]:
-    """Reports, and alarms apart from levels, of one force, which shows most of what is left of the rotation."""
+    """Reports, and alarms apart from levels, with one force, which shows residuals of the rotation best."""
     direction = np.array([[0.5, 0.7, 0.0, -0.4, 0.6, 0.0]])
     scenario = Scenario(
         machine="lab", seed=5_280_031, duration_s=duration_s, sources=sources_along(direction, 70.0, 0.3),
@@ -47,7 +47,7 @@ STEP = "% of nominal from one hop to the next, evaluation limit 1.4 %"
         (WITHOUT_ANGLE, 95.0, Event(at_s=65.0, speed_rpm=0.3 * RPM, ramp_s=14.0), "5 of 12 hops, evaluation limit 50%"),
     ],
 )
-def test_a_rotation_that_cannot_be_taken_out_is_no_misfit(
+def test_a_rotation_that_cannot_be_removed_is_not_evaluable_and_no_misfit(
     machine: Machine, duration_s: float, change: Event, told: str
 ) -> None:
     windows, alarms = watched(machine, machine, duration_s, change)
@@ -57,12 +57,12 @@ def test_a_rotation_that_cannot_be_taken_out_is_no_misfit(
 
 @pytest.mark.parametrize("to", [0.97, 1.12])
 def test_without_a_phase_reference_a_drive_is_judged_at_each_set_point(to: float) -> None:
-    """While a window holds both, on the hops before and after the change."""
+    """While a window holds both, on the hops before or after the change."""
     change = Event(at_s=66.0, speed_rpm=to * RPM, ramp_s=3.0)
     windows, alarms = watched(WITHOUT_ANGLE, WITHOUT_ANGLE, 130.0, change)
     states = [window.state for window in windows if window.filled == 1.0]
     assert not alarms
-    # Only what comes after it tells that the newest hop had a part of the change.
+    # Only later data show that the newest hop had a part of the change.
     assert states.count(HealthState.HEALTHY) >= len(states) - 1
 
 
@@ -83,7 +83,7 @@ def commissioned_at_both_speeds() -> Installed:
 
 @pytest.mark.parametrize("parameter", ["", "k_by"])
 def test_at_level_none_a_drive_is_judged_at_each_set_point(parameter: str) -> None:
-    """A bearing that changes while the window holds both is named all the same."""
+    """A bearing that changes while the window holds both is still named."""
     changes = [Event(at_s=67.0, speed_rpm=1.15 * RPM, ramp_s=6.0), Event(at_s=170.0, speed_rpm=RPM)]
     changes += [Event(at_s=100.0, parameter=parameter, relative_change=-0.25)] if parameter else []
     monitor = MachineMonitor(commissioned_at_both_speeds())

@@ -1,4 +1,4 @@
-"""Times are those of the data: streams that came faster than real time, publishers that were started again."""
+"""Times are data times: streams that came faster than real time, and restarted publishers."""
 
 import json
 from collections.abc import Callable
@@ -45,7 +45,7 @@ def quick(slow: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def twice(tmp_path_factory: pytest.TempPathFactory, blocks: list[SampleBlock]) -> Path:
-    """A run of 30 s, and after it one that begins 10 s after the beginning of the first."""
+    """A run of 30 s, then a second one that begins 10 s after the start of the first."""
     again = [replace(one, run=9, sequence=number) for number, one in enumerate(blocks[100:250])]
     messages = [
         message
@@ -69,7 +69,7 @@ def stream_of(path: Path) -> Recorded:
     return Recorded(source, LAB.keys, *source.between(None, None))
 
 
-def test_a_source_knows_the_times_of_the_data(quick: Path, tmp_path: Path) -> None:
+def test_a_source_selects_by_data_time(quick: Path, tmp_path: Path) -> None:
     for files in ([quick], split(quick, tmp_path, 150)):
         source = RecordingSource(files)
         assert (source.span().start_ns, source.span().end_ns) == (START_NS, START_NS + 40 * S)
@@ -77,8 +77,8 @@ def test_a_source_knows_the_times_of_the_data(quick: Path, tmp_path: Path) -> No
         assert source.between("12", "2026-01-01T00:00:15Z") == (START_NS + 12 * S, START_NS + 15 * S)
 
 
-def test_what_was_recorded_with_a_block_goes_with_it(quick: Path, tmp_path: Path) -> None:
-    """A descriptor before the first block, a report after one, and a message of nobody."""
+def test_messages_between_blocks_take_the_time_of_their_block(quick: Path, tmp_path: Path) -> None:
+    """A descriptor before the first block, a report after one, and a message of no machine."""
     messages = list(read_recording(quick))
     late = messages[200].log_time_ns
     report = RecordedMessage(LAB.keys.report, b"{}", b"", "application/json", late, late)
@@ -88,7 +88,7 @@ def test_what_was_recorded_with_a_block_goes_with_it(quick: Path, tmp_path: Path
     assert timed == {LAB.keys.descriptor: START_NS, LAB.keys.report: START_NS + round(19.9 * S), "weather": late}
 
 
-def test_reports_without_samples_have_times_of_the_data(tmp_path: Path) -> None:
+def test_reports_without_samples_have_data_times(tmp_path: Path) -> None:
     said = [
         RecordedMessage(LAB.keys.report, json.dumps({"end_ns": START_NS + at * S}).encode(), b"", "", at, at)
         for at in (60, 65, 70)
@@ -98,7 +98,7 @@ def test_reports_without_samples_have_times_of_the_data(tmp_path: Path) -> None:
     assert source.span().end_ns == START_NS + 70 * S
 
 
-def test_a_recording_of_two_runs_at_the_same_times(twice: Path) -> None:
+def test_a_recording_of_two_overlapping_runs_has_the_span_of_both(twice: Path) -> None:
     source = RecordingSource([twice])
     span = source.span(LAB.keys)
     assert ((span.start_ns - START_NS) / S, (span.end_ns - START_NS) / S) == (0, 30)
@@ -115,7 +115,7 @@ def test_a_recording_of_two_runs_at_the_same_times(twice: Path) -> None:
         ("twice", (10, 25), None, 5, range(0, 25, 5)),
     ],
 )  # fmt: skip
-def test_spectra_are_of_the_latest_seconds_of_the_data_and_of_two_runs_of_the_later_one(
+def test_spectra_are_of_the_latest_data_and_of_the_later_of_two_runs(
     name: str, latest_s: tuple[int, int], averages: int | None, hop_s: float, starts_s: range,
     request: pytest.FixtureRequest,
 ) -> None:  # fmt: skip
@@ -131,7 +131,7 @@ def test_spectra_are_of_the_latest_seconds_of_the_data_and_of_two_runs_of_the_la
     "kind",
     ["orbit", pytest.param("spectrum", marks=pytest.mark.long), pytest.param("waterfall", marks=pytest.mark.long)],
 )
-def test_pictures_do_not_depend_on_how_fast_the_data_came(slow: Path, quick: Path, tmp_path: Path, kind: str) -> None:
+def test_plots_do_not_depend_on_how_fast_the_data_came(slow: Path, quick: Path, tmp_path: Path, kind: str) -> None:
     where = ("--at", "31") if kind != "waterfall" else ("--from", "8", "--to", "31")
     options = ("--size", "4x3") if kind == "orbit" else ("--window", "4")
     for path, out in ((slow, tmp_path / "slow.svg"), (quick, tmp_path / "quick.svg")):
@@ -148,7 +148,7 @@ def test_pictures_do_not_depend_on_how_fast_the_data_came(slow: Path, quick: Pat
         (("--from", "39", "--to", "4000"), 10),
     ],
 )
-def test_replays_between_times_of_the_data(quick: Path, tmp_path: Path, options: tuple[str, ...], count: int) -> None:
+def test_a_replay_is_limited_by_data_times(quick: Path, tmp_path: Path, options: tuple[str, ...], count: int) -> None:
     out = tmp_path / "lines.jsonl"
     found = CliRunner().invoke(
         app, ["replay", str(quick), "--offline", *options, "--out", str(out), "--progress", "json"]
@@ -161,7 +161,7 @@ def test_replays_between_times_of_the_data(quick: Path, tmp_path: Path, options:
 
 
 class Timed(Control):
-    """Waits for nothing, and notes how long it would have waited."""
+    """Does not wait, but notes how long it would have waited."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -183,13 +183,13 @@ def played(path: Path, **limits: int) -> tuple[list[float], list[ReplayProgress]
     return [due_s - 100.0 for due_s in control.due_s], progress
 
 
-def test_a_paced_replay_goes_at_the_pace_of_the_data(quick: Path) -> None:
+def test_a_paced_replay_follows_data_time(quick: Path) -> None:
     due_s, progress = played(quick, from_ns=START_NS + 10 * S, to_ns=START_NS + 100 * S)
     assert due_s == pytest.approx([number / 20 for number in range(300)])
     assert (progress[0].fraction, progress[-1].fraction) == (0.0, 1.0)
 
 
-def test_a_paced_replay_goes_on_where_the_data_begin_again_or_pause_for_hours(
+def test_a_paced_replay_does_not_wait_at_a_restart_or_a_long_gap_in_the_data(
     twice: Path, blocks: list[SampleBlock], tmp_path: Path
 ) -> None:
     due_s, _ = played(twice)
@@ -202,6 +202,6 @@ def test_a_paced_replay_goes_on_where_the_data_begin_again_or_pause_for_hours(
 
 
 @pytest.mark.parametrize("end", ["1e999", "NaN", "[" * 50_000, "9" * 4000, "-1", '"soon"'])
-def test_a_report_without_a_time_is_left_out(end: str) -> None:
+def test_a_report_without_a_valid_time_has_no_data_time(end: str) -> None:
     odd = RecordedMessage(LAB.keys.report, f'{{"end_ns": {end}}}'.encode(), b"", "", 5, 5)
     assert data_start_ns(odd) is None

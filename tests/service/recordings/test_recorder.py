@@ -34,7 +34,7 @@ DESCRIPTOR = RecordedMessage(KEYS.descriptor, b'{"channels": []}', b"", "applica
 
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a recorder does every second, it does ten times as often."""
+    """Let the recorder sync and retry ten times as often as usual."""
     for name in ("_SYNC_S", "_RETRY_S"):
         monkeypatch.setattr(f"service.recordings.recorder.{name}", 0.1)
 
@@ -75,7 +75,7 @@ def recorded(recorder: MachineRecorder, key: str = KEYS.stream) -> list[Recorded
     return [message for path in files(recorder) for message in read_recording(path, keys=[key])]
 
 
-def test_everything_under_the_keys_is_recorded_as_it_was(tmp_path: Path) -> None:
+def test_everything_under_the_machines_keys_is_recorded_verbatim(tmp_path: Path) -> None:
     with feeding(settings(endpoint(), recording=into(tmp_path / "kept"))) as (service, feed):
         sent = []
         feed.session.put(KEYS.descriptor, b'{"channels": []}', encoding="application/json")
@@ -103,11 +103,11 @@ def test_everything_under_the_keys_is_recorded_as_it_was(tmp_path: Path) -> None
     assert all(key.startswith(KEYS.root + "/") for key in keys)
     report = next(m for m in found if m.key == KEYS.report)
     assert json.loads(report.payload)["machine"] == "lab"
-    # Both are this computer's clock here, read when the message was published and when it arrived.
+    # Both times are of this computer's clock, at publishing and at arrival.
     assert all(0 < message.publish_time_ns < message.log_time_ns for message in found if message.key == KEYS.stream)
 
 
-def test_a_descriptor_announced_before_the_recorder_came_is_asked_for(tmp_path: Path) -> None:
+def test_a_descriptor_announced_before_the_recorder_started_is_queried(tmp_path: Path) -> None:
     listen = endpoint()
     announced = b'{"announced": "by query"}'
     command = ("service", "record", "--machine", "lab", "--out", str(tmp_path / "o"), "--connect", listen)
@@ -122,7 +122,7 @@ def test_a_descriptor_announced_before_the_recorder_came_is_asked_for(tmp_path: 
         folder = tmp_path / "o" / "demo" / "lab"
 
         def both() -> bool:
-            # Again and again: there is no knowing when the recorder has subscribed to all that it records.
+            # Repeated, as there is no sign of when the recorder has all of its subscriptions.
             session.put(KEYS.stream, b"a block", congestion_control=zenoh.CongestionControl.BLOCK)
             time.sleep(0.1)
             return any(_has(path, announced, b"a block") for path in folder.glob("*.part"))
@@ -143,7 +143,7 @@ def _has(path: Path, *payloads: bytes) -> bool:
     return found >= set(payloads)
 
 
-def test_files_are_closed_by_size_and_each_stands_alone(tmp_path: Path) -> None:
+def test_files_are_closed_by_size_and_each_has_the_descriptor(tmp_path: Path) -> None:
     content = blocks(600)
     with recording(tmp_path, rotate_mb=0.5) as recorder:
         put(recorder, [DESCRIPTOR, *content])
@@ -154,13 +154,13 @@ def test_files_are_closed_by_size_and_each_stands_alone(tmp_path: Path) -> None:
     for path in files(recorder):
         first = next(iter(read_recording(path)))
         assert (first.payload, first.publish_time_ns) == (DESCRIPTOR.payload, DESCRIPTOR.publish_time_ns)
-        # Logged with what follows, so that the file does not seem to begin when the descriptor was announced.
+        # Logged with the next message, or the file would seem to begin when the descriptor was announced.
         assert summarize_recording(path).start_ns >= NOW_NS
     assert (recorder.status().synced, recorder.status().files) == (len(content) + 1, len(names))
     assert not list(recorder.folder.glob("*.part"))
 
 
-def test_without_an_announced_descriptor_the_machine_file_s_own_is_marked_as_such(tmp_path: Path) -> None:
+def test_without_an_announced_descriptor_the_machine_files_is_recorded_as_assumed(tmp_path: Path) -> None:
     with recording(tmp_path) as recorder:
         put(recorder, blocks(1))
     (descriptor,) = recorded(recorder, KEYS.descriptor)
@@ -168,11 +168,11 @@ def test_without_an_announced_descriptor_the_machine_file_s_own_is_marked_as_suc
     assert descriptor.encoding == "application/json;assumed-from-machine-file"
 
 
-def test_files_are_closed_by_age_also_when_nothing_more_comes(tmp_path: Path) -> None:
+def test_files_are_closed_by_age_even_without_new_messages(tmp_path: Path) -> None:
     time_s = [0.0]
 
     def clock() -> float:
-        time_s[0] += 0.1  # or a message written after the last second would never be confirmed
+        time_s[0] += 0.1  # or messages after the last sync would never be confirmed
         return time_s[0]
 
     recorder = MachineRecorder(LAB, into(tmp_path, rotate_s=300), lambda _: (), clock, lambda: NOW_NS)
@@ -187,8 +187,8 @@ def test_files_are_closed_by_age_also_when_nothing_more_comes(tmp_path: Path) ->
     assert [path.name for path in files(recorder)] == ["20261121T142530Z.mcap", "20261121T143030Z.mcap"]
 
 
-def test_a_missing_folder_is_waited_for_without_losing_anything(tmp_path: Path) -> None:
-    """What a mount that comes late looks like; the monitor does not care."""
+def test_a_missing_folder_is_retried_without_losing_messages(tmp_path: Path) -> None:
+    """As with a late mount; the monitor carries on."""
     place = tmp_path / "disk"
     place.write_text("not a folder")
     with feeding(settings(endpoint(), recording=into(place))) as (service, feed):
@@ -208,7 +208,7 @@ def test_a_missing_folder_is_waited_for_without_losing_anything(tmp_path: Path) 
     assert len(recorded(recorder)) == 30
 
 
-def test_a_folder_that_vanishes_is_noticed_and_made_again(tmp_path: Path) -> None:
+def test_a_vanished_folder_is_noticed_and_created_again(tmp_path: Path) -> None:
     with recording(tmp_path / "disk") as recorder:
         put(recorder, blocks(10))
         until(lambda: recorder.status().synced == 10, "confirmed messages")
@@ -224,8 +224,8 @@ def test_a_folder_that_vanishes_is_noticed_and_made_again(tmp_path: Path) -> Non
     assert recorded(recorder) == later
 
 
-def test_a_write_error_is_told_and_recording_resumes_without_loss(tmp_path: Path) -> None:
-    """The system refuses to let the program's files grow; then it lets them again."""
+def test_a_write_error_is_reported_and_recording_resumes_without_loss(tmp_path: Path) -> None:
+    """The file size limit of the process is lowered for a while."""
     listen, place = endpoint(), str(tmp_path / "kept")
     command = ("service", "record", "--machine", "lab", "--json", "--out", place, "--listen", listen)
     with program(tmp_path, *command) as recorder:
@@ -262,11 +262,11 @@ def check_whole(recorder: Program, directory: Path, sent: list[tuple[bytes, byte
     assert found == sent
 
 
-def test_a_full_queue_drops_samples_and_counts_but_keeps_the_rest() -> None:
+def test_a_full_queue_drops_and_counts_samples_but_keeps_other_messages() -> None:
     backlog = Backlog(100_000, KEYS.stream)
     alarm = RecordedMessage(KEYS.alarm_event, b"{}", b"", "application/json", NOW_NS, NOW_NS)
     backlog.put(alarm)
-    for message in blocks(30):  # 19 and the alarm find room
+    for message in blocks(30):  # 19 and the alarm fit
         backlog.put(message)
     assert (backlog.received, backlog.dropped) == (31, 19)
     assert (backlog.take(0.0), backlog.take(0.0)) == ([alarm, *blocks(30)[19:]], [])
@@ -296,7 +296,7 @@ def test_two_recorders_never_write_into_one_folder(tmp_path: Path) -> None:
     assert recorded(first) == [*blocks(3), *blocks(2, start_ns=NOW_NS + 10**9)]
 
 
-def test_what_a_crash_left_is_recovered_at_the_start(tmp_path: Path) -> None:
+def test_files_left_by_a_crash_are_recovered_at_the_start(tmp_path: Path) -> None:
     folder = tmp_path / "demo" / "lab"
     folder.mkdir(parents=True)
     crashed = RecordingWriter(folder / "20261121T142000Z.mcap")
@@ -313,15 +313,15 @@ def test_what_a_crash_left_is_recovered_at_the_start(tmp_path: Path) -> None:
     assert names == {".lock", "20261121T142000Z.mcap", "20261121T141000Z.mcap.damaged"}
 
 
-def test_a_message_that_cannot_be_written_is_left_out_alone(tmp_path: Path) -> None:
-    odd = RecordedMessage(f"{KEYS.root}/odd", b"", b"", "text/plain", NOW_NS, 2**70)  # no such time fits into a file
+def test_only_the_message_that_cannot_be_written_is_lost(tmp_path: Path) -> None:
+    odd = RecordedMessage(f"{KEYS.root}/odd", b"", b"", "text/plain", NOW_NS, 2**70)  # a time beyond the file format
     with recording(tmp_path) as recorder:
         put(recorder, [*blocks(3), odd, *blocks(4, start_ns=NOW_NS + 10**9)])
     assert recorded(recorder) == [*blocks(3), *blocks(4, start_ns=NOW_NS + 10**9)]
     assert (recorder.status().lost, recorder.status().failures) == (1, 1)
 
 
-def test_the_settings_say_what_is_wrong(tmp_path: Path) -> None:
+def test_contradictory_recording_settings_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"alarm_before_s is 86400, longer than keep_days \(0\.5\)"):
         into(tmp_path, alarm_before_s=86400, keep_days=0.5)
     with pytest.raises(ValueError, match="rotate_mb is 256, more than keep_gb"):

@@ -1,4 +1,4 @@
-"""kill -9 of the recorder at random moments: what it called safe is there, the rest is bounded and stated."""
+"""kill -9 of the recorder at random moments: messages reported safe are there, the loss is bounded and stated."""
 
 import os
 import re
@@ -21,7 +21,7 @@ from tests.service.rig.preloaded import ran
 
 KEY = LAB.keys.stream
 ROUNDS, BESIDE = 2, 3
-WINDOW = 100  # most messages that the sender is ahead of what the slowest recorder has called safe
+WINDOW = 100  # most messages that the sender is ahead of the slowest recorder's safe count
 CHUNK_BYTES = 256 * 1024 + 20_000  # a chunk ends with the message that fills it
 NS = 1_000_000_000
 
@@ -31,7 +31,7 @@ def recover(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 class Sender:
-    """Puts messages of many sizes on the stream's key and remembers them."""
+    """Publishes messages of many sizes on the stream's key and keeps a copy."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
@@ -64,7 +64,7 @@ def on_disk(folder: Path, scratch: Path) -> list[tuple[bytes, bytes]]:
     found = []
     for path in sorted(folder.glob("*.mcap*")):
         readable = path
-        if ".recovered" in path.name:  # a copy that was being made when it was killed: the next one throws it away
+        if ".recovered" in path.name:  # a copy interrupted by the kill: the next recorder deletes it
             continue
         if inspect_recording(path).count == 0:  # killed before its first chunk was complete
             assert path.suffix in {".part", DAMAGED}
@@ -79,7 +79,7 @@ def on_disk(folder: Path, scratch: Path) -> list[tuple[bytes, bytes]]:
 
 
 @pytest.mark.slow
-def test_nothing_that_was_safe_is_lost_when_the_recorder_is_killed_again_and_again(tmp_path: Path) -> None:
+def test_no_message_reported_safe_is_lost_when_the_recorder_is_killed_repeatedly(tmp_path: Path) -> None:
     listen = endpoint()
     moments = np.random.default_rng(20)
     folders = [tmp_path / f"disk{n}" / "demo" / "lab" for n in range(BESIDE)]
@@ -110,10 +110,10 @@ def test_nothing_that_was_safe_is_lost_when_the_recorder_is_killed_again_and_aga
                         "confirmation of what was sent",
                     )
     assert len(losses) == ROUNDS * BESIDE
-    assert any(losses)  # otherwise nobody was killed in the middle of anything
+    assert any(losses)  # otherwise no kill interrupted any writing
     found = [path for folder in folders for path in folder.glob("*.part") if ".recovered" not in path.name]
     parts = [path for path in found if inspect_recording(path).count]
-    completed = sum(inspect_recording(part).complete for part in parts)  # killed before it was given its name
+    completed = sum(inspect_recording(part).complete for part in parts)  # killed before its final rename
     done = recover(*parts)
     assert done.returncode == (0 if parts else 2), done.stderr
     for part in parts:
@@ -130,10 +130,10 @@ def test_nothing_that_was_safe_is_lost_when_the_recorder_is_killed_again_and_aga
 def check(
     victim: Victim, sent: list[tuple[bytes, bytes]], before: dict[Path, list[tuple[bytes, bytes]]], scratch: Path
 ) -> int:
-    """Compare what is on the disk with what was sent; how many messages were lost."""
+    """Compare the disk with what was sent; return the number of lost messages."""
     found = on_disk(victim.folder, scratch)
     earlier = before[victim.folder]
-    assert found[: len(earlier)] == earlier  # what earlier rounds left is still there, recovered by this recorder
+    assert found[: len(earlier)] == earlier  # files of earlier rounds are still there, recovered by this recorder
     new = found[len(earlier) :]
     assert len(new) >= victim.safe
     if new:
@@ -159,7 +159,7 @@ def half_written(path: Path, count: int = 200) -> tuple[Path, list[RecordedMessa
     return writer.part, messages
 
 
-def test_recover_says_what_was_recovered_and_what_was_lost(tmp_path: Path) -> None:
+def test_recover_states_what_was_recovered_and_what_was_lost(tmp_path: Path) -> None:
     part, messages = half_written(tmp_path / "run.mcap")
     data = part.read_bytes()
     part.write_bytes(data[:-500])
@@ -187,7 +187,7 @@ def test_recover_says_what_was_recovered_and_what_was_lost(tmp_path: Path) -> No
     assert list(read_recording(tmp_path / "other.mcap")) == back
 
 
-def test_recover_goes_on_after_a_file_that_it_cannot_recover(tmp_path: Path) -> None:
+def test_recover_continues_after_a_file_that_it_cannot_recover(tmp_path: Path) -> None:
     part, _ = half_written(tmp_path / "run.mcap")
     with RecordingWriter(tmp_path / "whole.mcap") as writer:
         writer.write(RecordedMessage("k", b"data", b"", "x", 1, 1))

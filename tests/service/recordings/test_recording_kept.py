@@ -1,4 +1,4 @@
-"""What is kept of the recordings, what is dropped, and what the catalogue finds and refuses to find."""
+"""Which recordings are kept or dropped, and what the catalogue finds and refuses to find."""
 
 import json
 import os
@@ -79,7 +79,7 @@ def names(recordings: list[Recording]) -> list[str]:
     return [one.path.name for one in recordings]
 
 
-def test_what_is_too_old_goes_but_not_files_being_written_nor_renamed_by_people() -> None:
+def test_old_files_are_dropped_but_not_unfinished_or_renamed_ones() -> None:
     files = [stored(-3 * 86_400, 0.001), stored(-86_400, 0.001)]
     decision = decide(files, [], limits(keep_days=2), NOW_NS)
     assert [(one.path.name, why) for one, why in decision.dropped] == [
@@ -90,7 +90,7 @@ def test_what_is_too_old_goes_but_not_files_being_written_nor_renamed_by_people(
     assert [one for one, _ in decision.dropped] == files[2:]
 
 
-def test_files_around_an_alarm_stay_under_limits_of_their_own() -> None:
+def test_files_around_an_alarm_have_limits_of_their_own() -> None:
     files = [stored(300.0 * n) for n in range(10)]
     mark = AlarmMark(NOW_NS + 1650 * NS, "raised: k_by")  # in the middle of file 5
     decision = decide(
@@ -102,7 +102,7 @@ def test_files_around_an_alarm_stay_under_limits_of_their_own() -> None:
     assert decision.dropped == tuple((one, "beyond keep_gb = 0.1") for one in (*files[:4], *files[7:9]))
 
 
-def test_alarms_cannot_fill_the_disk_either() -> None:
+def test_files_around_alarms_are_limited_in_size_and_age() -> None:
     files = [stored(300.0 * n) for n in range(10)]
     marks = [AlarmMark(one.start_ns, "raised") for one in files]
     decision = decide(files, marks, limits(alarm_keep_gb=0.35), NOW_NS)
@@ -118,7 +118,7 @@ def test_alarms_cannot_fill_the_disk_either() -> None:
     keep_gb=st.floats(0.1, 2.0),
     alarm_keep_gb=st.floats(0.1, 2.0),
 )
-def test_limits_hold_and_nothing_goes_without_need(
+def test_limits_hold_and_no_file_is_dropped_without_need(
     sizes: list[float], alarms: list[int], keep_gb: float, alarm_keep_gb: float
 ) -> None:
     files = [stored(300.0 * n, size) for n, size in enumerate(sizes)]
@@ -139,7 +139,7 @@ def test_limits_hold_and_nothing_goes_without_need(
             assert sum(one.size_bytes for one in [group[-len(left) - 1], *left]) > limit * 1e9
 
 
-def test_an_alarm_event_says_what_it_was_and_an_odd_one_counts_too() -> None:
+def test_the_mark_of_an_alarm_event_has_its_text_or_its_name_if_unreadable() -> None:
     assert alarm_mark(EVENT) == AlarmMark(EVENT.recorded_ns, f"{SAID.data.kind}: {SAID.data.text}")
     for text in ("", "[]", '{"data": 1}', "null"):
         assert alarm_mark(replace(EVENT, text=text)) == AlarmMark(EVENT.recorded_ns, f"{SAID.data.kind}: {EVENT.alarm}")
@@ -175,11 +175,11 @@ def at_file(number: int) -> StoredEvent:
 
 
 def numbers(folder: Path) -> list[int]:
-    """Which of the files of `record_files` are there."""
+    """Numbers of the files of `record_files` that are there."""
     return [n for n in range(30) if (folder / name_of(NOW_NS + 300 * n * NS)).exists()]
 
 
-def test_the_recorder_keeps_what_lies_around_an_alarm_when_the_rest_is_thinned_out(tmp_path: Path) -> None:
+def test_the_recorder_keeps_files_around_an_alarm_when_it_drops_others(tmp_path: Path) -> None:
     events = (at_file(2),)
     folder = record_files(tmp_path, 0, 3, events=events)
     assert numbers(folder) == [0, 1, 2]
@@ -194,7 +194,7 @@ def test_the_recorder_keeps_what_lies_around_an_alarm_when_the_rest_is_thinned_o
 
 
 @pytest.mark.parametrize("lost", ["history", "database", "kept.json"])
-def test_what_is_kept_stays_when_the_history_or_what_it_said_is_lost(tmp_path: Path, lost: str) -> None:
+def test_kept_files_stay_when_the_history_or_kept_json_is_lost(tmp_path: Path, lost: str) -> None:
     folder = record_files(tmp_path, 0, 3, events=(at_file(1),))
     before = kept_reasons(folder)
     assert len(before) == 3
@@ -207,7 +207,7 @@ def test_what_is_kept_stays_when_the_history_or_what_it_said_is_lost(tmp_path: P
     assert numbers(folder)[:3] == [0, 1, 2]
 
 
-def test_a_clock_that_is_set_forward_drops_nothing_until_it_has_stayed_so_for_a_day(tmp_path: Path) -> None:
+def test_a_clock_set_forward_drops_nothing_for_a_day(tmp_path: Path) -> None:
     passed_s, set_days = 0.0, 0
 
     def now_ns() -> int:
@@ -235,7 +235,7 @@ def test_a_clock_that_is_set_forward_drops_nothing_until_it_has_stayed_so_for_a_
     assert first in closed(3)
     passed_s += 86_400.0
     closed(4)
-    until(lambda: first not in names(), "the oldest file dropped")  # which follows the closing
+    until(lambda: first not in names(), "the oldest file dropped")  # after the file was closed
     recorder.stop()
 
 
@@ -247,7 +247,7 @@ def recorded(folder: Path) -> Iterator[tuple[Runtime, Feed]]:
         yield found
 
 
-def test_a_monitor_keeps_recordings_for_its_own_alarms_alone(tmp_path: Path) -> None:
+def test_a_monitor_keeps_recordings_only_for_its_own_alarms(tmp_path: Path) -> None:
     folder = tmp_path / "kept" / "demo" / "lab"
     with recorded(tmp_path) as (runtime, feed):
         worker = worker_of(runtime)
@@ -261,7 +261,7 @@ def test_a_monitor_keeps_recordings_for_its_own_alarms_alone(tmp_path: Path) -> 
         until(lambda: closed(2), "two files with forged alarms in them")
         assert worker.history.events() == ()
         assert kept_reasons(folder) == {}
-        feed.sequence, feed.start_ns = feed.sequence + 50, feed.start_ns + 5 * NS  # a gap, which is an alarm
+        feed.sequence, feed.start_ns = feed.sequence + 50, feed.start_ns + 5 * NS  # a gap, which raises an alarm
 
         def raised() -> bool:
             feed.put_good()
@@ -274,7 +274,7 @@ def test_a_monitor_keeps_recordings_for_its_own_alarms_alone(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_a_recorder_beside_a_monitor_keeps_recordings_for_what_is_in_its_history(tmp_path: Path) -> None:
+def test_a_separate_recorder_keeps_recordings_only_for_alarms_in_the_history(tmp_path: Path) -> None:
     address, folder = endpoint(), tmp_path / "kept" / "demo" / "lab"
     with monitor_running(tmp_path, address, machine_file(tmp_path, PATIENT)) as monitor:
         monitor.url()
@@ -282,7 +282,7 @@ def test_a_recorder_beside_a_monitor_keeps_recordings_for_what_is_in_its_history
         history = f"sqlite:///{tmp_path / 'history.sqlite'}"
 
         def record(kind: str) -> dict[str, str]:
-            """Record until an alarm event has come by; what is kept afterwards."""
+            """Record until an alarm event arrives; return the reasons for files kept afterwards."""
             command = ("service", "record", *plan, "--json")
             with (
                 program(tmp_path, *command, ROTORWATCH_HISTORY__URL=history) as recorder,
@@ -315,7 +315,7 @@ def write(path: Path, count: int = 3) -> Path:
     return path
 
 
-def test_the_catalogue_lists_what_is_there(tmp_path: Path) -> None:
+def test_the_catalogue_lists_complete_unfinished_and_damaged_recordings(tmp_path: Path) -> None:
     assert Catalogue(tmp_path / "none").recordings() == ()
     write(tmp_path / "a" / "m2" / name_of(NOW_NS))
     write(tmp_path / "a" / "m1" / name_of(NOW_NS, 2))
@@ -347,7 +347,7 @@ def test_the_catalogue_lists_what_is_there(tmp_path: Path) -> None:
     assert all(catalogue.find(key) == one for key, one in found.items())
 
 
-def test_a_file_that_changes_is_read_anew(tmp_path: Path) -> None:
+def test_a_changed_file_is_read_again(tmp_path: Path) -> None:
     path = write(tmp_path / "s" / "m" / "x.mcap")
     catalogue = Catalogue(tmp_path)
     assert catalogue.recordings()[0].messages == 3
@@ -360,7 +360,7 @@ def test_a_file_that_changes_is_read_anew(tmp_path: Path) -> None:
 
 @pytest.fixture
 def with_secret(tmp_path: Path) -> Catalogue:
-    """A directory with one recording, another one outside of it, and links to that from within."""
+    """A directory with one recording, and with links to another one outside it."""
     write(tmp_path / "recordings" / "s" / "m" / "good.mcap")
     secret = write(tmp_path / "s" / "m" / "secret.mcap")
     inside = tmp_path / "recordings"
@@ -382,7 +382,7 @@ def with_secret(tmp_path: Path) -> Catalogue:
         *("s/m/none.mcap", "s/m/.lock", "s/m/kept.json"),
     ],
 )
-def test_no_id_reaches_anything_but_the_directory_s_own_files(with_secret: Catalogue, name: str) -> None:
+def test_no_id_leads_outside_the_directory(with_secret: Catalogue, name: str) -> None:
     assert with_secret.find(name) is None
 
 
@@ -390,7 +390,7 @@ PIECES = ["s", "m", "/", ".", "..", "../", "secret.mcap", "good.mcap", "link.mca
 
 
 @given(name=st.lists(st.sampled_from(PIECES), max_size=12).map("".join))
-def test_no_combination_does_either(tmp_path_factory: pytest.TempPathFactory, name: str) -> None:
+def test_no_joined_path_leads_outside_the_directory(tmp_path_factory: pytest.TempPathFactory, name: str) -> None:
     inside = tmp_path_factory.getbasetemp() / "shared" / "recordings"
     if not inside.exists():
         write(inside / "s" / "m" / "good.mcap")
@@ -406,7 +406,7 @@ def test_links_are_not_listed(with_secret: Catalogue) -> None:
 
 
 @pytest.mark.parametrize("when", ["before", "while"])
-def test_a_part_that_is_completed_meanwhile_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
+def test_a_part_file_completed_meanwhile_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
     complete = recording(tmp_path / "run.mcap", scenario_blocks(3.0))
     expected = list(read_recording(complete, keys={LAB.keys.stream}))
     part = complete.rename(complete.with_name(complete.name + PART))

@@ -1,4 +1,4 @@
-"""Live, replayed at any pace, and offline: the same reports and alarms; and what is live hears nothing of a replay."""
+"""Live, replayed and offline: the same reports and alarms; and a replay does not reach a live monitor."""
 
 import threading
 from collections.abc import Iterator
@@ -57,7 +57,7 @@ def monitor_in(namespace: str, link: LinkSettings) -> Iterator[MachineWorker]:
         yield worker_of(runtime)
 
 
-def test_offline_says_what_the_monitor_says_in_two_files_too(
+def test_offline_replay_gives_the_monitors_counts_also_from_two_files(
     faulty: Path, expected: OfflineSummary, tmp_path: Path
 ) -> None:
     monitor = MachineMonitor(install(LAB, "lab"))
@@ -76,8 +76,8 @@ def test_offline_says_what_the_monitor_says_in_two_files_too(
     assert (summary.sha256, summary.windows) == (expected.sha256, expected.windows)
 
 
-def test_one_sample_more_or_less_is_another_answer(tmp_path: Path) -> None:
-    """The digest notices what it is there to notice."""
+def test_a_single_changed_sample_changes_the_digest(tmp_path: Path) -> None:
+    """The digest is sensitive to a single sample."""
     stream = scenario_blocks(20.0, FAULT)
     summary, _ = offline(recording(tmp_path / "as_it_was.mcap", stream))
     samples = stream[100].samples.copy()
@@ -88,8 +88,8 @@ def test_one_sample_more_or_less_is_another_answer(tmp_path: Path) -> None:
     assert touched.sha256 != summary.sha256
 
 
-def test_a_replay_disturbs_nothing_that_is_live(faulty: Path, expected: OfflineSummary, tmp_path: Path) -> None:
-    """A healthy machine, and on the same network the replay of its fault, with a monitor of its own."""
+def test_a_replay_does_not_disturb_a_live_monitor(faulty: Path, expected: OfflineSummary, tmp_path: Path) -> None:
+    """A healthy machine live, and on the same network the replay of its fault with a second monitor."""
     healthy = scenario_blocks(BLOCKS / 10)
     undisturbed, lines = offline(recording(tmp_path / "healthy.mcap", healthy))
     assert undisturbed.alarms == 0
@@ -117,10 +117,10 @@ def test_a_replay_disturbs_nothing_that_is_live(faulty: Path, expected: OfflineS
     assert health.quality.refused_blocks == elsewhere.quality.refused_blocks == {}
     assert elsewhere.stream.descriptor_mismatch == ()
     assert health.quality.queue_dropped_blocks == health.quality.link_missed_blocks == 0
-    # While the replay goes on, nothing comes from the live machine any more; that is all there is to tell of it.
+    # The live machine may go silent while the replay is still running; no other alarm is allowed.
     assert {alarm.name for alarm in health.alarms} <= {STREAM_LOST}
     assert said == lines
-    assert digests == (undisturbed.sha256, expected.sha256)  # the other did raise its alarm, there
+    assert digests == (undisturbed.sha256, expected.sha256)  # the replayed monitor did raise its alarm
     reports = [message for message in heard if message.key == MachineKeys("demo", "lab").report]
     assert len(reports) == undisturbed.windows
     assert all(STREAM_LOST in message.text for message in heard if message not in reports)

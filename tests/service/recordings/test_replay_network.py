@@ -1,4 +1,4 @@
-"""What a replay publishes, under which keys, and that it never meets a live machine."""
+"""What a replay publishes, under which keys, and that it never mixes with a live machine."""
 
 import json
 import threading
@@ -61,7 +61,7 @@ def source(tmp_path: Path) -> RecordingSource:
 
 
 @pytest.mark.parametrize("everything", [False, True])
-def test_messages_go_out_byte_for_byte(source: RecordingSource, everything: bool) -> None:
+def test_messages_are_replayed_byte_for_byte(source: RecordingSource, everything: bool) -> None:
     address, alive = endpoint(), list[str]()
     with session(address) as listener, hearing(listener) as heard:
         tokens = listener.liveliness().declare_subscriber(
@@ -80,7 +80,7 @@ def test_messages_go_out_byte_for_byte(source: RecordingSource, everything: bool
     assert alive == [f"SampleKind.{kind} x/{LAB.keys.publisher_alive}" for kind in ("PUT", "DELETE")]
 
 
-def test_a_stretch_begins_with_the_descriptor_that_held_then(source: RecordingSource) -> None:
+def test_a_section_begins_with_the_descriptor_valid_then(source: RecordingSource) -> None:
     address = endpoint()
     begin_ns, end_ns = source.span().start_ns + 10**9, source.span().start_ns + 2 * 10**9
     with session(address, "x") as listener, hearing(listener, "rotorwatch/**") as heard:
@@ -103,7 +103,7 @@ def test_each_pass_has_a_prefix_of_its_own(source: RecordingSource) -> None:
 
 
 @pytest.mark.parametrize("who", ["publisher", "monitor"])
-def test_original_keys_are_refused_while_somebody_is_alive(source: RecordingSource, who: str) -> None:
+def test_original_keys_are_refused_while_a_publisher_or_monitor_is_alive(source: RecordingSource, who: str) -> None:
     address, alive = endpoint(), getattr(LAB.keys, f"{who}_alive")
     with session(address) as other, hearing(other) as heard:
         token = other.liveliness().declare_token(alive)
@@ -121,7 +121,7 @@ def replay_until_refused(source: RecordingSource, what: NetworkPlan, errors: lis
 
 
 @pytest.mark.parametrize("who", ["publisher", "monitor"])
-def test_original_keys_are_left_as_soon_as_somebody_live_appears(source: RecordingSource, who: str) -> None:
+def test_replay_on_original_keys_stops_when_a_publisher_or_monitor_appears(source: RecordingSource, who: str) -> None:
     address, errors = endpoint(), list[str]()
     with session(address) as other, hearing(other, LAB.keys.stream) as heard:
         # Three seconds of recording at this pace would take half a minute.
@@ -138,7 +138,7 @@ def test_original_keys_are_left_as_soon_as_somebody_live_appears(source: Recordi
     assert 1 <= len(heard) < 30
 
 
-def test_a_monitor_that_starts_during_a_replay_on_the_original_keys_takes_none_of_it(source: RecordingSource) -> None:
+def test_a_monitor_started_during_a_replay_on_original_keys_takes_no_block(source: RecordingSource) -> None:
     address, taken, errors = endpoint(), list[RawBlock](), list[str]()
 
     callbacks = MachineCallbacks(taken.append, ignore, ignore, ignore, lambda: "{}", lambda: "{}", no_events)
@@ -152,7 +152,7 @@ def test_a_monitor_that_starts_during_a_replay_on_the_original_keys_takes_none_o
         late = Link(LinkSettings(mode="client", connect=(address,)))
         monitor = MachineLink(late, LAB.keys, callbacks, wait_when_full=False)
         thread.join()
-        assert errors  # it has seen the monitor
+        assert errors  # the replay has noticed the monitor
         monitor.close()
         late.close()
         other.close()

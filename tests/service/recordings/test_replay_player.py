@@ -36,7 +36,7 @@ def times(source: RecordingSource, **where: int) -> list[float]:
 
 
 class Taker:
-    """Takes what is replayed, and does something at one message."""
+    """Collects replayed messages and runs an action at one of them."""
 
     def __init__(self, at_s: float = -1.0, action: Callable[[], object] = lambda: None) -> None:
         self.messages: list[RecordedMessage] = []
@@ -54,7 +54,7 @@ class Taker:
         return [one.log_time_ns / SECOND for one in self.messages]
 
 
-def test_files_are_read_in_the_order_of_time(tmp_path: Path) -> None:
+def test_files_are_read_in_order_of_time(tmp_path: Path) -> None:
     late, early = tens(tmp_path / "a.mcap", 20, 30), tens(tmp_path / "b.mcap", 10, 20)
     source = RecordingSource([late, early, late])
     assert source.paths == (early, late)
@@ -63,15 +63,15 @@ def test_files_are_read_in_the_order_of_time(tmp_path: Path) -> None:
     assert (source.span().start_ns, source.span().end_ns) == (SECOND, 29 * SECOND // 10)
 
 
-def test_what_two_files_both_hold_is_read_once(tmp_path: Path) -> None:
-    """A capture around an alarm repeats a part of the files it was taken from."""
+def test_messages_in_two_files_are_read_once(tmp_path: Path) -> None:
+    """A capture around an alarm repeats part of the files that it was taken from."""
     files = [tens(tmp_path / "a.mcap", 10, 20), tens(tmp_path / "b.mcap", 15, 25), tens(tmp_path / "c.mcap", 22, 30)]
     assert times(RecordingSource(files)) == [at / 10 for at in range(10, 30)]
     source = RecordingSource([write(tmp_path / "d.mcap", [message(1.0), message(1.0)])])
     assert times(source) == [1.0, 1.0]
 
 
-def test_the_machine_is_named_if_there_are_several(tmp_path: Path) -> None:
+def test_a_machine_must_be_named_if_there_are_several(tmp_path: Path) -> None:
     both = write(
         tmp_path / "a.mcap", [message(1.0), message(1.1, "rotorwatch/demo/pump/stream"), message(1.2, "other")]
     )
@@ -84,7 +84,7 @@ def test_the_machine_is_named_if_there_are_several(tmp_path: Path) -> None:
         source.machine("demo/fan")
 
 
-def test_the_descriptor_of_a_time_is_the_latest_before_it(tmp_path: Path) -> None:
+def test_the_descriptor_at_a_time_is_the_latest_before_it(tmp_path: Path) -> None:
     key = "rotorwatch/demo/lab/descriptor"
     said = [message(at, key, str(at).encode()) for at in (1.0, 2.0, 3.0)]
     source = RecordingSource([write(tmp_path / "a.mcap", [message(0.5), *said])])
@@ -94,7 +94,7 @@ def test_the_descriptor_of_a_time_is_the_latest_before_it(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("missing", ["absent.mcap", "text.mcap", "empty.mcap: contains no message"])
-def test_files_that_are_no_recordings_are_refused(tmp_path: Path, missing: str) -> None:
+def test_files_that_are_not_recordings_are_refused(tmp_path: Path, missing: str) -> None:
     (tmp_path / "text.mcap").write_text("no recording", encoding="utf-8")
     write(tmp_path / "empty.mcap", [])
     others = [] if "empty" in missing else [tens(tmp_path / "a.mcap", 1, 2)]
@@ -102,7 +102,7 @@ def test_files_that_are_no_recordings_are_refused(tmp_path: Path, missing: str) 
         RecordingSource([*others, tmp_path / missing.partition(":")[0]])
 
 
-def test_moments() -> None:
+def test_times_are_parsed_in_several_forms() -> None:
     assert parse_moment("+90s", SECOND, "--from") == 91 * SECOND
     assert parse_moment("1970-01-01T01:00:00+01:00", 5, "--from") == 0
     assert parse_moment("1970-01-01T00:00:00.000001", 5, "--from") == 1000
@@ -127,7 +127,7 @@ def plan(pace: float | None = None, from_s: float = 0.0, to_s: float = 100.0) ->
     ],
     ids=["forward", "back", "before the beginning", "after the end", "stopped"],
 )
-def test_an_order_holds_from_the_next_message_on(
+def test_seek_and_stop_take_effect_at_the_next_message(
     tmp_path: Path, at_s: float, order: Callable[[Control], object], where: PlayPlan, expected: tuple[int, ...]
 ) -> None:
     source, control = RecordingSource([tens(tmp_path / "a.mcap", 0, 100)]), Control()
@@ -137,7 +137,7 @@ def test_an_order_holds_from_the_next_message_on(
     assert control.reason == ("enough" if control.stopped else "")
 
 
-def test_a_paused_replay_says_where_it_was_moved_and_does_not_end_at_the_end(tmp_path: Path) -> None:
+def test_a_paused_replay_reports_seeks_and_does_not_end_at_the_end(tmp_path: Path) -> None:
     source, control = RecordingSource([tens(tmp_path / "a.mcap", 0, 100)]), Control()
     taker, told = Taker(2.0, control.pause), list[ReplayProgress]()
     thread = threading.Thread(target=play, args=(source, taker.put, plan(to_s=10.0), control, told.append), daemon=True)
@@ -153,14 +153,14 @@ def test_a_paused_replay_says_where_it_was_moved_and_does_not_end_at_the_end(tmp
     assert taker.times == [at / 10 for at in (*range(21), *range(90, 100))]
 
 
-def test_a_paused_replay_waits_and_its_clock_stands_still() -> None:
+def test_a_paused_replay_waits_and_its_clock_stops() -> None:
     control = Control()
     control.pause()
     now_s = control.now_s()
     control.pause()
     assert control.now_s() == now_s
     assert control.paused
-    control.seek(5)  # is heard all the same
+    control.seek(5)  # is accepted all the same
     assert not control.wait_until(None)
     assert control.take_seek() == 5
     assert control.take_seek() is None
@@ -170,7 +170,7 @@ def test_a_paused_replay_waits_and_its_clock_stands_still() -> None:
     assert not control.wait_until(None)
 
 
-def test_orders() -> None:
+def test_text_commands_control_a_replay() -> None:
     control = Control()
     control.at(10 * SECOND)
     for order in ("fly", "pause now", "seek", "seek soon", "seek +x", "seek 1e5", ""):
@@ -180,7 +180,7 @@ def test_orders() -> None:
     assert obey(control, "resume")
     assert not control.paused
     assert obey(control, "seek -2.5")
-    assert obey(control, "seek +1")  # from where it is going, not from where it was
+    assert obey(control, "seek +1")  # relative to the pending seek, not to the current position
     assert control.take_seek() == 85 * SECOND // 10
     assert obey(control, "seek 42")
     assert control.take_seek() == 42

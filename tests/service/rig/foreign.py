@@ -1,4 +1,4 @@
-"""Streams that no rotor of the model makes, in the form of a machine's own."""
+"""Streams that no modelled rotor can produce, in the format of a machine's own."""
 
 from collections.abc import Iterator
 from typing import Literal
@@ -82,7 +82,7 @@ def simulated(
 
 
 def late_copy(machine: Machine, samples: FloatArray, copies: dict[str, str], late: int, seed: int) -> FloatArray:
-    """The same with both sensors of some motions replaced by those of others, some samples later."""
+    """The samples with both sensors of some motions replaced by delayed copies of others'."""
     names = [channel.name for channel in machine.sensors]
     rng, out = np.random.default_rng(seed), samples.copy()
     for copy, source in copies.items():
@@ -107,7 +107,7 @@ def _sine(phase: FloatArray, w: float, amplitude: float, rng: np.random.Generato
 
 
 def _coloured(n: int, rate_hz: float, slope: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Noise of density f^-slope from 0.2 Hz on, rms 1, and its rate."""
+    """Noise of density f^-slope from 0.2 Hz on, rms 1, and its derivative."""
     f = np.fft.rfftfreq(n, 1 / rate_hz)
     amplitude = np.where(f >= 0.2, np.maximum(f, 0.2) ** (-slope / 2), 0.0)
     spectrum = amplitude * (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size))

@@ -1,4 +1,4 @@
-"""A small guarded application behind a real server, with a real store: what the tests of access talk to."""
+"""A small application with access control, a real server and a real store, for the tests of access."""
 
 import asyncio
 import base64
@@ -75,7 +75,7 @@ class Guarded:
 
 
 def application(guard: Guard, done: list[str]) -> FastAPI:
-    """Routes of every kind; `done` tells which of them ran."""
+    """Routes of every kind; `done` records which of them ran."""
     app = FastAPI(dependencies=[guard.gate], openapi_url=None, docs_url=None, redoc_url=None)
     add_problems(app)
 
@@ -153,7 +153,7 @@ def served(app: FastAPI, host: str = "127.0.0.1", **arguments: Any) -> Iterator[
     """Serve an application on a free port; its URL."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listening = socket.create_server((host, 0), family=family)
-    # Without it the end of every answer waits for the other side's acknowledgement, 40 ms.
+    # Without it the end of every response waits 40 ms for the peer's acknowledgement.
     listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     config = uvicorn.Config(app, log_config=None, access_log=False, lifespan="off", **arguments)
     server = uvicorn.Server(config)

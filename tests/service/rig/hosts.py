@@ -17,7 +17,7 @@ _CLONE_NEWNET = 0x40000000  # of sched.h; Python has setns from 3.12 on
 
 
 def why_not() -> str:
-    """Why there can be no hosts on this computer; empty if there can."""
+    """Why hosts cannot be created on this computer; empty if they can."""
     if os.geteuid() != 0:
         return "network namespaces need root"
     if shutil.which("ip") is None:
@@ -37,19 +37,19 @@ class Running(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Hosts:
-    """The hosts that there are: the n-th is 10.77.n.2, and knows the middle as 10.77.n.1."""
+    """Named hosts: the n-th is 10.77.n.2 and reaches the middle at 10.77.n.1."""
 
     names: tuple[str, ...]
 
     def within(self, name: str) -> tuple[str, ...]:
-        """What goes before a command that is to run on a host."""
+        """Prefix of a command that is to run on a host."""
         return ("ip", "netns", "exec", self._space(name))
 
     def network(self, name: str) -> str:
         return f"/run/netns/{self._space(name)}"
 
     def middle_from(self, name: str) -> str:
-        """Address of the host in the middle, as another one reaches it."""
+        """Address of the host in the middle as seen from another."""
         return f"10.77.{self.names.index(name)}.1"
 
     def address(self, name: str) -> str:
@@ -64,14 +64,14 @@ class Hosts:
         _ip("-n", self._space(MIDDLE), "link", "set", self._cable(name), "up")
 
     def lose(self, name: str, *running: Running) -> None:
-        """Take the power from a host on which these programs run: nobody is told, and no connection is closed."""
+        """Power off a host on which these programs run, without notice: no connection is closed."""
         _ip("-n", self._space(MIDDLE), "link", "del", self._cable(name))
         for one in running:
             one.kill()
         self.take_away(name)
 
     def put(self, name: str) -> None:
-        """Put a host there, with its cable; or back there, after it was lost."""
+        """Create a host with its cable, or again after it was lost."""
         space = self._space(name)
         _ip("netns", "add", space)
         _ip("-n", space, "link", "set", "lo", "up")
@@ -90,11 +90,11 @@ class Hosts:
     def asked(self, name: str, url: str) -> str:
         def answer() -> str:
             move_to(self.network(name))
-            time.sleep(0.15)  # of one caller 600 questions a minute are answered
+            time.sleep(0.15)  # one caller may make 600 requests a minute
             with urllib.request.urlopen(url, timeout=20) as response:  # noqa: S310  # of a monitor of ours
                 return str(response.read().decode())
 
-        with ThreadPoolExecutor(1) as asking:  # which ends there, and never comes back
+        with ThreadPoolExecutor(1) as asking:  # a thread that moved cannot come back
             return asking.submit(answer).result(60)
 
     def _cable(self, name: str) -> str:
@@ -106,9 +106,9 @@ class Hosts:
 
 @contextmanager
 def hosts(*names: str, joined: bool = False) -> Iterator[Hosts]:
-    """Hosts with these names, and one in the middle; gone, with all that is between them, when the block is left.
+    """Hosts with these names and one in the middle, removed with their cables on exit.
 
-    The one in the middle passes on what they send each other only if they are `joined`.
+    The one in the middle forwards packets between them only if they are `joined`.
     """
     made = Hosts(names)
     with ExitStack() as undo:

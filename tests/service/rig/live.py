@@ -42,11 +42,11 @@ START_NS = 1_767_225_600_000_000_000
 IN_MEMORY = HistorySettings(url="sqlite:///:memory:")
 OPEN = AccessSettings(open_on_loopback=True, limits=LimitSettings(requests_per_minute=1_000_000))
 PATIENT = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]")
-"""For `machine_file`: no silence is one."""
+"""For `machine_file`: missing data are never a silence."""
 IN_ORDER = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
-"""The same, and a gap is one at once."""
+"""The same without reordering: a gap is one at once."""
 IMPATIENT = ("[operation]", "[ingest]\nblock_to_s = 0.2\nno_data_after_s = 0.5\n\n[operation]")
-"""The opposite: half a second is a silence."""
+"""The opposite: half a second without data is a silence."""
 SHORT = (("length_s = 60.0", "length_s = 20.0"), ("off_delay_s = 60.0", "off_delay_s = 20.0"))
 """For `machine_file`: windows are full, and alarms cleared, after a third of the time."""
 QUICK = (PATIENT, *SHORT)
@@ -62,16 +62,16 @@ when it is busy."""
 
 
 def until(condition: Callable[[], bool], what: str, timeout_s: float = 180.0) -> None:
-    """Wait for a condition; a deadline ends a wait that would be in vain."""
+    """Wait for a condition, at most until a deadline."""
     deadline, pause_s = time.monotonic() + timeout_s, 0.005
     while not condition():
         assert time.monotonic() < deadline, f"no {what} within {timeout_s} s"
         time.sleep(pause_s)
-        pause_s = min(1.2 * pause_s, 0.05)  # what is asked over HTTP keeps two programs busy
+        pause_s = min(1.2 * pause_s, 0.05)  # polling over HTTP keeps two programs busy
 
 
 def until_subscribed(session: zenoh.Session, key: str) -> None:
-    """Wait until what is put on a key is heard: a subscriber's declaration takes its time to arrive."""
+    """Wait until a key has a subscriber, whose declaration takes time to arrive."""
     probe = session.declare_publisher(key)
     until(lambda: bool(probe.matching_status.matching), f"subscriber of {key}")  # type: ignore[attr-defined]  # the stub says bool
     probe.undeclare()  # type: ignore[no-untyped-call]
@@ -79,7 +79,7 @@ def until_subscribed(session: zenoh.Session, key: str) -> None:
 
 @contextmanager
 def open_session(connect: str, mode: Literal["peer", "client"] = "peer") -> Iterator[zenoh.Session]:
-    """A session beside a service that subscribes to the lab machine; what it puts is heard from the beginning."""
+    """A session with a service that has subscribed to the lab machine: nothing that it puts is missed."""
     with loopback.session_of(LinkSettings(mode=mode, connect=(connect,))) as session:
         until_subscribed(session, LAB.keys.stream)
         yield session
@@ -88,7 +88,7 @@ def open_session(connect: str, mode: Literal["peer", "client"] = "peer") -> Iter
 def advanced_publisher(
     session: zenoh.Session, key: str, kept: int = 0, *, heartbeat_s: float = 0.2, detected: bool = True, **more: Any
 ) -> zenoh.ext.AdvancedPublisher:
-    """As the simulator's: what is lost is noticed, and as much is kept for who comes late."""
+    """A publisher like the simulator's: losses are detected, and `kept` messages cached for late subscribers."""
     return zenoh.ext.declare_advanced_publisher(
         session, key, congestion_control=zenoh.CongestionControl.BLOCK,
         cache=zenoh.ext.CacheConfig(max_samples=kept) if kept else None,
@@ -105,7 +105,7 @@ def settings(
     bound: int = 600,
     **others: object,
 ) -> ServiceSettings:
-    """Settings of a service on loopback with a free HTTP port, and others of its sections."""
+    """Settings of a service on loopback with a free HTTP port; `others` are sections to replace."""
     made = ServiceSettings(
         link=LinkSettings(listen=(listen,)), http=HttpSettings(port=0), history=IN_MEMORY, access=OPEN,
         machines=(MachineEntry(file=machine, bundle=bundle),),
@@ -144,11 +144,11 @@ def machine_file(folder: Path, *replacements: tuple[str, str]) -> str:
 
 
 _simulated: dict[tuple[tuple[Event, ...], int, int], list[SampleBlock]] = {}
-"""The longest stream of each kind that was asked for: others begin with the same blocks."""
+"""The longest stream of each kind so far: shorter ones are its first blocks."""
 
 
 def scenario_blocks(duration_s: float, *faults: Event, start_ns: int = START_NS, run: int = 1) -> list[SampleBlock]:
-    """Blocks of 0.1 s of the shipped healthy scenario, shortened, with faults added; not to be written to."""
+    """Blocks of 0.1 s of the shipped healthy scenario, shortened, with faults added; read-only."""
     count, what = round(10 * duration_s), (faults, start_ns, run)
     if len(_simulated.get(what, ())) < count:
         scenario, machine = load_scenario("healthy")
@@ -170,7 +170,7 @@ def send(connect: str, stream: list[SampleBlock], machine: MachineFile = LAB) ->
 
 @dataclass(slots=True)
 class Feed:
-    """Good blocks of the shipped machine, one after the other, put on the key without the simulator."""
+    """Good blocks of the shipped machine, one after the other, published without the simulator."""
 
     session: zenoh.Session
     machine: MachineFile = LAB
@@ -201,7 +201,7 @@ class Feed:
             payload,
             attachment=attachment or None,
             encoding=encoding,
-            # The sender must not drop on a busy computer: what is lost shall be lost where the test looks.
+            # The sender must not drop on a busy computer: blocks may be lost only where the test looks.
             congestion_control=zenoh.CongestionControl.BLOCK,
         )
 
@@ -214,7 +214,7 @@ class Feed:
             self.start_ns = block.end_ns
 
     def skip(self, seconds: int = 3) -> None:
-        """Leave out so much: a gap before the next block."""
+        """Leave out some seconds: a gap before the next block."""
         self.sequence += 10 * seconds
         self.start_ns += seconds * 10**9
 
@@ -252,7 +252,7 @@ class Program:
         return self.err.read_text(encoding="utf-8")
 
     def latest(self) -> dict[str, Any]:
-        """The newest line that it has printed, of a program that prints JSON."""
+        """The newest line of a program that prints JSON lines."""
         lines = self.output().rpartition("\n")[0].splitlines()
         return dict(json.loads(lines[-1])) if lines else {}
 
@@ -262,7 +262,7 @@ class Program:
         assert text in self.output(), f"ended without {text!r}:\n{self.output()}\n{self.errors()}"
 
     def url(self) -> str:
-        """Where the HTTP API of a monitor is, from what it printed."""
+        """URL of a monitor's HTTP API, from its output."""
         self.wait_for("HTTP API http")
         return self.output().split("HTTP API ", 1)[1].split()[0]
 
@@ -291,7 +291,7 @@ def program(
 ) -> Iterator[Program]:
     """Run ``python -m ARGUMENTS`` from the checkout or elsewhere; `alone` is an environment of its own.
 
-    The words `within` come before the command; `network` is that of a host. It is gone when the block is left.
+    The words `within` come before the command; `network` is that of a host. It is killed on exit.
     """
     number = len(list(folder.glob("*.out")))
     out, err = folder / f"{number}.out", folder / f"{number}.err"
@@ -314,7 +314,7 @@ def program(
 
 
 def ignore(*_: object) -> None:
-    """Take anything."""
+    """Accept any arguments."""
 
 
 def no_events(after: int, limit: int) -> str:
@@ -330,7 +330,7 @@ def machine_link(
     wait: bool = False,
     alarm_events: Callable[[int, int], str] = no_events,
 ) -> Iterator[tuple[Link, MachineLink]]:
-    """A machine's link that listens on an address, or connects as it is told."""
+    """A machine's link that listens on an address, or connects as its settings say."""
     callbacks = MachineCallbacks(on_block, ignore, ignore, ignore, lambda: '{"h": 1}', lambda: '{"a": 1}', alarm_events)
     link = Link(LinkSettings(listen=(where,)) if isinstance(where, str) else where)
     declared = MachineLink(link, LAB.keys, callbacks, wait_when_full=wait)

@@ -57,7 +57,7 @@ def faulty(folder: Path, access: AccessSettings = OPEN) -> Iterator[tuple[Runtim
 
 @contextmanager
 def fed(folder: Path, access: AccessSettings = OPEN, *lines: tuple[str, str]) -> Iterator[tuple[Runtime, Feed]]:
-    """The lab machine, which gets the blocks that a test puts; gaps of a second are an alarm at once."""
+    """The lab machine, fed by the test; a gap of a second raises an alarm at once."""
     with feeding(
         settings(endpoint(), machine_file(folder, IN_ORDER, *lines), when_full="wait", access=access)
     ) as found:

@@ -69,8 +69,8 @@ class PostgresServer:
 
 @contextmanager
 def postgres_server() -> Iterator[PostgresServer]:
-    """A running server; it and its folder are gone when the block is left."""
-    # Not below pytest's own folder: the path of a socket may have hundred letters, and another user must get there.
+    """A running server, removed with its folder on exit."""
+    # Not below pytest's own folder: a socket's path is limited to about 100 characters, and another user needs it.
     with tempfile.TemporaryDirectory(prefix="pg-") as name:
         folder = Path(name)
         account = _account() if os.geteuid() == 0 else None
@@ -86,7 +86,7 @@ def postgres_server() -> Iterator[PostgresServer]:
 
 
 def database_url(kind: str, folder: Path, *, empty: bool = False) -> str:
-    """Address of a database of one of `KINDS` with the tables of a history, which take their time, or with nothing."""
+    """Address of a database of one of `KINDS` with the tables of a history, copied as making them is slow, or empty."""
     if kind == "sqlite":
         path = folder / "history.sqlite"
         if not empty:
@@ -147,7 +147,7 @@ def _shared_server() -> PostgresServer:
 
 
 def _account() -> str:
-    """Who runs the server when the tests run as root: PostgreSQL refuses to be root."""
+    """Account of the server when the tests run as root, which PostgreSQL refuses."""
     try:
         return pwd.getpwnam("postgres").pw_name
     except KeyError:

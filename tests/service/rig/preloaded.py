@@ -1,4 +1,4 @@
-"""Programs that start at once: forked off a process that has imported what they import, which takes seconds each time.
+"""Programs that start at once: forked off a process that has imported their modules, which takes seconds each time.
 
 Each is a process of its own with its own arguments, environment and output, and runs the program from its first line.
 """
@@ -26,7 +26,7 @@ PROGRAMS = [
     *("models.signals.recording", "service.recordings.replay.offline", "service.terminal.stopping"),
     *("service.history.migrations", "pydantic.v1", "uvicorn.loops.asyncio", "uvicorn.lifespan.off", __name__),
 ]
-"""What they import."""
+"""Modules that the programs import."""
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(PROGRAMS)
 
@@ -116,7 +116,7 @@ def ran(
 
 
 def rotorwatch(*arguments: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run the command to its end, in an environment of little else."""
+    """Run the command to its end, in a minimal environment."""
     clean = {"PATH": "/usr/bin:/bin", "COLUMNS": "200", **environment}
     return ran("service", *arguments, environment=clean)
 
@@ -128,7 +128,7 @@ def _run(
     environment: dict[str, str],
     network: str = "",
 ) -> None:
-    gc.freeze()  # looking through what is shared would copy it
+    gc.freeze()  # garbage collection would copy shared pages
     if network:
         move_to(network)
     for number, end in enumerate(ends):

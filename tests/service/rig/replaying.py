@@ -1,4 +1,4 @@
-"""What the tests of replays share: recordings of simulated machines, and what a running service said, as lines."""
+"""What the tests of replays share: recordings of simulated machines, and the output of a running service as lines."""
 
 import hashlib
 import json
@@ -37,7 +37,7 @@ def write(path: Path, messages: Sequence[RecordedMessage]) -> Path:
 
 
 def hurried(source: Path, path: Path, pace: float = 20.0, at_ns: int = 1_790_000_000 * 10**9) -> Path:
-    """The same messages as a recorder has them whose stream came faster than real time, on another day."""
+    """The same messages as recorded from a stream faster than real time, on another day."""
     messages = list(read_recording(source))
     begin_ns = messages[0].log_time_ns
     for number, one in enumerate(messages):
@@ -94,12 +94,12 @@ def without_angle(path: Path, stream: Sequence[SampleBlock]) -> Path:
 def made(
     folder: Path, signals: dict[str, Callable[[FloatArray], FloatArray]], seconds: float, without: Sequence[int] = ()
 ) -> Recorded:
-    """What a recording of `machine_blocks` has."""
+    """A recording of `machine_blocks`, opened."""
     return recorded(recording(folder / "made.mcap", machine_blocks(signals, seconds, without)))
 
 
 def recorded(path: Path, seconds: tuple[float, float] | None = None) -> Recorded:
-    """What the rotor kit's recording has, all or between two times."""
+    """A recording of the rotor kit, opened in full or between two times."""
     source = RecordingSource([path])
     from_ns, to_ns = source.span().start_ns, source.span().end_ns + 1
     if seconds is not None:

@@ -1,4 +1,4 @@
-"""A run-up in closed form: a circle of a shaft that is out of round, and that climbs in its bearing."""
+"""A run-up in closed form: a circular orbit with run-out, of a shaft that climbs in its bearing."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ CHANNELS: tuple[Channel, ...] = tuple(one for one in LAB.sensors if one.name in 
 
 
 def angle(t: FloatArray) -> FloatArray:
-    """Of a run-up from 15 to 35 Hz."""
+    """Shaft angle during a run-up from 15 to 35 Hz."""
     return np.asarray(2 * np.pi * (FROM_HZ * t + (TO_HZ - FROM_HZ) / SECONDS * t**2 / 2))
 
 

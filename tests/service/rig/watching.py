@@ -1,4 +1,4 @@
-"""A monitor that is fed without any network, and what it says."""
+"""A monitor fed without a network, and its output."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -29,7 +29,7 @@ def raised(monitor: MachineMonitor) -> set[str]:
 
 
 def resumed(monitor: MachineMonitor, installed: Installed, *, whole: bool = True, **how: Any) -> MachineMonitor:
-    """Another one that goes on from what a monitor remembers, with its window or without."""
+    """A second monitor restored from the state of the first, with its window or without."""
     state, again = monitor.state(whole=whole), MachineMonitor(installed, **how)
     again.restore(state.state, [data for _, data in state.new_parts])
     again.restore_alarms(state.alarms)

@@ -1,4 +1,4 @@
-"""Shards on the computers of a Ray cluster: one that is lost, one that comes, and settings that are none of a fleet."""
+"""Shards on the computers of a Ray cluster: a node lost, a node added, and settings that a fleet refuses."""
 
 import json
 import math
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def fleet_plan(folder: Path, database: str, count: int = 2) -> ServiceSettings:
-    """Two machines, each in a shard of its own if there are two."""
+    """Settings of a fleet of two machines in `count` shards."""
     plan = plan_for(folder, count)
     link = LinkSettings(mode="client", connect=plan.link.listen)
     changed = {"link": link, "history": HistorySettings(url=database), "fleet": FleetSettings(listen=endpoint())}
@@ -41,7 +41,7 @@ def fleet_plan(folder: Path, database: str, count: int = 2) -> ServiceSettings:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator["Cluster"]:
-    """A Ray cluster of two computers with a core each, beside one without any; all are this computer."""
+    """A Ray cluster on this computer: a head node without cores and two worker nodes with one core each."""
     from ray.cluster_utils import Cluster  # noqa: PLC0415  # half a second, and every worker reads this module
 
     head = {
@@ -64,11 +64,11 @@ def actors_of(runtime: Runtime) -> list[Any]:
 
 
 def computers_of(runtime: Runtime) -> list[str]:
-    """Where the shards run; empty for one that does not."""
+    """Node of each shard; empty for a shard that is not running."""
     return [one.computer for one in actors_of(runtime)]
 
 
-def test_a_computer_that_is_lost_and_one_that_comes(cluster: "Cluster", tmp_path: Path) -> None:
+def test_shards_move_off_a_lost_computer_and_onto_a_new_one(cluster: "Cluster", tmp_path: Path) -> None:
     blocks = scenario_blocks(SECONDS, parse_fault("k_by=-0.33@10"))
     assert HEALTH_CHECKS in (ROOT / "docs" / "service.md").read_text(encoding="utf-8")
     with postgres_server() as server:
@@ -101,7 +101,7 @@ def test_a_computer_that_is_lost_and_one_that_comes(cluster: "Cluster", tmp_path
             cluster.remove_node(lost, allow_graceful=False)
             until(lambda: not runtime.readiness().ready, "that it is told")
             assert "its computer was lost and is being started again" in machines[0].health().reason
-            assert machines[0].health().state is HealthState.ALERT  # what was raised stays in sight
+            assert machines[0].health().state is HealthState.ALERT  # a raised alarm stays visible
             until(lambda: runtime.readiness().ready, "that it goes on")
             assert computers_of(runtime) == [there[1], there[1]]
             assert "00:42" not in machines[1].health().restart
@@ -120,7 +120,7 @@ def test_a_computer_that_is_lost_and_one_that_comes(cluster: "Cluster", tmp_path
                 assert [event.alarm for event in after if event.kind == "raised"].count("k_by") == 1
 
 
-def test_an_archive_and_a_study_on_a_cluster(cluster: "Cluster", tmp_path: Path) -> None:
+def test_offline_replay_on_a_cluster_gives_the_results_of_single_replays(cluster: "Cluster", tmp_path: Path) -> None:
     plan = plan_for(tmp_path, 1)
     kits = [load_machine(entry.file) for entry in plan.machines]
     files = [
@@ -152,7 +152,7 @@ def test_an_archive_and_a_study_on_a_cluster(cluster: "Cluster", tmp_path: Path)
         assert list(spread(abs, [-1, 2, -3])) == [1, 2, 3]
 
 
-def test_settings_that_are_none_of_a_fleet(tmp_path: Path) -> None:
+def test_shard_count_of_a_fleet_and_settings_that_it_refuses(tmp_path: Path) -> None:
     plan = fleet_plan(tmp_path, "postgresql://me@host/plant")
     assert fleet_count(plan) == 2
     many = plan.model_copy(update={"machines": 31 * plan.machines})
@@ -167,7 +167,7 @@ def test_settings_that_are_none_of_a_fleet(tmp_path: Path) -> None:
             fleet_count(plan.model_copy(update=update))
 
 
-def test_a_cluster_that_is_not_there(tmp_path: Path) -> None:
+def test_an_unreachable_cluster_is_named_with_the_command_that_starts_one(tmp_path: Path) -> None:
     (tmp_path / "fleet.toml").write_text(
         '[link]\nmode = "client"\nconnect = ["tcp/127.0.0.1:7447"]\n'
         '[history]\nurl = "postgresql://me@127.0.0.1/plant"\n[fleet]\nlisten = "tcp/127.0.0.1:7448"\n',
@@ -180,7 +180,7 @@ def test_a_cluster_that_is_not_there(tmp_path: Path) -> None:
     assert "RAY_worker_niceness=0 ray start --head" in found.output
 
 
-def test_where_a_shard_goes() -> None:
+def test_a_shard_moves_only_to_a_computer_with_more_room() -> None:
     assert better_place([], {"a": 2.0}) is None
     assert better_place([("a", 0.4), ("b", 0.4)], {"a": 2.0, "b": 2.0}) is None
     assert better_place([("a", 0.4), ("a", 0.4), ("b", 0.4)], {"a": 2.0, "b": 2.0}) is None  # it would be the same

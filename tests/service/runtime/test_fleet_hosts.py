@@ -1,4 +1,4 @@
-"""A fleet on hosts of their own, a cable cut and a host lost: all is evaluated again, and the alarm logs are whole."""
+"""A fleet on separate hosts: after a cut cable and a lost host all is evaluated again and alarm logs are complete."""
 
 import os
 import pwd
@@ -28,13 +28,13 @@ from tests.service.rig.live import PATIENT, ROOT, SHORT, machine_file, program, 
 from tests.service.rig.postgres import USER, postgres_server
 
 _WHY_NOT = why_not()
-# Hosts are network namespaces, which take an administrator to make.
+# Hosts are network namespaces, which only root can create.
 pytestmark = [pytest.mark.long, pytest.mark.skipif(bool(_WHY_NOT), reason=f"NO HOSTS: {_WHY_NOT}")]
 
 KITS = ("one", "two")
 CUT_S = 30.0
 AGAIN_S = 60.0
-"""PostgreSQL lets go of a silent host after 15 s, Ray notices it after about 5; a process starts, a hop comes."""
+"""PostgreSQL drops a silent host after 15 s, Ray after about 5 s; then a process has to start and a hop to arrive."""
 FAULT = "k_by=-0.33@30"
 START_NS = 1_767_225_600 * 10**9
 _VARIABLES = {
@@ -44,7 +44,7 @@ _VARIABLES = {
 
 @dataclass(slots=True)
 class Group:
-    """A program with all that it has started."""
+    """A program and its child processes."""
 
     process: subprocess.Popen[bytes]
 
@@ -68,7 +68,7 @@ def ray_node(net: Hosts, host: str, log: Path, *options: str) -> Group:
 
 @contextmanager
 def database_on(net: Hosts, host: str) -> Iterator[tuple[str, str]]:
-    """PostgreSQL on a host: its address for all others, and for this test, which is on none."""
+    """Run PostgreSQL on a host: its address for the other hosts, and for this test, which runs on none."""
     with postgres_server() as server:
         server.new_database("fleet")
         server.stop()
@@ -89,7 +89,7 @@ def database_on(net: Hosts, host: str) -> Iterator[tuple[str, str]]:
         finally:
             process.send_signal(signal.SIGQUIT)  # at once
             process.wait()
-            server.start()  # as it is to be found
+            server.start()  # its owner stops it
 
 
 def _answers(url: str) -> bool:
@@ -133,11 +133,11 @@ def logs_of(database: str) -> dict[str, list[tuple[int, str, str, int]]]:
     return found
 
 
-def test_a_cut_cable_and_a_lost_host_leave_the_alarm_logs_of_a_fleet_as_they_would_be(tmp_path: Path) -> None:
+def test_a_cut_cable_and_a_lost_host_do_not_change_the_alarm_logs_of_a_fleet(tmp_path: Path) -> None:
     with hosts("first", "left", "right", "machine", joined=True) as net, ExitStack() as running:
         database, local = running.enter_context(database_on(net, "first"))
         settings = settings_of(tmp_path, net, database)
-        # The path of a socket may have a hundred letters.
+        # The path of a socket is limited to about a hundred characters.
         rays = Path(running.enter_context(tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True)))
         listening = ("--listen", "tcp/0.0.0.0:7447", "--without-grants")
         router = program(tmp_path, "service", "router", *listening, network=net.network(MIDDLE))
@@ -169,7 +169,7 @@ def test_a_cut_cable_and_a_lost_host_leave_the_alarm_logs_of_a_fleet_as_they_wou
             return 0 if report is None or report.state is HealthState.WARMING else report.end_ns
 
         def all_again(why: str) -> float:
-            """Wait until every machine is evaluated with data of now; seconds."""
+            """Wait until every machine's window has reached current data; return the seconds it took."""
             begin_s, now_ns = time.monotonic(), START_NS + round(1e9 * (time.monotonic() - sent_s))
             until(lambda: min(evaluated_until(name) for name in KITS) > now_ns, why)
             return time.monotonic() - begin_s
@@ -193,7 +193,7 @@ def test_a_cut_cable_and_a_lost_host_leave_the_alarm_logs_of_a_fleet_as_they_wou
         cut_s = all_again("window while a cable is cut")
         time.sleep(max(0.0, CUT_S - cut_s))
         net.mend("left")
-        worker("left")  # Ray has given the former one up, which has ended
+        worker("left")  # Ray has given up the former one, which has exited
         net.lose("right", right)
         lost_s = all_again("window after a host was lost")
         length_s = time.monotonic() - sent_s

@@ -1,4 +1,4 @@
-"""Machine, monitor and operator on hosts of their own, a router between them: a cut cable, and a host that is lost."""
+"""Machine, monitor and operator on separate hosts with a router between them: a cut cable and a lost host."""
 
 import sqlite3
 import subprocess
@@ -15,14 +15,14 @@ from tests.service.rig.hosts import MIDDLE, hosts, why_not
 from tests.service.rig.live import ROOT, SHORT, Program, machine_file, program, until
 
 _WHY_NOT = why_not()
-# Hosts are network namespaces, which take an administrator to make.
+# Hosts are network namespaces, which only root can create.
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(_WHY_NOT), reason=f"NO HOSTS: {_WHY_NOT}")]
 
 PACE = 10.0
 CUT_S = 13.0
-"""Longer than Zenoh waits for a sign of life (10 s); at this pace, longer than the publisher keeps what it sent too."""
+"""Longer than Zenoh's lease (10 s) and, at this pace, than what the publisher's cache holds."""
 LATER_S, LENGTH_S = 900.0, 45.0
-"""When the data of the machine begin again, whose host was lost, and for how long."""
+"""When the machine's data resume after its host was lost, and for how long."""
 START_NS = 1_767_225_600 * 10**9
 BLOCK_S = 0.1
 FOLLOW = """
@@ -44,7 +44,7 @@ def log_of(history: Path) -> list[tuple[int, str, str, str]]:
         return database.execute("SELECT sequence, id, kind, alarm FROM alarm_events ORDER BY sequence").fetchall()
 
 
-def test_what_a_cut_cable_and_a_lost_host_cost_is_stated_and_the_alarm_log_arrives_once(tmp_path: Path) -> None:
+def test_loss_by_a_cut_cable_or_lost_host_is_stated_and_alarm_events_arrive_once(tmp_path: Path) -> None:
     history, machine, told = tmp_path / "history.sqlite", machine_file(tmp_path, *SHORT), tmp_path / "told"
     with hosts("machine", "monitor", "operator") as net, ExitStack() as running:
 
@@ -75,7 +75,7 @@ def test_what_a_cut_cable_and_a_lost_host_cost_is_stated_and_the_alarm_log_arriv
             return 0 if report is None or report.state is HealthState.WARMING else report.end_ns
 
         def accounted_s() -> float:
-            """Data that were evaluated, and those that are said to be missing."""
+            """Seconds of data that were evaluated or are reported missing."""
             quality = health().quality
             return BLOCK_S * quality.accepted_blocks + quality.missing_s
 

@@ -1,4 +1,4 @@
-"""The running service: what it says equals what the monitor says offline, silence, errors, start and stop."""
+"""The running service: output equal to that of the offline monitor, silence, errors, start and stop."""
 
 import json
 import platform
@@ -47,7 +47,7 @@ from tests.service.rig.live import (
 
 
 class Topics:
-    """What a client collected, by the last part of the key."""
+    """Messages that a client received, by the last part of the key."""
 
     def __init__(self) -> None:
         self.messages: list[TopicMessage] = []
@@ -56,7 +56,7 @@ class Topics:
         return [message.text for message in list(self.messages) if message.key.endswith(suffix)]
 
 
-def test_live_says_exactly_what_the_monitor_says_offline_and_silence_clears_nothing(tmp_path: Path) -> None:
+def test_live_output_equals_offline_output_and_silence_clears_no_alarm(tmp_path: Path) -> None:
     file = machine_file(tmp_path, IMPATIENT)
     machine = load_machine(file)
     stream = scenario_blocks(70.0, parse_fault("c_bz=0.5@0"))
@@ -101,26 +101,26 @@ def test_live_says_exactly_what_the_monitor_says_offline_and_silence_clears_noth
 
             until(lambda: latest().stream.silent, "silence on the topic")
             silent = latest()
-            assert silent.state == "danger"  # what stands is seen, with the silence beside it
+            assert silent.state == "danger"  # the raised alarm stays visible beside the silence
             assert silent.stream.silent_since_ns == stream[-1].end_ns
             assert silent.reason.startswith("no data since 2026-01-01T00:0")
             assert [alarm.name for alarm in silent.alarms if alarm.raised and alarm.name != STREAM_LOST] == ["c_bz"]
             assert silent.report == published[-1]
             said = [Health.model_validate_json(text).state.value for text in topics.texts("/health")]
             assert "danger" in said
-            # News only: a service does not repeat itself because a block came in or a second went by.
-            news = [silence_aside(json.loads(text)) for text in topics.texts("/health")]
+            # Health is published on changes only, not because a block came in or a second went by.
+            news = [without_progress(json.loads(text)) for text in topics.texts("/health")]
             assert all(before != after for before, after in pairwise(news))
 
 
-def silence_aside(health: dict[str, Any]) -> dict[str, Any]:
-    """The message without what changes with every block."""
+def without_progress(health: dict[str, Any]) -> dict[str, Any]:
+    """The health message without the fields that change with every block."""
     health["stream"]["data_age_s"] = None
     health["quality"]["accepted_blocks"] = None
     return health
 
 
-def test_data_after_silence_end_it(tmp_path: Path) -> None:
+def test_new_data_end_a_silence_and_refused_blocks_do_not(tmp_path: Path) -> None:
     with fed_service(machine_file(tmp_path, IMPATIENT)) as (_, worker, feed):
         until(lambda: worker.health().state == "no-data", "silence from the start")
         assert worker.health().reason == "no data since the monitor started"
@@ -129,7 +129,7 @@ def test_data_after_silence_end_it(tmp_path: Path) -> None:
         feed.put_good()
         until(lambda: worker.health().state == "warming", "end of the silence")
         until(lambda: worker.health().state == "no-data", "silence")
-        # Blocks that are refused are no data either.
+        # Refused blocks do not count as data.
         accepted = worker.health().quality.accepted_blocks
         for _ in range(3):
             feed.put(feed.block(samples=np.full((200, 9), np.nan, dtype=np.float32)))
@@ -138,7 +138,7 @@ def test_data_after_silence_end_it(tmp_path: Path) -> None:
 
 
 class _Poisoned(MachineMonitor):
-    """A monitor with a defect that one payload brings to light."""
+    """A monitor with a defect that one payload triggers."""
 
     def step_payload(
         self, payload: bytes, attachment: bytes, encoding: str, dropped_before: int = 0
@@ -148,7 +148,7 @@ class _Poisoned(MachineMonitor):
         return super().step_payload(payload, attachment, encoding, dropped_before)
 
 
-def test_defect_in_the_monitor_costs_one_block_and_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_defect_in_the_monitor_costs_one_block_and_raises_an_alarm(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.stream.worker.MachineMonitor", _Poisoned)
     with fed_service() as (runtime, worker, feed):
         feed.put_good()
@@ -162,7 +162,7 @@ def test_defect_in_the_monitor_costs_one_block_and_is_shown(monkeypatch: pytest.
         assert (answer.status_code, answer.json()["machines"][0]["worker_errors"]) == (200, 1)
 
 
-def test_several_machines_have_nothing_to_do_with_each_other(tmp_path: Path) -> None:
+def test_bad_blocks_of_one_machine_do_not_affect_another(tmp_path: Path) -> None:
     other = machine_file(tmp_path, ('name = "lab"', 'name = "rig-2"'))
     address = endpoint()
     two = settings(address, machines=(MachineEntry(file="lab"), MachineEntry(file=other)))
@@ -181,7 +181,7 @@ def test_several_machines_have_nothing_to_do_with_each_other(tmp_path: Path) -> 
         assert [entry["machine"] for entry in listed] == ["lab", "rig-2"]
 
 
-def test_nothing_is_left_behind_when_a_part_cannot_start() -> None:
+def test_a_failed_start_leaves_nothing_running_and_frees_its_ports() -> None:
     address = endpoint()
     with service(address) as (runtime, _):
         port = int(runtime.http_url.rsplit(":", 1)[1])
@@ -199,7 +199,7 @@ def test_nothing_is_left_behind_when_a_part_cannot_start() -> None:
         assert runtime.readiness().ready
 
 
-def test_stopped_service_has_no_thread_left() -> None:
+def test_a_stopped_service_ends_its_worker_thread() -> None:
     with fed_service(when_full="wait", bound=1) as (_, worker, feed):
         feed.put_good(50)
         until(lambda: worker.health().quality.accepted_blocks > 0, "blocks")
@@ -254,7 +254,7 @@ done.set()
 
 # What is tested is a setting of glibc; elsewhere it changes nothing.
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have no arenas")
-def test_threads_keep_no_memory_of_their_own() -> None:
+def test_threads_get_no_malloc_arena_of_their_own() -> None:
     grown_mb = {}
     for how in ("own", "shared"):
         run = subprocess.run([sys.executable, "-c", _ARENAS, how], cwd=ROOT, capture_output=True, text=True, check=True)
@@ -280,7 +280,7 @@ NO_THREAD = "threading.stack_size(2**32); threading.Thread(target=print).start()
 
 
 def ended(limit_kb: int, *arguments: str) -> list[str]:
-    """What a program says that has to end by itself."""
+    """Error output of a program that must exit with 1."""
     command = [*LIMITED, str(limit_kb), sys.executable, *arguments]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=180, check=False)
     assert (done.returncode, done.stdout) == (1, ""), done
@@ -288,7 +288,7 @@ def ended(limit_kb: int, *arguments: str) -> list[str]:
 
 
 @pytest.mark.parametrize("limit_kb", [200_000, 400_000, 1_000_000])
-def test_a_monitor_does_not_start_where_it_would_get_no_memory(limit_kb: int) -> None:
+def test_a_monitor_does_not_start_under_too_low_a_memory_limit(limit_kb: int) -> None:
     (said,) = ended(limit_kb, *MONITOR, endpoint())
     assert "ulimit -v" in said
     assert f"{limit_kb * 1024 // 1_000_000} MB" in said
@@ -296,7 +296,7 @@ def test_a_monitor_does_not_start_where_it_would_get_no_memory(limit_kb: int) ->
 
 
 @pytest.mark.parametrize("code", [NO_MEMORY, NO_THREAD])
-def test_what_gets_no_memory_later_names_the_limit(code: str) -> None:
+def test_running_out_of_memory_later_names_the_limit(code: str) -> None:
     (said,) = ended(2_500_000, "-c", PROGRAM.format(code))
     assert "ulimit -v" in said
     assert "2560 MB" in said

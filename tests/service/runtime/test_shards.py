@@ -1,4 +1,4 @@
-"""Processes that share the machines of a monitor: the same answers, one that is killed, and what cannot be shared."""
+"""Processes that share the machines of a monitor: the same answers, a killed one, and settings that allow one only."""
 
 import multiprocessing
 import os
@@ -53,7 +53,7 @@ PATHS = (
 
 @pytest.fixture(autouse=True)
 def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Processes are forked off one that has imported everything; a monitor that is a program starts them as ever."""
+    """Fork processes off one that has imported everything, which is faster; a monitor run as a program spawns them."""
     monkeypatch.setattr("service.runtime.processes.multiprocessing.get_context", lambda _: CONTEXT)
 
 
@@ -71,7 +71,7 @@ def plan_for(folder: Path, count: int | None, address: str | None = None) -> Ser
 
 @contextmanager
 def fed(folder: Path, count: int) -> Iterator[tuple[Runtime, httpx.Client]]:
-    """The machine lab loses a third of its bearing stiffness, pump is well; both have sent everything."""
+    """The machine lab loses a third of its bearing stiffness, pump is healthy; both have sent all data."""
     plan = plan_for(folder, count)
     with running(plan) as runtime, client(runtime) as http:
         for entry, faults in zip(plan.machines, ((parse_fault("k_by=-0.33@10"),), ()), strict=True):
@@ -82,7 +82,7 @@ def fed(folder: Path, count: int) -> Iterator[tuple[Runtime, httpx.Client]]:
 
 
 def comparable(http: httpx.Client, path: str) -> str:
-    """An answer without the times of this computer."""
+    """An answer without wall-clock times."""
     answer = http.get(path)
     assert answer.status_code == 200, answer.text
     found = answer.json()
@@ -102,7 +102,7 @@ def operators_and_listeners_reach_a_machine_of_another_process(http: httpx.Clien
         assert answered(done, OperationDone).alarm.state == "acknowledged"
         told = next(event for event in events if event.event == "alarm")
         assert '"acknowledged"' in told.data
-        assert '"acknowledged"' in http.get("/api/v1/machines/demo/lab/health").text  # who hears it finds it there
+        assert '"acknowledged"' in http.get("/api/v1/machines/demo/lab/health").text  # as soon as the event is out
         health = next(event for event in events if event.event == "health" and '"acknowledged"' in event.data)
         assert Health.model_validate_json(health.data).machine == "lab"
     again = http.post(f"{place}/k_by/acknowledge", json={}, headers={"If-Match": seen.headers["etag"]})
@@ -113,7 +113,7 @@ def operators_and_listeners_reach_a_machine_of_another_process(http: httpx.Clien
     assert [one.state for one in states.alarms if one.name == "k_by"] == ["acknowledged"]
 
 
-def test_the_same_answers_whatever_the_number_of_processes_and_orders_reach_all(tmp_path: Path) -> None:
+def test_answers_do_not_depend_on_the_number_of_processes_and_operations_reach_all(tmp_path: Path) -> None:
     answers, reports = [], []
     for count in (1, 2):
         folder = tmp_path / str(count)
@@ -140,7 +140,7 @@ def test_the_same_answers_whatever_the_number_of_processes_and_orders_reach_all(
     assert reports[0] == reports[1]
 
 
-def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -> None:
+def test_a_hung_process_is_reported_and_a_killed_one_is_restarted_and_resumes(tmp_path: Path) -> None:
     plan = plan_for(tmp_path, 2)
     blocks = scenario_blocks(SECONDS, parse_fault("k_by=-0.33@10"))
     with running(plan) as runtime, client(runtime) as http, open_session(plan.link.listen[0]) as session:
@@ -156,14 +156,14 @@ def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -
         until(lambda: not http.get("/readyz").is_success, "that it is told")
         assert "demo/pump: the process that monitors it has not responded" in problem(http.get("/readyz"), 503).detail
         assert pump.health().state is HealthState.NOT_EVALUABLE
-        # Nobody waits for one that hangs until it does not answer.
+        # Requests for a hung process are refused at once.
         assert "has not responded" in problem(http.get("/api/v1/machines/demo/pump/orbits"), 503).detail
         assert http.get("/api/v1/machines/demo/lab/orbits").status_code == 200
         os.kill(second, signal.SIGCONT)
         until(lambda: bool(http.get("/readyz").is_success), "that it is heard again")
         assert pump.health().state is not HealthState.NOT_EVALUABLE
         os.kill(first, signal.SIGKILL)
-        # The machine's history is held until all has been looked at: the next process waits for it.
+        # Hold the lock of the machine's history during the checks: the next process waits for it.
         lock = tmp_path / "history.sqlite.demo.lab.lock"
         held: list[int] = []
 
@@ -175,12 +175,12 @@ def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -
         until(taken, "the lock")
         until(lambda: not http.get("/readyz").is_success, "that it is told")
         assert "demo/lab: the process that monitored it ended (exit -9)" in problem(http.get("/readyz"), 503).detail
-        assert lab.health().state is HealthState.ALERT  # what was raised stays in sight
+        assert lab.health().state is HealthState.ALERT  # a raised alarm stays visible
         assert "is being started again" in lab.health().reason
         for path in ("/orbits", "/alarms", "/detectable"):
             assert "is being started again" in problem(http.get(f"/api/v1/machines/demo/lab{path}"), 503).detail
             assert http.get(f"/api/v1/machines/demo/pump{path}").status_code == 200
-        assert lab.status().tally.blocks == 440  # what was counted is no less for that
+        assert lab.status().tally.blocks == 440  # counters do not go back
         os.close(held[0])
         until(lambda: bool(http.get("/readyz").is_success), "a new process")
         started = [one.pid for one in multiprocessing.active_children()]
@@ -213,17 +213,17 @@ def test_processes_end_with_the_monitor_that_started_them(tmp_path: Path) -> Non
         own = {one: Path(f"/proc/{one}/cmdline").read_bytes() for one in children_of(monitor.process.pid)}
         started = [one for one, command in own.items() if b"spawn_main" in command]  # to share its machines
         assert len(started) == 2
-        # A terminal that is closed tells all of its processes; the monitor alone decides when these end.
+        # A closing terminal signals all of its processes; the monitor alone decides when these end.
         states = [Path(f"/proc/{one}/status").read_text().partition("SigIgn:")[2].split()[0] for one in started]
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             assert all(int(ignored, 16) >> (number - 1) & 1 for ignored in states)
         monitor.kill()
     until(lambda: not any(Path(f"/proc/{one}").exists() for one in started), "end of all processes")
-    with running(plan) as runtime:  # which has their machines at once
+    with running(plan) as runtime:  # their machines are free at once
         assert runtime.readiness().ready
 
 
-def test_how_many_processes(tmp_path: Path) -> None:
+def test_the_number_of_processes_follows_machines_cores_and_settings(tmp_path: Path) -> None:
     plan = plan_for(tmp_path, None)
     assert shard_count(plan) == 1  # few machines
     cores = len(os.sched_getaffinity(0))
@@ -244,7 +244,7 @@ def test_how_many_processes(tmp_path: Path) -> None:
             shard_count(plan_for(tmp_path, 2).model_copy(update={"link": named}))
 
 
-def test_a_machine_that_cannot_be_monitored_is_named(tmp_path: Path) -> None:
+def test_a_broken_bundle_fails_the_start_by_name_and_leaves_no_process(tmp_path: Path) -> None:
     plan = plan_for(tmp_path, 2)
     broken = MachineEntry(file=plan.machines[1].file, bundle=str(tmp_path / "nothing"))
     failed = Runtime(plan.model_copy(update={"machines": (plan.machines[0], broken)}))
@@ -253,7 +253,7 @@ def test_a_machine_that_cannot_be_monitored_is_named(tmp_path: Path) -> None:
     assert multiprocessing.active_children() == []
 
 
-def test_a_shard_that_takes_nothing_is_cut_off_before_machines_of_others_are_called_silent() -> None:
+def test_the_timeout_of_a_stalled_shards_link_is_shorter_than_a_silence() -> None:
     place = "transport/link/tx/queue/congestion_control/block/wait_before_close"
     cut_off_s = int(relay_items(waits=False)[place]) / 1e6
     assert cut_off_s < IngestSettings().no_data_after_s / 2

@@ -1,4 +1,4 @@
-"""kill -9 of a monitor, and what the next one knows: real programs, a real database, operators in between."""
+"""kill -9 of a monitor and what its successor knows: real programs, a real database, actions of operators."""
 
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,7 @@ def states(at: Program) -> dict[str, str]:
 
 
 @pytest.mark.slow
-def test_alarms_and_what_operators_did_survive_kill_9(tmp_path: Path) -> None:
+def test_alarms_and_operator_actions_survive_kill_9(tmp_path: Path) -> None:
     file, address = machine_file(tmp_path, *QUICK), endpoint()
     machine: Machine = load_machine(file)
     stream = scenario_blocks(80.0, FAULT)
@@ -72,7 +72,7 @@ def test_alarms_and_what_operators_did_survive_kill_9(tmp_path: Path) -> None:
         assert health.restart.startswith("resumed at 2026-01-01T00:00:45.000000Z; there is no window until")
         assert health.filled == 0.0
         assert health.state in {"alert", "danger"}
-        # What no cache holds any more is missing; what comes then raises nothing twice.
+        # Blocks that no cache holds any more are missing; later data raise no alarm twice.
         send(address, stream[480:], machine)
         until(lambda: second.health().quality.accepted_blocks == len(stream) - 480, "the rest")
         after = second.health()
@@ -84,7 +84,7 @@ def test_alarms_and_what_operators_did_survive_kill_9(tmp_path: Path) -> None:
         assert states(second)["c_bz"] == "acknowledged"
         assert second.stop() == 0
 
-    # Another machine file: what was accumulated does not fit, the alarms do.
+    # Another machine file: the accumulated window does not fit, the alarms do.
     changed = machine_file(tmp_path, *QUICK, ("on_delay_s = 5.0", "on_delay_s = 6.0"))
     with running(tmp_path, address, changed) as third:
         third.wait_for("HTTP API")

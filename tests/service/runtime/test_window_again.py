@@ -1,4 +1,4 @@
-"""A monitor that ends and is started again, and its window: real processes, what each of them can know, and the log."""
+"""The window of a restarted monitor: restored from caches and recordings, refilled, or with a gap; real processes."""
 
 import json
 from collections.abc import Iterator
@@ -39,7 +39,7 @@ from tests.service.rig.postgres import opened
 
 BLOCK_S = 0.5
 FIRST, ALL = 78, 124
-"""Blocks until the monitor ends, in the middle of a hop, and in all: one alarm comes before, another one after."""
+"""Blocks until the monitor ends, in mid-hop, and in all: one alarm is raised before, another one after."""
 
 
 @cache
@@ -51,7 +51,7 @@ def stream() -> tuple[SampleBlock, ...]:
 
 
 class Plant:
-    """A monitor that is started again and again, and a publisher that keeps so many blocks."""
+    """A monitor that can be restarted, and a publisher that keeps `kept` blocks."""
 
     def __init__(self, folder: Path, session: zenoh.Session, address: str, recording: bool, kept: int) -> None:
         self.folder, self.session, self.address = folder, session, address
@@ -88,7 +88,7 @@ class Plant:
 
 @cache
 def offline() -> tuple[list[str], list[str]]:
-    """What is said without a network, in one go."""
+    """The same of one uninterrupted run without a network."""
     with TemporaryDirectory() as folder:
         installed = install(load_machine(machine_file(Path(folder), *QUICK)), None)
     identity = identity_of(installed)
@@ -103,10 +103,10 @@ def until_accepted(at: Program, count: int) -> None:
 
 
 @contextmanager
-def again(folder: Path, *, recording: bool, kept: int, killed: bool = True) -> Iterator[tuple[Plant, Program]]:
-    """A monitor that has ended after the first blocks, and the one that is started then."""
+def restarted(folder: Path, *, recording: bool, kept: int, killed: bool = True) -> Iterator[tuple[Plant, Program]]:
+    """A monitor that ends after the first blocks, and its successor."""
     address = endpoint()
-    # On a busy computer a queue may be full for longer than a link is held for.
+    # On a busy computer a queue may be full for longer than Zenoh keeps the link.
     patience = {"transport/link/tx/queue/congestion_control/block/wait_before_close": json.dumps(60_000_000)}
     with session_of(LinkSettings(connect=(address,)), **patience) as session:
         here = Plant(folder, session, address, recording, kept)
@@ -124,7 +124,7 @@ def again(folder: Path, *, recording: bool, kept: int, killed: bool = True) -> I
 
 
 def until_evaluated(at: Program) -> None:
-    last_ns = START_NS + 57_500_000_000  # of the last hop, or a little later where hops began anew
+    last_ns = START_NS + 57_500_000_000  # of the last hop, or a little later where hops started again
 
     def evaluated() -> bool:
         report = at.health().report
@@ -147,10 +147,10 @@ def raised(events: list[str]) -> list[str]:
         pytest.param(False, 300, id="a cache longer than the window"),
     ],
 )
-def test_killed_where_the_window_can_be_had_again_all_goes_on_as_if_not(
+def test_after_a_kill_a_recoverable_window_gives_the_same_events_and_reports(
     tmp_path: Path, recording: bool, kept: int
 ) -> None:
-    with again(tmp_path, recording=recording, kept=kept) as (here, second):
+    with restarted(tmp_path, recording=recording, kept=kept) as (here, second):
         until(lambda: second.health().filled == 1.0, "full window")
         assert second.health().restart == "resumed at 2026-01-01T00:00:37.500000Z"
         here.put(stream()[FIRST:])
@@ -161,8 +161,8 @@ def test_killed_where_the_window_can_be_had_again_all_goes_on_as_if_not(
 
 
 @pytest.mark.slow
-def test_killed_with_recordings_alone_the_window_is_there_and_what_nobody_has_is_a_gap(tmp_path: Path) -> None:
-    with again(tmp_path, recording=True, kept=0) as (here, second):
+def test_after_a_kill_recordings_restore_the_window_and_unrecorded_blocks_are_a_gap(tmp_path: Path) -> None:
+    with restarted(tmp_path, recording=True, kept=0) as (here, second):
         until(lambda: second.health().filled == 1.0, "full window")
         here.put(stream()[FIRST + 4 :])
         until_evaluated(second)
@@ -172,8 +172,8 @@ def test_killed_with_recordings_alone_the_window_is_there_and_what_nobody_has_is
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kept", [pytest.param(0, marks=pytest.mark.long), 12])
-def test_killed_where_nobody_has_the_window_it_fills_anew_and_alarms_are_held(tmp_path: Path, kept: int) -> None:
-    with again(tmp_path, recording=False, kept=kept) as (here, second):
+def test_after_a_kill_an_unrecoverable_window_refills_and_alarms_stay_raised(tmp_path: Path, kept: int) -> None:
+    with restarted(tmp_path, recording=False, kept=kept) as (here, second):
         health = second.health()
         assert health.filled < 1.0
         assert [one for one in health.alarms if one.raised] == here.raised != []
@@ -191,12 +191,12 @@ def test_killed_where_nobody_has_the_window_it_fills_anew_and_alarms_are_held(tm
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kept", [0, 20])
-def test_stopped_in_order_the_window_is_kept(tmp_path: Path, kept: int) -> None:
-    with again(tmp_path, recording=False, kept=kept, killed=False) as (here, second):
+def test_after_a_clean_stop_the_window_is_kept(tmp_path: Path, kept: int) -> None:
+    with restarted(tmp_path, recording=False, kept=kept, killed=False) as (here, second):
         health = second.health()
         assert (health.filled, health.restart) == (1.0, "resumed at 2026-01-01T00:00:39.000000Z")
         here.put(stream()[FIRST:])
         until_evaluated(second)
-        assert second.health().quality.refused_blocks == {}  # the cache was asked for what it sends again
+        assert second.health().quality.refused_blocks == {}  # the resent blocks had been requested
         assert second.stop() == 0
     assert here.said() == offline()

@@ -1,7 +1,7 @@
-"""The topics as an AsyncAPI 3.0 document, made of the models that are published; kept in ``docs/asyncapi.json``.
+"""The topics as an AsyncAPI 3.0 document, generated from the published models; kept in ``docs/asyncapi.json``.
 
-The document speaks of the monitor: it *sends* what it publishes and *receives* samples and questions. How keys, late
-joiners and questions work on Zenoh stands in ``docs/topics.md``.
+The document describes the monitor: it *sends* what it publishes and *receives* samples and queries. How keys, late
+joiners and queries work on Zenoh is explained in ``docs/topics.md``.
 """
 
 import json
@@ -27,7 +27,7 @@ nanoseconds since 1970-01-01 UTC, data time. What is replayed has the prefix of 
 
 @dataclass(frozen=True, slots=True)
 class _Topic:
-    """A key: what the monitor does with it, and what travels there."""
+    """A key: what the monitor does with it, and the messages on it."""
 
     text: str
     action: Literal["send", "receive"] | None = None
@@ -127,7 +127,7 @@ def _add_log(document: dict[str, Any]) -> None:
 
 
 def _add_question(document: dict[str, Any], channel: str, message: str, text: str) -> None:
-    """A query has no payload of its own: what is asked is in the key and its parameters."""
+    """A query has no payload: the question is in the key and its parameters."""
     document["components"]["messages"]["question"] = {
         "name": "question",
         "summary": "A Zenoh query without payload.",
@@ -176,7 +176,7 @@ def _named_apart(schemas: dict[str, Any]) -> dict[str, Any]:
 
 
 def _draft_7(schema: Any) -> Any:
-    """Write what pydantic says of tuples, in words of JSON Schema 2020-12, in those of draft 7."""
+    """Convert pydantic's schemas of tuples from JSON Schema 2020-12 to draft 7."""
     if isinstance(schema, list):
         return [_draft_7(part) for part in schema]
     if not isinstance(schema, dict):

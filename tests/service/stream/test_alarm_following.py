@@ -1,4 +1,4 @@
-"""Following an alarm log: any order of arrival gives the log, what is not it is refused, and who may not write it."""
+"""Following an alarm log: any order of arrival gives the log; other logs are refused; read-only access."""
 
 import json
 import threading
@@ -89,7 +89,7 @@ def test_any_order_of_arrival_gives_the_log_from_an_event_on(after: int, happeni
     assert taken == LOG[after + 1 :]
 
 
-def test_what_the_log_says_outranks_what_was_heard_and_another_log_is_noticed() -> None:
+def test_the_log_overrides_received_events_and_a_replaced_log_is_noticed() -> None:
     with pytest.raises(LogReplaced) as caught:
         LogOrder(PLACE, 17).read(page([], 12))
     assert "demo/lab: event 17 was taken from the alarm log, which now ends at 12" in str(caught.value)
@@ -116,7 +116,7 @@ def test_events_far_ahead_are_left_to_the_log() -> None:
 
 
 class Monitor:
-    """A machine's link with a log of its own, which it can fail to publish, or to read."""
+    """A machine's link with a log of its own; publishing or reading it can be made to fail."""
 
     def __init__(self, link: Link, place: str = PLACE) -> None:
         self.place = place
@@ -203,7 +203,7 @@ class Following:
         assert self.error is None
 
 
-def test_follower_asks_for_the_past_and_hears_the_present() -> None:
+def test_a_follower_queries_past_events_and_receives_new_ones() -> None:
     address = endpoint()
     with monitor(address) as (machine,):
         for _ in range(1234):
@@ -216,7 +216,7 @@ def test_follower_asks_for_the_past_and_hears_the_present() -> None:
     assert (following.sequences(), following.taken) == (list(range(18, 1239)), machine.log[18:])
 
 
-def test_missed_events_are_asked_for_at_once_or_when_the_state_tells(caplog: pytest.LogCaptureFixture) -> None:
+def test_missed_events_are_queried_on_a_later_event_or_alarm_state(caplog: pytest.LogCaptureFixture) -> None:
     address = endpoint()
     with monitor(address) as (machine,), Following(address) as following:
         machine.happen()
@@ -224,11 +224,11 @@ def test_missed_events_are_asked_for_at_once_or_when_the_state_tells(caplog: pyt
         machine.happen(published=False)
         machine.happen(published=False)
         machine.happen()
-        following.reaches(3)  # long before the next regular question
+        following.reaches(3)  # long before the next regular query
         machine.happen(published=False)
         machine.link.publish("alarm_state", machine.state())
         following.reaches(4)
-        machine.link.publish("alarm_event", '{"specversion": "1.0"}')  # nonsense is left to the log
+        machine.link.publish("alarm_event", '{"specversion": "1.0"}')  # an invalid event is replaced by a query
         machine.happen(published=False)
         machine.happen()
         following.reaches(6)
@@ -236,7 +236,7 @@ def test_missed_events_are_asked_for_at_once_or_when_the_state_tells(caplog: pyt
     assert "do not match this version" in caplog.text
 
 
-def test_follower_waits_for_a_monitor_and_for_its_return() -> None:
+def test_a_follower_waits_for_a_monitor_and_for_its_restart() -> None:
     address = endpoint()
     with Following(address) as following:
         with monitor(address) as (first,):
@@ -250,7 +250,7 @@ def test_follower_waits_for_a_monitor_and_for_its_return() -> None:
     assert following.sequences() == [0, 1, 2]
 
 
-def test_machines_are_found_by_a_pattern() -> None:
+def test_a_follower_finds_machines_by_a_pattern() -> None:
     address = endpoint()
     with monitor(address, PLACE, "demo/pump", "other/fan") as (lab, pump, fan):
         for machine, count in ((lab, 3), (pump, 2), (fan, 4)):
@@ -265,7 +265,7 @@ def test_machines_are_found_by_a_pattern() -> None:
     assert [one for one in following.taken if one.data.machine == "pump"] == pump.log
 
 
-def test_log_that_cannot_be_read_is_waited_for(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unreadable_log_is_queried_again_and_reported_once(caplog: pytest.LogCaptureFixture) -> None:
     address = endpoint()
     with monitor(address) as (machine,):
         machine.happen(published=False)
@@ -274,13 +274,13 @@ def test_log_that_cannot_be_read_is_waited_for(caplog: pytest.LogCaptureFixture)
             until(lambda: len(machine.asked) > 2, "questions")
             machine.broken = ""
             following.reaches(0)
-            machine.happen(published=False)  # which nothing tells of: it is asked for every now and then
+            machine.happen(published=False)  # not announced: found by the regular query
             following.reaches(1)
     assert "demo/lab: the alarm log cannot be read at present: rotorwatch/demo/lab/alarm/event: history" in caplog.text
     assert caplog.text.count("cannot be read at present") == 1
 
 
-def test_another_log_and_another_version_end_the_following() -> None:
+def test_a_replaced_log_or_another_version_ends_the_following() -> None:
     address = endpoint()
     with monitor(address) as (machine,):
         machine.happen()
@@ -294,7 +294,7 @@ def test_another_log_and_another_version_end_the_following() -> None:
         assert not following.taken
 
 
-def test_event_that_could_not_be_kept_is_not_taken() -> None:
+def test_an_event_whose_handler_fails_is_not_taken() -> None:
     address = endpoint()
     with monitor(address) as (machine,):
         for _ in range(4):
@@ -305,7 +305,7 @@ def test_event_that_could_not_be_kept_is_not_taken() -> None:
         assert following.sequences() == [0, 1]
 
 
-def test_viewer_with_a_grant_can_follow(tmp_path: Path) -> None:
+def test_a_viewer_can_follow_only_granted_machines(tmp_path: Path) -> None:
     """Through a router that lets a viewer read this machine and nothing else."""
     with plant(tmp_path) as router:
         link, viewer = Link(router.link("monitor")), router.link("one")
@@ -326,8 +326,8 @@ def test_viewer_with_a_grant_can_follow(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_connection_that_was_cut_is_made_again() -> None:
-    """The router between monitor and follower goes and comes back; what happened meanwhile is asked for."""
+def test_a_follower_reconnects_and_misses_no_event() -> None:
+    """The router between monitor and follower is restarted; events missed meanwhile are queried."""
     address = endpoint()
     through = LinkSettings(mode="client", connect=(address,))
     with ExitStack() as stack:
@@ -349,7 +349,7 @@ def test_connection_that_was_cut_is_made_again() -> None:
     assert following.taken == machine.log
 
 
-def test_who_may_not_write_reads_what_was_committed_and_makes_nothing(store: Store, url: str, tmp_path: Path) -> None:
+def test_read_only_access_sees_committed_events_and_creates_no_file(store: Store, url: str, tmp_path: Path) -> None:
     lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
     events = tuple(alarm_event(number) for number in range(4))
     lab.commit(Step(events=events))

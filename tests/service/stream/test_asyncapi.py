@@ -1,4 +1,4 @@
-"""The AsyncAPI document is what the models say, and what a running service really sends.
+"""The AsyncAPI document agrees with the models and with what a running service sends.
 
 ``python -m tests.service.stream.test_asyncapi`` writes it anew.
 """
@@ -45,7 +45,7 @@ def written() -> str:
 
 
 def resolved(reference: str) -> Any:
-    """What a reference of the document leads to; a KeyError if that is nothing."""
+    """Target of a reference of the document; KeyError if there is none."""
     assert reference.startswith("#/")
     found: Any = DOCUMENT
     for part in reference[2:].split("/"):
@@ -65,12 +65,12 @@ def references(part: Any) -> Iterator[str]:
 
 
 def checker(message: str) -> jsonschema_rs.Draft7Validator:
-    """Checks payloads of a message of the document."""
+    """Validator of payloads of a message of the document."""
     payload = DOCUMENT["components"]["messages"][message]["payload"]
     return jsonschema_rs.Draft7Validator({**payload, "components": DOCUMENT["components"]})
 
 
-def test_the_document_in_the_repository_is_this_one() -> None:
+def test_the_document_in_the_repository_is_up_to_date() -> None:
     assert PAGE.read_text(encoding="utf-8") == written(), "python -m tests.service.stream.test_asyncapi writes it anew"
 
 
@@ -82,8 +82,8 @@ def test_every_key_is_a_channel() -> None:
         assert address.replace("{site}", "demo").replace("{machine}", "lab") == getattr(KEYS, name)
 
 
-def test_structure() -> None:
-    """What the specification asks for and this document could get wrong; the whole of it is checked by hand."""
+def test_the_structure_follows_the_asyncapi_specification() -> None:
+    """Requirements of the specification that this document could break; the rest is checked by hand."""
     for reference in references(DOCUMENT):
         assert resolved(reference) is not None
     for name, channel in DOCUMENT["channels"].items():
@@ -111,7 +111,7 @@ def test_examples_are_valid() -> None:
 
 @pytest.fixture(scope="module")
 def heard(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
-    """Everything on the keys of a simulated machine with a fault, and answers to questions."""
+    """Everything on the keys of a simulated machine with a fault, and replies to queries."""
     address, found, lock = endpoint(), dict[str, list[str]](), threading.Lock()
     file = machine_file(tmp_path_factory.mktemp("machine"), ("on_delay_s = 5.0", "on_delay_s = 0.0"), PATIENT)
     scenario, machine = load_scenario("healthy")
@@ -145,14 +145,14 @@ def heard(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("name", ["descriptor", "truth", "report", "health", "alarm_event", "alarm_state", "alarm_log"])
-def test_what_is_sent_is_what_the_document_says(heard: dict[str, list[str]], name: str) -> None:
+def test_messages_match_the_schemas_of_the_document(heard: dict[str, list[str]], name: str) -> None:
     assert set(heard) == {name for name, channel in DOCUMENT["channels"].items() if channel["messages"]}
     assert set(heard) == set(DOCUMENT["components"]["messages"]) - {"question"}
     check = checker(name)
     for text in heard[name]:
         check.validate(json.loads(text))
     first = json.loads(heard[name][0])
-    # The schema says something: a missing field, a field too many, and a wrong type are noticed.
+    # The schema is not empty: a missing field, an extra field and a wrong type are noticed.
     for field in first:
         assert not check.is_valid({key: value for key, value in first.items() if key != field} | {"x": 1})
     assert not check.is_valid([first])

@@ -1,4 +1,4 @@
-"""Every reason for refusing a block, over a real session to a running service; and what other versions read."""
+"""Every reason for refusing a block, over a real session to a running service; data of other versions."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -47,7 +47,7 @@ def raw(feed: Feed, *, payload: bytes | None = None, encoding: str | None = None
 
 
 def elsewhere(number: int, seconds: float) -> Callable[[Feed], None]:
-    """Put a block so much later in number and time than it should be."""
+    """Put a block with its number and time shifted by so much."""
     return lambda feed: feed.put(
         feed.block(sequence=feed.sequence + number, start_ns=feed.start_ns + round(seconds * 1e9))
     )
@@ -77,7 +77,7 @@ BAD: dict[str, tuple[Reason, Callable[[Feed], None], str]] = {
 
 @pytest.fixture(scope="module")
 def fed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Runtime, MachineWorker, Feed]]:
-    # What is missing is waited for no longer than silence may last.
+    # Missing blocks are waited for no longer than a silence may last.
     quick = ("[operation]", "[ingest]\nno_data_after_s = 1.0\nblock_to_s = 0.5\n\n[operation]")
     with fed_service(machine_file(tmp_path_factory.mktemp("machine"), quick)) as (runtime, worker, feed):
         feed.put_good()
@@ -85,12 +85,12 @@ def fed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Runtime, Mac
         yield runtime, worker, feed
 
 
-def test_every_reason_is_covered() -> None:
+def test_every_reason_for_refusal_is_covered() -> None:
     assert {reason for reason, _, _ in BAD.values()} == set(Reason)
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_refused_explained_and_carried_on(fed: tuple[Runtime, MachineWorker, Feed], name: str) -> None:
+def test_a_bad_block_is_refused_and_the_next_accepted(fed: tuple[Runtime, MachineWorker, Feed], name: str) -> None:
     runtime, worker, feed = fed
     reason, put_bad, text = BAD[name]
     before = worker.health().quality
@@ -119,7 +119,7 @@ def test_refused_explained_and_carried_on(fed: tuple[Runtime, MachineWorker, Fee
         ('"rate_hz":2000.0', '"rate_hz":"fast"', "descriptor cannot be read: rate_hz: expected a number"),
     ],
 )
-def test_another_descriptor_is_named(field: str, other: str, named: str) -> None:
+def test_a_mismatching_descriptor_is_explained(field: str, other: str, named: str) -> None:
     text = LAB.descriptor.model_dump_json()
     assert field in text
     assert descriptor_mismatch(text.replace(field, other).encode(), LAB)[0].startswith(named)
@@ -135,7 +135,7 @@ ANSWERS = (
 
 
 def grown(value: Any) -> Any:
-    """JSON of a version that says more."""
+    """JSON as a later version writes it, with more fields."""
     if isinstance(value, list):
         return [grown(one) for one in value]
     if isinstance(value, dict):
@@ -160,7 +160,7 @@ def everything(source: Table) -> list[dict[str, Any]]:
 
 @pytest.fixture
 def of_later(tmp_path: Path) -> Path:
-    """The recording, by a version that says more in every JSON message."""
+    """The recording as a later version writes it, with more fields in every JSON message."""
     path = tmp_path / "later.mcap"
     with RecordingWriter(path) as writer:
         for one in read_recording(FIXTURES / VERSIONS[-1] / "recording.mcap"):
@@ -195,7 +195,7 @@ def test_reports_alarm_logs_and_recordings_of_every_version_are_read(version: st
     assert len(everything(alarm_table(selection))) == 6
 
 
-def test_fields_added_later_change_nothing_in_what_is_read() -> None:
+def test_fields_of_later_versions_are_ignored() -> None:
     report, log = documents(VERSIONS[-1])
     assert Report.model_validate_json(later(report)) == Report.model_validate_json(report)
     for line in log:
@@ -207,12 +207,12 @@ def test_fields_added_later_change_nothing_in_what_is_read() -> None:
 
 
 @pytest.mark.parametrize("model", ANSWERS)
-def test_a_client_reads_answers_of_a_later_version(model: Any) -> None:
+def test_a_client_reads_responses_of_a_later_version(model: Any) -> None:
     answer = {**example(model), "added_later": 1}
     assert understood(model, json.dumps(answer), "here") == model.model_validate(example(model))
 
 
-def test_a_later_version_may_have_other_faults_and_describe_its_channels_further() -> None:
+def test_unknown_sensor_faults_and_descriptor_fields_are_accepted() -> None:
     fault = example(SensorFault) | {"kind": "wobbling"}
     report = Report.model_validate_json(json.dumps(example(Report) | {"sensors": [fault]}))
     assert report.sensors[0].kind == "wobbling"

@@ -1,4 +1,4 @@
-"""What nobody should send or ask, a few thousand messages and some dozens of callers, against a monitor at work."""
+"""Fuzzing a monitor at work: a few thousand hostile messages, and some dozens of HTTP callers."""
 
 import importlib
 import json
@@ -26,7 +26,7 @@ def _programs_start_at_once_and_leave_nothing(tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.slow
-def test_a_monitor_at_work_bears_whatever_is_sent(
+def test_a_monitor_survives_hostile_messages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     result = tmp_path / "result.json"
@@ -39,7 +39,7 @@ def test_a_monitor_at_work_bears_whatever_is_sent(
 
 
 @pytest.mark.slow
-def test_a_monitor_bears_all_callers(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_monitor_survives_http_misuse(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", ["http_campaign", "--small"])
     code = importlib.import_module("http_campaign").main()
     said = capsys.readouterr().out

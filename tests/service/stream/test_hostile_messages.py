@@ -1,4 +1,4 @@
-"""Messages made to cost more than they weigh, and streams of what is no such rotor: no parameter is blamed."""
+"""Messages made to use up resources, forged blocks, and streams that no such rotor makes."""
 
 import json
 import struct
@@ -63,7 +63,7 @@ def other_names(length: int) -> bytes:
     "announced",
     [empty_channels(300_000), empty_channels(10_000), other_names(3_000), b"[" * 60_000, b'"' + b"x" * 60_000],
 )
-def test_a_descriptor_is_answered_in_few_words(announced: bytes) -> None:
+def test_the_differences_of_a_hostile_descriptor_are_kept_short(announced: bytes) -> None:
     said = descriptor_mismatch(announced, LAB)
     assert 1 <= len(said) <= MOST_DIFFERENCES + 1
     assert sum(map(len, said)) < 20 * KB
@@ -71,7 +71,7 @@ def test_a_descriptor_is_answered_in_few_words(announced: bytes) -> None:
         assert said == (f"descriptor has {len(announced)} bytes, expected at most {MOST_BYTES}",)
 
 
-def test_floods_of_descriptors_publishers_and_replays_are_logged_now_and_then(tmp_path: Path) -> None:
+def test_log_lines_on_descriptors_publishers_and_replays_are_limited(tmp_path: Path) -> None:
     with bench(tmp_path) as at, structlog.testing.capture_logs() as lines:
         for number in range(200):
             at.worker.descriptor(other_names(number + 1))
@@ -83,7 +83,7 @@ def test_floods_of_descriptors_publishers_and_replays_are_logged_now_and_then(tm
         assert 1 <= len(lines) <= 4
 
 
-def test_health_stays_small_whatever_is_sent() -> None:
+def test_the_health_message_stays_small_whatever_is_sent() -> None:
     with fed_service() as (_, worker, feed):
         feed.put_good()
         feed.put_raw(b"", b"", "text/" + "x" * 200)
@@ -100,7 +100,7 @@ def test_health_stays_small_whatever_is_sent() -> None:
         until(lambda: worker.health().stream.descriptor_mismatch == (), "the right one")
 
 
-def test_two_publishers_on_one_key_are_named() -> None:
+def test_two_publishers_on_one_key_raise_a_conflict_alarm_with_their_runs() -> None:
     monitor = MachineMonitor(install(LAB, None))
     ours = scenario_blocks(68.0)
     theirs = [replace(one, run=2, samples=one.samples[::-1].copy()) for one in ours]
@@ -111,11 +111,11 @@ def test_two_publishers_on_one_key_are_named() -> None:
     (alarm,) = [alarm for alarm in monitor.health().alarms if alarm.raised]
     assert alarm.name == CONFLICT
     assert "runs 1 and 2" in alarm.note
-    assert monitor.health().quality.accepted_blocks == len(ours)  # the first goes on undisturbed
+    assert monitor.health().quality.accepted_blocks == len(ours)  # the first is not disturbed
 
 
 @pytest.mark.parametrize("ahead", [0, pytest.param(1, marks=pytest.mark.long), 5])
-def test_a_forged_block_replaces_no_true_one(ahead: int) -> None:
+def test_forged_blocks_raise_a_conflict_and_no_machine_alarm(ahead: int) -> None:
     monitor = MachineMonitor(install(LAB, None))
     ours = scenario_blocks(70.0)
     for number, one in enumerate(ours):
@@ -133,7 +133,7 @@ def test_a_forged_block_replaces_no_true_one(ahead: int) -> None:
 
 
 def misshapen(good: SampleBlock, rng: np.random.Generator) -> SampleBlock:
-    """What can be no block of the machine, although its run, number and time are those of one near by."""
+    """An unusable block whose run, number and time are close to those of a good one."""
     sequences = [good.sequence + ahead for ahead in (0, 1, 2, -1, int(rng.integers(40)))]
     sequence = max(0, [*sequences, 2**63, 2**64 - 1][rng.integers(7)])
     start_ns = good.start_ns + (min(sequence, good.sequence + 50) - good.sequence) * 10**8
@@ -146,7 +146,7 @@ def misshapen(good: SampleBlock, rng: np.random.Generator) -> SampleBlock:
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, 4))])
-def test_what_can_be_no_block_costs_none(seed: int) -> None:
+def test_unusable_blocks_cost_no_good_block(seed: int) -> None:
     monitor, rng = MachineMonitor(install(LAB, None)), np.random.default_rng(seed)
     ours = scenario_blocks(30.0)
     for one in ours:
@@ -163,7 +163,7 @@ def test_what_can_be_no_block_costs_none(seed: int) -> None:
 
 
 @pytest.mark.parametrize("encode", [encode_block, encode_arrow])
-def test_what_may_be_a_block_of_a_machine_is_known_by_form(encode: Callable[..., tuple[bytes, bytes, str]]) -> None:
+def test_usable_blocks_are_recognised_by_their_format(encode: Callable[..., tuple[bytes, bytes, str]]) -> None:
     monitor = MachineMonitor(install(LAB, None))
     (block,) = scenario_blocks(0.1)
     assert monitor.could_use(*encode(block, ""))
@@ -176,12 +176,12 @@ def test_what_may_be_a_block_of_a_machine_is_known_by_form(encode: Callable[...,
     assert not monitor.could_use(payload[1:], attachment, encoding)
 
 
-def test_a_forged_block_that_lets_true_ones_go_on_is_not_the_one_that_was_used() -> None:
+def test_a_forged_block_that_releases_waiting_ones_does_not_count_as_used() -> None:
     monitor, ours = MachineMonitor(install(LAB, None)), scenario_blocks(3.0)
     for one in ours[:5]:
         monitor.step_payload(*encode_block(one, ""))
         assert monitor.used
-    for one in ours[6:26]:  # wait for the missing one
+    for one in ours[6:26]:  # these wait for the missing one
         monitor.step_payload(*encode_block(one, ""))
         assert not monitor.used
     forged = replace(ours[0], sequence=90_000)
@@ -195,7 +195,7 @@ def raw(run: int, size: int = 4, encoding: str = BLOCK_ENCODING, source: str = "
     return RawBlock(b"\0" * size, header, encoding, source)
 
 
-def test_what_cannot_be_a_block_costs_no_place_and_a_queue_is_bounded_in_bytes_too() -> None:
+def test_non_blocks_take_no_room_and_a_queue_is_bounded_in_bytes_too() -> None:
     inbox = Inbox(10, "drop", may_be_block=lambda one, _: one.encoding == BLOCK_ENCODING)
     good = [raw(1) for _ in range(10)]
     for one in good:
@@ -205,7 +205,7 @@ def test_what_cannot_be_a_block_costs_no_place_and_a_queue_is_bounded_in_bytes_t
     assert inbox.dropped == 0
     assert [inbox.get() for _ in range(10)] == good
     assert len(inbox) + inbox.unread == 10_000
-    assert len(inbox) < 100  # a few are looked at
+    assert len(inbox) < 100  # only a few are decoded
     inbox = Inbox(1000, "drop", most_bytes=1_000_000)
     for _ in range(50):
         inbox.put(raw(1, size=100_000))
@@ -213,10 +213,10 @@ def test_what_cannot_be_a_block_costs_no_place_and_a_queue_is_bounded_in_bytes_t
     assert inbox.dropped == 50 - len(inbox)
     first = inbox.get()
     assert isinstance(first, RawBlock)
-    assert first.dropped_before == inbox.dropped  # all that was dropped, of every time that it was full
+    assert first.dropped_before == inbox.dropped  # of all the times that it was full
 
 
-def test_only_a_session_that_is_followed_is_known_and_a_run_alone_is_anybodys() -> None:
+def test_only_the_followed_session_is_known_not_a_run_number_alone() -> None:
     told: list[bool] = []
 
     def may_be_block(_: RawBlock, known: bool) -> bool:
@@ -231,7 +231,7 @@ def test_only_a_session_that_is_followed_is_known_and_a_run_alone_is_anybodys() 
 
 
 @pytest.mark.parametrize("same_run", [False, True])
-def test_another_publisher_costs_the_one_that_is_followed_no_block(same_run: bool) -> None:
+def test_another_publisher_costs_the_followed_one_no_block(same_run: bool) -> None:
     inbox = Inbox(20, "drop")
     good = [raw(1, source="ours") for _ in range(15)]
     inbox.follow(good[0])
@@ -240,11 +240,11 @@ def test_another_publisher_costs_the_one_that_is_followed_no_block(same_run: boo
             inbox.put(raw(1 if same_run else run, source="theirs"))
         inbox.put(one)
     assert inbox.dropped == 0  # of the publisher that is followed
-    assert [inbox.get() for _ in range(15)] == good  # first
+    assert [inbox.get() for _ in range(15)] == good  # ahead of the others
     assert len(inbox) + inbox.unread == 15 * 48
 
 
-def test_a_block_that_was_used_is_followed_by_what_waits_of_its_publisher() -> None:
+def test_waiting_blocks_of_the_followed_publisher_come_first() -> None:
     inbox = Inbox(20, "drop")
     inbox.follow(raw(1))
     for run in (2, 3, 2, 3):
@@ -278,17 +278,17 @@ def test_a_flood_of_bad_messages_costs_no_good_block(tmp_path: Path) -> None:
         try:
             for _ in range(20):
                 feed.put_good()
-                stop.wait(0.1)  # a block is a tenth of a second
+                stop.wait(0.1)  # the length of a block
         finally:
             stop.set()
             thread.join()
         until(lambda: worker.health().quality.accepted_blocks == 20, "all good blocks")
         health = worker.health()
         assert (health.quality.gaps, health.quality.queue_dropped_blocks) == (0, 0)
-        assert sum(health.quality.refused_blocks.values()) > 1000  # how many come through is the network's affair
+        assert sum(health.quality.refused_blocks.values()) > 1000  # how many arrive depends on the network
 
 
-def test_a_message_larger_than_any_block_is_not_taken_and_ends_no_link() -> None:
+def test_an_oversized_message_is_dropped_and_the_link_stays_open() -> None:
     address, key = endpoint(), LAB.keys.stream
     sizes: list[int] = []
     with closing(Link(LinkSettings(listen=(address,), max_message_mb=2.0))) as link, ExitStack() as stack:
@@ -302,8 +302,8 @@ def test_a_message_larger_than_any_block_is_not_taken_and_ends_no_link() -> None
 
 
 @pytest.mark.parametrize("first", ["monitor", "token"])
-def test_a_replay_that_is_announced_silences_no_machine(first: str) -> None:
-    """Anybody on a link without grants can announce one: what the machine sends is evaluated all the same."""
+def test_an_announced_replay_does_not_silence_a_live_machine(first: str) -> None:
+    """Without grants anybody can announce a replay: the machine's own blocks are evaluated all the same."""
     address = endpoint()
     joined = LinkSettings(mode="client", connect=(address,))
     with route(LinkSettings(listen=(address,))), closing(Link(joined)) as liar:
@@ -326,7 +326,7 @@ def test_a_replay_that_is_announced_silences_no_machine(first: str) -> None:
             assert worker.health().quality.gaps == 0
 
 
-def test_blocks_that_say_they_are_replayed_are_not_the_machines() -> None:
+def test_blocks_marked_as_replayed_are_ignored() -> None:
     with fed_service() as (_, worker, feed):
         feed.put_good()
         for one in scenario_blocks(2.0, start_ns=feed.start_ns, run=2):
@@ -337,8 +337,8 @@ def test_blocks_that_say_they_are_replayed_are_not_the_machines() -> None:
         assert worker.health().quality.refused_blocks == {}
 
 
-def test_what_others_say_in_the_monitors_name_stays_on_the_network(tmp_path: Path) -> None:
-    """Nor does a token that nobody is behind hide that the data have stopped."""
+def test_forged_messages_in_the_monitors_name_do_not_enter_its_history(tmp_path: Path) -> None:
+    """Nor does a liveliness token without a publisher hide that the data have stopped."""
     address, quick = endpoint(), ("[operation]", "[ingest]\nno_data_after_s = 1.0\nblock_to_s = 0.5\n\n[operation]")
     with service(address, machine_file(tmp_path, quick)) as (runtime, worker), open_session(address) as session:
         _token = session.liveliness().declare_token(LAB.keys.publisher_alive)
@@ -364,7 +364,7 @@ LONG = pytest.mark.long
 
 
 def watched(name: str, kind: Foreign, seed: int) -> tuple[list[Report], set[str]]:
-    """Reports of full windows, and the alarms that were raised."""
+    """Reports of full windows, and names of the alarms raised."""
     machine = load_machine(name)
     alarms = machine.alarms.model_copy(update={"on_delay_s": machine.window.hop_s})
     machine = machine.model_copy(update={"alarms": alarms})
@@ -373,7 +373,7 @@ def watched(name: str, kind: Foreign, seed: int) -> tuple[list[Report], set[str]
     return [one for one in windows if one.filled == 1], {name for what, name in named(events) if what == "raised"}
 
 
-# One sine far from every mode of the lightly damped machine passes for the one resonance of a softer shaft.
+# A sine far from every mode of the lightly damped machine looks like the one resonance of a softer shaft.
 CASES = [
     *(pytest.param("lab", kind, SEED, marks=LONG if "sines" in kind else ()) for kind in FOREIGN),
     *(pytest.param("heavy", kind, SEED + 2, marks=LONG) for kind in FOREIGN),
@@ -382,7 +382,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "kind", "seed"), CASES)
-def test_no_parameter_is_blamed_for_what_is_no_rotor(name: str, kind: Foreign, seed: int) -> None:
+def test_no_parameter_is_blamed_for_a_stream_that_no_rotor_makes(name: str, kind: Foreign, seed: int) -> None:
     windows, raised = watched(name, kind, seed)
     assert len(windows) >= 2
     assert not raised & set(PARAMETERS)
@@ -396,10 +396,10 @@ def test_no_parameter_is_blamed_for_what_is_no_rotor(name: str, kind: Foreign, s
         assert window.verdict is None or not window.verdict.changed
 
 
-# As factors of both masses, length and inertia. The first fits no parameters but for ten seconds at a time, the second
-# one those of a machine with another shaft.
+# Factors of both masses, length and inertia. The first fits no parameters except for ten seconds at a time, the second
+# fits those of a machine with another shaft.
 @pytest.mark.parametrize("factors", [(0.44, 0.7, 0.54, 0.61), (0.56, 1.33, 0.7, 0.44)])
-def test_no_parameter_is_blamed_where_the_file_is_of_another_rotor(factors: tuple[float, float, float, float]) -> None:
+def test_no_parameter_is_blamed_if_the_file_is_of_another_rotor(factors: tuple[float, float, float, float]) -> None:
     machine = load_machine("lab")
     rotor, (m1, m2, length, inertia) = machine.rotor, factors
     other = rotor.model_copy(update={
@@ -413,7 +413,7 @@ def test_no_parameter_is_blamed_where_the_file_is_of_another_rotor(factors: tupl
 
 
 @pytest.mark.parametrize(("gain", "unbalance", "name"), [(25.4, 1.0, MODEL), (1000.0, 1.0, MODEL), (1.0, 10.0, "e")])
-def test_an_unbalance_of_wrong_units_is_none(gain: float, unbalance: float, name: str) -> None:
+def test_wrong_units_raise_a_model_alarm_and_not_unbalance(gain: float, unbalance: float, name: str) -> None:
     machine = load_machine("lab")
     rotor = machine.rotor.model_copy(update={"e_m": unbalance * machine.rotor.e_m})
     samples = simulated(machine.model_copy(update={"rotor": rotor}), SEED, 80.0).copy()

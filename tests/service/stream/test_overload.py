@@ -1,4 +1,4 @@
-"""A computer that is too small for its machines: windows are skipped, samples and loud vibration are not."""
+"""A computer too small for its machines: windows are skipped, but no samples and no loud vibration."""
 
 import json
 import math
@@ -39,19 +39,19 @@ from tests.service.rig.watching import feed, named, raised, resumed
 
 S = 10**9
 LOUD_FROM_S, LOUD_TO_S = 60, 90
-LENGTH_S = 260.0  # long enough for the alarm to clear after what waits has been taken
+LENGTH_S = 260.0  # long enough for the alarm to clear after the backlog
 LIMIT = '\n[[levels.limits]]\nchannel = "y1"\nmeasure = "overall"\nalert = 220.0\ndanger = 1000.0\n'
 
 
 def short_machine(folder: Path) -> str:
-    """The rotor kit with windows of 20 s and a limit for what the channel y1 shows."""
+    """The rotor kit with windows of 20 s and a limit on the level of channel y1."""
     file = Path(machine_file(folder, *QUICK))
     file.write_text(file.read_text(encoding="utf-8") + LIMIT, encoding="utf-8")
     return str(file)
 
 
 def loud_in_between(seconds: float) -> list[SampleBlock]:
-    """The rotor kit; from one time to another the whole of it vibrates twice as much."""
+    """The rotor kit, with twice the vibration between two times."""
     gain = np.array([2.0] * 8 + [1.0], np.float32)
     return [
         replace(one, samples=one.samples * gain) if LOUD_FROM_S <= (one.start_ns - START_NS) / S < LOUD_TO_S else one
@@ -62,7 +62,7 @@ def loud_in_between(seconds: float) -> list[SampleBlock]:
 def queue_of(
     arrivals_s: Sequence[float], evaluated_s: float, skipped_s: float, held: Callable[[float], float] = lambda at: at
 ) -> list[tuple[float, float, bool]]:
-    """Of each hop of a worker, of 50 blocks: when its last block came, when it is done, whether it was skipped."""
+    """For each hop of 50 blocks: when its last block came, when it is done, whether it is skipped."""
     rule, now_s, found = LoadShedding(), 0.0, []
     ends = arrivals_s[49::50]
     for number, came_s in enumerate(ends):
@@ -79,37 +79,37 @@ def steadily(seconds: float, begin_s: float = 0.0) -> list[float]:
 
 
 @pytest.mark.parametrize("load", [0.5, 0.8, 0.95])
-def test_what_a_stall_leaves_is_evaluated_to_the_last_window(load: float) -> None:
+def test_no_window_is_skipped_after_a_stall(load: float) -> None:
     stood_still = queue_of(steadily(600), 5 * load, 1.0, lambda at: 70.0 if 60.0 < at < 70.0 else at)
     assert max(done_s - came_s for came_s, done_s, _ in stood_still) > 7.0  # it was behind
     assert not any(skipped for _, _, skipped in stood_still)
 
 
 @pytest.mark.parametrize("load", [0.5, 0.8])
-def test_what_a_restart_leaves_is_evaluated_to_the_last_window(load: float) -> None:
+def test_no_window_is_skipped_after_a_restart(load: float) -> None:
     backlog = [0.0] * 1200  # a publisher's cache, all at once
     restarted = queue_of(backlog + steadily(900), 5 * load, 1.0)
     assert max(done_s - came_s for came_s, done_s, _ in restarted) > 50.0
     assert not any(skipped for _, _, skipped in restarted)
 
 
-def test_a_computer_that_stays_too_small_evaluates_what_it_can_and_is_no_later_than_two_hops() -> None:
+def test_under_lasting_overload_every_second_window_is_skipped_and_delay_is_bounded() -> None:
     overloaded = queue_of(steadily(1200), 7.5, 2.5)
     began_s = next(done_s for _, done_s, skipped in overloaded if skipped)
     assert 30.0 < began_s < 120.0
     later = [one for one in overloaded if one[0] > 300.0]
     assert max(done_s - came_s for came_s, done_s, _ in later) < 1.25 + 7.5 + 2.5
-    # 7.5 s of every evaluated window and 2.5 s of the others are 5 s a hop: every second one.
+    # 7.5 s for an evaluated window and 2.5 s for a skipped one are 5 s a hop if every second one is skipped.
     assert np.mean([not skipped for *_, skipped in later]) == pytest.approx(0.5, abs=0.05)
 
 
-def test_once_it_keeps_up_again_a_short_delay_costs_no_window() -> None:
+def test_after_an_overload_a_short_delay_skips_no_window() -> None:
     rule = LoadShedding()
     for number in range(20):
         rule.skips(60 + number, 50, 5.0 * number)
     assert rule.skips(90, 50, 100.0)
     assert not rule.skips(12, 50, 105.0)
-    assert rule.skips(13, 50, 110.0)  # it was behind a moment ago
+    assert rule.skips(13, 50, 110.0)  # it was behind until a moment ago
     assert not rule.skips(3, 50, 125.0)
     assert not rule.skips(49, 50, 140.0)
     assert not rule.skips(60, 50, 145.0)
@@ -121,7 +121,7 @@ def kit(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     return install(load_machine(short_machine(tmp_path_factory.mktemp("kit"))), None)
 
 
-def test_a_skipped_window_is_not_healthy_and_an_alarm_says_why(kit: Installed) -> None:
+def test_a_skipped_window_is_not_evaluable_and_an_alarm_says_why(kit: Installed) -> None:
     skipped = {START_NS + round(end_s * 1e9) for end_s in (42.5, 47.5)}
     monitor, stream = MachineMonitor(kit, skipped.__contains__), scenario_blocks(90.0)
     windows, events = feed(monitor, stream[:480])
@@ -138,7 +138,7 @@ def test_a_skipped_window_is_not_healthy_and_an_alarm_says_why(kit: Installed) -
     assert named([*events, *more]) == [("raised", OVERLOADED), ("cleared", OVERLOADED)]
 
 
-def test_a_defect_is_not_over_for_a_window_that_was_not_evaluated(kit: Installed) -> None:
+def test_a_skipped_window_does_not_clear_the_alarm_on_a_defect(kit: Installed) -> None:
     monitor = MachineMonitor(kit, lambda _: True)
     feed(monitor, scenario_blocks(30.0))
     monitor.fault("a defect", START_NS + 30 * S)
@@ -146,7 +146,7 @@ def test_a_defect_is_not_over_for_a_window_that_was_not_evaluated(kit: Installed
     assert FAULT in raised(monitor)
 
 
-def test_what_is_loud_is_heard_in_skipped_windows_as_soon_as_in_others(kit: Installed) -> None:
+def test_level_alarms_come_as_soon_in_skipped_windows_as_in_others(kit: Installed) -> None:
     def alarms(skips: Callable[[int], bool]) -> list[tuple[str, float]]:
         monitor = MachineMonitor(kit, skips)
         _, events = feed(monitor, loud_in_between(LOUD_TO_S + 60.0))
@@ -159,7 +159,7 @@ def test_what_is_loud_is_heard_in_skipped_windows_as_soon_as_in_others(kit: Inst
     assert LOUD_FROM_S < skipped[0][1] < LOUD_FROM_S + 20
 
 
-def test_a_change_is_named_although_every_other_window_is_skipped(kit: Installed) -> None:
+def test_a_change_is_named_even_if_every_other_window_is_skipped(kit: Installed) -> None:
     stream = scenario_blocks(90.0, parse_fault("k_by=-0.33@50"))
     hop_ns = round(kit.machine.window.hop_s * 1e9)
     monitor = MachineMonitor(kit, lambda end_ns: (end_ns - START_NS) // hop_ns % 2 == 0)
@@ -167,7 +167,7 @@ def test_a_change_is_named_although_every_other_window_is_skipped(kit: Installed
     assert [one for one in named(events) if one[1] in PARAMETERS] == [("raised", "k_by")]
 
 
-def test_a_monitor_goes_on_from_between_skipped_windows_as_if_nothing_had_happened(kit: Installed) -> None:
+def test_a_monitor_resumed_between_skipped_windows_gives_the_same_output(kit: Installed) -> None:
     stream = scenario_blocks(90.0, parse_fault("k_by=-0.33@50"))
     hop_ns = round(kit.machine.window.hop_s * 1e9)
 
@@ -180,8 +180,8 @@ def test_a_monitor_goes_on_from_between_skipped_windows_as_if_nothing_had_happen
     assert feed(second, stream[at:]) == feed(first, stream[at:]) != ([], [])
 
 
-def test_what_grows_beside_a_named_change_is_heard_in_skipped_windows(kit: Installed) -> None:
-    """A skipped window does not know whether the change still explains the growth."""
+def test_level_growth_beside_a_named_change_is_found_in_skipped_windows(kit: Installed) -> None:
+    """A skipped window cannot tell whether the change still explains the growth."""
     levels = LevelSettings(reference="first windows", reference_windows=2)
     monitor = MachineMonitor(
         install(kit.machine.model_copy(update={"levels": levels}), None), lambda end_ns: end_ns > START_NS + 85 * S
@@ -200,7 +200,7 @@ def message(number: int, source: str) -> RawBlock:
     return RawBlock(*encode_block(scenario_blocks(10.0)[number], ""), source=source)
 
 
-def test_blocks_of_others_and_bursts_for_an_idle_worker_are_no_reason_to_skip() -> None:
+def test_other_publishers_and_bursts_to_an_idle_worker_count_as_no_delay() -> None:
     inbox = Inbox(1000, "drop")
     inbox.put(message(0, "own"))
     first = inbox.get()
@@ -221,17 +221,17 @@ def test_blocks_of_others_and_bursts_for_an_idle_worker_are_no_reason_to_skip() 
 
     burst = threading.Timer(0.1, send)
     burst.start()
-    inbox.get(40)  # waits for them
+    inbox.get(40)  # waits for 40
     burst.join()
     assert inbox.behind == 0
-    assert inbox.behind == 39  # until all are taken again
+    assert inbox.behind == 39  # until all have been taken once
 
 
 def test_the_last_block_of_a_hop_waits_for_its_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shedding, "_LONGEST_TURN_S", 60.0)
     with fed_service(short_machine(tmp_path)) as (_, worker, feed):
         first, *others = scenario_blocks(10.0)
-        feed.put(first)  # nobody knows yet how many blocks a hop has
+        feed.put(first)  # the blocks in a hop are not known yet
         until(lambda: worker.tally.blocks == 1, "the first block")
         with in_turn(completes_hop=True):  # another machine's
             feed.put(*others)
@@ -241,8 +241,8 @@ def test_the_last_block_of_a_hop_waits_for_its_turn(tmp_path: Path, monkeypatch:
         until(lambda: worker.tally.blocks == 100, "all blocks")
 
 
-def test_turns_come_one_by_one_in_the_order_in_which_they_were_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However long they take together; one that never ends is waited for once."""
+def test_turns_are_taken_one_at_a_time_in_order_of_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However long they take together; a turn that never ends is waited for only once."""
     asked, began, beside, ends = list[int](), list[int](), list[int](), threading.Event()
 
     class Turns(deque[threading.Event]):
@@ -277,7 +277,7 @@ def test_turns_come_one_by_one_in_the_order_in_which_they_were_asked_for(monkeyp
 
 
 def hurry(feed: Feed, worker: MachineWorker, stream: list[SampleBlock], until_sent: int, ahead: int) -> None:
-    """Put blocks so that so many wait at the worker, whatever it does about it, until so many are sent."""
+    """Put blocks so that `ahead` of them always wait at the worker, until `until_sent` are sent."""
     while feed.sequence < until_sent:
         if len(worker.inbox) < ahead:
             feed.put(*stream[feed.sequence : feed.sequence + 50])
@@ -285,7 +285,7 @@ def hurry(feed: Feed, worker: MachineWorker, stream: list[SampleBlock], until_se
         time.sleep(0.002)  # a loop that never rests takes the processor from the worker
 
 
-def test_an_overloaded_service_loses_no_sample_and_is_replayed_the_same(
+def test_an_overloaded_service_loses_no_sample_and_replays_identically(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shedding, "_LASTING_S", 0.3)  # data come a hundred times as fast as from a machine
@@ -293,9 +293,9 @@ def test_an_overloaded_service_loses_no_sample_and_is_replayed_the_same(
     recording = RecordingSettings(directory=str(tmp_path / "recordings"))
     with fed_service(file, bound=1500, recording=recording) as (runtime, worker, feed):
         hurry(feed, worker, stream, 10 * (LOUD_TO_S + 50), 200)
-        # From now on a hop comes when the one before is done.
+        # From now on each hop is sent when the previous one is done.
         for end in (*range(feed.sequence + 25, len(stream), 50), len(stream)):
-            # nothing waits, and nothing but what follows the latest hop is on its way
+            # nothing waits, and at most what follows the latest hop is in flight
             known = feed.sequence - (0 if feed.sequence % 50 else 40)
             until(
                 lambda known=known: len(worker.inbox) == 0 and worker.health().quality.accepted_blocks >= known,  # type: ignore[misc]  # bound now
@@ -329,7 +329,7 @@ def test_an_overloaded_service_loses_no_sample_and_is_replayed_the_same(
     assert sum(json.loads(one)["message"].get("skipped", False) for one in found) >= 5
 
 
-def test_what_was_recorded_before_damage_is_replayed(tmp_path: Path) -> None:
+def test_a_damaged_recording_is_replayed_up_to_the_damage(tmp_path: Path) -> None:
     machine, blocks, files = load_machine(short_machine(tmp_path)), scenario_blocks(60.0), []
     keys, installed = machine.keys, install(machine, None)
     for number, part in enumerate((blocks[:300], blocks[300:])):

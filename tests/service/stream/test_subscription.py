@@ -1,4 +1,4 @@
-"""What publishers have kept and what is new, over real sessions on loopback: in order, each once, and nobody waits."""
+"""Cached and new blocks of publishers, over real sessions on loopback: in order, each once, none held up."""
 
 import json
 import threading
@@ -30,7 +30,7 @@ SIZE = 30_000
 
 
 @pytest.mark.parametrize("wait", [True, False], ids=["batch run", "live machine"])
-def test_kept_and_live_blocks_arrive_each_once(wait: bool) -> None:
+def test_cached_and_live_blocks_arrive_once_each(wait: bool) -> None:
     address = endpoint()
     patience = {"transport/link/tx/queue/congestion_control/block/wait_before_close": json.dumps(60_000_000)}
     seen: list[int] = []
@@ -54,13 +54,13 @@ def test_kept_and_live_blocks_arrive_each_once(wait: bool) -> None:
     assert sorted(seen) == list(range(KEPT + LIVE))
 
 
-# Zenoh would hold back 1200 until all are there.
+# With 1200 cached blocks Zenoh would hold back all until the last has come.
 @pytest.mark.parametrize(
     ("kept", "at_once", "turns"),
     [(1199, KEPT, (False, True) * 2), (1, 0, (False,) * 6)],
     ids=["all are kept", "one is kept"],
 )
-def test_blocks_that_come_meanwhile_cost_none(kept: int, at_once: int, turns: tuple[bool, ...]) -> None:
+def test_blocks_published_during_a_start_are_not_lost(kept: int, at_once: int, turns: tuple[bool, ...]) -> None:
     address, over = endpoint(), threading.Event()
     with session_of(LinkSettings(listen=(address,))) as session:
         publisher = advanced_publisher(session, LAB.keys.stream, kept)
@@ -87,7 +87,7 @@ def test_blocks_that_come_meanwhile_cost_none(kept: int, at_once: int, turns: tu
 
 
 @pytest.mark.parametrize("alive", [True, False], ids=["alive token", "no token"])
-def test_a_publisher_that_appears_later_loses_nothing_that_it_has_kept(alive: bool) -> None:
+def test_cached_blocks_of_a_publisher_that_appears_later_arrive(alive: bool) -> None:
     address, seen = endpoint(), list[int]()
     with machine_link(address, partial(_numbered, seen)), session_of(LinkSettings(connect=(address,))) as before:
         first = advanced_publisher(before, LAB.keys.stream, KEPT)
@@ -96,17 +96,17 @@ def test_a_publisher_that_appears_later_loses_nothing_that_it_has_kept(alive: bo
         until(lambda: seen == [7], "the block of the first publisher")
         with session_of(LinkSettings(mode="client", connect=(address,))) as session:
             later = advanced_publisher(session, LAB.keys.stream, KEPT)
-            if alive:  # it need not publish any more then
+            if alive:  # then it need not publish again
                 session.liveliness().declare_token(LAB.keys.publisher_alive)
-            for number in range(LIVE):  # the first before it can know of a subscriber
+            for number in range(LIVE):  # the first ones before it can know of a subscriber
                 later.put(_payload(number))
                 time.sleep(0.01 * (number > LIVE // 2))
             until(lambda: len(seen) == 1 + LIVE, "all blocks")
     assert seen == [7, *range(LIVE)]
 
 
-def test_what_a_publisher_kept_that_connects_again_after_a_start_is_not_lost() -> None:
-    """A monitor that listens itself is there before its publishers have connected again."""
+def test_cached_blocks_of_a_reconnecting_publisher_arrive() -> None:
+    """A listening monitor has started before its publishers reconnect."""
     address, seen, sent = endpoint(), list[int](), KEPT + LIVE
     again = {"connect/retry": json.dumps({"period_init_ms": 300, "period_max_ms": 300, "period_increase_factor": 1})}
     with session_of(LinkSettings(connect=(address,)), **again) as session:
@@ -123,7 +123,7 @@ def test_what_a_publisher_kept_that_connects_again_after_a_start_is_not_lost() -
     assert seen == list(range(seen[0], seen[0] + len(seen)))
 
 
-def test_a_publisher_that_does_not_answer_holds_up_no_other() -> None:
+def test_a_publisher_that_does_not_reply_holds_up_no_other() -> None:
     address, seen = endpoint(), list[int]()
     with machine_link(address, partial(_numbered, seen)), session_of(LinkSettings(connect=(address,))) as session:
         silent = session.declare_publisher(LAB.keys.stream)
@@ -139,8 +139,8 @@ def test_a_publisher_that_does_not_answer_holds_up_no_other() -> None:
         assert seen == list(range(LIVE))
 
 
-def test_a_publisher_whose_new_blocks_do_not_follow_on_its_answers_is_asked_again() -> None:
-    """As where it published while the subscription was on its way to it, or a link broke."""
+def test_a_gap_between_cached_and_new_blocks_is_queried_again() -> None:
+    """As when it published while the subscription was on its way, or a link broke."""
     address, seen = endpoint(), list[int]()
     with session_of(LinkSettings(listen=(address,))) as session:
         publisher = advanced_publisher(session, LAB.keys.stream, KEPT)
@@ -148,7 +148,7 @@ def test_a_publisher_whose_new_blocks_do_not_follow_on_its_answers_is_asked_agai
         publisher.put(_payload(1))
         with machine_link(LinkSettings(mode="client", connect=(address,)), partial(_numbered, seen)):
             until(lambda: seen == [0, 1], "what it has kept")
-            # Zenoh takes no notice of what is older than what it has handed on: as good as lost.
+            # Zenoh drops blocks older than those it has delivered: the next ones are as good as lost.
             session.put(LAB.keys.stream, _payload(5), source_info=_source(publisher, 5))
             for number in range(2, 7):
                 publisher.put(_payload(number))
@@ -156,8 +156,8 @@ def test_a_publisher_whose_new_blocks_do_not_follow_on_its_answers_is_asked_agai
     assert seen == list(range(7))
 
 
-def test_no_more_publishers_are_waited_for_than_a_machine_can_have() -> None:
-    """Anybody may claim to be another one."""
+def test_replies_of_at_most_64_publishers_are_waited_for() -> None:
+    """Anybody can claim to be another publisher."""
     address, seen = endpoint(), list[int]()
     with (
         machine_link(address, partial(_numbered, seen)) as (link, _),
@@ -176,7 +176,7 @@ def test_no_more_publishers_are_waited_for_than_a_machine_can_have() -> None:
         unanswered.clear()  # which ends the queries
 
 
-def test_blocks_of_a_publisher_that_gives_times_and_no_numbers_arrive_in_order() -> None:
+def test_blocks_of_a_publisher_with_timestamps_only_arrive_in_order() -> None:
     address, seen = endpoint(), list[int]()
     stamped = {"timestamping/enabled": "true"}
     with session_of(LinkSettings(listen=(address,)), **stamped) as session:
@@ -193,7 +193,7 @@ def test_blocks_of_a_publisher_that_gives_times_and_no_numbers_arrive_in_order()
     assert seen == list(range(KEPT + LIVE))
 
 
-def test_a_machine_that_holds_up_its_publisher_leaves_the_others_their_turns() -> None:
+def test_a_machine_that_holds_up_its_publisher_does_not_starve_others() -> None:
     address, order = endpoint(), list[str]()
     other = LAB.model_copy(update={"name": "other"})
 
@@ -243,8 +243,8 @@ def _more_than(seen: list[int], count: int) -> bool:
     return len(seen) > count
 
 
-def test_a_heartbeat_does_not_hold_up_what_is_asked_for_again() -> None:
-    """The publisher connects, as most do: Zenoh then serves its socket from the thread that sends its heartbeats."""
+def test_heartbeats_do_not_hold_up_replies_from_a_cache() -> None:
+    """The publisher connects, as most do: Zenoh then serves its socket from the thread that sends heartbeats."""
     with Link(LinkSettings(listen=(address := endpoint(),))).session as session:
         stream = LAB.keys.stream
         with session_of(LinkSettings(connect=(address,))) as publishing:
@@ -261,5 +261,5 @@ def test_a_heartbeat_does_not_hold_up_what_is_asked_for_again() -> None:
                 accept_replies=zenoh.ReplyKeyExpr.ANY, timeout=60.0,
             )  # fmt: skip
             until(lambda: answers.try_recv() is not None, "first answer")
-            time.sleep(0.5)  # several heartbeats, while nothing more is taken
+            time.sleep(0.5)  # several heartbeats, while no reply is taken
             assert sum(answer.ok is not None for answer in answers) == KEPT - 1

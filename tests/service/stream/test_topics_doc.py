@@ -1,4 +1,4 @@
-"""The page on topics lists everything there is, and its examples and recipes are what the programs send and take.
+"""The page on topics lists every key, and its examples and recipes agree with the programs.
 
 ``python -m tests.service.stream.test_topics_doc`` writes the examples of what a monitor sends anew.
 """
@@ -46,7 +46,7 @@ def shown(name: str) -> dict[str, Any]:
     return found
 
 
-def test_every_key_has_its_section_and_its_row() -> None:
+def test_every_key_has_a_section_and_a_row() -> None:
     assert set(NAMES) == set(TAKEN) | set(SENT) | WITHOUT_JSON
     assert set(sections()) == {getattr(KEYS, name) for name in NAMES}
     page = PAGE.read_text(encoding="utf-8")
@@ -55,21 +55,21 @@ def test_every_key_has_its_section_and_its_row() -> None:
 
 
 @pytest.mark.parametrize("name", TAKEN)
-def test_example_of_what_others_send_is_valid_and_complete(name: str) -> None:
+def test_examples_of_received_messages_are_valid_and_complete(name: str) -> None:
     TAKEN[name].model_validate(shown(name))
-    # Fields with a default would pass unseen if they were missing in the page.
+    # A field with a default could be missing in the page unnoticed.
     assert set(shown(name)) == set(TAKEN[name].model_fields)
     if name == "descriptor":
         assert ChannelDescriptor.model_validate(shown(name)) == LAB.descriptor
 
 
 @pytest.mark.parametrize("name", SENT)
-def test_example_of_what_a_monitor_sends_is_that_of_the_model(name: str) -> None:
+def test_examples_of_sent_messages_are_those_of_the_models(name: str) -> None:
     assert shown(name) == example(SENT[name]), "python -m tests.service.stream.test_topics_doc writes it anew"
     SENT[name].model_validate(shown(name))
 
 
-def test_every_state_and_kind_is_explained() -> None:
+def test_every_health_state_and_kind_of_event_is_explained() -> None:
     for state in HealthState:
         assert f"`{state.value}`" in sections()[KEYS.health]
     for kind in EventKind:
@@ -79,8 +79,8 @@ def test_every_state_and_kind_is_explained() -> None:
         assert f"`{field}`" in sections()[KEYS.alarm_event]
 
 
-def test_recipe_for_a_follower_takes_each_event_once_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The program in the page, run as it stands but for the address and the end, against a service with alarms."""
+def test_the_follower_recipe_gets_each_event_once_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The program in the page, unchanged except for its address and end, against a service with alarms."""
     (recipe,) = re.findall(r"```python\n(.*?)```", sections()[KEYS.alarm_event], flags=re.DOTALL)
     address = endpoint()
     rounds: list[Callable[[], object]] = []
@@ -88,7 +88,7 @@ def test_recipe_for_a_follower_takes_each_event_once_in_order(tmp_path: Path, mo
     genuine = time.sleep
 
     def sleep(duration_s: float) -> None:
-        if duration_s < 0.5:  # not the program's: somebody waits for a condition
+        if duration_s < 0.5:  # not of the program: a test waits for a condition
             genuine(duration_s)
             return
         if not rounds:
@@ -103,12 +103,12 @@ def test_recipe_for_a_follower_takes_each_event_once_in_order(tmp_path: Path, mo
         def gap() -> None:
             latest = worker.alarms().sequence
             feed.skip(60)
-            feed.put_good(60)  # the first ones wait for those that are missing
+            feed.put_good(60)  # the first ones wait for the missing ones
             until(lambda: worker.alarms().sequence > latest, "an alarm event")
 
         feed.put_good()
         gap()
-        for _ in range(2):  # the second time it goes on where the first has stopped
+        for _ in range(2):  # the second run continues where the first stopped
             rounds += [lambda: None, gap]
             with pytest.raises(KeyboardInterrupt):
                 exec(compile(recipe.replace("tcp/127.0.0.1:7447", address), str(PAGE), "exec"), {})  # noqa: S102
@@ -118,7 +118,7 @@ def test_recipe_for_a_follower_takes_each_event_once_in_order(tmp_path: Path, mo
     assert len(kept) >= 2
 
 
-def test_settings_in_the_page_are_read(tmp_path: Path) -> None:
+def test_settings_in_the_page_can_be_loaded(tmp_path: Path) -> None:
     text = (ROOT / "docs" / "service.md").read_text(encoding="utf-8")
     (toml,) = re.findall(r"```toml\n(.*?)```", text, flags=re.DOTALL)
     (tmp_path / "plant.toml").write_text(toml, encoding="utf-8")

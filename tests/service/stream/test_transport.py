@@ -37,7 +37,7 @@ from tests.sure import sure
 KEYS = LAB.keys
 
 
-def test_a_worker_that_waits_for_blocks_is_woken_by_enough_or_by_a_call(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_waiting_worker_is_woken_by_enough_blocks_or_a_call(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.stream.inbox._PATIENCE_S", 600.0)
     inbox, order = Inbox(100, "drop"), list[bytes]()
 
@@ -51,7 +51,7 @@ def test_a_worker_that_waits_for_blocks_is_woken_by_enough_or_by_a_call(monkeypa
         inbox.put(RawBlock(bytes([number]), b"", ""))
     until(lambda: len(order) == 3, "blocks that were enough", 20.0)
     inbox.put(RawBlock(b"\3", b"", ""))
-    time.sleep(0.05)  # that it would take to be woken by a single one
+    time.sleep(0.05)  # long enough to be woken by a single one
     inbox.call(lambda: None)
     until(lambda: len(order) == 5, "a block that a call let be taken", 20.0)
     inbox.close()
@@ -60,7 +60,7 @@ def test_a_worker_that_waits_for_blocks_is_woken_by_enough_or_by_a_call(monkeypa
 
 
 @pytest.mark.parametrize(("bound", "odd"), [(2, False), (100, True)])
-def test_nobody_waits_without_room_or_in_trouble(bound: int, odd: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_small_inbox_or_a_non_block_ends_the_wait(bound: int, odd: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.stream.inbox._PATIENCE_S", 600.0)
     inbox, taken = Inbox(bound, "wait", may_be_block=lambda _, __: not odd), list[object]()
     thread = threading.Thread(target=lambda: taken.append(inbox.get(50)), daemon=True)
@@ -70,7 +70,7 @@ def test_nobody_waits_without_room_or_in_trouble(bound: int, odd: bool, monkeypa
     thread.join()
 
 
-def test_closed_inbox_frees_everybody_who_waits() -> None:
+def test_closing_an_inbox_releases_all_waiting_threads() -> None:
     inbox = Inbox(1, "wait")
     inbox.put(RawBlock(b"", b"", ""))
     threads = [threading.Thread(target=inbox.put, args=(RawBlock(b"", b"", ""),)) for _ in range(2)]
@@ -83,7 +83,7 @@ def test_closed_inbox_frees_everybody_who_waits() -> None:
     assert inbox.get() is None
 
 
-def test_blocks_of_two_sessions_are_told_apart() -> None:
+def test_blocks_of_two_sessions_have_different_sources() -> None:
     taken: list[RawBlock] = []
     address = endpoint()
     with machine_link(address, taken.append), open_session(address) as session, open_session(address) as other:
@@ -96,8 +96,8 @@ def test_blocks_of_two_sessions_are_told_apart() -> None:
         assert sources[0] != sources[1]
 
 
-def test_waiting_survives_a_long_stall() -> None:
-    """A publisher's heartbeat overtakes blocks that wait; with recovery Zenoh would then skip hundreds of them."""
+def test_no_block_is_lost_while_publishers_wait_out_a_long_stall() -> None:
+    """A publisher's heartbeat overtakes waiting blocks; with recovery Zenoh would then skip hundreds of them."""
     address, gate = endpoint(), threading.Event()
     inbox: Inbox = Inbox(10, "wait")
     received: list[RawBlock] = []
@@ -114,7 +114,7 @@ def test_waiting_survives_a_long_stall() -> None:
         publisher = advanced_publisher(session, KEYS.stream, 300, detected=False)
         sender = threading.Thread(target=lambda: [publisher.put(bytes(7200)) for _ in range(10_000)])
         sender.start()
-        # Longer than several heartbeats; a publisher blocked in a put shows nothing else to wait for.
+        # Longer than several heartbeats; a publisher blocked in a put gives no other sign.
         threading.Event().wait(1.5)
         gate.set()
         sender.join()
@@ -123,7 +123,7 @@ def test_waiting_survives_a_long_stall() -> None:
         worker.join()
 
 
-def test_exception_in_a_callback_is_counted_and_the_next_block_arrives() -> None:
+def test_an_exception_in_a_callback_is_counted_and_the_next_block_arrives() -> None:
     address = endpoint()
     received: list[RawBlock] = []
 
@@ -150,7 +150,7 @@ def test_nothing_is_delivered_or_published_after_close() -> None:
         feed = Feed(session)
         feed.put_good()
         until(lambda: len(first) == 1, "first block")
-        # Published again until the subscription has arrived, of which there is no other sign.
+        # Published again until the subscription has arrived: there is no other sign of it.
         until(repeating(lambda: declared.publish("health", '"open"'), lambda: bool(healths)), "health")
         declared.close()
         declared.publish("health", '"closed"')
@@ -165,7 +165,7 @@ def test_nothing_is_delivered_or_published_after_close() -> None:
 
 
 def repeating(action: Callable[[], None], condition: Callable[[], bool]) -> Callable[[], bool]:
-    """The condition, with the action before every look at it."""
+    """The condition, with the action run before every check."""
 
     def act_and_look() -> bool:
         action()
@@ -174,7 +174,7 @@ def repeating(action: Callable[[], None], condition: Callable[[], bool]) -> Call
     return act_and_look
 
 
-def test_late_joiner_asks_for_health_and_alarm_state() -> None:
+def test_late_joiners_can_query_health_and_alarm_states() -> None:
     with fed_service() as (runtime, worker, feed):
         feed.put_good(5)
         until(lambda: worker.health().quality.accepted_blocks == 5, "blocks")
@@ -199,7 +199,7 @@ def query(session: zenoh.Session, key: str) -> str:
     return found[0]
 
 
-def test_follower_gets_the_latest_state_at_once_and_then_what_happens() -> None:
+def test_a_follower_gets_the_latest_state_and_then_live_messages() -> None:
     address = endpoint()
     messages: list[TopicMessage] = []
     with machine_link(address, ignore) as (opened, declared):
@@ -223,7 +223,7 @@ def test_follower_gets_the_latest_state_at_once_and_then_what_happens() -> None:
             assert connected()
 
 
-def test_alarm_log_is_answered_from_a_number_on() -> None:
+def test_the_alarm_log_can_be_queried_from_a_sequence_number_on() -> None:
     address = endpoint()
 
     def alarm_events(after: int, limit: int) -> str:
@@ -248,11 +248,11 @@ def test_alarm_log_is_answered_from_a_number_on() -> None:
         assert link.errors == 0
 
 
-def test_alarm_log_is_answered_while_the_machine_is_busy() -> None:
-    """An operator's request waits for the machine's thread; the log, and health beside a slow log, do not."""
+def test_the_alarm_log_can_be_queried_while_the_machine_is_busy() -> None:
+    """Requests of operators wait for the machine's thread; the log, and health beside a slow log, do not."""
     address, gate = endpoint(), threading.Event()
     with service(address) as (_, worker), open_session(address) as session:
-        worker.inbox.call(lambda: ignore(gate.wait()))  # the thread is stuck in the middle of something
+        worker.inbox.call(lambda: ignore(gate.wait()))  # the thread is stuck
         page = AlarmLogPage.model_validate_json(query(session, KEYS.alarm_event))
         assert page == AlarmLogPage(site="demo", machine="lab", events=(), latest=-1)
         gate.set()
@@ -269,7 +269,7 @@ def test_alarm_log_is_answered_while_the_machine_is_busy() -> None:
         assert [reply.ok.payload.to_string() for reply in waiting if reply.ok is not None] == ["[]"]
 
 
-def test_publisher_is_seen_to_come_and_go_and_its_descriptor_is_asked_for() -> None:
+def test_a_publishers_liveliness_is_followed_and_its_descriptor_queried() -> None:
     address = endpoint()
     wrong = LAB.descriptor.model_copy(update={"rate_hz": 1000.0}).model_dump_json()
     with service(address) as (_, worker), open_session(address) as session:
@@ -283,7 +283,7 @@ def test_publisher_is_seen_to_come_and_go_and_its_descriptor_is_asked_for() -> N
         assert worker.health().stream.descriptor_mismatch == ()
 
 
-def test_a_monitor_says_that_another_one_of_its_machine_is_there() -> None:
+def test_a_monitor_warns_of_another_monitor_of_its_machine() -> None:
     def said() -> list[object]:
         return [entry["machine"] for entry in logs if "another monitor" in entry["event"]]
 
@@ -291,10 +291,10 @@ def test_a_monitor_says_that_another_one_of_its_machine_is_there() -> None:
     with capture_logs() as logs, machine_link(address, ignore):
         with machine_link(LinkSettings(mode="client", connect=(address,)), ignore):
             until(lambda: bool(said()), "the warning")
-        assert said() == ["demo/lab"]  # of the second; the first was alone
+        assert said() == ["demo/lab"]  # logged by the second; the first was alone at its start
 
 
-def test_all_channels_are_emptied_until_that_is_ended() -> None:
+def test_an_intake_empties_all_channels_until_each_is_ended() -> None:
     intake, waiting, taken = Intake(), deque([1, 2]), list[int]()
     other, seen = deque[int](), list[int]()
 
@@ -311,7 +311,7 @@ def test_all_channels_are_emptied_until_that_is_ended() -> None:
         waiting.append(4)
         other.append(5)
         until(lambda: seen == [5], "the message of the other channel")
-        end()  # once more changes nothing
+        end()  # a second call changes nothing
     finally:
         intake.close()
     assert taken == [1, 2, 3]

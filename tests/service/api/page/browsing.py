@@ -1,8 +1,8 @@
-"""A real Chromium that looks at the page of a running service, and a plant to look at.
+"""A real Chromium that opens the page of a running service, and a plant to show.
 
-The browser is what ``ROTORWATCH_CHROMIUM`` names, or the system's own; no registry of Python packages has one that is
-kept up to date, so where there is none, these tests are skipped (what is asked of browsers is tested without one in
-``test_access_http.py``). To keep what was seen: ``ROTORWATCH_SCREENSHOTS=FOLDER``.
+The browser is the one in ``ROTORWATCH_CHROMIUM``, or the system's own; no Python package provides one that is kept up
+to date, so without one these tests are skipped (``test_access_http.py`` tests the access of browsers without one).
+To keep screenshots: ``ROTORWATCH_SCREENSHOTS=FOLDER``.
 """
 
 import json
@@ -57,13 +57,13 @@ def chromium() -> Iterator[Browser]:
             timeout=PATIENCE_MS,
         ) as found,
     ):
-        expect.set_options(timeout=PATIENCE_MS)  # of every test of this process, whichever is the first
+        expect.set_options(timeout=PATIENCE_MS)  # for all tests of this process
         yield found
 
 
 @dataclass(slots=True)
 class Plant:
-    """A machine whose data come as fast as they are taken up to a block, and then slowly; and one without any."""
+    """A machine with data, as fast as they are accepted up to a block and then slowly; and one without data."""
 
     runtime: Runtime
     feed: Feed
@@ -102,7 +102,7 @@ def plant_running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
 def looking(
     browser: Browser, url: str, *, phone: bool = False, dark: bool = False, given: HttpCredentials | None = None
 ) -> Iterator[Page]:
-    """A page that nothing goes wrong on and that asks nobody else, in a browser of its own."""
+    """A page in a browser of its own, which must have no errors and no requests to other hosts."""
     asked: list[str] = []
     faults: list[str] = []
     with browser.new_context(
@@ -128,19 +128,19 @@ def kept(page: Page, name: str) -> None:
 
 
 def tell_instead(page: Page, *healths: Mapping[str, Any]) -> None:
-    """Tell a page health other than the monitor does, of these machines when the page asks, and end that."""
+    """Replace the event stream of a page with these health messages, after which it ends."""
 
     def instead(route: Route) -> None:
         told = "".join(f"event: health\ndata: {json.dumps(health)}\n\n" for health in healths)
         named = ",".join(f"{health['site']}/{health['machine']}=-1" for health in healths)
         route.fulfill(body=f"id: {named}\nevent: start\ndata: {{}}\n\n{told}", content_type="text/event-stream")
 
-    page.add_init_script("delete window.SharedWorker")  # what it asks for cannot be routed
+    page.add_init_script("delete window.SharedWorker")  # its requests cannot be routed
     page.route("**/api/v1/events?*", instead)
 
 
 def run_deno(folder: Path, *arguments: str, given: str = "") -> subprocess.CompletedProcess[str]:
-    """What a command of Deno, which brings TypeScript, says; nothing is fetched."""
+    """Run a command of Deno, which brings TypeScript, without any downloads."""
     quiet = {"DENO_DIR": str(folder / "cache"), "DENO_NO_UPDATE_CHECK": "1", "NO_COLOR": "1"}
     command, *rest = arguments
     words = [find_deno_bin(), command, "--no-remote", "--quiet", *rest]
@@ -148,14 +148,14 @@ def run_deno(folder: Path, *arguments: str, given: str = "") -> subprocess.Compl
 
 
 def violations(page: Page) -> list[str]:
-    """What breaks a rule of WCAG 2.2 AA on the page, as axe-core tells it; nothing of it stays there.
+    """Violations of WCAG 2.2 AA on the page found by axe-core.
 
-    If anything does, it is looked at again from its top and a second later: where plots come in, and under bars that
-    stay while the page is scrolled, one control lies upon another for a moment.
+    If there are any, check again a second later from the top of the page: while plots appear, and under bars that stay
+    in place during scrolling, controls overlap for a moment.
     """
     if not page.evaluate("'axe' in window"):
         page.evaluate(files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8"))
-    # What it says of rules that hold takes as long as looking: one place each of those is told.
+    # Details on rules that hold take as long as the check itself: only one place each is reported.
     options = {"runOnly": RULES, "resultTypes": ["violations"]}
     found: dict[str, Any] = page.evaluate("options => axe.run(document, options)", options)
     if found["violations"]:
@@ -171,7 +171,7 @@ def violations(page: Page) -> list[str]:
 
 
 def unreached(page: Page) -> list[str]:
-    """Controls that the Tab key does not lead to, or that do not show that they have the focus."""
+    """Controls that the Tab key does not reach, or that do not show their focus."""
     wrong: list[str] = []
     page.evaluate(
         "[document.activeElement.blur(), window.getSelection().removeAllRanges(), window.reached = new Map()]"

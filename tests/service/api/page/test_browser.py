@@ -1,4 +1,4 @@
-"""What a person sees in a browser: a real Chromium opens the pages of a running service."""
+"""The page in a browser: a real Chromium opens the views of a running service."""
 
 import re
 from collections.abc import Iterator
@@ -46,7 +46,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
         yield made
 
 
-def test_who_signs_in_with_a_token_sees_the_machine_until_signing_out(browser: Browser, runtime: Runtime) -> None:
+def test_a_signed_in_user_sees_machines_until_signing_out(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
     with browser.new_context() as context:
         context.set_default_timeout(PATIENCE_MS)
@@ -70,7 +70,7 @@ def test_who_signs_in_with_a_token_sees_the_machine_until_signing_out(browser: B
         page.goto(f"{url}/#/")
         page.get_by_text("1 without data").click()
         page.get_by_role("heading", name="demo/lab").wait_for()
-        others = [context.new_page() for _ in range(6)]  # more than a caller has streams, and a browser connections
+        others = [context.new_page() for _ in range(6)]  # more than a caller's streams and a browser's connections
         for other in others:
             other.goto(url)
             expect(other.locator(".apart summary")).to_have_text("1 without data")
@@ -84,17 +84,17 @@ def test_who_signs_in_with_a_token_sees_the_machine_until_signing_out(browser: B
         expect(page.locator("machine-tile")).to_have_count(0)
 
 
-def test_a_browser_that_shows_the_page_of_the_api_asks_for_a_password(browser: Browser, runtime: Runtime) -> None:
+def test_a_browser_on_the_api_page_asks_for_a_password(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url + "/docs"
     with browser.new_page() as stranger, stranger.expect_response(url) as refused:
-        with pytest.raises(Error, match="ERR_INVALID_AUTH_CREDENTIALS"):  # it asked, and nobody gave one
+        with pytest.raises(Error, match="ERR_INVALID_AUTH_CREDENTIALS"):  # it asked, and none was given
             stranger.goto(url)
         assert refused.value.status == 401
         asked = [one["value"].split()[0] for one in refused.value.headers_array() if one["name"] == "www-authenticate"]
         assert asked == ["Bearer", "Basic"]
 
 
-def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Plant) -> None:
+def test_a_fault_is_shown_explained_and_acknowledged(browser: Browser, plant: Plant) -> None:
     url = plant.runtime.http_url
     with looking(browser, url) as page, looking(browser, url) as second, client(plant.runtime) as http:
         shown = sure(page.goto(url))
@@ -188,7 +188,7 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
                 broken += [f"{view}: {one}" for one in unreached(page)] if kind == "light" else []
                 assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
                 assert page.evaluate("document.querySelector('header').offsetHeight") < 100
-                if phone:  # nor is anything cut on a small one, or on a large one at 400 % zoom
+                if phone:  # also on a small phone, or a large screen at 400 % zoom
                     page.set_viewport_size({"width": 320, "height": 844})
                     assert page.evaluate("document.documentElement.scrollWidth") == 320, view
                     page.set_viewport_size({"width": 390, "height": 844})
@@ -197,7 +197,7 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
     assert not broken, "\n".join(broken)
 
 
-def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser, plant: Plant) -> None:
+def test_everything_in_a_report_is_on_the_machines_page(browser: Browser, plant: Plant) -> None:
     url = plant.runtime.http_url
     told: dict[str, Any] = dict(example(Health))
     report: dict[str, Any] = told["report"] | {
@@ -260,7 +260,7 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
         expect(page.locator("machine-tile .worst")).to_have_text("<b>reason</b> & more")  # not one of its levels
 
 
-def test_a_view_that_comes_late_does_not_take_the_place_of_the_one_chosen_since(browser: Browser, plant: Plant) -> None:
+def test_a_view_that_loads_late_does_not_replace_a_newer_one(browser: Browser, plant: Plant) -> None:
     url = plant.runtime.http_url
     late = "await new Promise((come) => { globalThis.letCome = come; document.body.id = 'comes' });"
     with looking(browser, url) as page:
@@ -280,7 +280,7 @@ def test_a_view_that_comes_late_does_not_take_the_place_of_the_one_chosen_since(
         expect(page.locator("machine-view h1")).to_have_text("demo/lab")
 
 
-def test_a_machine_that_the_monitor_has_no_longer_is_not_shown(browser: Browser, plant: Plant) -> None:
+def test_removed_and_unknown_machines_are_not_shown(browser: Browser, plant: Plant) -> None:
     url = plant.runtime.http_url
     told = [{**dict(example(Health)), "machine": name} for name in ("lab", "spare")]
     with looking(browser, url) as page:
@@ -289,12 +289,12 @@ def test_a_machine_that_the_monitor_has_no_longer_is_not_shown(browser: Browser,
         expect(page.locator("machine-view")).to_contain_text("no machine of this name")
         page.goto(f"{url}/#/")
         expect(page.locator("machine-tile")).to_have_count(2)
-        tell_instead(page, told[0])  # the stream begins anew, as after a restart
+        tell_instead(page, told[0])  # the stream reconnects, as after a restart
         expect(page.locator("machine-tile")).to_have_count(1)
         expect(page.get_by_role("link", name="Alarms 1")).to_be_visible()
 
 
-def test_names_as_long_as_they_may_be_fit_a_phone(browser: Browser, plant: Plant) -> None:
+def test_the_longest_names_fit_a_phone(browser: Browser, plant: Plant) -> None:
     told = {**dict(example(Health)), "site": "Compressor" * 6, "machine": "BoilerFeed" * 6}
     with browser.new_context(viewport={"width": 390, "height": 844}) as context:
         page = context.new_page()
@@ -307,7 +307,7 @@ def test_names_as_long_as_they_may_be_fit_a_phone(browser: Browser, plant: Plant
             assert page.evaluate("document.documentElement.scrollWidth") == 390
 
 
-def test_machines_stand_by_site_and_only_lines_that_are_seen_are_asked_for(browser: Browser, plant: Plant) -> None:
+def test_machines_are_grouped_by_site_and_only_visible_trends_loaded(browser: Browser, plant: Plant) -> None:
     url = plant.runtime.http_url
     asked: list[list[str]] = []
 
@@ -336,7 +336,7 @@ def test_machines_stand_by_site_and_only_lines_that_are_seen_are_asked_for(brows
         expect(tiles.first).to_have_attribute("place", "site-0/m0")
         sites.nth(1).locator("summary").click()
         expect(tiles).to_have_count(80)
-        expect(sites.nth(1).locator("state-mark")).to_have_text("alert")  # what is folded away
+        expect(sites.nth(1).locator("state-mark")).to_have_text("alert")  # of the folded site
         page.reload()
         expect(tiles).to_have_count(80)
         expect(tiles.first).to_have_attribute("place", "site-0/m0")
@@ -359,11 +359,11 @@ CanvasRenderingContext2D.prototype.fillText = function (text, ...rest) {
   window.written.push(text);
   fill.call(this, text, ...rest);
 };
-"""  # what charts say; none of it is in the document
+"""  # texts on charts, which are not in the document
 
 
 def _two_operators(browser: Browser, plant: Plant, http: httpx.Client) -> None:
-    """Whoever comes second is told so; whoever may not act is not offered it."""
+    """The second operator gets a notice; a viewer without rights has no buttons."""
     url = plant.runtime.http_url
 
     def overtaken(route: Route) -> None:
@@ -396,7 +396,7 @@ def _two_operators(browser: Browser, plant: Plant, http: httpx.Client) -> None:
         page.unroute("**/shelve")
         page.get_by_label("Order").select_option("first-out")
         expect(page.locator("alarm-list tbody tr")).to_have_text([re.compile("k_by"), re.compile("stream-lost")])
-        assert page.locator("alarm-list").get_by_role("link", name="Why?").count() == 1  # no window lost the stream
+        assert page.locator("alarm-list").get_by_role("link", name="Why?").count() == 1  # stream-lost has no window
         for box in page.locator("alarm-list").get_by_role("checkbox").all():
             box.check()
         kept(page, "alarms-chosen")
@@ -412,7 +412,7 @@ def _two_operators(browser: Browser, plant: Plant, http: httpx.Client) -> None:
         assert row.get_by_role("button").count() == 0
 
 
-def test_the_page_of_the_api_works_without_anything_from_elsewhere(browser: Browser, runtime: Runtime) -> None:
+def test_the_api_page_works_without_other_hosts(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
     given = HttpCredentials(username="anybody", password=token(runtime, Scope.READ, name="reader"), origin=url)
     with looking(browser, url, given=given) as page:

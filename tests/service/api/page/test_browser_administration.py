@@ -1,4 +1,4 @@
-"""The service itself in a browser: who may use it, who did, and whether it keeps up."""
+"""The administration view in a browser: tokens, audit log, and the state of the service."""
 
 import re
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from tests.service.api.page.browsing import PATIENCE_MS, kept, looking, unreache
 from tests.service.rig.monitored import GUARDED, fed, token
 
 OLD = 60
-"""Entries of the audit log from before, more than a page."""
+"""Older entries of the audit log, more than a page."""
 
 
 @pytest.fixture(scope="module")
@@ -37,14 +37,14 @@ def sign_in(page: Page, url: str, text: str, view: str) -> None:
     page.keyboard.press("Enter")
 
 
-def test_what_there_is_none_of_has_its_heading(browser: Browser, tmp_path: Path) -> None:
+def test_empty_sections_keep_their_headings(browser: Browser, tmp_path: Path) -> None:
     with fed(tmp_path) as (running, _), looking(browser, running.http_url) as page:
         page.goto(f"{running.http_url}/#/administration")
         for heading in ("Access tokens", "Webhooks", "Audit log"):
             expect(page.get_by_role("heading", name=heading, exact=True)).to_be_visible()
         expect(page.locator("token-list")).to_contain_text("There are no tokens.")
         assert not violations(page)
-        with browser.new_page() as other:  # whose console says that something was refused
+        with browser.new_page() as other:  # whose console reports the refused request
             other.goto(f"{running.http_url}/#/recordings")
             expect(other.locator("recordings-view")).to_contain_text("the settings name no directory for them")
             for element in ("replay-order", "recording-line", "recording-table", "recordings-view .tools select"):
@@ -63,7 +63,7 @@ def test_a_token_is_created_used_to_sign_in_and_revoked(browser: Browser, runtim
         chief = token(runtime, Scope.READ, Scope.CONFIGURE, name="chief")
         sign_in(page, url, chief, "administration")
         expect(page.locator("token-list tr", has_text="chief")).to_contain_text("(yours)")
-        expect(page.get_by_label("operate")).to_be_disabled()  # nobody gives what is not his own
+        expect(page.get_by_label("operate")).to_be_disabled()  # a scope that the user lacks
 
         page.get_by_label("Name, as shown in the audit log").fill("screen <b>1</b>")
         page.get_by_role("button", name="Create token").click()
@@ -95,7 +95,7 @@ def test_a_token_is_created_used_to_sign_in_and_revoked(browser: Browser, runtim
         token_id = text[3:15]
         for action, outcome in (("revoke-token", "done (200)"), ("create-token", "done (201)")):
             entry = log.filter(has_text=action)
-            expect(entry).to_have_count(1)  # the deed and its announcement are one
+            expect(entry).to_have_count(1)  # start and outcome are one entry
             expect(entry).to_contain_text(outcome)
             expect(entry).to_contain_text(token_id)
         assert text[16:] not in page.content()

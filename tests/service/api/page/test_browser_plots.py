@@ -1,4 +1,4 @@
-"""The plots of a machine in a browser: loaded when they are opened, of what is live and of recordings."""
+"""The plots of a machine in a browser: loaded on opening, of live data and of recordings."""
 
 import importlib
 import re
@@ -44,7 +44,7 @@ def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
         yield running
 
 
-def test_plots_are_drawn_when_they_are_opened_and_say_what_they_show(browser: Browser, runtime: Runtime) -> None:
+def test_plots_load_when_opened_and_state_their_data(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
     with looking(browser, url) as page:
         asked: list[str] = []
@@ -54,7 +54,7 @@ def test_plots_are_drawn_when_they_are_opened_and_say_what_they_show(browser: Br
         expect(page.locator("spectrum-plot canvas")).to_be_visible()
         expect(page.locator("spectrum-plot .note")).to_contain_text("1× is taken out")
         spectrum = page.locator("spectrum-plot")
-        spectrum.get_by_label("Channel").select_option("y1_dot")  # of which the window shows none
+        spectrum.get_by_label("Channel").select_option("y1_dot")  # not in the window's spectra
         expect(spectrum.locator(".note")).to_have_text(
             re.compile("^Amplitudes in the newest samples, .*mean of 20 spec")
         )
@@ -92,8 +92,8 @@ def test_plots_are_drawn_when_they_are_opened_and_say_what_they_show(browser: Br
         kept(page, "plots-phone")
 
 
-def test_the_drawing_turns_the_unbalance_and_names_the_sensor_at_fault(browser: Browser, runtime: Runtime) -> None:
-    """A shaft that turns from z to y, its heavy spot first at 30°, now a quarter turn further that way: at -60°."""
+def test_the_drawing_rotates_the_unbalance_and_marks_a_faulty_sensor(browser: Browser, runtime: Runtime) -> None:
+    """A shaft that turns from z to y; its heavy spot was at 30° and is a quarter turn further, at -60°."""
     told: dict[str, Any] = dict(example(Health))
     report: dict[str, Any] = told["report"]
     vector = example(UnbalanceVector) | {"turned_deg": 90.0, "turned_interval_95_deg": (88.5, 91.5)}
@@ -126,7 +126,7 @@ def test_the_drawing_turns_the_unbalance_and_names_the_sensor_at_fault(browser: 
 
 
 @pytest.mark.parametrize(("part", "least", "most"), [(1.0, 20.0, 22.0), (1e-4, 0.0, 0.5)])
-def test_the_line_of_a_tile_breaks_where_data_lack_and_is_flat_where_nothing_could_be_detected(
+def test_a_tiles_trend_breaks_at_gaps_and_is_flat_below_detectable_changes(
     browser: Browser, runtime: Runtime, part: float, least: float, most: float
 ) -> None:
     trend = {"site": "demo", "machine": "lab", "quantity": "parameter", "name": "k_by", "length_ns": 10**9}
@@ -138,19 +138,19 @@ def test_the_line_of_a_tile_breaks_where_data_lack_and_is_flat_where_nothing_cou
         lines = page.locator("spark-line polyline")
         expect(lines).to_have_count(3)
         points = [(line.get_attribute("points") or "").split() for line in lines.all()]
-        assert [len(one) for one in points] == [4, 2, 2]  # the one alone is a dot
+        assert [len(one) for one in points] == [4, 2, 2]  # the single one is a dot
         rise = float(points[0][0].partition(",")[2]) - float(points[2][1].partition(",")[2])
-        assert least <= rise <= most  # of 22: all of it that lies beyond what could be detected
+        assert least <= rise <= most  # of 22, the full height for detectable changes
 
 
-def test_a_plant_is_measured(
+def test_the_page_benchmark_measures_a_plant(
     browser: Browser, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     page = importlib.import_module("page")
 
-    class AtOnce(page.Plant):  # type: ignore[misc, name-defined]  # of a program that is found while it runs
-        """Tells all machines in one piece: a busy browser shows no tile later than the others."""
+    class AtOnce(page.Plant):  # type: ignore[misc, name-defined]  # imported at run time
+        """Sends all machines in one piece, so that a busy browser shows all tiles at once."""
 
         async def events(self) -> AsyncIterator[str]:
             pieces = super().events()
@@ -160,4 +160,4 @@ def test_a_plant_is_measured(
 
     monkeypatch.setattr(page, "Plant", AtOnce)
     page.plant(browser, 5, 1.0)
-    assert re.fullmatch(r"\| 5 \|.*\| 1, 0 \|\n", capsys.readouterr().out)  # the lines of all, asked for together
+    assert re.fullmatch(r"\| 5 \|.*\| 1, 0 \|\n", capsys.readouterr().out)  # all trends in one request

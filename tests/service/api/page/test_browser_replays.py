@@ -1,4 +1,4 @@
-"""Recordings in a browser: found on a line of time, replayed with another limit, looked through window by window."""
+"""Recordings in a browser: found on a time line, replayed with another limit, inspected window by window."""
 
 import re
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ from tests.service.rig.replaying import recording
 ID = "demo/lab/20260101T000000Z.mcap"
 SECONDS, FAULT_S = 80.0, 30.0
 pytestmark = pytest.mark.usefixtures("replays_at_once")
-# A slow network: the first order to move takes longer than everything ordered after it.
+# A slow network: the first seek takes longer than all later requests.
 _LATE_FIRST_SEEK = """() => {
     const ask = window.fetch;
     let late = 1000;
@@ -54,14 +54,14 @@ def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
 
 
 def chosen(page: Page, url: str) -> None:
-    """The view of recordings, with what is around the alarm chosen."""
+    """Open the view of recordings and choose those around the alarm."""
     page.goto(f"{url}/#/recordings")
     page.get_by_role("button", name=re.compile("Choose ten minutes before and after .*k_by")).click()
     expect(page.locator("replay-order")).to_contain_text("1 recording of demo/lab")
     expect(page.get_by_role("checkbox", name="20260101T000000Z.mcap")).to_be_checked()
 
 
-def test_nothing_is_said_of_recordings_before_they_are_known(browser: Browser, runtime: Runtime) -> None:
+def test_no_recording_is_not_shown_before_the_list_has_loaded(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
     held: dict[str, Route] = {}
 
@@ -69,20 +69,20 @@ def test_nothing_is_said_of_recordings_before_they_are_known(browser: Browser, r
         held["events" if "/events" in route.request.url else "recordings"] = route
 
     with looking(browser, url) as page:
-        page.add_init_script("delete window.SharedWorker")  # what it asks for cannot be routed
+        page.add_init_script("delete window.SharedWorker")  # its requests cannot be routed
         page.route("**/api/v1/events?*", hold)
         page.route("**/recordings?site=*", hold)
         page.goto(f"{url}/#/recordings/demo/lab")
         expect(page.get_by_label("Machine", exact=True)).to_have_text("demo/lab")
         held["events"].continue_()
-        expect(page.get_by_role("link", name="Alarms 1")).to_be_visible()  # the stream has told of the machine
+        expect(page.get_by_role("link", name="Alarms 1")).to_be_visible()  # the machine has arrived on the stream
         page.wait_for_timeout(200)
         expect(page.locator("recordings-view")).not_to_contain_text("No recording")
         held["recordings"].continue_()
         expect(page.locator("recording-table")).to_contain_text("20260101T000000Z.mcap")
 
 
-def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browser, runtime: Runtime) -> None:
+def test_a_recording_is_replayed_with_other_settings_and_browsed_by_window(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
     with looking(browser, url) as page:
         chosen(page, url)
@@ -97,7 +97,7 @@ def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browse
         expect(page.locator(".replay-banner")).to_contain_text("REPLAY of demo/lab. Nothing in this view is live")
         expect(view).to_contain_text("alarms.on_delay_s = 10")
 
-        # After twice the delay of the live machine; and windows are full from the twentieth second on.
+        # With twice the live on-delay; windows are full from the twentieth second on.
         events = page.locator("alarm-comparison tbody tr")
         expect(events.first).to_contain_text(re.compile(r"changed by −\d"))  # no hyphen, as in the text itself
         expect(events.filter(has_text="raised")).to_have_count(1)
@@ -143,7 +143,7 @@ def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browse
         page.get_by_label("Beside it").select_option(index=1)
         expect(page.locator("alarm-comparison tbody tr").first).to_contain_text("the other replay only")
 
-    with browser.new_page() as page:  # whose console says that something was refused
+    with browser.new_page() as page:  # whose console reports the refused request
         chosen(page, url)
         page.get_by_label("Alert when a parameter has changed by more than, %").fill("80")
         page.get_by_role("button", name="Start replay").click()
@@ -172,7 +172,7 @@ def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browse
                     page.mouse.wheel(0, 3000)
                     until(partial(page.evaluate, "scrollY > 1500"), "the page to scroll")
                     tall = page.locator(".replay-banner").evaluate("one => one.getBoundingClientRect().bottom")
-                    # What is scrubbed stays in sight below the banner, however many lines that has.
+                    # The slider stays visible below the banner, however many lines that has.
                     assert scrub.evaluate("one => one.getBoundingClientRect().top") >= tall > 0
                     page.evaluate("scrollTo(0, 0)")
                 kept(page, f"{name}-{kind}")
@@ -180,7 +180,7 @@ def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browse
                 assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
 
 
-# A hand that takes the scrubber over all windows up to one.
+# Drag the slider over all windows up to one.
 _DRAGGED = """(scrub, to) => {
     for (let at = 0; at <= to; at += 1) {
         scrub.value = String(at);
@@ -197,7 +197,7 @@ def unfolded(page: Page, *headings: str) -> None:
     for heading in headings:
         page.locator("window-plots summary").filter(has_text=heading).press(
             "Enter"
-        )  # not the mouse: what is above may grow meanwhile
+        )  # not by mouse: the page may shift meanwhile
 
 
 def diameters(snapshot: OrbitSnapshot) -> list[float]:
@@ -205,7 +205,7 @@ def diameters(snapshot: OrbitSnapshot) -> list[float]:
     return [2 * one.ellipse.semi_major for one in snapshot.orbits if one.ellipse is not None]
 
 
-def test_orbits_and_spectra_of_any_window_of_a_replay(browser: Browser, runtime: Runtime) -> None:
+def test_orbits_and_spectra_are_those_of_the_selected_window(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
     with client(runtime) as http:
         answer = http.post("/api/v1/replays", json={"recordings": [ID]}).raise_for_status()
@@ -246,12 +246,12 @@ def test_orbits_and_spectra_of_any_window_of_a_replay(browser: Browser, runtime:
                 expect(orbits.locator("ellipse.nominal")).to_have_count(len(diameters(api)))
                 expect(orbits.locator("ellipse.estimated")).to_have_count(len(diameters(api)))
                 density = answered(http.get(f"{PLACE}/spectra", params=asked_of(at)), SpectrumSnapshot).densities[0]
-                # The element says the level of the density it has drawn.
+                # The element's label has the level of the density drawn.
                 expect(spectrum.locator("line-chart")).to_have_attribute(
                     "aria-label", f"spectrum of {density.channel}, rms {float(f'{density.rms or 0:.3g}'):g}"
                 )
                 expect(spectrum).to_contain_text("Replay, window 2026-01-01 00:00:")
-                # Of windows that are passed over nothing is asked for.
+                # Nothing is requested for windows that the slider passes over.
                 assert len([one for one in asked if one.startswith("/spectra")]) == 1
                 seen[at] = orbits.locator("figcaption").all_inner_texts()
                 kept(page, f"replay-window-{at}")
@@ -266,7 +266,7 @@ def test_orbits_and_spectra_of_any_window_of_a_replay(browser: Browser, runtime:
             kept(page, "replay-window-all")
         for kind, phone, dark in (("dark", False, True), ("phone", True, False)):
             with looking(browser, url, phone=phone, dark=dark) as page:
-                if kind == "dark":  # no answer; one that refuses would be an error on the console too
+                if kind == "dark":  # an empty response; a refusal would be an error on the console too
                     page.clock.install()
                     page.route("**/spectra?*", lambda route: route.fulfill(json={}))
                 page.goto(f"{url}/#/replays/{job_id}")
@@ -282,12 +282,12 @@ def test_orbits_and_spectra_of_any_window_of_a_replay(browser: Browser, runtime:
                 assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
 
 
-def test_a_paced_replay_is_paused_and_moved(browser: Browser, runtime: Runtime) -> None:
+def test_a_paced_replay_is_paused_moved_and_stopped(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
     with looking(browser, url) as page, client(runtime) as http:
         chosen(page, url)
         page.get_by_label("How").select_option("paced")
-        page.get_by_label("Seconds of data per second").fill("0.1")  # it may not end by itself
+        page.get_by_label("Seconds of data per second").fill("0.1")  # slow, so that it does not end by itself
         page.get_by_role("button", name="Start replay").click()
         control = page.locator("paced-control")
         expect(control).to_contain_text("rotorwatch run --namespace replay/")

@@ -1,4 +1,4 @@
-"""What the page shows of a machine first: the same that an overview leaves of its health, by the same numbers."""
+"""What the page shows first of a machine: the page and the service's overview must choose the same."""
 
 import itertools
 import json
@@ -31,7 +31,7 @@ console.log(JSON.stringify(told.map((one) => worst(one))));
 
 
 def limits(found: list[tuple[float | None, str]]) -> tuple[dict[str, float | None], tuple[LevelLimits, ...]]:
-    """Values of measures of a channel, and what they are judged by."""
+    """Levels of a channel and their limits."""
     measures = ["velocity", "overall"][: len(found)]
     judged = [
         LevelLimits.model_validate({"measure": measure, "alert": 2.8, "source": "", "state": state})
@@ -50,7 +50,7 @@ def channel(level: ChannelLevels, name: str, found: list[tuple[float | None, str
 
 
 def healths() -> Iterator[Health]:
-    """Every combination of alarms, readings and levels; of some parameters nothing is known that would be seen."""
+    """Every combination of alarms, readings and levels; some parameters have no detectable change."""
     health = Health.model_validate(example(Health))
     report, alarm = sure(health.report), health.alarms[0]
     one, seen, level = report.parameters[0], report.detectable[0], report.levels[0]
@@ -64,7 +64,7 @@ def healths() -> Iterator[Health]:
             **{
                 **dict(report),
                 **dict.fromkeys(("opinions", "equations", "sensors", "shapes"), ()),
-                # Before the verdict is settled, what is true now is not what the whole window says.
+                # Before the verdict is settled, current values differ from those of the whole window.
                 "parameters": stated if settled else (*stated[:1], parameter(one, "c_by", 5.0)),
                 "detectable": tuple(least[:known]),
                 "levels": (channel(level, "y1", y1), channel(level, "z1", z1)),
@@ -85,7 +85,7 @@ def named(alarm: Alarm, name: str) -> Alarm:
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Health, dict[str, object], dict[str, object]]]:
-    """What the page finds worst, of everything and of its overview."""
+    """What the page finds worst in each full health and in its overview."""
     folder = tmp_path_factory.mktemp("deno")
     script = folder / "ask.js"
     script.write_text(_ASKED.replace("STATES", STATES.as_uri()))
@@ -97,13 +97,13 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Health, dict[s
     return list(zip(all_of_them, answers[::2], answers[1::2], strict=True))
 
 
-def test_an_overview_has_what_the_page_shows(found: list[tuple[Health, dict[str, object], dict[str, object]]]) -> None:
+def test_the_page_agrees_with_the_overview(found: list[tuple[Health, dict[str, object], dict[str, object]]]) -> None:
     assert len(found) > 6000
     different = [(whole, brief) for _, whole, brief in found if whole != brief]
     assert not different, different[:3]
 
 
-def test_what_is_nearest_to_its_limit_is_that_by_the_same_number(
+def test_the_page_and_the_service_agree_on_nearness_to_limits(
     found: list[tuple[Health, dict[str, object], dict[str, object]]],
 ) -> None:
     calm = [(health, whole) for health, whole, _ in found if not health.alarms]
@@ -116,7 +116,7 @@ def test_what_is_nearest_to_its_limit_is_that_by_the_same_number(
         assert first == (series if whole["quantity"] == "parameter" else f"level:{series.partition(':')[0]}")
 
 
-def test_a_narrow_interval_is_not_rounded_to_nothing(tmp_path: Path) -> None:
+def test_a_narrow_interval_is_not_rounded_to_zero(tmp_path: Path) -> None:
     script = tmp_path / "ask.js"
     figures = STATES.with_name("figures.js").as_uri()
     script.write_text(

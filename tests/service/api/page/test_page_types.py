@@ -1,6 +1,6 @@
-"""What the page says of its types holds: TypeScript checks every module, with the records as the API describes them.
+"""Type annotations of the page: TypeScript checks every module against the records described by the API.
 
-Deno brings TypeScript in a package of Python; nothing of the page is run here, and nothing is fetched.
+Deno brings TypeScript in a Python package; the page is not run here, and nothing is downloaded.
 """
 
 import json
@@ -15,18 +15,18 @@ from tests.service.api.test_api_doc import description
 from tests.service.rig.live import ROOT
 
 PAGE = ROOT / "service" / "api" / "page"
-RECORDS = "monitor/records.d.ts"  #: where the modules expect those, and where nobody keeps them
+RECORDS = "monitor/records.d.ts"  #: imported by the modules, and generated only here
 OPTIONS = {
     "checkJs": True,
     "strict": True,
     "noImplicitReturns": True,
-    "noImplicitOverride": False,  # a word in JavaScript it would be, in a comment it is clutter
+    "noImplicitOverride": False,  # JavaScript has no such keyword, and in a comment it is clutter
     "lib": ["dom", "dom.iterable", "esnext"],
 }
 
 
 def found(folder: Path, checked: list[Path]) -> str:
-    """What TypeScript finds in modules, on a computer that has fetched nothing and fetches nothing."""
+    """Errors that TypeScript finds in modules, without any downloads."""
     config = folder / "deno.json"
     config.write_text(json.dumps({"compilerOptions": OPTIONS}))
     done = run_deno(folder, "check", "--config", str(config), *map(str, checked))
@@ -70,7 +70,7 @@ def schemas() -> dict[str, Any]:
 
 
 def compared(folder: Path, schemas: dict[str, Any], *beside: Path) -> str:
-    """What is wrong with the modules of the page, and with others: it takes as long."""
+    """Errors in the modules of the page, and in others in the same run."""
     page = folder / "page"
     shutil.copytree(PAGE, page)
     lines = (f"export type {name} = {as_type(one)};" for name, one in schemas.items())
@@ -78,12 +78,12 @@ def compared(folder: Path, schemas: dict[str, Any], *beside: Path) -> str:
     return found(folder, [*sorted(page.rglob("*.js")), *beside])
 
 
-def test_every_module_is_of_the_types_it_says_and_reads_the_api(tmp_path: Path, schemas: dict[str, Any]) -> None:
+def test_every_module_passes_type_checks_against_the_api(tmp_path: Path, schemas: dict[str, Any]) -> None:
     assert len(list(PAGE.rglob("*.js"))) > 20
     assert compared(tmp_path, schemas) == ""
 
 
-def test_a_wrong_type_and_what_the_api_does_not_have_are_found(tmp_path: Path, schemas: dict[str, Any]) -> None:
+def test_a_wrong_type_and_a_field_missing_from_the_api_are_found(tmp_path: Path, schemas: dict[str, Any]) -> None:
     wrong = tmp_path / "wrong.js"
     wrong.write_text("/** @param {number} one */\nexport const twice = (one) => one.length;\n")
     stream, alarm = schemas["StreamStatus"]["properties"], schemas["Alarm"]["properties"]
